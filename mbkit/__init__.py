@@ -1,0 +1,60 @@
+"""Equations of motion that can be trusted: one description, several engines, a judgement.
+
+The equation, everywhere in this library::
+
+    M(q) v̇ + C(q, v) v + g(q) = τ + τ_passive(q, v),      q̇ = D(q) v
+
+SI units and radians; see the README for the conventions. Heavy parts load when
+they are first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mbkit import catalog as catalog
+    from mbkit import errors as errors
+    from mbkit.engines import Dynamics as Dynamics
+    from mbkit.engines import dynamics as dynamics
+    from mbkit.errors import MbkitError as MbkitError
+    from mbkit.load import load as load
+    from mbkit.load import robots as robots
+    from mbkit.model import Mimic as Mimic
+    from mbkit.model import Model as Model
+    from mbkit.model import ModelBuilder as ModelBuilder
+    from mbkit.simulate import Trajectory as Trajectory
+    from mbkit.simulate import simulate as simulate
+    from mbkit.studies import compare as compare
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Dynamics": "mbkit.engines",
+    "MbkitError": "mbkit.errors",
+    "Mimic": "mbkit.model",
+    "Model": "mbkit.model",
+    "ModelBuilder": "mbkit.model",
+    "Trajectory": "mbkit.simulate",
+    "compare": "mbkit.studies",
+    "dynamics": "mbkit.engines",
+    "load": "mbkit.load",
+    "robots": "mbkit.load",
+    "simulate": "mbkit.simulate",
+}
+_MODULES = ("catalog", "errors")
+
+__all__ = sorted([*_HOME, *_MODULES, "__version__"])
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    if name in _MODULES:
+        return importlib.import_module(f"mbkit.{name}")
+    raise AttributeError(f"module 'mbkit' has no attribute {name!r}; it has: {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return __all__

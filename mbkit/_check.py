@@ -1,0 +1,78 @@
+"""Checks of arguments that come from users: one shape, one type, one message."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbkit.errors import InputError
+
+Array = NDArray[np.float64]
+
+__all__ = ["Array", "batch_of", "finite_array", "require_finite", "rows"]
+
+
+def _as_float(name: str, value: ArrayLike) -> Array:
+    try:
+        raw = np.asarray(value)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__} ({error})") from None
+    if raw.dtype.kind not in "fiu":
+        raise InputError(f"{name}: expected real numbers, got dtype {raw.dtype}")
+    return np.asarray(raw, dtype=np.float64)
+
+
+def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return `value` as a new float64 array of exactly this shape, all finite."""
+    array = _as_float(name, value)
+    if array.shape != shape:
+        raise InputError(f"{name}: expected shape {shape}, got {array.shape}")
+    require_finite(name, array)
+    return array.copy()
+
+
+def require_finite(name: str, array: Array) -> None:
+    """Raise `InputError` that says where `array` holds NaN or infinity."""
+    bad = ~np.isfinite(array)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise InputError(f"{name}: {array[where]} at index {where}; expected finite numbers")
+
+
+def rows(name: str, value: ArrayLike, n: int, owner: str, size: str) -> Array:
+    """Return `value` as float64 with shape ``(n,)`` or ``(N, n)``, all finite.
+
+    `owner` and `size` only serve the message: "panda has nq = 7".
+    """
+    array = _as_float(name, value)
+    if array.ndim not in (1, 2) or array.shape[-1] != n:
+        raise InputError(f"{name}: expected shape ({n},) or (N, {n}), got {array.shape}; {owner} has {size} = {n}")
+    require_finite(name, array)
+    return array
+
+
+def batch_of(**arrays: Array) -> int | None:
+    """Return the common batch size, or None when every array is a single state.
+
+    A single state beside a batch is allowed: it is repeated.
+    """
+    sizes = {name: a.shape[0] for name, a in arrays.items() if a.ndim == 2}
+    if len(set(sizes.values())) > 1:
+        told = ", ".join(f"{k} has {v}" for k, v in sizes.items())
+        raise InputError(f"batches of different sizes: {told}; give every array the same N, or one state")
+    return next(iter(sizes.values()), None)
+
+
+def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = False) -> float:
+    """Return `value` as a finite float, optionally of a required sign."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: expected a number, got {value!r}") from None
+    if not np.isfinite(number):
+        raise InputError(f"{name}: expected a finite number, got {number}")
+    if positive and number <= 0 or nonnegative and number < 0:
+        raise InputError(f"{name}: expected a number {'above' if positive else 'of at least'} 0, got {number}")
+    return number

@@ -1,0 +1,55 @@
+"""One adapter a file behind one protocol; an engine is imported when first asked for."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Final
+
+from mbkit.engines.base import QUANTITIES, Dynamics
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.model import Model
+
+__all__ = ["ENGINES", "QUANTITIES", "Dynamics", "dynamics"]
+
+#: Engine name -> (module, class, package to install).
+ENGINES: Final = {
+    "pinocchio": ("mbkit.engines.pinocchio", "PinocchioDynamics", "pin"),
+    "lagrangian": ("mbkit.engines.lagrangian", "LagrangianDynamics", "casadi"),
+    "mujoco": ("mbkit.engines.mujoco", "MujocoDynamics", "mujoco"),
+}
+
+
+def dynamics(model: Model, engine: str = "pinocchio") -> Dynamics:
+    """Return the model's dynamics as one engine computes them.
+
+    Parameters
+    ----------
+    model : Model
+    engine : {"pinocchio", "lagrangian", "mujoco"}
+        Rigid-body algorithms of Pinocchio, mbkit's own derivation from energies,
+        or MuJoCo.
+
+    Returns
+    -------
+    Dynamics
+
+    Raises
+    ------
+    UnknownNameError
+        No engine of this name.
+    UnsupportedError
+        The engine is not installed, or cannot hold this model; with the reason.
+    """
+    if not isinstance(model, Model):
+        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    if engine not in ENGINES:
+        raise UnknownNameError("engine", str(engine), ENGINES)
+    module, name, package = ENGINES[engine]
+    try:
+        adapter = getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name and error.name.startswith("mbkit"):
+            raise
+        raise UnsupportedError(f"{engine} is not installed ({error}); pip install {package}") from error
+    made: Dynamics = adapter(model)
+    return made

@@ -1,0 +1,234 @@
+"""The protocol of the engines: `Dynamics`, one description evaluated by one engine.
+
+The equation of motion stands in the package's docstring. An adapter fills in the
+``_``-methods for one state or a batch; checks of arguments and results, and the
+quantities that follow from others, are here.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of
+from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.model import Model
+from mbkit.model.manifold import check_quaternions
+
+__all__ = ["QUANTITIES", "Dynamics"]
+
+QUANTITIES: Final = (
+    "mass_matrix",
+    "coriolis_matrix",
+    "gravity",
+    "nle",
+    "passive",
+    "inverse_dynamics",
+    "forward_dynamics",
+    "kinetic_energy",
+    "potential_energy",
+    "pose",
+    "jacobian",
+    "function",
+)
+
+
+class Dynamics(ABC):
+    """A model evaluated by one engine; made by `mbkit.dynamics`.
+
+    Every method takes one state or a batch with one leading axis, checks shapes,
+    finite numbers and unit quaternions, and returns new arrays.
+
+    Raises
+    ------
+    InputError
+        An argument of the wrong shape, not finite, or with a quaternion that is
+        not of unit length.
+    NumericalError
+        The engine's answer is not finite.
+    UnsupportedError
+        The engine cannot give this quantity, with the reason.
+    """
+
+    engine: ClassVar[str]
+    #: Quantities this engine cannot give, each with the reason.
+    refuses: ClassVar[dict[str, str]] = {}
+
+    def __init__(self, model: Model) -> None:
+        for needed, told in ((model.needs.loops, "loop closures"), (model.needs.time, "motions prescribed in time")):
+            if needed:
+                remedy = "loops" if told.startswith("loop") else "prescribed"
+                raise UnsupportedError(
+                    f"{self.engine}: {model.name} has {told}, which no engine here solves yet; "
+                    f"model.without({remedy!r}) is the tree without them"
+                )
+        self.model = model
+
+    @property
+    def supports(self) -> frozenset[str]:
+        """Names of the quantities that this engine can give."""
+        return frozenset(QUANTITIES) - frozenset(self.refuses)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.model.name!r}: nq={self.model.nq}, nv={self.model.nv}>"
+
+    def __reduce__(self) -> tuple[type, tuple[Model]]:
+        return type(self), (self.model,)
+
+    # Terms of the equation of motion
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """Return M(q), shape (nv, nv) or (N, nv, nv)."""
+        return self._evaluate("mass_matrix", self._mass_matrix, q=q)
+
+    def coriolis_matrix(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return C(q, v) with Ṁ - 2C skew, shape (nv, nv) or (N, nv, nv).
+
+        Coriolis matrices are not unique; this one is Christoffel's. Compare C v
+        between engines, not the entries.
+        """
+        return self._evaluate("coriolis_matrix", self._coriolis_matrix, q=q, v=v)
+
+    def gravity(self, q: ArrayLike) -> Array:
+        """Return g(q), on the left of the equation, without springs; (nv,) or (N, nv)."""
+        return self._evaluate("gravity", self._gravity, q=q)
+
+    def nle(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return C(q, v) v + g(q), shape (nv,) or (N, nv)."""
+        return self._evaluate("nle", self._nle, q=q, v=v)
+
+    def passive(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the generalized force of springs and dampers, shape (nv,) or (N, nv)."""
+        return self._evaluate("passive", self._passive, q=q, v=v)
+
+    def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
+        """Return τ = M a + nle - τ_passive, shape (nv,) or (N, nv)."""
+        return self._evaluate("inverse_dynamics", self._inverse_dynamics, q=q, v=v, a=a)
+
+    def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+        """Return v̇ = M⁻¹ (τ + τ_passive - nle), shape (nv,) or (N, nv)."""
+        return self._evaluate("forward_dynamics", self._forward_dynamics, q=q, v=v, tau=tau)
+
+    def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
+        """Return ½ vᵀ M v in J, a float or shape (N,)."""
+        return self._scalar(self._evaluate("kinetic_energy", self._kinetic_energy, q=q, v=v))
+
+    def potential_energy(self, q: ArrayLike) -> Any:
+        """Return the energy of gravity and springs in J, a float or shape (N,).
+
+        Gravity's part is zero where every centre of mass is at the world's origin.
+        """
+        return self._scalar(self._evaluate("potential_energy", self._potential_energy, q=q))
+
+    def pose(self, q: ArrayLike, frame: str) -> Array:
+        """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4)."""
+        self.model.frame(frame)
+        return self._evaluate("pose", lambda q: self._pose(q, frame), q=q)
+
+    def jacobian(self, q: ArrayLike, frame: str, axes: str = "world") -> Array:
+        """Return the Jacobian of a frame's velocity, shape (6, nv) or (N, 6, nv).
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        frame : str
+            Name of a frame or body.
+        axes : {"world", "body"}
+            Axes in which the velocity is written. It is that of the frame's
+            origin either way, linear then angular.
+        """
+        self.model.frame(frame)
+        if axes not in ("world", "body"):
+            raise InputError(f"axes: expected 'world' or 'body', got {axes!r}")
+        return self._evaluate("jacobian", lambda q: self._jacobian(q, frame, axes), q=q)
+
+    def function(self, name: str) -> Any:
+        """Return a quantity as a `casadi.Function`; the lagrangian engine only."""
+        self._require("function")
+        return self._function(name)
+
+    # What an adapter fills in. Arguments are float64, checked, and either all
+    # single states or all batches of one size.
+
+    @abstractmethod
+    def _mass_matrix(self, q: Array) -> Array: ...
+
+    @abstractmethod
+    def _gravity(self, q: Array) -> Array: ...
+
+    @abstractmethod
+    def _nle(self, q: Array, v: Array) -> Array: ...
+
+    @abstractmethod
+    def _passive(self, q: Array, v: Array) -> Array: ...
+
+    @abstractmethod
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array: ...
+
+    @abstractmethod
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array: ...
+
+    @abstractmethod
+    def _kinetic_energy(self, q: Array, v: Array) -> Array: ...
+
+    @abstractmethod
+    def _potential_energy(self, q: Array) -> Array: ...
+
+    @abstractmethod
+    def _pose(self, q: Array, frame: str) -> Array: ...
+
+    @abstractmethod
+    def _jacobian(self, q: Array, frame: str, axes: str) -> Array: ...
+
+    def _coriolis_matrix(self, q: Array, v: Array) -> Array:
+        raise NotImplementedError
+
+    def _function(self, name: str) -> Any:
+        raise NotImplementedError
+
+    # Shared by all
+
+    def _require(self, quantity: str) -> None:
+        if quantity in self.refuses:
+            raise UnsupportedError(f"{self.engine} cannot give {quantity}: {self.refuses[quantity]}")
+
+    def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+        self._require(quantity)
+        checked = {k: (self.model.check_q(x) if k == "q" else self.model.check_v(x, k)) for k, x in arguments.items()}
+        size = batch_of(**checked)
+        if size is not None:
+            checked = {k: np.broadcast_to(x, (size, x.shape[-1])) for k, x in checked.items()}
+        out = np.asarray(method(*checked.values()), dtype=np.float64)
+        self._require_finite(quantity, out, checked)
+        return out
+
+    def _require_finite(self, quantity: str, out: Array, arguments: dict[str, Array]) -> None:
+        if np.isfinite(out).all():
+            return
+        where = np.argwhere(~np.isfinite(out))[0]
+        state = f" in sample {where[0]}" if next(iter(arguments.values())).ndim == 2 else ""
+        causes = [f"{name!r} ({why})" for name, why in self.model.nonphysical]
+        blame = f"; suspect: {', '.join(causes[:4])}" if causes else "; the mass matrix may be singular there"
+        raise NumericalError(
+            f"{self.engine}: {quantity} of {self.model.name} is not finite at index {tuple(map(int, where))}{state}{blame}"
+        )
+
+    @staticmethod
+    def _scalar(value: Array) -> Any:
+        return float(value) if value.ndim == 0 else value
+
+    def _check_unit(self, q: Array) -> None:
+        check_quaternions(self.model, q)
+
+
+def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:
+    """Call a single-state method on one state, or on each of a batch."""
+    if arguments[0].ndim == 1:
+        return np.array(method(*arguments))
+    if not len(arguments[0]):
+        return np.empty((0, *np.shape(method(*(np.zeros(a.shape[1]) for a in arguments)))))
+    return np.array([np.array(method(*row)) for row in zip(*arguments, strict=True)])

@@ -1,0 +1,62 @@
+"""Known wrong values of engines: named here, measured before they are announced.
+
+A defect is announced only where it acts on the model at hand: each adapter
+compares the value with another of the same engine that is known to be right, so
+a version that has mended it stays silent.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Final
+
+from mbkit.errors import KnownDefectWarning
+
+__all__ = ["CORIOLIS", "KINETIC_ENERGY", "Defect", "announce"]
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A wrong value that an engine is known to return.
+
+    Attributes
+    ----------
+    engine, quantity : str
+    seen_in : str
+        Version in which it was reproduced.
+    summary : str
+        What is wrong.
+    instead : str
+        What is right in the same engine.
+    """
+
+    engine: str
+    quantity: str
+    seen_in: str
+    summary: str
+    instead: str
+
+    def __str__(self) -> str:
+        return f"known defect of {self.engine} {self.seen_in}, {self.quantity}: {self.summary}; {self.instead}"
+
+
+CORIOLIS: Final = Defect(
+    "pinocchio",
+    "coriolis_matrix",
+    "4.1.0",
+    "computeCoriolisMatrix leaves C v + g different from nle for spherical-ZYX and universal joints (pinocchio#2053)",
+    "nle is right",
+)
+KINETIC_ENERGY: Final = Defect(
+    "pinocchio",
+    "kinetic_energy",
+    "4.1.0",
+    "computeKineticEnergy leaves out the armature of revolute joints whose axis is not exactly +x, +y or +z",
+    "half vᵀ M v is right",
+)
+
+
+def announce(defect: Defect, where: str) -> None:
+    """Warn that the value returned is the engine's own and wrong."""
+    warnings.warn(f"{defect}; returned as it is, because of {where}", KnownDefectWarning, stacklevel=5)

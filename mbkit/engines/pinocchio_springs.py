@@ -1,0 +1,61 @@
+"""Point-to-point springs and dampers on Pinocchio's kinematics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from mbkit._check import Array
+from mbkit.engines.pinocchio_model import PinModel
+from mbkit.model import Model
+
+__all__ = ["PointSprings"]
+
+
+class PointSprings:
+    """Forces and energy of all point springs of a model, in Pinocchio's coordinates."""
+
+    def __init__(self, model: Model, made: PinModel) -> None:
+        self._ends = []
+        for spring in model.springs:
+            ends = []
+            for body, point in ((spring.body_a, spring.point_a), (spring.body_b, spring.point_b)):
+                carrier, R, p = made.bodies[body]
+                ends.append((carrier, p + R @ point))
+            self._ends.append((spring, *ends))
+
+    def energy(self, m: Any, d: Any, q: Array) -> float:
+        """Return Σ ½ k (l - l0)²."""
+        pin.forwardKinematics(m, d, q)
+        total = 0.0
+        for spring, (i, a), (j, b) in self._ends:
+            length = np.linalg.norm(d.oMi[j].act(b) - d.oMi[i].act(a))
+            total += 0.5 * spring.stiffness * float(length - spring.rest_length) ** 2
+        return total
+
+    def force(self, m: Any, d: Any, q: Array, v: Array) -> Array:
+        """Return the generalized force, by the points' Jacobians."""
+        pin.computeJointJacobians(m, d, q)
+        out = np.zeros(m.nv)
+        for spring, (i, a), (j, b) in self._ends:
+            gap = d.oMi[j].act(b) - d.oMi[i].act(a)
+            J = self._point_jacobian(m, d, j, b) - self._point_jacobian(m, d, i, a)
+            # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0.
+            length = float(np.linalg.norm(gap))
+            pull = spring.stiffness * gap
+            if spring.rest_length:
+                pull = pull - spring.stiffness * spring.rest_length * gap / length
+            if spring.damping:
+                pull = pull + spring.damping * gap * float(gap @ (J @ v)) / length**2
+            out -= J.T @ pull
+        return out
+
+    @staticmethod
+    def _point_jacobian(m: Any, d: Any, joint: int, point: Array) -> Array:
+        if not joint:
+            return np.zeros((3, m.nv))
+        J = pin.getJointJacobian(m, d, joint, pin.LOCAL)
+        R = d.oMi[joint].rotation
+        return np.asarray(R @ (J[:3] - pin.skew(point) @ J[3:]))

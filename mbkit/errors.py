@@ -1,0 +1,122 @@
+"""The errors and warnings that mbkit raises, all in one place.
+
+Every message names the argument or the body, says what was expected and what
+came, and what to do next.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+__all__ = [
+    "InputError",
+    "KnownDefectWarning",
+    "LoadError",
+    "MbkitError",
+    "MbkitWarning",
+    "ModelError",
+    "NonPhysicalWarning",
+    "NumericalError",
+    "OutputError",
+    "UnknownNameError",
+    "UnsupportedError",
+    "nearest",
+]
+
+
+class MbkitError(Exception):
+    """Base of every error that mbkit raises on purpose."""
+
+
+class InputError(MbkitError, ValueError):
+    """An argument has the wrong shape, type or value."""
+
+
+class UnknownNameError(MbkitError, LookupError):
+    """A name that does not exist; the message suggests near ones.
+
+    Parameters
+    ----------
+    what : str
+        The kind of thing asked for, such as ``"robot"``.
+    name : str
+        What was asked for.
+    known : iterable of str
+        The names that exist.
+    hint : str
+        What else the caller can do.
+    """
+
+    def __init__(self, what: str, name: str, known: Iterable[str], hint: str = "") -> None:
+        self.what, self.name, self.known, self.hint = what, name, tuple(known), hint
+        near = nearest(name, self.known)
+        if near:
+            advice = f"did you mean {' or '.join(repr(n) for n in near)}?"
+        elif len(self.known) <= 40:
+            advice = f"there are: {', '.join(self.known) or 'none'}"
+        else:
+            advice = f"none of the {len(self.known)} known names is near"
+        super().__init__(f"unknown {what} {name!r}; {advice}" + (f" {hint}" if hint else ""))
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        return type(self), (self.what, self.name, self.known, self.hint)
+
+
+class ModelError(MbkitError, ValueError):
+    """A description has faults; all of them are in ``faults``.
+
+    Parameters
+    ----------
+    name : str
+        Name of the model, or the file it came from.
+    faults : sequence of str
+        One sentence per fault, each with its remedy.
+    """
+
+    def __init__(self, name: str, faults: Sequence[str]) -> None:
+        self.name, self.faults = name, tuple(faults)
+        if len(self.faults) == 1:
+            text = f"{name}: {self.faults[0]}"
+        else:
+            text = "\n".join([f"{name}: {len(self.faults)} faults", *(f"  - {f}" for f in self.faults)])
+        super().__init__(text)
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        return type(self), (self.name, self.faults)
+
+
+class LoadError(MbkitError, ValueError):
+    """A file cannot be read as a robot."""
+
+
+class OutputError(MbkitError, OSError):
+    """A result cannot be written; what was computed is kept by the caller."""
+
+
+class UnsupportedError(MbkitError, NotImplementedError):
+    """An engine cannot do what was asked; the message has the reason."""
+
+
+class NumericalError(MbkitError, ArithmeticError):
+    """A computation gave NaN or infinity where a number was due."""
+
+
+class MbkitWarning(UserWarning):
+    """Base of mbkit's warnings."""
+
+
+class KnownDefectWarning(MbkitWarning):
+    """An engine is known to return a wrong value here; it is returned as it is."""
+
+
+class NonPhysicalWarning(MbkitWarning):
+    """A body that no piece of matter can have, taken as it was written."""
+
+
+def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
+    """Return up to `count` of the `known` names that look like `name`."""
+    lower = {k.lower(): k for k in known}
+    close = difflib.get_close_matches(name.lower(), lower, n=count, cutoff=0.6)
+    inside = [k for k in lower if len(name) >= 3 and name.lower() in k and k not in close]
+    return [lower[k] for k in (close + sorted(inside, key=len))[:count]]

@@ -1,0 +1,134 @@
+"""Kinematics of a model as CasADi expressions: nothing but placements and twists.
+
+Vectors are lists of three scalars, so that every zero and one of the description
+vanishes while the graph is built.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+
+from mbkit._check import Array
+from mbkit.model import Joint, Model
+from mbkit.model.kinds import cross3
+
+__all__ = ["Kinematics", "add", "constant_times", "dot3"]
+
+Vector = list[Any]
+
+
+def add(a: Vector, b: Vector) -> Vector:
+    """Return a + b."""
+    return [x + y for x, y in zip(a, b, strict=True)]
+
+
+def dot3(a: Any, b: Any) -> Any:
+    """Return a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def constant_times(A: Array, x: Vector) -> Vector:
+    """Return A x for a matrix of numbers, leaving out its zeros."""
+    return [sum((float(A[i, k]) * x[k] for k in range(3) if A[i, k] != 0.0), 0.0) for i in range(3)]
+
+
+class Kinematics:
+    """Symbols q and v of a model, and what moves with them.
+
+    Attributes
+    ----------
+    q, v : casadi.SX
+        The model's own (reduced) coordinates and velocities.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.q = ca.SX.sym("q", model.nq)
+        self.v = ca.SX.sym("v", model.nv)
+        layout = model.layout
+        self._q_of: dict[str, Vector] = {}
+        self._v_of: dict[str, Vector] = {}
+        for joint in model.joints:
+            if joint.mimic:
+                leader_q = self.q[layout.q[joint.mimic.joint].start]
+                leader_v = self.v[layout.v[joint.mimic.joint].start]
+                self._q_of[joint.name] = [joint.mimic.ratio * leader_q + joint.mimic.offset]
+                self._v_of[joint.name] = [joint.mimic.ratio * leader_v]
+            else:
+                self._q_of[joint.name] = [self.q[i] for i in _range(layout.q[joint.name])]
+                self._v_of[joint.name] = [self.v[i] for i in _range(layout.v[joint.name])]
+        self._carrier = {j.child: j for j in model.joints}
+
+    def coordinates(self, joint: Joint) -> Vector:
+        """Return the joint's coordinates, those of its leader if it mimics."""
+        return self._q_of[joint.name]
+
+    def velocities(self, joint: Joint) -> Vector:
+        """Return the joint's velocities."""
+        return self._v_of[joint.name]
+
+    @cached_property
+    def placements(self) -> dict[str, tuple[Any, Vector]]:
+        """(R_JC, p_JC_J) of every joint."""
+        return {j.name: j.type.placement(ca, j, self._q_of[j.name]) for j in self.model.tree}
+
+    @cached_property
+    def twists(self) -> dict[str, tuple[Vector, Vector]]:
+        """Linear and angular velocity of every body's origin in the world, in its own axes."""
+        out: dict[str, tuple[Vector, Vector]] = {"world": ([0.0] * 3, [0.0] * 3)}
+        for joint in self.model.tree:
+            linear, angular = out[joint.parent]
+            at_joint = add(linear, cross3(angular, [float(x) for x in joint.translation]))
+            R, p = self.placements[joint.name]
+            angular_J = constant_times(joint.rotation.T, angular)
+            linear_J = add(constant_times(joint.rotation.T, at_joint), cross3(angular_J, p))
+            own = joint.type.twist(ca, joint, self._q_of[joint.name], self._v_of[joint.name])
+            out[joint.child] = (
+                add(_transposed_times(R, linear_J), own[0]),
+                add(_transposed_times(R, angular_J), own[1]),
+            )
+        return out
+
+    def to_parent(self, joint: Joint, x: Vector, weight: Any = 1.0) -> Vector:
+        """Return R_PC x + weight · p_PC: a point (weight 1), vector (0) or first moment (mass)."""
+        R, p = self.placements[joint.name]
+        in_J = add(_times(R, x), [weight * c for c in p])
+        in_P = constant_times(joint.rotation, in_J)
+        return add(in_P, [weight * float(c) for c in joint.translation])
+
+    def to_world(self, body: str, x: Vector, weight: float = 1.0) -> Vector:
+        """Return a point (weight 1) or vector (weight 0) of a body in world axes."""
+        while body != "world":
+            joint = self._carrier[body]
+            x = self.to_parent(joint, x, weight)
+            body = joint.parent
+        return x
+
+    @cached_property
+    def qdot(self) -> ca.SX:
+        """D(q) v."""
+        parts = [x for j in self.model.independent_joints for x in j.type.qdot(self._q_of[j.name], self._v_of[j.name])]
+        return ca.vertcat(ca.SX(0, 1), *parts)
+
+    def pullback(self, gradient: ca.SX) -> ca.SX:
+        """Return D(q)ᵀ g for a gradient with respect to q."""
+        parts: Vector = []
+        for j in self.model.independent_joints:
+            g = [gradient[i] for i in _range(self.model.layout.q[j.name])]
+            parts += j.type.pullback(self._q_of[j.name], g)
+        return ca.vertcat(ca.SX(0, 1), *parts)
+
+
+def _range(part: slice) -> range:
+    return range(part.start, part.stop)
+
+
+def _times(R: Any, x: Vector) -> Vector:
+    return [R[i][0] * x[0] + R[i][1] * x[1] + R[i][2] * x[2] for i in range(3)]
+
+
+def _transposed_times(R: Any, x: Vector) -> Vector:
+    return [R[0][i] * x[0] + R[1][i] * x[1] + R[2][i] * x[2] for i in range(3)]

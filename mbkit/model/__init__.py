@@ -1,0 +1,23 @@
+"""What a system is: frozen data and its builder. No engine is imported here."""
+
+from mbkit.model.builder import ModelBuilder
+from mbkit.model.kinds import KINDS, JointKind, kind_of
+from mbkit.model.model import Model
+from mbkit.model.needs import Needs
+from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
+
+__all__ = [
+    "KINDS",
+    "Body",
+    "Frame",
+    "Joint",
+    "JointKind",
+    "Loop",
+    "Mimic",
+    "Model",
+    "ModelBuilder",
+    "Needs",
+    "PointSpring",
+    "Prescribed",
+    "kind_of",
+]

@@ -1,0 +1,128 @@
+"""Moving on the configuration manifold: exponential, logarithm, random states."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.errors import InputError
+
+if TYPE_CHECKING:
+    from mbkit.model.model import Model
+
+__all__ = ["check_quaternions", "difference", "integrate", "limits_box", "neutral", "random_state"]
+
+# A quaternion is data of the caller: rounding is accepted, a rotation that
+# engines would read differently is not.
+_UNIT = 1e-9
+
+
+def check_quaternions(model: Model, q: Array, name: str = "q") -> None:
+    """Raise `InputError` where a quaternion in q is not of unit length."""
+    for start, joint in model.quaternions:
+        square = np.einsum("...i,...i->...", q[..., start : start + 4], q[..., start : start + 4])
+        off = np.abs(square - 1)
+        if np.any(off > _UNIT):
+            norm = float(np.sqrt(np.ravel(square)[np.argmax(off)]))
+            raise InputError(
+                f"{name}: the quaternion of joint {joint!r} ({name}[{start}:{start + 4}], order x, y, z, w) "
+                f"has norm {norm:.9g}; expected 1: divide it by its norm"
+            )
+
+
+def neutral(model: Model) -> Array:
+    """Return zeros with identity quaternions, shape (nq,)."""
+    q = np.zeros(model.nq)
+    for start, _ in model.quaternions:
+        q[start + 3] = 1.0
+    return q
+
+
+def limits_box(model: Model) -> tuple[Array, Array]:
+    """Return lower and upper ends of the box that `random_state` draws from."""
+    lower, upper = np.array(model.lower), np.array(model.upper)
+    for joint in model.independent_joints:
+        part = model.layout.q[joint.name]
+        for i in joint.type.angular:
+            k = part.start + i
+            lower[k], upper[k] = _clipped(lower[k], upper[k], np.pi)
+        for i in joint.type.lengths:
+            k = part.start + i
+            lower[k], upper[k] = _clipped(lower[k], upper[k], 1.0)
+    return lower, upper
+
+
+def _clipped(lower: float, upper: float, reach: float) -> tuple[float, float]:
+    # A range that lies wholly beyond the clip is kept: an empty one helps nobody.
+    low, high = max(lower, -reach), min(upper, reach)
+    if low <= high:
+        return low, high
+    return max(lower, upper - 2 * reach), min(upper, lower + 2 * reach)
+
+
+def random_state(model: Model, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
+    """Draw q uniformly within the limits and v from the standard normal."""
+    n = 1 if size is None else size
+    lower, upper = limits_box(model)
+    finite = np.isfinite(lower)
+    q = np.empty((n, model.nq))
+    q[:, finite] = rng.uniform(lower[finite], upper[finite], size=(n, int(finite.sum())))
+    for start, _ in model.quaternions:
+        # A normal four-vector points uniformly over the sphere: a uniform rotation.
+        q[:, start : start + 4] = spatial.normalized(rng.standard_normal((n, 4)))
+    v = rng.standard_normal((n, model.nv))
+    return (q[0], v[0]) if size is None else (q, v)
+
+
+def integrate(model: Model, q: Array, dq: Array) -> Array:
+    """Return q ⊕ dq."""
+    if not model.quaternions:
+        return np.asarray(q + dq)
+    q, dq = np.broadcast_arrays(q, dq) if q.shape[-1] == dq.shape[-1] else _broadcast(q, dq)
+    out = np.empty(q.shape)
+    for joint in model.independent_joints:
+        a, b = model.layout.q[joint.name], model.layout.v[joint.name]
+        x, u = q[..., a], dq[..., b]
+        if joint.kind == "free":
+            p, turn = spatial.exp_se3(u)
+            out[..., a] = np.concatenate(
+                [
+                    x[..., :3] + spatial.rotate(x[..., 3:], p),
+                    spatial.normalized(spatial.multiply(x[..., 3:], turn)),
+                ],
+                axis=-1,
+            )
+        elif joint.kind == "ball":
+            out[..., a] = spatial.normalized(spatial.multiply(x, spatial.exp_quaternion(u)))
+        else:
+            out[..., a] = x + u
+    return out
+
+
+def difference(model: Model, q0: Array, q1: Array) -> Array:
+    """Return the dq with integrate(q0, dq) = q1."""
+    if not model.quaternions:
+        return np.asarray(q1 - q0)
+    q0, q1 = np.broadcast_arrays(q0, q1)
+    out = np.empty((*q0.shape[:-1], model.nv))
+    for joint in model.independent_joints:
+        a, b = model.layout.q[joint.name], model.layout.v[joint.name]
+        x, y = q0[..., a], q1[..., a]
+        if joint.kind == "free":
+            back = spatial.conjugate(x[..., 3:])
+            w = spatial.log_quaternion(spatial.multiply(back, y[..., 3:]))
+            p = spatial.rotate(back, y[..., :3] - x[..., :3])
+            out[..., b] = np.concatenate([np.einsum("...ij,...j->...i", spatial.left_jacobian_inverse(w), p), w], -1)
+        elif joint.kind == "ball":
+            out[..., b] = spatial.log_quaternion(spatial.multiply(spatial.conjugate(x), y))
+        else:
+            out[..., b] = y - x
+    return out
+
+
+def _broadcast(q: Array, dq: Array) -> tuple[Array, Array]:
+    lead = np.broadcast_shapes(q.shape[:-1], dq.shape[:-1])
+    return np.broadcast_to(q, (*lead, q.shape[-1])), np.broadcast_to(dq, (*lead, dq.shape[-1]))

@@ -1,0 +1,343 @@
+"""`Model`: a whole description, frozen. Engines read it and never change it."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of, rows
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.model import manifold
+from mbkit.model.digest import digest
+from mbkit.model.layout import Layout
+from mbkit.model.needs import Needs
+from mbkit.model.parts import Body, Frame, Joint, Loop, PointSpring, Prescribed
+
+__all__ = ["Model"]
+
+_PER_VELOCITY: Final = {
+    "damping": ("damping",),
+    "springs": ("stiffness",),
+    "armature": ("armature",),
+    "friction": ("friction",),
+}
+_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed")
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A multibody system: a tree of bodies and what acts on it.
+
+    Made by `ModelBuilder.build` or `mbkit.load`; not meant to be called directly,
+    because the builder holds the checks.
+
+    Attributes
+    ----------
+    name : str
+    gravity : (3,) array
+        m/s², in world axes.
+    bodies : tuple of Body
+    joints : tuple of Joint
+        In the order of their coordinates; fixed joints are among them.
+    frames : tuple of Frame
+    springs : tuple of PointSpring
+    loops : tuple of Loop
+    prescribed : tuple of Prescribed
+    notes : tuple of str
+        What the loader decided or met, for the user to read.
+    nonphysical : tuple of (str, str)
+        Bodies that no matter can have, each with the reason.
+    """
+
+    name: str
+    gravity: Array
+    bodies: tuple[Body, ...]
+    joints: tuple[Joint, ...]
+    frames: tuple[Frame, ...] = ()
+    springs: tuple[PointSpring, ...] = ()
+    loops: tuple[Loop, ...] = ()
+    prescribed: tuple[Prescribed, ...] = ()
+    notes: tuple[str, ...] = ()
+    nonphysical: tuple[tuple[str, str], ...] = ()
+    layout: Layout = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        gravity = np.array(self.gravity, dtype=np.float64)
+        gravity.setflags(write=False)
+        object.__setattr__(self, "gravity", gravity)
+        object.__setattr__(self, "layout", Layout(self.joints))
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        return type(self), (
+            self.name,
+            self.gravity,
+            self.bodies,
+            self.joints,
+            self.frames,
+            self.springs,
+            self.loops,
+            self.prescribed,
+            self.notes,
+            self.nonphysical,
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return self.digest == other.digest if isinstance(other, Model) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    # Sizes and names
+
+    @property
+    def nq(self) -> int:
+        """Number of coordinates."""
+        return self.layout.sizes[0]
+
+    @property
+    def nv(self) -> int:
+        """Number of velocities."""
+        return self.layout.sizes[1]
+
+    @cached_property
+    def independent_joints(self) -> tuple[Joint, ...]:
+        """The joints that have coordinates of their own."""
+        return tuple(j for j in self.joints if j.type.nv and not j.mimic)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints that have coordinates of their own, in their order."""
+        return tuple(j.name for j in self.independent_joints)
+
+    @cached_property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """One name per coordinate of q."""
+        return tuple(_named(j.name, s) for j in self.independent_joints for s in j.type.suffixes)
+
+    @cached_property
+    def velocity_names(self) -> tuple[str, ...]:
+        """One name per entry of v."""
+        return tuple(_named(j.name, s) for j in self.independent_joints for s in j.type.velocity_suffixes)
+
+    @property
+    def mass(self) -> float:
+        """Total mass, kg."""
+        return float(sum(b.mass for b in self.bodies))
+
+    @cached_property
+    def needs(self) -> Needs:
+        """What this description needs from an engine."""
+        return Needs.of(self.gravity, self.joints, self.springs, self.loops, self.prescribed)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over every name and number of the description (not the notes)."""
+        return digest(
+            self.name,
+            self.gravity,
+            self.bodies,
+            self.joints,
+            self.frames,
+            self.springs,
+            self.loops,
+            self.prescribed,
+        )
+
+    # Structure
+
+    @cached_property
+    def tree(self) -> tuple[Joint, ...]:
+        """All joints with every parent before its children, siblings as declared, depth first."""
+        by_parent: dict[str, list[Joint]] = {}
+        for joint in self.joints:
+            by_parent.setdefault(joint.parent, []).append(joint)
+        out: list[Joint] = []
+        stack = list(reversed(by_parent.get("world", [])))
+        while stack:
+            joint = stack.pop()
+            out.append(joint)
+            stack.extend(reversed(by_parent.get(joint.child, [])))
+        return tuple(out)
+
+    @cached_property
+    def quaternions(self) -> tuple[tuple[int, str], ...]:
+        """(start in q, joint name) of every quaternion."""
+        return tuple(
+            (self.layout.q[j.name].start + j.type.quaternion, j.name)
+            for j in self.independent_joints
+            if j.type.quaternion is not None
+        )
+
+    @cached_property
+    def lower(self) -> Array:
+        """Lower limits, shape (nq,)."""
+        return np.concatenate([np.empty(0), *(j.lower for j in self.independent_joints)])
+
+    @cached_property
+    def upper(self) -> Array:
+        """Upper limits, shape (nq,)."""
+        return np.concatenate([np.empty(0), *(j.upper for j in self.independent_joints)])
+
+    def body(self, name: str) -> Body:
+        """Return the body of this name."""
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        raise UnknownNameError("body", name, [b.name for b in self.bodies])
+
+    def joint(self, name: str) -> Joint:
+        """Return the joint of this name."""
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        raise UnknownNameError("joint", name, [j.name for j in self.joints])
+
+    def frame(self, name: str) -> Frame:
+        """Return the frame of this name; a body's own frame has the body's name."""
+        for frame in self.frames:
+            if frame.name == name:
+                return frame
+        if any(b.name == name for b in self.bodies):
+            return Frame(name, name, np.eye(3), np.zeros(3))
+        names = [f.name for f in self.frames] + [b.name for b in self.bodies]
+        raise UnknownNameError("frame", name, names)
+
+    # Configurations
+
+    def neutral(self) -> Array:
+        """Return the zero configuration with identity quaternions, shape (nq,).
+
+        It may lie outside the limits.
+        """
+        return manifold.neutral(self)
+
+    def random_state(self, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
+        """Draw a random state.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+        size : int, optional
+            Number of states; one without batch axis when not given.
+
+        Returns
+        -------
+        q : (nq,) or (size, nq) array
+            Uniform within the limits, clipped to ±π rad; ±1 m where a length has
+            none; uniform rotations.
+        v : (nv,) or (size, nv) array
+            Standard normal.
+        """
+        if not isinstance(rng, np.random.Generator):
+            raise InputError(f"rng: expected a numpy Generator, got {rng!r}; use numpy.random.default_rng(seed)")
+        if size is not None and (not isinstance(size, (int, np.integer)) or size < 0):
+            raise InputError(f"size: expected None or a count of at least 0, got {size!r}")
+        return manifold.random_state(self, rng, size)
+
+    def check_q(self, q: ArrayLike, name: str = "q") -> Array:
+        """Return `q` as float64, checked for shape, finite numbers and unit quaternions."""
+        out = rows(name, q, self.nq, self.name, "nq")
+        if self.quaternions:
+            manifold.check_quaternions(self, out, name)
+        return out
+
+    def check_v(self, v: ArrayLike, name: str = "v") -> Array:
+        """Return `v` (or an acceleration or force) as float64, checked."""
+        return rows(name, v, self.nv, self.name, "nv")
+
+    def integrate(self, q: ArrayLike, dq: ArrayLike) -> Array:
+        """Move from q along dq with the joints' exponential.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array
+        dq : (nv,) or (N, nv) array
+            A displacement in the space of v; for a free joint a twist in body
+            axes, whose exponential is SE(3)'s.
+
+        Returns
+        -------
+        (nq,) or (N, nq) array
+        """
+        q, dq = self.check_q(q), self.check_v(dq, "dq")
+        batch_of(q=q, dq=dq)
+        return manifold.integrate(self, q, dq)
+
+    def difference(self, q0: ArrayLike, q1: ArrayLike) -> Array:
+        """Return the dq with ``integrate(q0, dq) = q1``, shape (nv,) or (N, nv).
+
+        Rotations take the shorter way round, so an angle of a ball or free joint
+        is at most π.
+        """
+        q0, q1 = self.check_q(q0, "q0"), self.check_q(q1, "q1")
+        batch_of(q0=q0, q1=q1)
+        return manifold.difference(self, q0, q1)
+
+    # Variants
+
+    def without(self, *features: str) -> Model:
+        """Return the same description less some features.
+
+        Parameters
+        ----------
+        *features : str
+            Any of damping, springs, armature, friction, gravity, limits, loops,
+            prescribed. Springs and damping cover joints and point-to-point
+            elements alike.
+        """
+        for feature in features:
+            if feature not in _FEATURES:
+                raise UnknownNameError("feature", str(feature), _FEATURES)
+        model = self
+        for feature in features:
+            model = model._without(feature)
+        return model
+
+    def _without(self, feature: str) -> Model:
+        if feature == "gravity":
+            return replace(self, gravity=np.zeros(3))
+        if feature == "loops":
+            return replace(self, loops=())
+        if feature == "prescribed":
+            return replace(self, prescribed=())
+        if feature == "limits":
+            free = (replace(j, lower=np.full(j.type.nq, -np.inf), upper=np.full(j.type.nq, np.inf)) for j in self.joints)
+            return replace(self, joints=tuple(free))
+        names = _PER_VELOCITY[feature]
+        joints = tuple(replace(j, **{n: np.zeros(j.type.nv) for n in names}) for j in self.joints)
+        springs: Iterable[PointSpring] = self.springs
+        if feature == "springs":
+            springs = (replace(s, stiffness=0.0) for s in springs)
+        if feature == "damping":
+            springs = (replace(s, damping=0.0) for s in springs)
+        kept = tuple(s for s in springs if s.stiffness or s.damping)
+        return replace(self, joints=joints, springs=kept)
+
+    # Reading
+
+    def __repr__(self) -> str:
+        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self.mass:.4g} kg; {self.needs}>"
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f"<tr><td>{html.escape(j.name)}</td><td>{j.kind}</td><td>{html.escape(j.parent)}</td>"
+            f"<td>{html.escape(j.child)}</td><td>{self.body(j.child).mass:.4g}</td>"
+            f"<td>{html.escape(f'{j.mimic.ratio:g} × {j.mimic.joint}') if j.mimic else ''}</td></tr>"
+            for j in self.tree
+        )
+        head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
+        notes = "".join(f"<li>{html.escape(n)}</li>" for n in self.notes)
+        return (
+            f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self.mass:.4g} kg; {self.needs}</p>"
+            f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
+        )
+
+
+def _named(joint: str, suffix: str) -> str:
+    return f"{joint}.{suffix}" if suffix else joint

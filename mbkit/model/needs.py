@@ -1,0 +1,66 @@
+"""What a description needs from an engine, so that the rest can be left out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.model.parts import Joint, Loop, PointSpring, Prescribed
+
+__all__ = ["Needs"]
+
+
+@dataclass(frozen=True)
+class Needs:
+    """One flag per feature; True where the description has it.
+
+    Friction, limits and loops are kept as data and named here; the smooth terms
+    of every engine leave friction and limits out.
+    """
+
+    gravity: bool
+    springs: bool
+    damping: bool
+    armature: bool
+    friction: bool
+    limits: bool
+    mimic: bool
+    loops: bool
+    quaternions: bool
+    time: bool
+
+    @classmethod
+    def of(
+        cls,
+        gravity: Array,
+        joints: Iterable[Joint],
+        springs: Iterable[PointSpring],
+        loops: Iterable[Loop],
+        prescribed: Iterable[Prescribed],
+    ) -> Needs:
+        """Read the flags off the parts of a description."""
+        joints, springs = tuple(joints), tuple(springs)
+        return cls(
+            gravity=bool(np.any(gravity)),
+            springs=any(np.any(j.stiffness) for j in joints) or any(s.stiffness for s in springs),
+            damping=any(np.any(j.damping) for j in joints) or any(s.damping for s in springs),
+            armature=any(np.any(j.armature) for j in joints),
+            friction=any(np.any(j.friction) for j in joints),
+            limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
+            mimic=any(j.mimic is not None for j in joints),
+            loops=bool(tuple(loops)),
+            quaternions=any(j.type.quaternion is not None for j in joints),
+            time=bool(tuple(prescribed)),
+        )
+
+    def as_dict(self) -> dict[str, bool]:
+        """Return the flags by name."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        present = [k for k, on in self.as_dict().items() if on]
+        absent = [k for k, on in self.as_dict().items() if not on]
+        return f"has {', '.join(present) or 'nothing'}; without {', '.join(absent) or 'nothing'}"

@@ -1,0 +1,190 @@
+"""The parts of a description: bodies, joints, springs, loops. Frozen data.
+
+All lengths are metres, masses kilograms, angles radians. Arrays are read-only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.model.kinds import JointKind, kind_of
+
+__all__ = ["Body", "Frame", "Joint", "Loop", "Mimic", "PointSpring", "Prescribed"]
+
+
+class _Frozen:
+    """Read-only arrays, equality by content, and pickling that keeps both."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
+            value = getattr(self, f.name)
+            if isinstance(value, np.ndarray):
+                value = np.array(value, dtype=np.float64)
+                value.setflags(write=False)
+                object.__setattr__(self, f.name, value)
+
+    def _values(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        pairs = zip(self._values(), other._values(), strict=True)  # type: ignore[attr-defined]
+        return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
+
+    def __hash__(self) -> int:
+        return hash(tuple(v.tobytes() if isinstance(v, np.ndarray) else v for v in self._values()))
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        return type(self), self._values()
+
+
+@dataclass(frozen=True, eq=False)
+class Body(_Frozen):
+    """A rigid body.
+
+    Attributes
+    ----------
+    name : str
+    mass : float
+        kg.
+    com : (3,) array
+        Centre of mass in body axes, m.
+    inertia : (3, 3) array
+        About the centre of mass, in body axes, kg m².
+    """
+
+    name: str
+    mass: float
+    com: Array
+    inertia: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Mimic(_Frozen):
+    """A joint that follows another: y = ratio * q + offset."""
+
+    joint: str
+    ratio: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Joint(_Frozen):
+    """A joint between `parent` and `child`; the child's frame is the joint's moving frame.
+
+    Attributes
+    ----------
+    kind : str
+        One of fixed, revolute, continuous, prismatic, helical, universal,
+        spherical_zyx, ball, planar, free.
+    rotation, translation : (3, 3) and (3,) arrays
+        R_PJ and p_PJ_P, the joint's fixed frame in the parent's.
+    axes : (k, 3) array
+        Unit axes in the joint's frame; two for a universal joint (the second
+        one turns with the first), none where the kind has its own.
+    pitch : float
+        Advance of a helical joint, metres per radian.
+    lower, upper : (nq,) arrays
+        Limits of the coordinates, infinite where there are none.
+    velocity_limit, effort_limit, armature, damping, friction, stiffness, rest : (nv,) arrays
+        Per velocity. `stiffness` acts on q - `rest`, `damping` on v; dry
+        `friction` and the limits are data only.
+    mimic : Mimic or None
+        The joint that this one follows; its coordinate is then not free.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    rotation: Array
+    translation: Array
+    axes: Array
+    pitch: float
+    lower: Array
+    upper: Array
+    velocity_limit: Array
+    effort_limit: Array
+    armature: Array
+    damping: Array
+    friction: Array
+    stiffness: Array
+    rest: Array
+    mimic: Mimic | None = None
+
+    @property
+    def type(self) -> JointKind:
+        """The formulas of this joint's kind."""
+        return kind_of(self.kind)
+
+    @property
+    def has_placement(self) -> bool:
+        """Whether the joint's frame is not simply the parent's."""
+        return bool(np.any(self.rotation != np.eye(3)) or np.any(self.translation != 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame(_Frozen):
+    """A named frame fixed to a body: R_BF and p_BF_B."""
+
+    name: str
+    body: str
+    rotation: Array
+    translation: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PointSpring(_Frozen):
+    """A spring and viscous damper along the line between two points.
+
+    The pull is stiffness * (l - rest_length) + damping * dl/dt, with l the
+    distance. Points are in body axes; a body may be ``"world"``.
+    """
+
+    name: str
+    body_a: str
+    point_a: Array
+    body_b: str
+    point_b: Array
+    stiffness: float
+    rest_length: float
+    damping: float
+
+
+@dataclass(frozen=True, eq=False)
+class Loop(_Frozen):
+    """A loop closure: two points, or two frames, that stay together.
+
+    Attributes
+    ----------
+    kind : str
+        ``"point"`` (3 equations) or ``"frame"`` (6).
+    rotation_a, translation_a, rotation_b, translation_b : arrays
+        The two frames in the axes of their bodies.
+    """
+
+    name: str
+    kind: str
+    body_a: str
+    rotation_a: Array
+    translation_a: Array
+    body_b: str
+    rotation_b: Array
+    translation_b: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Prescribed(_Frozen):
+    """A coordinate moved in time: offset + rate t + amplitude sin(frequency t + phase)."""
+
+    joint: str
+    offset: float = 0.0
+    rate: float = 0.0
+    amplitude: float = 0.0
+    frequency: float = 0.0
+    phase: float = 0.0

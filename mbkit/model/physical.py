@@ -1,0 +1,103 @@
+"""Whether a body can exist, and whether every joint moves some inertia."""
+
+from __future__ import annotations
+
+import types
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.model.parts import Body
+from mbkit.spatial import skew
+
+if TYPE_CHECKING:
+    from mbkit.model.model import Model
+
+__all__ = ["body_fault", "idle_joints", "sample_mass_matrix"]
+
+# Descriptions carry rounded decimals; a thin plate written with six digits may
+# miss A + B >= C by its last digit.
+_TRIANGLE = 1e-6
+
+
+def body_fault(body: Body, *, point_masses: bool) -> str | None:
+    """Return why no matter can have this mass and inertia, or None.
+
+    A body of zero mass and zero inertia is no fault: it is a frame, and
+    `idle_joints` finds the joints that would then move nothing.
+
+    Parameters
+    ----------
+    body : Body
+    point_masses : bool
+        Whether a positive mass with zero inertia is meant that way.
+    """
+    eigenvalues = np.linalg.eigvalsh(body.inertia)
+    largest = float(np.max(np.abs(eigenvalues)))
+    if body.mass < 0:
+        return f"mass {body.mass:g} is negative"
+    if body.mass == 0:
+        return f"no mass but inertia up to {largest:.3g} kg m²" if largest else None
+    if largest == 0:
+        return None if point_masses else "mass without inertia: give the inertia, however small"
+    if eigenvalues[0] < -1e-12 * largest:
+        return f"inertia is not positive: principal moments {_told(eigenvalues)} kg m²"
+    if eigenvalues[0] <= 1e-12 * largest and not point_masses:
+        return f"inertia is not positive: principal moments {_told(eigenvalues)} kg m²"
+    if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
+        return f"inertia violates A + B >= C: principal moments {_told(eigenvalues)} kg m²"
+    return None
+
+
+def _told(values: Array) -> str:
+    return ", ".join(f"{x:.4g}" for x in values)
+
+
+def idle_joints(model: Model) -> list[str]:
+    """Return the joints whose motion costs no kinetic energy, so that M is singular.
+
+    M is formed at one random state from the definition, Σ Jᵀ I J, and scaled to
+    a unit diagonal; a null vector names its joints.
+    """
+    if not model.nv:
+        return []
+    M = sample_mass_matrix(model)
+    diagonal = np.diag(M)
+    zero = diagonal <= 1e-14 * float(diagonal.max())
+    if not zero.any():
+        scaled = M / np.sqrt(np.outer(diagonal, diagonal))
+        values, vectors = np.linalg.eigh(scaled)
+        if values[0] > 4 * model.nv * np.finfo(float).eps:
+            return []
+        zero = np.abs(vectors[:, 0]) > 0.3 * np.abs(vectors[:, 0]).max()
+    return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()]
+
+
+def sample_mass_matrix(model: Model) -> Array:
+    """Return M at one fixed random state, by its definition; slow and only for checks."""
+    q, _ = model.random_state(np.random.default_rng(0))
+    q_full = model.layout.expand_q(q)
+    n = model.layout.sizes[3]
+    numpy = types.ModuleType("numpy_scalars")
+    numpy.sin, numpy.cos = np.sin, np.cos  # type: ignore[attr-defined]
+    jacobians = {"world": np.zeros((6, n))}
+    M = np.zeros((n, n))
+    bodies = {b.name: b for b in model.bodies}
+    for joint in model.tree:
+        part = model.layout.full_q[joint.name], model.layout.full_v[joint.name]
+        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(numpy, joint, q_full[part[0]]))
+        R, p = joint.rotation @ R_JC, joint.translation + joint.rotation @ p_JC
+        parent = jacobians[joint.parent]
+        J = np.vstack([R.T @ (parent[:3] - skew(p) @ parent[3:]), R.T @ parent[3:]])
+        for k in range(joint.type.nv):
+            unit = np.zeros(joint.type.nv)
+            unit[k] = 1.0
+            linear, angular = joint.type.twist(numpy, joint, q_full[part[0]], unit)
+            J[:, part[1].start + k] += np.array([*linear, *angular], dtype=float)
+        jacobians[joint.child] = J
+        body = bodies[joint.child]
+        at_com = J[:3] - skew(body.com) @ J[3:]
+        M += body.mass * at_com.T @ at_com + J[3:].T @ body.inertia @ J[3:]
+        M[part[1], part[1]] += np.diag(joint.armature)
+    return np.asarray(model.layout.G.T @ M @ model.layout.G)

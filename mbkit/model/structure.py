@@ -1,0 +1,141 @@
+"""Faults in how the parts of a description hang together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from mbkit.errors import nearest
+from mbkit.model.parts import Body, Frame, Joint, Loop, PointSpring, Prescribed
+
+__all__ = ["structure_faults"]
+
+
+def structure_faults(
+    bodies: Sequence[Body],
+    joints: Sequence[Joint],
+    frames: Sequence[Frame],
+    springs: Sequence[PointSpring],
+    loops: Sequence[Loop],
+    prescribed: Sequence[Prescribed],
+) -> list[str]:
+    """Return one sentence per fault: names, the tree, mimics, and what joints may carry."""
+    known = {b.name for b in bodies} | {"world"}
+    faults: list[str] = []
+    if not bodies:
+        faults.append("no bodies; add at least one")
+    for what, names in (
+        ("body", [b.name for b in bodies]),
+        ("joint", [j.name for j in joints]),
+        ("frame", [f.name for f in frames]),
+        ("spring", [s.name for s in springs]),
+        ("loop", [x.name for x in loops]),
+    ):
+        faults += [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
+    if any(b.name == "world" for b in bodies):
+        faults.append("body 'world': that name is the ground's; choose another")
+    for joint in joints:
+        faults += _unknown(f"joint {joint.name!r}", (joint.parent, joint.child), known)
+        faults += _joint_faults(joint)
+    for frame in frames:
+        faults += _unknown(f"frame {frame.name!r}", (frame.body,), known - {"world"})
+    for spring in springs:
+        faults += _unknown(f"spring {spring.name!r}", (spring.body_a, spring.body_b), known)
+        if spring.body_a == spring.body_b:
+            faults.append(f"spring {spring.name!r}: both ends on {spring.body_a!r}; it would never act")
+    for loop in loops:
+        faults += _unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b), known)
+    faults += _tree_faults(bodies, joints)
+    faults += _mimic_faults(joints)
+    one = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
+    faults += [
+        f"prescribed {p.joint!r}: expected a joint of one velocity that mimics none; there are: {', '.join(sorted(one))}"
+        for p in prescribed
+        if p.joint not in one
+    ]
+    return faults
+
+
+def _unknown(who: str, names: Iterable[str], known: Iterable[str]) -> list[str]:
+    out = []
+    for name in names:
+        if name not in known:
+            near = nearest(name, known)
+            hint = f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(sorted(known))}"
+            out.append(f"{who}: unknown body {name!r}{hint}")
+    return out
+
+
+def _joint_faults(joint: Joint) -> list[str]:
+    who, out = f"joint {joint.name!r}", []
+    if joint.child == "world":
+        out.append(f"{who}: the world cannot be a child; swap parent and child")
+    if np.any(joint.lower > joint.upper):
+        out.append(f"{who}: lower limit {joint.lower} above upper limit {joint.upper}")
+    for name in ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit"):
+        if np.any(getattr(joint, name) < 0):
+            out.append(f"{who}: {name} {getattr(joint, name)} is negative")
+    if np.any(joint.armature) and joint.type.nv != 1:
+        out.append(
+            f"{who}: armature on a {joint.kind} joint; expected a joint of one velocity "
+            "(engines leave out the gyroscopic term otherwise): add a rotor as a body"
+        )
+    if np.any(joint.stiffness) and not joint.type.coordinate_velocities:
+        out.append(f"{who}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring")
+    if joint.pitch and joint.kind != "helical":
+        out.append(f"{who}: pitch {joint.pitch} on a {joint.kind} joint; only helical joints have one")
+    return out
+
+
+def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
+    out = []
+    carriers = Counter(j.child for j in joints)
+    for name, count in carriers.items():
+        if count > 1 and name != "world":
+            told = ", ".join(repr(j.name) for j in joints if j.child == name)
+            out.append(f"body {name!r}: carried by {count} joints ({told}); keep one and close the loop with add_loop")
+    reached = {"world"}
+    grew = True
+    while grew:
+        new = {j.child for j in joints if j.parent in reached} - reached
+        reached |= new
+        grew = bool(new)
+    for body in bodies:
+        if body.name in reached:
+            continue
+        if carriers[body.name]:
+            out.append(f"body {body.name!r}: not connected to the world; its joints form a cycle or hang in the air")
+        else:
+            out.append(f"body {body.name!r}: no joint carries it; add a joint with child={body.name!r}")
+    return out
+
+
+def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
+    out = []
+    by_name = {j.name: j for j in joints}
+    for joint in joints:
+        if joint.mimic is None:
+            continue
+        who = f"joint {joint.name!r}"
+        leader = by_name.get(joint.mimic.joint)
+        if leader is None:
+            near = nearest(joint.mimic.joint, by_name)
+            out.append(f"{who}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near[0]!r}" if near else ""))
+            continue
+        if joint.type.nv != 1 or leader.type.nv != 1:
+            out.append(f"{who}: mimics {leader.name!r}, but both must have one velocity")
+        if not np.isfinite([joint.mimic.ratio, joint.mimic.offset]).all():
+            out.append(f"{who}: mimic ratio and offset must be finite")
+        seen, at = {joint.name}, leader
+        while at.mimic is not None and at.mimic.joint in by_name:
+            if at.name in seen:
+                out.append(f"{who}: mimics in a circle through {at.name!r}")
+                break
+            seen.add(at.name)
+            at = by_name[at.mimic.joint]
+        else:
+            if at.name in seen:
+                out.append(f"{who}: mimics itself")
+    return out

@@ -1,0 +1,160 @@
+"""Rotations, quaternions (x, y, z, w) and rigid motions, on batches.
+
+Every function works along the last axes and broadcasts over leading ones.
+Series replace closed forms near zero where those lose digits; each says where.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mbkit._check import Array
+
+__all__ = [
+    "conjugate",
+    "exp_quaternion",
+    "exp_se3",
+    "left_jacobian",
+    "left_jacobian_inverse",
+    "log_quaternion",
+    "matrix_from_quaternion",
+    "matrix_from_rpy",
+    "multiply",
+    "normalized",
+    "quaternion_from_matrix",
+    "rotate",
+    "skew",
+]
+
+# Below this angle the truncated series of the coefficients here are exact to
+# rounding: the first term left out is below 1e-17 relative.
+_SMALL = 1e-2
+
+
+def skew(w: Array) -> Array:
+    """Return the matrix of ``w ×``, shape (..., 3, 3)."""
+    out = np.zeros((*w.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = w[..., 2], -w[..., 1], w[..., 0]
+    return out
+
+
+def multiply(a: Array, b: Array) -> Array:
+    """Return the quaternion product a b."""
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + np.cross(av, bv)
+    scalar = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
+    return np.concatenate([vector, scalar], axis=-1)
+
+
+def conjugate(a: Array) -> Array:
+    """Return the conjugate, the inverse of a unit quaternion."""
+    return a * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def normalized(a: Array) -> Array:
+    """Return a / |a|."""
+    return np.asarray(a / np.linalg.norm(a, axis=-1, keepdims=True))
+
+
+def rotate(quaternion: Array, x: Array) -> Array:
+    """Rotate the vector x by a unit quaternion."""
+    u, w = quaternion[..., :3], quaternion[..., 3:]
+    t = 2.0 * np.cross(u, x)
+    return np.asarray(x + w * t + np.cross(u, t))
+
+
+def matrix_from_quaternion(quaternion: Array) -> Array:
+    """Return R with R x = q x q*, shape (..., 3, 3)."""
+    x, y, z, w = (quaternion[..., i] for i in range(4))
+    out = np.empty((*quaternion.shape[:-1], 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return out
+
+
+def quaternion_from_matrix(R: Array) -> Array:
+    """Return the unit quaternion of one rotation matrix, with w >= 0.
+
+    Shepperd's method: the largest of the four squares is taken, so that no
+    component is found by a small divisor.
+    """
+    trace = float(np.trace(R))
+    squares = np.array([*(1 + 2 * np.diag(R) - trace), 1 + trace])
+    k = int(np.argmax(squares))
+    if k == 3:
+        q = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], squares[3]])
+    else:
+        i, j = (k + 1) % 3, (k + 2) % 3
+        q = np.empty(4)
+        q[k], q[i], q[j], q[3] = squares[k], R[i, k] + R[k, i], R[j, k] + R[k, j], R[j, i] - R[i, j]
+    q = normalized(q)
+    return -q if q[3] < 0 else q
+
+
+def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+    """Return Rz(yaw) Ry(pitch) Rx(roll), URDF's convention."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def exp_quaternion(w: Array) -> Array:
+    """Return the quaternion of the rotation vector w."""
+    theta = np.linalg.norm(w, axis=-1, keepdims=True)
+    half = theta / 2
+    safe = np.where(theta < _SMALL, 1.0, theta)
+    half2 = half * half
+    series = 0.5 * (1 - half2 / 6 * (1 - half2 / 20 * (1 - half2 / 42)))
+    scale = np.where(theta < _SMALL, series, np.sin(half) / safe)
+    return np.concatenate([scale * w, np.cos(half)], axis=-1)
+
+
+def log_quaternion(quaternion: Array) -> Array:
+    """Return the rotation vector, |w| <= pi, of a unit quaternion."""
+    q = np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+    n = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    safe = np.where(n == 0, 1.0, n)
+    # atan2(n, w)/n -> 1/w for n -> 0; atan2 itself keeps every digit down there.
+    scale = np.where(n == 0, 2.0 / q[..., 3:], 2.0 * np.arctan2(n, q[..., 3:]) / safe)
+    return np.asarray(scale * q[..., :3])
+
+
+def left_jacobian(w: Array) -> Array:
+    """Return V with exp_se3([u, w]).p = V(w) u (Murray, Li, Sastry 1994, eq. 2.36)."""
+    theta2 = np.sum(w * w, axis=-1)
+    theta = np.sqrt(theta2)
+    small = theta < _SMALL
+    safe = np.where(small, 1.0, theta)
+    a_series = 0.5 * (1 - theta2 / 12 * (1 - theta2 / 30 * (1 - theta2 / 56)))
+    b_series = (1 - theta2 / 20 * (1 - theta2 / 42 * (1 - theta2 / 72))) / 6
+    a = np.where(small, a_series, 2 * np.sin(safe / 2) ** 2 / safe**2)
+    b = np.where(small, b_series, (safe - np.sin(safe)) / safe**3)
+    W = skew(w)
+    return np.asarray(np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W))
+
+
+def left_jacobian_inverse(w: Array) -> Array:
+    """Return the inverse of `left_jacobian`."""
+    theta2 = np.sum(w * w, axis=-1)
+    theta = np.sqrt(theta2)
+    # (1 - (t/2) cot(t/2))/t^2 cancels as eps/t^2, so its series serves up to 0.1:
+    # the first term left out is t^8 / 4.7e7 relative to 1/12.
+    small = theta < 0.1
+    safe = np.where(small, 1.0, theta)
+    series = 1 / 12 + theta2 * (1 / 720 + theta2 * (1 / 30240 + theta2 * (1 / 1209600 + theta2 / 47900160)))
+    c = np.where(small, series, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
+    W = skew(w)
+    return np.asarray(np.eye(3) - W / 2 + c[..., None, None] * (W @ W))
+
+
+def exp_se3(xi: Array) -> tuple[Array, Array]:
+    """Return translation and quaternion of exp of the twist (linear, angular)."""
+    u, w = xi[..., :3], xi[..., 3:]
+    return np.einsum("...ij,...j->...i", left_jacobian(w), u), exp_quaternion(w)
