@@ -1,0 +1,273 @@
+"""MuJoCo behind the protocol: terms from its smooth dynamics, rollouts from its integrators.
+
+Todorov, Erez, Tassa 2012, "MuJoCo: a physics engine for model-based control". The
+only place that knows MuJoCo's quaternion order and its velocity of a free joint
+(linear in the world's axes): v_mj = T v with T = diag(R, 1), so M = Tᵀ M_mj T, and
+a_mj = T a + b with b = R (ω × v).
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.engines.base import Dynamics, per_sample
+from mbkit.engines.mujoco_api import full_mass_matrix, make_mass_matrix
+from mbkit.engines.mujoco_model import MujocoModel, build
+from mbkit.engines.mujoco_rollout import Rollout
+from mbkit.errors import UnsupportedError
+from mbkit.model import Model
+
+__all__ = ["MujocoDynamics"]
+
+_BODY: Final = int(mujoco.mjtObj.mjOBJ_BODY)
+
+
+class MujocoDynamics(Dynamics):
+    """MuJoCo on a description.
+
+    Attributes
+    ----------
+    mj_model : mujoco.MjModel
+        What was compiled; free to read.
+    disabled : tuple of str
+        What was switched off because the comparison of smooth terms does not
+        want it.
+    """
+
+    engine = "mujoco"
+    refuses = {
+        "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
+        "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
+    }
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self._made: MujocoModel = build(model)
+        self.mj_model = self._m = self._made.model
+        self.disabled = self._made.disabled
+        self._d = mujoco.MjData(self._m)
+        self._reduced = model.layout.reduced
+
+    # Between the description's numbers and MuJoCo's.
+
+    def _set(self, q: Array, v: Array | None = None) -> tuple[Array, Array]:
+        """Put a state into MuJoCo; return full velocities and b of a_mj = T a + b."""
+        layout, d = self.model.layout, self._d
+        d.qpos[:] = layout.expand_q(q)[self._made.q_index]
+        full = np.zeros(layout.sizes[3]) if v is None else layout.expand_v(v)
+        qvel = full[self._made.v_index]
+        b = np.zeros(self._m.nv)
+        for _, iv in self._made.free:
+            R = self._rotation(iv)
+            linear, angular = qvel[iv : iv + 3].copy(), qvel[iv + 3 : iv + 6]
+            b[iv : iv + 3] = R @ np.cross(angular, linear)
+            qvel[iv : iv + 3] = R @ linear
+        d.qvel[:] = qvel
+        return qvel, b
+
+    def _rotation(self, start_v: int) -> Array:
+        iq = next(q for q, v in self._made.free if v == start_v)
+        w, x, y, z = self._d.qpos[iq + 3 : iq + 7]
+        return spatial.matrix_from_quaternion(np.array([x, y, z, w]))
+
+    def _to_mujoco(self, x: Array) -> Array:
+        """Return T x for a vector of full velocities or accelerations, after `_set`."""
+        out = self.model.layout.expand_v(x)[self._made.v_index].copy()
+        for _, iv in self._made.free:
+            out[iv : iv + 3] = self._rotation(iv) @ out[iv : iv + 3]
+        return out
+
+    def _columns(self, J: Array) -> Array:
+        """Return J T, in the description's order and reduced."""
+        J = J.copy()
+        for _, iv in self._made.free:
+            J[:, iv : iv + 3] = J[:, iv : iv + 3] @ self._rotation(iv)
+        full = np.empty_like(J)
+        full[:, self._made.v_index] = J
+        return np.asarray(full @ self.model.layout.G) if self._reduced else full
+
+    def _force(self, f: Array) -> Array:
+        return self._columns(f[None, :])[0]
+
+    def _positions(self) -> None:
+        mujoco.mj_fwdPosition(self._m, self._d)
+
+    def _velocities(self) -> None:
+        mujoco.mj_fwdPosition(self._m, self._d)
+        mujoco.mj_fwdVelocity(self._m, self._d)
+
+    # The protocol.
+
+    def _mass_matrix(self, q: Array) -> Array:
+        return per_sample(self._one_mass_matrix, q)
+
+    def _one_mass_matrix(self, q: Array) -> Array:
+        self._set(q)
+        mujoco.mj_kinematics(self._m, self._d)
+        mujoco.mj_comPos(self._m, self._d)
+        make_mass_matrix(self._m, self._d)
+        return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
+
+    def _gravity(self, q: Array) -> Array:
+        def one(q: Array) -> Array:
+            self._set(q)
+            self._velocities()
+            return self._force(self._d.qfrc_bias)
+
+        return per_sample(one, q)
+
+    def _nle(self, q: Array, v: Array) -> Array:
+        def one(q: Array, v: Array) -> Array:
+            _, b = self._set(q, v)
+            self._velocities()
+            return self._force(self._d.qfrc_bias + self._times_mass(b))
+
+        return per_sample(one, q, v)
+
+    def _times_mass(self, x: Array) -> Array:
+        out = np.zeros(self._m.nv)
+        if self._made.free:
+            mujoco.mj_mulM(self._m, self._d, out, x)
+        return out
+
+    def _passive(self, q: Array, v: Array) -> Array:
+        def one(q: Array, v: Array) -> Array:
+            self._set(q, v)
+            self._velocities()
+            return self._force(self._d.qfrc_passive)
+
+        return per_sample(one, q, v)
+
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        def one(q: Array, v: Array, a: Array) -> Array:
+            _, b = self._set(q, v)
+            self._d.qacc[:] = self._to_mujoco(a) + b
+            mujoco.mj_inverse(self._m, self._d)
+            return self._force(self._d.qfrc_inverse)
+
+        return per_sample(one, q, v, a)
+
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        return per_sample(self._forward_reduced if self._reduced else self._forward_tree, q, v, tau)
+
+    def _forward_tree(self, q: Array, v: Array, tau: Array) -> Array:
+        _, b = self._set(q, v)
+        # T is orthogonal, so a force maps as a velocity does.
+        self._d.qfrc_applied[:] = self._to_mujoco(tau)
+        mujoco.mj_forward(self._m, self._d)
+        self._d.qfrc_applied[:] = 0.0
+        return self._force(self._d.qacc - b)
+
+    def _forward_reduced(self, q: Array, v: Array, tau: Array) -> Array:
+        # A mimic joint inside MuJoCo would be a soft equality: reduce instead.
+        M = self._one_mass_matrix(q)
+        _, b = self._set(q, v)
+        self._velocities()
+        rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
+        return np.asarray(np.linalg.solve(M, tau + rest))
+
+    def _kinetic_energy(self, q: Array, v: Array) -> Array:
+        def one(q: Array, v: Array) -> Any:
+            self._set(q, v)
+            self._velocities()
+            mujoco.mj_energyVel(self._m, self._d)
+            return float(self._d.energy[1])
+
+        return per_sample(one, q, v)
+
+    def _potential_energy(self, q: Array) -> Array:
+        def one(q: Array) -> Any:
+            self._set(q)
+            self._positions()
+            mujoco.mj_energyPos(self._m, self._d)
+            return float(self._d.energy[0])
+
+        return per_sample(one, q)
+
+    def _body(self, frame: str) -> tuple[int, Array, Array]:
+        f = self.model.frame(frame)
+        if f.body in self._made.absorbed:
+            raise UnsupportedError(
+                f"mujoco: frame {frame!r} rides on {f.body!r}, a body without mass between two joints, "
+                "which MuJoCo holds as two joints of one body"
+            )
+        return self._made.bodies[f.body], f.rotation, f.translation
+
+    def _frame_pose(self, body: int, R_BF: Array, p_BF: Array) -> tuple[Array, Array]:
+        mujoco.mj_kinematics(self._m, self._d)
+        mujoco.mj_comPos(self._m, self._d)
+        R = self._d.xmat[body].reshape(3, 3)
+        return R @ R_BF, self._d.xpos[body] + R @ p_BF
+
+    def _pose(self, q: Array, frame: str) -> Array:
+        body, R_BF, p_BF = self._body(frame)
+
+        def one(q: Array) -> Array:
+            self._set(q)
+            X = np.eye(4)
+            X[:3, :3], X[:3, 3] = self._frame_pose(body, R_BF, p_BF)
+            return X
+
+        return per_sample(one, q)
+
+    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
+        body, R_BF, p_BF = self._body(frame)
+
+        def one(q: Array) -> Array:
+            self._set(q)
+            R, p = self._frame_pose(body, R_BF, p_BF)
+            linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
+            mujoco.mj_jac(self._m, self._d, linear, angular, p, body)
+            if axes == "body":
+                linear, angular = R.T @ linear, R.T @ angular
+            return self._columns(np.vstack([linear, angular]))
+
+        return per_sample(one, q)
+
+    # Native integration.
+
+    def rollout(
+        self, integrator: str, q0: Array, v0: Array, dt: float, tau: Array | None, steps: int, *, euler_damping: bool = False
+    ) -> tuple[Array, Array]:
+        """Integrate with MuJoCo's own steps.
+
+        Parameters
+        ----------
+        integrator : {"euler", "rk4", "implicit", "implicitfast"}
+        q0, v0 : (n,) or (N, n) arrays
+        dt : float
+            Step, s.
+        tau : (steps, nv) or (N, steps, nv) array, optional
+            Held over each step.
+        steps : int
+        euler_damping : bool
+            Whether Euler treats joint damping implicitly, MuJoCo's default; it
+            then solves (M + h D) a = f and is no longer the explicit formula.
+
+        Returns
+        -------
+        q, v : (steps + 1, n) or (N, steps + 1, n) arrays
+            NaN from the step on that MuJoCo found to diverge.
+
+        Raises
+        ------
+        UnsupportedError
+            For reduced mimic joints (MuJoCo would make them soft), and forces on
+            a free joint's translation (MuJoCo holds them in world axes).
+        """
+        if self._reduced:
+            names = ", ".join(j.name for j in self.model.joints if j.mimic)
+            raise UnsupportedError(
+                f"mujoco: native rollouts of mimic joints ({names}) would follow a soft equality, not the reduced "
+                "equations; load with mimic='free', or use method='rk4' on this engine"
+            )
+        model = copy.copy(self._m)
+        if euler_damping:
+            model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        return Rollout(self.model, self._made, model)(integrator, q0, v0, dt, tau, steps)
