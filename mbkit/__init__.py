@@ -13,6 +13,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from mbkit._version import __version__ as __version__
+
 if TYPE_CHECKING:
     from mbkit import catalog as catalog
     from mbkit import errors as errors
@@ -26,9 +28,8 @@ if TYPE_CHECKING:
     from mbkit.model import ModelBuilder as ModelBuilder
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import simulate as simulate
-    from mbkit.studies import compare as compare
+    from mbkit.studies.compare import compare as compare
 
-__version__ = "0.1.0"
 
 _HOME = {
     "Dynamics": "mbkit.engines",

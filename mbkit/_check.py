@@ -11,10 +11,20 @@ from mbkit.errors import InputError
 
 Array = NDArray[np.float64]
 
-__all__ = ["Array", "batch_of", "finite_array", "require_finite", "rows"]
+__all__ = ["Array", "all_finite", "batch_of", "finite_array", "real", "require_finite", "rows"]
+
+
+def all_finite(array: Array) -> bool:
+    """Return whether an array holds only finite numbers."""
+    flat = array.ravel()
+    # One pass of multiply and add is several times cheaper than isfinite; huge but
+    # finite numbers overflow it and are looked at again.
+    return bool(flat.dot(flat) < np.inf) or bool(np.isfinite(array).all())
 
 
 def _as_float(name: str, value: ArrayLike) -> Array:
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
     try:
         raw = np.asarray(value)
     except (ValueError, TypeError) as error:
@@ -35,9 +45,8 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 def require_finite(name: str, array: Array) -> None:
     """Raise `InputError` that says where `array` holds NaN or infinity."""
-    bad = ~np.isfinite(array)
-    if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
+    if not all_finite(array):
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise InputError(f"{name}: {array[where]} at index {where}; expected finite numbers")
 
 
@@ -73,6 +82,6 @@ def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = F
         raise InputError(f"{name}: expected a number, got {value!r}") from None
     if not np.isfinite(number):
         raise InputError(f"{name}: expected a finite number, got {number}")
-    if positive and number <= 0 or nonnegative and number < 0:
+    if (positive and number <= 0) or (nonnegative and number < 0):
         raise InputError(f"{name}: expected a number {'above' if positive else 'of at least'} 0, got {number}")
     return number

@@ -49,7 +49,7 @@ def multiply(a: Array, b: Array) -> Array:
 
 def conjugate(a: Array) -> Array:
     """Return the conjugate, the inverse of a unit quaternion."""
-    return a * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.asarray(a * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
 def normalized(a: Array) -> Array:

@@ -14,16 +14,16 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of
+from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.manifold import check_quaternions
 
 __all__ = ["QUANTITIES", "Dynamics"]
 
 QUANTITIES: Final = (
     "mass_matrix",
     "coriolis_matrix",
+    "coriolis_force",
     "gravity",
     "nle",
     "passive",
@@ -92,6 +92,14 @@ class Dynamics(ABC):
         between engines, not the entries.
         """
         return self._evaluate("coriolis_matrix", self._coriolis_matrix, q=q, v=v)
+
+    def coriolis_force(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return C(q, v) v, shape (nv,) or (N, nv).
+
+        Formed with the engine's own Coriolis matrix where it has one, so that a
+        wrong matrix shows.
+        """
+        return self._evaluate("coriolis_force", self._coriolis_force, q=q, v=v)
 
     def gravity(self, q: ArrayLike) -> Array:
         """Return g(q), on the left of the equation, without springs; (nv,) or (N, nv)."""
@@ -187,6 +195,9 @@ class Dynamics(ABC):
     def _coriolis_matrix(self, q: Array, v: Array) -> Array:
         raise NotImplementedError
 
+    def _coriolis_force(self, q: Array, v: Array) -> Array:
+        return np.asarray((self._coriolis_matrix(q, v) @ v[..., None])[..., 0])
+
     def _function(self, name: str) -> Any:
         raise NotImplementedError
 
@@ -197,32 +208,41 @@ class Dynamics(ABC):
             raise UnsupportedError(f"{self.engine} cannot give {quantity}: {self.refuses[quantity]}")
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
-        self._require(quantity)
+        if self.refuses:
+            self._require(quantity)
         checked = {k: (self.model.check_q(x) if k == "q" else self.model.check_v(x, k)) for k, x in arguments.items()}
-        size = batch_of(**checked)
+        size = None if all(x.ndim == 1 for x in checked.values()) else batch_of(**checked)
         if size is not None:
             checked = {k: np.broadcast_to(x, (size, x.shape[-1])) for k, x in checked.items()}
-        out = np.asarray(method(*checked.values()), dtype=np.float64)
+        try:
+            out = np.asarray(method(*checked.values()), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            raise NumericalError(
+                f"{self.engine}: {quantity} of {self.model.name}: the mass matrix is singular{self._blame()}"
+            ) from None
         self._require_finite(quantity, out, checked)
         return out
 
     def _require_finite(self, quantity: str, out: Array, arguments: dict[str, Array]) -> None:
-        if np.isfinite(out).all():
+        if all_finite(out):
             return
         where = np.argwhere(~np.isfinite(out))[0]
         state = f" in sample {where[0]}" if next(iter(arguments.values())).ndim == 2 else ""
-        causes = [f"{name!r} ({why})" for name, why in self.model.nonphysical]
-        blame = f"; suspect: {', '.join(causes[:4])}" if causes else "; the mass matrix may be singular there"
+        index = tuple(int(i) for i in where)
         raise NumericalError(
-            f"{self.engine}: {quantity} of {self.model.name} is not finite at index {tuple(map(int, where))}{state}{blame}"
+            f"{self.engine}: {quantity} of {self.model.name} is not finite at index {index}{state}{self._blame()}"
         )
+
+    def _blame(self) -> str:
+        suspects = [f"{name!r} ({why})" for name, why in self.model.nonphysical]
+        # A joint that moves no mass is the likeliest cause; say it first.
+        suspects.sort(key=lambda text: "moves no mass" not in text)
+        more = f" and {len(suspects) - 3} more" if len(suspects) > 3 else ""
+        return f"; suspect: {', '.join(suspects[:3])}{more}" if suspects else "; look at massless links there"
 
     @staticmethod
     def _scalar(value: Array) -> Any:
         return float(value) if value.ndim == 0 else value
-
-    def _check_unit(self, q: Array) -> None:
-        check_quaternions(self.model, q)
 
 
 def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:

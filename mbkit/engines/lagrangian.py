@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines.base import Dynamics
@@ -54,6 +55,15 @@ class LagrangianDynamics(Dynamics):
 
     def _coriolis_matrix(self, q: Array, v: Array) -> Array:
         return self._machine("coriolis_matrix")(q, v)[0]
+
+    def _coriolis_force(self, q: Array, v: Array) -> Array:
+        return self._vector("coriolis_force", q, v)
+
+    def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
+        """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
+        return self._scalar(
+            self._evaluate("energy_rate", lambda q, v, a: self._vector("energy_rate", q, v, a)[..., 0], q=q, v=v, a=a)
+        )
 
     def _gravity(self, q: Array) -> Array:
         return self._vector("gravity", q)

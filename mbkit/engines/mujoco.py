@@ -9,7 +9,7 @@ a_mj = T a + b with b = R (ω × v).
 from __future__ import annotations
 
 import copy
-from typing import Any, Final
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -25,8 +25,6 @@ from mbkit.model import Model
 
 __all__ = ["MujocoDynamics"]
 
-_BODY: Final = int(mujoco.mjtObj.mjOBJ_BODY)
-
 
 class MujocoDynamics(Dynamics):
     """MuJoCo on a description.
@@ -41,7 +39,7 @@ class MujocoDynamics(Dynamics):
     """
 
     engine = "mujoco"
-    refuses = {
+    refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
     }
@@ -81,7 +79,7 @@ class MujocoDynamics(Dynamics):
         out = self.model.layout.expand_v(x)[self._made.v_index].copy()
         for _, iv in self._made.free:
             out[iv : iv + 3] = self._rotation(iv) @ out[iv : iv + 3]
-        return out
+        return np.asarray(out)
 
     def _columns(self, J: Array) -> Array:
         """Return J T, in the description's order and reduced."""
@@ -93,7 +91,7 @@ class MujocoDynamics(Dynamics):
         return np.asarray(full @ self.model.layout.G) if self._reduced else full
 
     def _force(self, f: Array) -> Array:
-        return self._columns(f[None, :])[0]
+        return np.asarray(self._columns(f[None, :])[0])
 
     def _positions(self) -> None:
         mujoco.mj_fwdPosition(self._m, self._d)
@@ -129,6 +127,9 @@ class MujocoDynamics(Dynamics):
             return self._force(self._d.qfrc_bias + self._times_mass(b))
 
         return per_sample(one, q, v)
+
+    def _coriolis_force(self, q: Array, v: Array) -> Array:
+        return self._nle(q, v) - self._gravity(q)
 
     def _times_mass(self, x: Array) -> Array:
         out = np.zeros(self._m.nv)
@@ -233,7 +234,15 @@ class MujocoDynamics(Dynamics):
     # Native integration.
 
     def rollout(
-        self, integrator: str, q0: Array, v0: Array, dt: float, tau: Array | None, steps: int, *, euler_damping: bool = False
+        self,
+        integrator: str,
+        q0: Array,
+        v0: Array,
+        dt: float,
+        tau: Array | None,
+        steps: int,
+        *,
+        euler_damping: bool = False,
     ) -> tuple[Array, Array]:
         """Integrate with MuJoCo's own steps.
 

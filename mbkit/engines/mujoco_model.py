@@ -59,8 +59,14 @@ class MujocoModel:
     notes: tuple[str, ...] = field(default=())
 
 
-def build(description: Model) -> MujocoModel:
+def build(description: Model, *, spheres: bool = False) -> MujocoModel:
     """Compile the description.
+
+    Parameters
+    ----------
+    description : Model
+    spheres : bool
+        Whether every body gets a sphere of 1 µm, to measure what geometry costs.
 
     Raises
     ------
@@ -86,6 +92,10 @@ def build(description: Model) -> MujocoModel:
     disabled = _switch_off(spec, description)
     placed = _add_tree(spec, description)
     _add_springs(spec, description, placed)
+    if spheres:
+        for name, body in placed.bodies.items():
+            if name != "world":
+                body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], pos=body.ipos, mass=0.0)
     try:
         model = spec.compile()
     except ValueError as error:
@@ -165,9 +175,16 @@ def _add_tree(spec: Any, description: Model) -> _Placed:
         made = placed.bodies[owner].add_body(name=body.name, pos=p, quat=_wxyz(R))
         placed.bodies[body.name] = made
         _give_inertia(made, body, description, placed)
+        at_origin = owner == "world" and np.array_equal(R, np.eye(3)) and not p.any()
         for stacked, R_PJ, p_PJ in stack:
-            _add_joint(made, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, in_world=owner == "world")
-        at[body.name] = (body.name, np.eye(3), np.zeros(3), [])
+            _add_joint(made, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin=at_origin)
+        if owner == "world" and joint.kind == "fixed":
+            # MuJoCo forms inertias about the centre of mass of a body's whole tree, and
+            # rounds accordingly. What hangs on a body fixed to the world starts a tree
+            # of its own in the world, so that one leg is not measured from the other's.
+            at[body.name] = ("world", R, p, [])
+        else:
+            at[body.name] = (body.name, np.eye(3), np.zeros(3), [])
     return placed
 
 
@@ -191,7 +208,7 @@ def _give_inertia(made: Any, body: Body, description: Model, placed: _Placed) ->
         made.inertia = np.ones(3)
 
 
-def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: _Placed, *, in_world: bool) -> None:
+def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: _Placed, *, at_origin: bool) -> None:
     """Add the joint, whose fixed frame at q = 0 is (R, p) in the body."""
     names: list[str] = []
 
@@ -224,7 +241,7 @@ def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: _Placed, *, 
     elif kind == "ball":
         add(_BALL, _Z, 0, "")
     elif kind == "free":
-        if in_world and not joint.has_placement:
+        if at_origin:
             # A true free joint's qpos is the pose in the world, ours too then.
             add(_FREE, _Z, 0, "")
         else:
@@ -293,7 +310,8 @@ def _verify(model: Any, description: Model, placed: _Placed) -> None:
 
 
 def _addresses(model: Any, names: list[str]) -> tuple[list[int], list[int]]:
-    q, v = [], []
+    q: list[int] = []
+    v: list[int] = []
     for name in names:
         j = model.joint(name)
         q += range(int(j.qposadr[0]), int(j.qposadr[0]) + len(j.qpos0))

@@ -57,7 +57,7 @@ class Rollout:
             self._m, data, start, control, control_spec=int(_FORCE), nstep=steps, skip_checks=False
         )
         states = np.concatenate([start[:, None], states], axis=1)
-        states[~self._alive(states, dt)] = np.nan
+        states[np.logical_not(self._alive(states, dt))] = np.nan
         q, v = self._read(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + self._m.nv])
         return (q[0], v[0]) if single else (q, v)
 

@@ -9,11 +9,10 @@ a NaN anywhere shows in the result.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines import defects
@@ -39,7 +38,7 @@ class PinocchioDynamics(Dynamics):
     """
 
     engine = "pinocchio"
-    refuses = {"function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has"}
+    refuses: ClassVar[dict[str, str]] = {"function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has"}
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -73,36 +72,44 @@ class PinocchioDynamics(Dynamics):
 
     # The direct way: one state, straight into Pinocchio.
 
-    def nle(self, q: ArrayLike, v: ArrayLike) -> Array:
+    def nle(self, q: Any, v: Any) -> Array:
         if self._direct:
             try:
                 out: Array = pin.nonLinearEffects(self._m, self._d, q, v)
             except Exception:  # Pinocchio's own errors vary; the checked path words them
                 return super().nle(q, v)
-            if out.dot(out) < _INFINITY and q.ndim == v.ndim == 1 and (not self._guarded or self._sound(q, v)):  # type: ignore[union-attr]
+            if out.dot(out) < _INFINITY and q.ndim == v.ndim == 1 and (not self._guarded or self._sound(q, v)):
                 return out
         return super().nle(q, v)
 
-    def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
+    def inverse_dynamics(self, q: Any, v: Any, a: Any) -> Array:
         if self._direct:
             try:
                 out: Array = pin.rnea(self._m, self._d, q, v, a)
                 if self._passive_any:
-                    out -= self._full_passive(q, v)  # type: ignore[arg-type]
+                    out -= self._full_passive(q, v)
             except Exception:  # as above
                 return super().inverse_dynamics(q, v, a)
-            if out.dot(out) < _INFINITY and q.ndim == v.ndim == a.ndim == 1 and (not self._guarded or self._sound(q, v)):  # type: ignore[union-attr]
+            if (
+                out.dot(out) < _INFINITY
+                and q.ndim == v.ndim == a.ndim == 1
+                and (not self._guarded or self._sound(q, v))
+            ):
                 return out
         return super().inverse_dynamics(q, v, a)
 
-    def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+    def forward_dynamics(self, q: Any, v: Any, tau: Any) -> Array:
         if self._direct:
             try:
-                total = tau + self._full_passive(q, v) if self._passive_any else tau  # type: ignore[arg-type, operator]
+                total = tau + self._full_passive(q, v) if self._passive_any else tau
                 out: Array = pin.aba(self._m, self._d, q, v, total)
             except Exception:  # as above
                 return super().forward_dynamics(q, v, tau)
-            if out.dot(out) < _INFINITY and q.ndim == v.ndim == tau.ndim == 1 and (not self._guarded or self._sound(q, v)):  # type: ignore[union-attr]
+            if (
+                out.dot(out) < _INFINITY
+                and q.ndim == v.ndim == tau.ndim == 1
+                and (not self._guarded or self._sound(q, v))
+            ):
                 return out
         return super().forward_dynamics(q, v, tau)
 
@@ -149,9 +156,7 @@ class PinocchioDynamics(Dynamics):
         return per_sample(lambda q: self._matrix(pin.crba(self._m, self._d, self._full_q(q))), q)
 
     def _gravity(self, q: Array) -> Array:
-        return per_sample(
-            lambda q: self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q))), q
-        )
+        return per_sample(lambda q: self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q))), q)
 
     def _nle(self, q: Array, v: Array) -> Array:
         return per_sample(

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit.model import Joint, Model
+from mbkit.model import Body, Joint, Model
 
 __all__ = ["PinModel", "build"]
 
@@ -76,15 +76,13 @@ def build(description: Model) -> PinModel:
         bodies[joint.child] = (carrier, R, p)
         body = description.body(joint.child)
         if carrier:
-            made.appendBodyToJoint(carrier, pin.Inertia(body.mass, body.com, body.inertia), pin.SE3(R, p))
+            made.appendBodyToJoint(carrier, _inertia(body), pin.SE3(R, p))
         else:
             ground += body.mass * (p + R @ body.com)
         q_order.extend(range(layout.full_q[joint.name].start, layout.full_q[joint.name].stop))
         v_order.extend(range(layout.full_v[joint.name].start, layout.full_v[joint.name].stop))
     ordered = q_order == list(range(len(q_order)))
-    return PinModel(
-        made, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground, tuple(unaligned)
-    )
+    return PinModel(made, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground, tuple(unaligned))
 
 
 def _motions(joint: Joint) -> list[tuple[str, object]]:
@@ -105,6 +103,14 @@ def _motions(joint: Joint) -> list[tuple[str, object]]:
     if kind == "planar":
         return [(".x", pin.JointModelPX()), (".y", pin.JointModelPY()), (".theta", pin.JointModelRZ())]
     return [("", pin.JointModelFreeFlyer())]
+
+
+def _inertia(body: Body) -> pin.Inertia:
+    # Set part by part: the constructor refuses an inertia that is not positive, which
+    # a description may hold after a warning.
+    made = pin.Inertia.Zero()
+    made.mass, made.lever, made.inertia = body.mass, np.array(body.com), np.array(body.inertia)
+    return made
 
 
 def _aligned(joint: Joint, letter: str, general: type) -> object:

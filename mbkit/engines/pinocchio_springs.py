@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from mbkit._check import Array
 from mbkit.engines.pinocchio_model import PinModel
-from mbkit.model import Model
+from mbkit.model import Model, PointSpring
 
 __all__ = ["PointSprings"]
 
@@ -18,13 +18,13 @@ class PointSprings:
     """Forces and energy of all point springs of a model, in Pinocchio's coordinates."""
 
     def __init__(self, model: Model, made: PinModel) -> None:
-        self._ends = []
+        self._ends: list[tuple[PointSpring, tuple[int, Array], tuple[int, Array]]] = []
         for spring in model.springs:
-            ends = []
-            for body, point in ((spring.body_a, spring.point_a), (spring.body_b, spring.point_b)):
-                carrier, R, p = made.bodies[body]
-                ends.append((carrier, p + R @ point))
-            self._ends.append((spring, *ends))
+            a, b = (
+                (made.bodies[body][0], made.bodies[body][2] + made.bodies[body][1] @ point)
+                for body, point in ((spring.body_a, spring.point_a), (spring.body_b, spring.point_b))
+            )
+            self._ends.append((spring, a, b))
 
     def energy(self, m: Any, d: Any, q: Array) -> float:
         """Return Σ ½ k (l - l0)²."""

@@ -40,7 +40,9 @@ def gravity_energy(kin: Kinematics) -> Any:
         moments[body.name] = [body.mass * float(c) for c in body.com]
         masses[body.name] = body.mass
     for joint in reversed(model.tree):
-        moments[joint.parent] = add(moments[joint.parent], kin.to_parent(joint, moments[joint.child], masses[joint.child]))
+        moments[joint.parent] = add(
+            moments[joint.parent], kin.to_parent(joint, moments[joint.child], masses[joint.child])
+        )
         masses[joint.parent] += masses[joint.child]
     return ca.SX(0) - dot3([float(g) for g in model.gravity], moments["world"])
 

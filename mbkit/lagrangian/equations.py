@@ -37,6 +37,7 @@ FUNCTIONS: Final = {
     "forward_dynamics": ("q", "v", "tau"),
     "kinetic_energy": ("q", "v"),
     "potential_energy": ("q",),
+    "energy_rate": ("q", "v", "a"),
 }
 
 
@@ -51,33 +52,39 @@ class Equations:
         self.tau = ca.SX.sym("tau", model.nv)
 
     @cached_property
-    def kinetic_energy(self) -> ca.SX:
+    def kinetic_energy(self) -> Any:
         """T(q, v)."""
         return energies.kinetic_energy(self.kin)
 
     @cached_property
-    def momentum(self) -> ca.SX:
+    def momentum(self) -> Any:
         """p = ∂T/∂v."""
         return ca.gradient(self.kinetic_energy, self.v)
 
     @cached_property
-    def potential_energy(self) -> ca.SX:
+    def potential_energy(self) -> Any:
         """V(q) of gravity and springs."""
         return energies.gravity_energy(self.kin) + energies.spring_energy(self.kin)
 
     @cached_property
-    def gravity(self) -> ca.SX:
+    def energy_rate(self) -> Any:
+        """d/dt (T + V) along (D v, a)."""
+        along = ca.vertcat(self.kin.qdot, self.a)
+        return ca.jtimes(self.kinetic_energy + self.potential_energy, ca.vertcat(self.q, self.v), along)
+
+    @cached_property
+    def gravity(self) -> Any:
         """g = Dᵀ ∂V_gravity/∂q."""
         return self.kin.pullback(ca.gradient(energies.gravity_energy(self.kin), self.q))
 
     @cached_property
-    def passive(self) -> ca.SX:
+    def passive(self) -> Any:
         """Forces of springs and dampers."""
         stored = self.kin.pullback(ca.gradient(energies.spring_energy(self.kin), self.q))
         return energies.damping_forces(self.kin) - stored
 
     @cached_property
-    def _hamel(self) -> ca.SX:
+    def _hamel(self) -> Any:
         parts: list[Any] = []
         for joint in self.model.independent_joints:
             part = self.model.layout.v[joint.name]
@@ -85,34 +92,34 @@ class Equations:
             parts += joint.type.hamel(self.kin.velocities(joint), p)
         return ca.vertcat(ca.SX(0, 1), *parts)
 
-    def _inertial(self, a: ca.SX) -> ca.SX:
+    def _inertial(self, a: ca.SX) -> Any:
         """M a + C v."""
         along = ca.vertcat(self.kin.qdot, a)
         rate = ca.jtimes(self.momentum, ca.vertcat(self.q, self.v), along)
         return rate + self._hamel - self.kin.pullback(ca.gradient(self.kinetic_energy, self.q))
 
     @cached_property
-    def coriolis_force(self) -> ca.SX:
+    def coriolis_force(self) -> Any:
         """C(q, v) v."""
         return self._inertial(ca.SX(self.model.nv, 1))
 
     @cached_property
-    def nle(self) -> ca.SX:
+    def nle(self) -> Any:
         """C v + g."""
         return self.coriolis_force + self.gravity
 
     @cached_property
-    def inverse_dynamics(self) -> ca.SX:
+    def inverse_dynamics(self) -> Any:
         """M a + C v + g - τ_passive."""
         return self._inertial(self.a) + self.gravity - self.passive
 
     @cached_property
-    def mass_matrix(self) -> ca.SX:
+    def mass_matrix(self) -> Any:
         """M = ∂p/∂v."""
         return ca.jacobian(self.momentum, self.v)
 
     @cached_property
-    def coriolis_matrix(self) -> ca.SX:
+    def coriolis_matrix(self) -> Any:
         """Christoffel's C = ½ ∂(C v)/∂v + ½ M A(v).
 
         A holds the quasi-velocities' structure: [[ω̂, v̂], [0, ω̂]] for a free joint
@@ -122,7 +129,7 @@ class Equations:
         half = 0.5 * ca.jacobian(self.coriolis_force, self.v)
         if not self.model.quaternions:
             return half
-        A = ca.SX(self.model.nv, self.model.nv)
+        A: Any = ca.SX(self.model.nv, self.model.nv)
         for joint in self.model.independent_joints:
             start = self.model.layout.v[joint.name].start
             if joint.kind == "ball":
@@ -135,12 +142,12 @@ class Equations:
         return half + 0.5 * ca.mtimes(self.mass_matrix, A)
 
     @cached_property
-    def applied(self) -> ca.SX:
+    def applied(self) -> Any:
         """τ_passive - C v - g: what accelerates a system without τ."""
         return self.passive - self.nle
 
     @cached_property
-    def forward_dynamics(self) -> ca.SX:
+    def forward_dynamics(self) -> Any:
         """M⁻¹ (τ + τ_passive - C v - g), by the tree's sparse factorisation."""
         return solve(self.mass_matrix, self.tau + self.applied, self.elimination_order)
 

@@ -37,9 +37,11 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
     factors: list[dict[int, Any]] = [{} for _ in range(n)]
     for k in reversed(range(n)):
         row = rows[k]
-        diagonal[k] = row.pop(k)
+        # A joint that moves nothing has no entry at all: the quotient is then
+        # infinite, and whoever evaluates finds it.
+        diagonal[k] = row.pop(k, 0.0)
         for i in sorted(row, reverse=True):
-            factors[k][i] = row[i] / diagonal[k]
+            factors[k][i] = row[i] / ca.SX(diagonal[k])
             for j, entry in row.items():
                 if j <= i:
                     rows[i][j] = rows[i].get(j, 0.0) - factors[k][i] * entry
@@ -47,7 +49,7 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
         for i, factor in factors[k].items():
             x[i] = x[i] - factor * x[k]
     for k in range(n):
-        x[k] = x[k] / diagonal[k] - sum((factor * x[i] for i, factor in factors[k].items()), 0.0)
+        x[k] = x[k] / ca.SX(diagonal[k]) - sum((factor * x[i] for i, factor in factors[k].items()), 0.0)
     out = ca.SX(n, 1)
     for k, index in enumerate(order):
         out[index] = x[k]

@@ -22,20 +22,19 @@ class Machine:
 
     def __init__(self, function: ca.Function) -> None:
         self.function = function
-        self._sizes: dict[int, tuple[Any, Any, list[Array], list[Array]]] = {}
+        self._sizes: dict[int, tuple[Any, Any, list[Any], list[Any]]] = {}
         # CasADi's buffers belong to one call at a time.
         self._lock = threading.Lock()
 
-    def _prepared(self, n: int) -> tuple[Any, Any, list[Array], list[Array]]:
+    def _prepared(self, n: int) -> tuple[Any, Any, list[Any], list[Any]]:
         if n not in self._sizes:
             if len(self._sizes) > 8:
                 self._sizes.clear()
             f = self.function if n == 1 else self.function.map(n)
+            buffer: Any
             buffer, run = f.buffer()
-            inputs = [np.zeros((n, self.function.size1_in(i))) for i in range(f.n_in())]
-            outputs = [
-                np.zeros((n, self.function.size2_out(i), self.function.size1_out(i))) for i in range(f.n_out())
-            ]
+            inputs: list[Any] = [np.zeros((n, self.function.size1_in(i))) for i in range(f.n_in())]
+            outputs: list[Any] = [np.zeros((n, self.function.size2_out(i), self.function.size1_out(i))) for i in range(f.n_out())]
             # An empty array has no memory to hand over, and CasADi reads none.
             for i, x in enumerate(inputs):
                 if x.size:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -75,7 +76,7 @@ class ModelBuilder:
         """
         who = f"body {name!r}"
         raw = np.zeros((3, 3)) if inertia is None else inertia
-        if np.shape(raw) == (3,):  # type: ignore[arg-type]  # any array_like has a shape
+        if np.shape(raw) == (3,):
             matrix = np.diag(self._vector(f"{who}: inertia", raw, 3))
         else:
             matrix = self._matrix(f"{who}: inertia", raw)
@@ -147,7 +148,10 @@ class ModelBuilder:
         if kind not in KINDS:
             near = nearest(str(kind), KINDS) or list(KINDS)
             self._faults.append(f"{who}: unknown kind {kind!r}; use one of {', '.join(near)}")
-            kind = "fixed"
+            # The other faults of this call would only be echoes of this one.
+            kind, axis, axis2, pitch, mimic = "fixed", None, None, 0.0, None
+            lower = upper = velocity_limit = effort_limit = None
+            armature = damping = friction = stiffness = rest = 0.0
         type_ = kind_of(kind)
         if mimic is not None and not isinstance(mimic, Mimic):
             mimic = self._mimic(who, mimic)
@@ -303,22 +307,19 @@ class ModelBuilder:
             self._bodies, self._joints, self._frames, self._springs, self._loops, self._prescribed
         )
         suspects = [(b.name, why) for b in self._bodies if (why := body_fault(b, point_masses=point_masses))]
+        if not faults:
+            named = {n for n, _ in suspects}
+            model = self._assemble(())
+            idle = [(model.joint(n).child, n) for n in idle_joints(model)]
+            suspects += [(child, _idle(n)) for child, n in idle if child not in named]
         strict = nonphysical == "error"
-        faults += [f"body {n!r}: {why}" for n, why in suspects if strict or "negative" in why]
+        remedy = '; correct it, or take it as written with nonphysical="warn"'
+        negative = {b.name for b in self._bodies if b.mass < 0}
+        faults += [f"body {n!r}: {why}{remedy}" for n, why in suspects if strict and n not in negative]
+        faults += [f"body {n!r}: {why}" for n, why in suspects if n in negative]
         if faults:
             raise ModelError(self._name, faults)
         model = self._assemble(tuple(suspects))
-        idle = idle_joints(model)
-        if idle and strict:
-            told = ", ".join(repr(n) for n in idle)
-            raise ModelError(
-                self._name,
-                [f"{_plural('joint', idle)} {told}: no mass moves, so the mass matrix is singular; "
-                 "give the bodies behind mass or inertia, or the joint an armature"],
-            )
-        if idle:
-            suspects += [(model.joint(n).child, f"joint {n!r} moves no mass: M is singular") for n in idle]
-            model = self._assemble(tuple(suspects))
         if suspects:
             told = "; ".join(f"{n!r}: {why}" for n, why in suspects[:5])
             more = f" and {len(suspects) - 5} more" if len(suspects) > 5 else ""
@@ -395,11 +396,11 @@ class ModelBuilder:
 
     def _axes(self, who: str, kind: str, axis: ArrayLike | None, axis2: ArrayLike | None) -> Array:
         wanted = kind_of(kind).n_axes
-        given = [a for a in (axis, axis2) if a is not None]
+        given: list[ArrayLike] = [a for a in (axis, axis2) if a is not None]
         if len(given) != wanted:
             names = ("no axis", "axis", "axis and axis2")[wanted]
             self._faults.append(f"{who}: a {kind} joint takes {names}; {len(given)} given")
-            given = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)][:wanted]
+            given = list(np.eye(3)[:wanted])
         out = np.zeros((wanted, 3))
         for i, a in enumerate(given):
             vector = self._vector(f"{who}: axis", a, 3)
@@ -420,14 +421,12 @@ class ModelBuilder:
             return None
 
 
-def _plural(word: str, things: list[str]) -> str:
-    return word if len(things) == 1 else word + "s"
+def _idle(joint: str) -> str:
+    return f"no mass moves with joint {joint!r}, so M is singular: give mass, inertia or armature"
 
 
 def _resolved(joints: list[Joint]) -> list[Joint]:
     """Let every mimic joint point at a joint that is free itself."""
-    from dataclasses import replace
-
     by_name = {j.name: j for j in joints}
     out = []
     for joint in joints:

@@ -23,6 +23,10 @@ _UNIT = 1e-9
 def check_quaternions(model: Model, q: Array, name: str = "q") -> None:
     """Raise `InputError` where a quaternion in q is not of unit length."""
     for start, joint in model.quaternions:
+        if q.ndim == 1:
+            x = q[start : start + 4]
+            if abs(x.dot(x) - 1.0) <= _UNIT:
+                continue
         square = np.einsum("...i,...i->...", q[..., start : start + 4], q[..., start : start + 4])
         off = np.abs(square - 1)
         if np.any(off > _UNIT):
@@ -81,7 +85,8 @@ def integrate(model: Model, q: Array, dq: Array) -> Array:
     """Return q ⊕ dq."""
     if not model.quaternions:
         return np.asarray(q + dq)
-    q, dq = np.broadcast_arrays(q, dq) if q.shape[-1] == dq.shape[-1] else _broadcast(q, dq)
+    lead = np.broadcast_shapes(q.shape[:-1], dq.shape[:-1])
+    q, dq = np.broadcast_to(q, (*lead, q.shape[-1])), np.broadcast_to(dq, (*lead, dq.shape[-1]))
     out = np.empty(q.shape)
     for joint in model.independent_joints:
         a, b = model.layout.q[joint.name], model.layout.v[joint.name]
@@ -121,8 +126,3 @@ def difference(model: Model, q0: Array, q1: Array) -> Array:
         else:
             out[..., b] = y - x
     return out
-
-
-def _broadcast(q: Array, dq: Array) -> tuple[Array, Array]:
-    lead = np.broadcast_shapes(q.shape[:-1], dq.shape[:-1])
-    return np.broadcast_to(q, (*lead, q.shape[-1])), np.broadcast_to(dq, (*lead, dq.shape[-1]))

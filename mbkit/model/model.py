@@ -22,10 +22,10 @@ from mbkit.model.parts import Body, Frame, Joint, Loop, PointSpring, Prescribed
 __all__ = ["Model"]
 
 _PER_VELOCITY: Final = {
-    "damping": ("damping",),
-    "springs": ("stiffness",),
-    "armature": ("armature",),
-    "friction": ("friction",),
+    "damping": "damping",
+    "springs": "stiffness",
+    "armature": "armature",
+    "friction": "friction",
 }
 _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed")
 
@@ -307,10 +307,12 @@ class Model:
         if feature == "prescribed":
             return replace(self, prescribed=())
         if feature == "limits":
-            free = (replace(j, lower=np.full(j.type.nq, -np.inf), upper=np.full(j.type.nq, np.inf)) for j in self.joints)
+            free = (
+                replace(j, lower=np.full(j.type.nq, -np.inf), upper=np.full(j.type.nq, np.inf)) for j in self.joints
+            )
             return replace(self, joints=tuple(free))
-        names = _PER_VELOCITY[feature]
-        joints = tuple(replace(j, **{n: np.zeros(j.type.nv) for n in names}) for j in self.joints)
+        name = _PER_VELOCITY[feature]
+        joints = tuple(replace(j, **{name: np.zeros(j.type.nv)}) for j in self.joints)  # type: ignore[arg-type]
         springs: Iterable[PointSpring] = self.springs
         if feature == "springs":
             springs = (replace(s, stiffness=0.0) for s in springs)

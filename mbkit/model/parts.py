@@ -33,7 +33,7 @@ class _Frozen:
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented
-        pairs = zip(self._values(), other._values(), strict=True)  # type: ignore[attr-defined]
+        pairs = zip(self._values(), other._values(), strict=True)
         return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
 
     def __hash__(self) -> int:
@@ -121,11 +121,6 @@ class Joint(_Frozen):
     def type(self) -> JointKind:
         """The formulas of this joint's kind."""
         return kind_of(self.kind)
-
-    @property
-    def has_placement(self) -> bool:
-        """Whether the joint's frame is not simply the parent's."""
-        return bool(np.any(self.rotation != np.eye(3)) or np.any(self.translation != 0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     point_masses : bool
         Whether a positive mass with zero inertia is meant that way.
     """
-    eigenvalues = np.linalg.eigvalsh(body.inertia)
+    eigenvalues = np.asarray(np.linalg.eigvalsh(body.inertia), dtype=np.float64)
     largest = float(np.max(np.abs(eigenvalues)))
     if body.mass < 0:
         return f"mass {body.mass:g} is negative"
@@ -86,14 +86,13 @@ def sample_mass_matrix(model: Model) -> Array:
     bodies = {b.name: b for b in model.bodies}
     for joint in model.tree:
         part = model.layout.full_q[joint.name], model.layout.full_v[joint.name]
-        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(numpy, joint, q_full[part[0]]))
+        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(numpy, joint, list(q_full[part[0]])))
         R, p = joint.rotation @ R_JC, joint.translation + joint.rotation @ p_JC
         parent = jacobians[joint.parent]
         J = np.vstack([R.T @ (parent[:3] - skew(p) @ parent[3:]), R.T @ parent[3:]])
         for k in range(joint.type.nv):
-            unit = np.zeros(joint.type.nv)
-            unit[k] = 1.0
-            linear, angular = joint.type.twist(numpy, joint, q_full[part[0]], unit)
+            unit = [float(i == k) for i in range(joint.type.nv)]
+            linear, angular = joint.type.twist(numpy, joint, list(q_full[part[0]]), unit)
             J[:, part[1].start + k] += np.array([*linear, *angular], dtype=float)
         jacobians[joint.child] = J
         body = bodies[joint.child]

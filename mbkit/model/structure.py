@@ -50,8 +50,9 @@ def structure_faults(
     faults += _tree_faults(bodies, joints)
     faults += _mimic_faults(joints)
     one = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
+    there = ", ".join(sorted(one)) or "none"
     faults += [
-        f"prescribed {p.joint!r}: expected a joint of one velocity that mimics none; there are: {', '.join(sorted(one))}"
+        f"prescribed {p.joint!r}: expected a joint of one velocity that mimics none; there are: {there}"
         for p in prescribed
         if p.joint not in one
     ]
@@ -74,9 +75,8 @@ def _joint_faults(joint: Joint) -> list[str]:
         out.append(f"{who}: the world cannot be a child; swap parent and child")
     if np.any(joint.lower > joint.upper):
         out.append(f"{who}: lower limit {joint.lower} above upper limit {joint.upper}")
-    for name in ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit"):
-        if np.any(getattr(joint, name) < 0):
-            out.append(f"{who}: {name} {getattr(joint, name)} is negative")
+    signed = ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
+    out += [f"{who}: {n} {getattr(joint, n)} is negative" for n in signed if np.any(getattr(joint, n) < 0)]
     if np.any(joint.armature) and joint.type.nv != 1:
         out.append(
             f"{who}: armature on a {joint.kind} joint; expected a joint of one velocity "

@@ -1,0 +1,43 @@
+"""Power balance: dE/dt = (τ + τ_damping) · v, with each engine's own acceleration.
+
+The rate of energy is differentiated exactly from T and V by the own derivation;
+acceleration and damping are the engine's. So it fails if either the engine's
+dynamics or the energies are wrong, whatever two engines agree on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from mbkit.engines import Dynamics
+from mbkit.errors import MbkitError
+from mbkit.studies.measure import Errors, Scales
+from mbkit.studies.states import States
+
+__all__ = ["power_rows"]
+
+
+def power_rows(made: Mapping[str, Dynamics], at: States, scales: Scales) -> Iterator[tuple[str, Errors]]:
+    """Yield (engine, errors) for every engine, where the own derivation is at hand."""
+    own = made.get("lagrangian")
+    energy_rate = getattr(own, "energy_rate", None)
+    if own is None or energy_rate is None:
+        return
+    for name, dyn in made.items():
+        try:
+            a = dyn.forward_dynamics(at.q, at.v, at.tau)
+            damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
+        except MbkitError:
+            # Told already, as the refusal of the term itself.
+            continue
+        inertial = own.inverse_dynamics(at.q, at.v, a)
+        e = np.abs(energy_rate(at.q, at.v, a) - np.sum((at.tau + damping) * at.v, axis=1))
+        # M a is as large as M's norm lets it be, and that is where it is rounded.
+        root = np.sqrt(scales.diagonal)
+        speed, size = np.linalg.norm(root * at.v, axis=1), np.linalg.norm(root * a, axis=1)
+        pushes = np.linalg.norm(inertial, axis=1) + np.linalg.norm(at.tau, axis=1) + np.linalg.norm(damping, axis=1)
+        scale = speed * size + np.linalg.norm(at.v, axis=1) * pushes + scales.floor
+        relative = np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
+        yield name, Errors(e, relative, np.empty(0))

@@ -1,0 +1,310 @@
+"""What a comparison returns: frozen rows, and ways to read them."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.errors import OutputError
+
+__all__ = ["Comparison", "CostPoint", "Omission", "Refusal", "RolloutRow", "Row"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One term of one engine against the reference, worst over all samples.
+
+    Attributes
+    ----------
+    term, engine, reference : str
+    joint : str
+        The joint with the largest per-joint error; empty for energies.
+    max_abs : float
+        Largest absolute difference of any entry, in the term's own unit.
+    relative : float
+        Worst normwise error of a sample; see `mbkit.studies.measure`.
+    per_joint : float
+        Worst error of a joint relative to its own scale.
+    median : float
+        Median normwise error of the samples.
+    samples : int
+    worst_kind : str
+        The kind of state (random, neutral, at limits, near singular) of the worst sample.
+    worst_q, worst_v : tuple of float
+        That state.
+    ns : float
+        Nanoseconds per evaluation of a single state, the engine's median.
+    ns_spread : float
+        Half the interquartile range of the timings, ns.
+    passed : bool
+    reason : str
+        Why it failed, naming joints and a known defect where there is one.
+    """
+
+    term: str
+    engine: str
+    reference: str
+    joint: str
+    max_abs: float
+    relative: float
+    per_joint: float
+    median: float
+    samples: int
+    worst_kind: str
+    worst_q: tuple[float, ...]
+    worst_v: tuple[float, ...]
+    ns: float
+    ns_spread: float
+    passed: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Something that an engine could not do, with its reason; `term` is empty for all of it."""
+
+    engine: str
+    term: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class RolloutRow:
+    """A trajectory of mbkit's integrator on one engine against MuJoCo's own.
+
+    Attributes
+    ----------
+    method : str
+        Integrator, the same formula on both sides.
+    engine, against : str
+    dt, duration : float
+        Step and compared horizon, s.
+    error : float
+        Largest difference of q over the horizon (on the manifold).
+    growth : float
+        How much a perturbation of the start had grown by then.
+    tolerance : float
+    steps : int
+    seconds, seconds_against : float
+        Run times of the two.
+    passed : bool
+    note : str
+    """
+
+    method: str
+    engine: str
+    against: str
+    dt: float
+    duration: float
+    error: float
+    growth: float
+    tolerance: float
+    steps: int
+    seconds: float
+    seconds_against: float
+    passed: bool
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class CostPoint:
+    """One run of one method: its error against a tight reference, and its run time.
+
+    Attributes
+    ----------
+    engine, method : str
+    setting : str
+        The step or tolerance.
+    error : float
+        Largest difference of q to the reference over the saved times.
+    seconds : float
+        Median run time.
+    spread : float
+        Half the interquartile range of the run times, s.
+    evaluations : int
+        Of forward dynamics; 0 where the engine does not tell.
+    """
+
+    engine: str
+    method: str
+    setting: str
+    error: float
+    seconds: float
+    spread: float
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class Omission:
+    """One thing that was left out, need by need.
+
+    Attributes
+    ----------
+    need : str
+    present : bool
+        Whether the description has it.
+    what : str
+        What was off, in words.
+    saved_ns : float
+        Nanoseconds saved per evaluation; NaN where it saves set-up time only.
+    saved_setup : float
+        Seconds of set-up saved; NaN where none.
+    change : float
+        Largest relative change of the accelerations with the thing on.
+    unchanged : bool
+        Whether the change is within rounding.
+    note : str
+    """
+
+    need: str
+    present: bool
+    what: str
+    saved_ns: float
+    saved_setup: float
+    change: float
+    unchanged: bool
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Several engines on one description: do they agree, to how many digits, at what cost.
+
+    Attributes
+    ----------
+    model : str
+        Name of the model.
+    facts : dict
+        nq, nv, mass, digest, needs and notes of the model.
+    engines : tuple of str
+        The engines compared, the reference among them.
+    reference : str
+    samples, seed : int
+    tolerance : float
+    rows : tuple of Row
+    rollouts : tuple of RolloutRow
+    costs : tuple of CostPoint
+        Error against run time of the rollouts.
+    reference_floor : float
+        How well the tight reference of `costs` is known.
+    omissions : tuple of Omission
+    refusals : tuple of Refusal
+    setup : dict
+        Seconds each engine took to be made, and to derive its terms.
+    versions : dict
+    processor : str
+    seconds : float
+        Time of the whole study.
+    """
+
+    model: str
+    facts: dict[str, Any]
+    engines: tuple[str, ...]
+    reference: str
+    samples: int
+    seed: int
+    tolerance: float
+    rows: tuple[Row, ...]
+    rollouts: tuple[RolloutRow, ...] = ()
+    costs: tuple[CostPoint, ...] = ()
+    reference_floor: float = math.nan
+    omissions: tuple[Omission, ...] = ()
+    refusals: tuple[Refusal, ...] = ()
+    setup: dict[str, float] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    processor: str = ""
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether at least two engines were compared and nothing differed."""
+        told = bool(self.rows) and all(r.passed for r in self.rows)
+        return told and all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
+
+    @property
+    def worst(self) -> Row | None:
+        """The row with the largest relative error; a failed one first."""
+        return max(self.rows, key=lambda r: (not r.passed, r.relative), default=None)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: agree, and to how many digits, or who differs in what."""
+        if not self.rows:
+            return f"nothing compared: {'; '.join(r.reason for r in self.refusals) or 'no engines'}"
+        if self.passed:
+            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits"
+        failed = [r for r in self.rows if not r.passed]
+        parts = [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
+        parts += [f"rollout {r.method} on {r.engine} differs" for r in self.rollouts if not r.passed]
+        parts += [f"leaving out {o.need} changes the accelerations" for o in self.omissions if not o.unchanged]
+        return "; ".join(parts)
+
+    @property
+    def digits(self) -> float:
+        """Decimal digits on which all terms agree, at most 16."""
+        worst = max((r.relative for r in self.rows), default=math.nan)
+        return float(-math.log10(max(worst, 1e-16)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return asdict(self) | {"passed": self.passed, "verdict": self.verdict, "digits": self.digits}
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """Return the result as JSON, and write it to `path` if given. NaN becomes null."""
+        text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False)
+        if path is not None:
+            try:
+                Path(path).write_text(text, encoding="utf-8")
+            except OSError as error:
+                raise OutputError(f"cannot write {path}: {error.strerror}; the result itself is kept") from error
+        return text
+
+    def to_markdown(self) -> str:
+        """Return the table of terms in Markdown."""
+        head = "| term | engine | worst | median | per joint | joint | ns | |\n|---|---|---|---|---|---|---|---|"
+        lines = [
+            f"| {r.term} | {r.engine} | {r.relative:.1e} | {r.median:.1e} | {r.per_joint:.1e} | {r.joint} | "
+            f"{r.ns:.0f} | {'agree' if r.passed else r.reason} |"
+            for r in self.rows
+        ]
+        told = [f"- {r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in self.refusals]
+        return "\n".join([f"**{self.model}**: {self.verdict}", "", head, *lines, "", *told]).rstrip() + "\n"
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f"<tr><td>{html.escape(r.term)}</td><td>{r.engine}</td><td>{r.relative:.1e}</td><td>{r.median:.1e}</td>"
+            f"<td>{html.escape(r.joint)}</td><td>{r.ns:.0f}</td>"
+            f"<td>{'agree' if r.passed else html.escape(r.reason)}</td></tr>"
+            for r in self.rows
+        )
+        head = "".join(f"<th>{h}</th>" for h in ("term", "engine", "worst", "median", "joint", "ns", ""))
+        refusals = "".join(f"<li>{html.escape(r.engine)}: {html.escape(r.reason)}</li>" for r in self.refusals)
+        return (
+            f"<p><b>{html.escape(self.model)}</b>: {html.escape(self.verdict)}</p>"
+            f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{refusals}</ul>" if refusals else "")
+        )
+
+    def __repr__(self) -> str:
+        return f"<Comparison of {self.model!r}: {self.verdict}>"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def tupled(x: Array) -> tuple[float, ...]:
+    """Return a vector as plain floats."""
+    return tuple(float(a) for a in x)
