@@ -159,6 +159,14 @@ class Dynamics(ABC):
         self._require("function")
         return self._function(name)
 
+    def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
+        """Return how far the engine's own formula amplifies rounding in M, per sample.
+
+        Σ |terms| / M_jj of the sum that makes the worst diagonal entry, (N,) or a
+        scalar; None where the formula is not known to amplify.
+        """
+        return None
+
     # What an adapter fills in. Arguments are float64, checked, and either all
     # single states or all batches of one size.
 

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mbkit import spatial
 from mbkit._check import Array
@@ -111,6 +112,32 @@ class MujocoDynamics(Dynamics):
         mujoco.mj_comPos(self._m, self._d)
         make_mass_matrix(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
+
+    def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
+        """Return Σ |terms| / M_jj, worst over j.
+
+        MuJoCo writes composite inertias and joint axes about the centre of mass of
+        the whole tree (`mj_comPos`, `mj_crb`); a light link far from there is the
+        small difference of large numbers.
+        """
+        return self._evaluate("mass_matrix_rounding", lambda q: per_sample(self._one_rounding, q), q=q)
+
+    def _one_rounding(self, q: Array) -> Array:
+        M = self._one_mass_matrix(q)
+        cdof, composite = np.abs(self._d.cdof), np.abs(self._d.crb[self._m.dof_bodyid])
+        # crb holds Ixx, Iyy, Izz, Ixy, Ixz, Iyz, m cx, m cy, m cz, m about that point.
+        w, v, h, mass = cdof[:, :3], cdof[:, 3:], composite[:, 6:9], composite[:, 9]
+        x, y, z = w.T
+        turning = composite[:, :3] * w * w
+        mixed = 2 * (composite[:, 3] * x * y + composite[:, 4] * x * z + composite[:, 5] * y * z)
+        coupling = 2 * np.sum(h * (np.roll(w, 1, 1) * np.roll(v, 2, 1) + np.roll(w, 2, 1) * np.roll(v, 1, 1)), axis=1)
+        terms = turning.sum(axis=1) + mixed + coupling + mass * np.sum(v * v, axis=1)
+        layout = self.model.layout
+        full = np.empty(self._m.nv)
+        full[self._made.v_index] = terms
+        own = layout.G.T**2 @ full if self._reduced else full
+        diagonal = np.diag(M)
+        return np.array(np.max(own / np.where(diagonal > 0, diagonal, np.inf), initial=1.0))
 
     def _gravity(self, q: Array) -> Array:
         def one(q: Array) -> Array:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from typing import Any, Final
 
 import mujoco
@@ -25,6 +27,24 @@ INTEGRATORS: Final = {
 }
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _FORCE: Final = mujoco.mjtState.mjSTATE_QFRC_APPLIED
+
+
+@contextlib.contextmanager
+def _own_warnings() -> Iterator[None]:
+    """Keep MuJoCo from printing and from writing MUJOCO_LOG.TXT into the working folder.
+
+    A divergence is read off the states themselves.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_heard)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _heard(_message: str) -> None:
+    """Take a warning that the states tell as well."""
 
 
 class Rollout:
@@ -53,9 +73,10 @@ class Rollout:
         control = None if tau is None else self._forces(tau, n, steps)
         threads = max(1, min(n, os.cpu_count() or 1))
         data = [mujoco.MjData(self._m) for _ in range(threads)]
-        states, _ = mujoco.rollout.rollout(
-            self._m, data, start, control, control_spec=int(_FORCE), nstep=steps, skip_checks=False
-        )
+        with _own_warnings():
+            states, _ = mujoco.rollout.rollout(
+                self._m, data, start, control, control_spec=int(_FORCE), nstep=steps, skip_checks=False
+            )
         states = np.concatenate([start[:, None], states], axis=1)
         states[np.logical_not(self._alive(states, dt))] = np.nan
         q, v = self._read(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + self._m.nv])

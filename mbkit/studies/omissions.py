@@ -12,8 +12,8 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.model import Model
-from mbkit.model.manifold import limits_box
 from mbkit.studies.result import Omission
+from mbkit.studies.states import inside
 from mbkit.studies.timing import interleaved
 
 __all__ = ["omissions"]
@@ -35,7 +35,8 @@ _FLAGS: Final = (
 
 def omissions(model: Model, made: Mapping[str, Dynamics], seed: int) -> tuple[Omission, ...]:
     """Return one row per need, measured on the engines at hand."""
-    q, v = _inside(model, seed)
+    # Well within the limits, where none of them acts.
+    q, v = inside(model, np.random.default_rng([seed, 2]))
     rows: list[Omission] = []
     mujoco = made.get("mujoco")
     if mujoco is not None:
@@ -43,16 +44,6 @@ def omissions(model: Model, made: Mapping[str, Dynamics], seed: int) -> tuple[Om
     if "lagrangian" in made:
         rows.append(_coriolis(model, q, v))
     return tuple(rows)
-
-
-def _inside(model: Model, seed: int) -> tuple[Array, Array]:
-    """Return a state well within the limits, where none of them acts."""
-    q, v = model.random_state(np.random.default_rng([seed, 2]))
-    lower, upper = limits_box(model)
-    bounded = np.isfinite(lower)
-    middle = 0.5 * (lower[bounded] + upper[bounded])
-    q[bounded] = middle + 0.5 * (q[bounded] - middle)
-    return q, v
 
 
 def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:

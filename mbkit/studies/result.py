@@ -45,7 +45,11 @@ class Row:
         Half the interquartile range of the timings, ns.
     passed : bool
     reason : str
-        Why it failed, naming joints and a known defect where there is one.
+        Why it failed, naming joints and a known defect where there is one; or why
+        more than the comparison's tolerance was allowed.
+    allowed : float
+        The error that passes: the comparison's tolerance, or more where the
+        engine's own formula cannot do better.
     """
 
     term: str
@@ -64,6 +68,7 @@ class Row:
     ns_spread: float
     passed: bool
     reason: str = ""
+    allowed: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -89,8 +94,10 @@ class RolloutRow:
     error : float
         Largest difference of q over the horizon (on the manifold).
     growth : float
-        How much a perturbation of the start had grown by then.
+        The rollout's condition: how far q moves per relative disturbance of the
+        forces, see `mbkit.studies.rollouts`.
     tolerance : float
+        1e-12, or a multiple of eps times the condition where that is more.
     steps : int
     seconds, seconds_against : float
         Run times of the two.

@@ -10,7 +10,7 @@ from mbkit._check import Array
 from mbkit.model import Model
 from mbkit.model.manifold import limits_box
 
-__all__ = ["States", "states"]
+__all__ = ["States", "inside", "states"]
 
 # An angle this far from gimbal lock loses four digits in anything that divides
 # by its cosine; none of the terms should.
@@ -56,6 +56,16 @@ def states(model: Model, samples: int, seed: int) -> States:
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
     a, tau = rng.standard_normal((2, len(q), model.nv))
     return States(q, v, a, tau, tuple(kinds))
+
+
+def inside(model: Model, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return a random state in the middle half of the limits."""
+    q, v = model.random_state(rng)
+    lower, upper = limits_box(model)
+    bounded = np.isfinite(lower)
+    middle = 0.5 * (lower[bounded] + upper[bounded])
+    q[bounded] = middle + 0.5 * (q[bounded] - middle)
+    return q, v
 
 
 def _at_limits(model: Model, rng: np.random.Generator, n: int) -> Array:
