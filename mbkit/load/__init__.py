@@ -1,0 +1,9 @@
+"""URDF, MJCF, and robots by name, to a `Model`. No mesh is ever opened."""
+
+from mbkit._callable import make_callable
+from mbkit.load.loader import load
+from mbkit.load.names import Robot, robots
+
+__all__ = ["Robot", "load", "robots"]
+
+make_callable(__name__, load)

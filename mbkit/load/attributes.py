@@ -1,0 +1,114 @@
+"""Numbers and names in attributes, read strictly; every fault is kept, none is raised."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Final
+
+from mbkit.load.xml import Element
+
+__all__ = ["Reader"]
+
+_NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+# Larger than anything that moves, and the products of several still fit a double.
+_LARGEST: Final = 1e30
+
+
+class Reader:
+    """Reads attributes of one file and collects its faults.
+
+    Attributes
+    ----------
+    faults : list of str
+        One sentence per fault: the element, what was expected, what came.
+    """
+
+    def __init__(self) -> None:
+        self.faults: list[str] = []
+
+    def fault(self, text: str, element: Element | None = None) -> None:
+        """Keep one fault; the element tells the line."""
+        where = f" (line {element.line})" if element else ""
+        self.faults.append(text + where)
+
+    def name(self, element: Element, attribute: str, who: str) -> str:
+        """Return a name that must be there and not be empty."""
+        value = element.attributes.get(attribute, "")
+        if not value.strip():
+            self.fault(f"{who}: <{element.tag}> has no {attribute}; give it one", element)
+        return value
+
+    def numbers(
+        self,
+        element: Element,
+        attribute: str,
+        who: str,
+        *,
+        count: int,
+        least: int | None = None,
+        default: tuple[float, ...] | None = None,
+        bounded: bool = True,
+    ) -> tuple[float, ...]:
+        """Return the numbers of an attribute.
+
+        Parameters
+        ----------
+        element, attribute, who
+            Where to read, and whom the message blames.
+        count, least : int
+            How many numbers are expected: exactly `count`, or from `least` to `count`.
+        default : tuple of float, optional
+            What stands for an absent attribute, which is a fault without it.
+        bounded : bool
+            Whether sizes that would overflow are a fault; limits may be that large.
+        """
+        where = f"{who}: {element.tag} {attribute}"
+        neutral = default if default is not None else (0.0,) * count
+        raw = element.attributes.get(attribute)
+        if raw is None:
+            if default is None:
+                self.fault(f"{where}: missing; expected {_told(count, least)}", element)
+            return neutral
+        values = []
+        for word in raw.split():
+            value = float(word) if _NUMBER.fullmatch(word) else math.nan
+            if not math.isfinite(value):
+                self.fault(f"{where}: {_short(word)} is not a finite number{_hint(word)}", element)
+                return neutral
+            if bounded and abs(value) > _LARGEST:
+                self.fault(f"{where}: {_short(word)} is too large to compute with", element)
+                return neutral
+            values.append(value)
+        if not (count if least is None else least) <= len(values) <= count:
+            self.fault(f"{where}: expected {_told(count, least)}, got {_short(raw)}", element)
+            return neutral
+        return tuple(values)
+
+    def number(
+        self, element: Element, attribute: str, who: str, default: float | None = None, *, bounded: bool = True
+    ) -> float:
+        """Return a single number; see `numbers`."""
+        fallback = None if default is None else (default,)
+        return self.numbers(element, attribute, who, count=1, default=fallback, bounded=bounded)[0]
+
+    def only(self, element: Element, tag: str, who: str) -> Element | None:
+        """Return the child of this tag, of which there may be one."""
+        found = element.all(tag)
+        if len(found) > 1:
+            self.fault(f"{who}: {len(found)} <{tag}> elements; keep one", found[1])
+        return found[0] if found else None
+
+
+def _told(count: int, least: int | None) -> str:
+    if count == 1 and least in (None, 1):
+        return "a number"
+    return f"{count} numbers" if least in (None, count) else f"{least} to {count} numbers"
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def _hint(word: str) -> str:
+    return "; run xacro on the file first" if "${" in word else ""

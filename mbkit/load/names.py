@@ -1,0 +1,172 @@
+"""The robots of example-robot-data, by their usual short names and by folder and file."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import warnings
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Final
+
+from mbkit.errors import LoadError, MbkitError, MbkitWarning, ModelError, UnknownNameError
+
+__all__ = ["Robot", "find", "robots"]
+
+_PACKAGE: Final = "example-robot-data"
+
+# Names of example-robot-data's own loaders, and others in common use, for files whose
+# stem is another one. Each is a folder and a stem.
+_SHORT: Final = {
+    "alexander": "alexander_description/alexander_v1.lowerBodyOnly",
+    "anymal": "anymal_b_simple_description/anymal",
+    "anymal_b": "anymal_b_simple_description/anymal",
+    "anymal_b_kinova": "anymal_b_simple_description/anymal-kinova",
+    "anymal_c": "anymal_c_simple_description/anymal",
+    "asr_twodof": "asr_twodof_description/TwoDofs",
+    "borinot": "borinot_description/borinot_flying_arm_2",
+    "g1": "g1_description/g1_29dof_rev_1_0",
+    "g1_with_hand": "g1_description/g1_29dof_with_hand_rev_1_0",
+    "hector": "hector_description/quadrotor_base",
+    "hextilt": "hextilt_description/hextilt_flying_arm_5",
+    "hyq": "hyq_description/hyq_no_sensors",
+    "solo8": "solo_description/solo",
+    "talos": "talos_data/talos_reduced",
+    "talos_arm": "talos_data/talos_left_arm",
+    "talos_box": "talos_data/talos_reduced_box",
+    "talos_full": "talos_data/talos_full_v2",
+    "talos_full_box": "talos_data/talos_full_v2_box",
+    "ur10": "ur_description/ur10_robot",
+    "ur10_limited": "ur_description/ur10_joint_limited_robot",
+    "ur3": "ur_description/ur3_robot",
+    "ur3_limited": "ur_description/ur3_joint_limited_robot",
+    "ur5": "ur_description/ur5_robot",
+    "ur5_limited": "ur_description/ur5_joint_limited_robot",
+}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A URDF of example-robot-data; its size is read when first asked for.
+
+    Attributes
+    ----------
+    name : str
+        Folder and file, such as ``"panda_description/panda"``.
+    aliases : tuple of str
+        Shorter names, the usual one first.
+    path : pathlib.Path
+    """
+
+    name: str
+    aliases: tuple[str, ...]
+    path: Path
+
+    @cached_property
+    def _facts(self) -> tuple[int | None, int | None, float | None, str | None]:
+        from mbkit.load.loader import load
+
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", MbkitWarning)
+                model = load(self.name)
+        except ModelError as error:
+            return None, None, None, "; ".join(error.faults)
+        except MbkitError as error:
+            return None, None, None, str(error)
+        return model.nq, model.nv, model.mass, None
+
+    @property
+    def nq(self) -> int | None:
+        """Number of coordinates, mimic joints reduced; None if it does not load."""
+        return self._facts[0]
+
+    @property
+    def nv(self) -> int | None:
+        """Number of velocities; None if it does not load."""
+        return self._facts[1]
+
+    @property
+    def mass(self) -> float | None:
+        """Total mass in kg; None if it does not load."""
+        return self._facts[2]
+
+    @property
+    def reason(self) -> str | None:
+        """Why it does not load; None if it does."""
+        return self._facts[3]
+
+
+def robots() -> tuple[Robot, ...]:
+    """Return a record of every robot of example-robot-data, by name.
+
+    Returns
+    -------
+    tuple of Robot
+        Each with ``name``, ``aliases``, ``path``, and ``nq``, ``nv``, ``mass`` or the
+        ``reason`` why it does not load; the last four are found when first asked for.
+
+    Raises
+    ------
+    LoadError
+        example-robot-data is not installed.
+    """
+    return _table()[0]
+
+
+def find(name: str) -> Robot | None:
+    """Return the robot of this name, or None; case and ``-`` or ``_`` do not matter."""
+    return _table()[1].get(_key(name))
+
+
+def unknown(name: str) -> UnknownNameError:
+    """Return the error for a name that is neither a robot nor a path."""
+    known = sorted({(r.aliases or (r.name,))[0] for r in robots()} | _SHORT.keys() | {r.name for r in robots()})
+    return UnknownNameError(
+        "robot", name, known, "(a path to a file ends in .urdf or .xml; mbkit robots lists all names)"
+    )
+
+
+def _key(name: str) -> str:
+    return name.lower().replace("-", "_")
+
+
+def _short_folder(folder: str) -> str:
+    return folder.removesuffix("_description").removesuffix("_data")
+
+
+def _files() -> list[tuple[str, str, Path]]:
+    """Return folder, stem and path of every URDF, read off the package's file list."""
+    try:
+        listed = importlib.metadata.files(_PACKAGE)
+    except importlib.metadata.PackageNotFoundError:
+        listed = None
+    if listed is None:
+        raise LoadError(f"robots by name come from {_PACKAGE}, which is not installed; pip install {_PACKAGE}")
+    out = []
+    for file in listed:
+        if file.suffix == ".urdf" and "robots" in file.parts[:-2]:
+            folder = file.parts[file.parts.index("robots") + 1]
+            out.append((folder, file.stem, Path(str(file.locate()))))
+    return sorted(out)
+
+
+@lru_cache(maxsize=1)
+def _table() -> tuple[tuple[Robot, ...], dict[str, Robot]]:
+    files = _files()
+    stems = Counter(_key(stem) for _, stem, _ in files)
+    short = {_key(alias) for alias in _SHORT}
+    made = []
+    for folder, stem, path in files:
+        name = f"{folder}/{stem}"
+        aliases = [a for a, full in _SHORT.items() if full == name]
+        if stems[_key(stem)] == 1 and _key(stem) not in short:
+            aliases.append(stem)
+        made.append(Robot(name, tuple(aliases), path))
+    by_key: dict[str, Robot] = {}
+    for robot in made:
+        folder, stem = robot.name.split("/")
+        for name in (robot.name, f"{_short_folder(folder)}/{stem}", *robot.aliases):
+            by_key.setdefault(_key(name), robot)
+    return tuple(made), by_key

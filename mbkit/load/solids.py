@@ -1,0 +1,87 @@
+"""Mass and inertia of MuJoCo's solid shapes, and of what is made of several."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.spatial import skew
+
+__all__ = ["NOTHING", "SIZES", "Lump", "solid", "together"]
+
+# How many sizes each shape takes; half lengths and radii. With two end points the
+# length is theirs.
+SIZES: Final = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
+
+
+@dataclass(frozen=True)
+class Lump:
+    """Mass, centre of mass, and inertia about it, in the axes of whoever asks."""
+
+    mass: float
+    com: Array
+    inertia: Array
+
+    def moved(self, R: Array, p: Array) -> Lump:
+        """Return the same matter seen from a frame in which this one stands at R, p."""
+        return Lump(self.mass, p + R @ self.com, R @ self.inertia @ R.T)
+
+    def scaled(self, factor: float) -> Lump:
+        """Return the same shape of another density."""
+        return Lump(factor * self.mass, self.com, factor * self.inertia)
+
+
+NOTHING: Final = Lump(0.0, np.zeros(3), np.zeros((3, 3)))
+
+
+def solid(shape: str, size: tuple[float, ...]) -> Lump:
+    """Return a shape of density 1 kg/m³ about its centre, in its own axes.
+
+    Half lengths and radii as MuJoCo takes them; the long axis is z.
+    """
+    if shape == "box":
+        a, b, c = size
+        mass = 8 * a * b * c
+        moments = [(b * b + c * c) / 3, (a * a + c * c) / 3, (a * a + b * b) / 3]
+    elif shape == "ellipsoid":
+        a, b, c = size
+        mass = 4 / 3 * pi * a * b * c
+        moments = [(b * b + c * c) / 5, (a * a + c * c) / 5, (a * a + b * b) / 5]
+    elif shape == "sphere":
+        (r,) = size
+        mass = 4 / 3 * pi * r**3
+        moments = [2 / 5 * r * r] * 3
+    elif shape == "cylinder":
+        r, h = size
+        mass = 2 * pi * r * r * h
+        moments = [r * r / 4 + h * h / 3] * 2 + [r * r / 2]
+    else:
+        return _capsule(*size)
+    return Lump(mass, np.zeros(3), mass * np.diag(moments))
+
+
+def _capsule(r: float, h: float) -> Lump:
+    # A cylinder and two half spheres, whose own centres stand 3/8 r beyond its ends.
+    tube, ball = 2 * pi * r * r * h, 4 / 3 * pi * r**3
+    along = tube * r * r / 2 + ball * 2 / 5 * r * r
+    across = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
+    return Lump(tube + ball, np.zeros(3), np.diag([across, across, along]))
+
+
+def together(lumps: list[Lump]) -> Lump:
+    """Return several lumps, given in the same axes, as one."""
+    mass = sum(x.mass for x in lumps)
+    if len(lumps) == 1:
+        return lumps[0]
+    if not mass:
+        return NOTHING
+    com = sum((x.mass * x.com for x in lumps), np.zeros(3)) / mass
+    inertia = np.zeros((3, 3))
+    for x in lumps:
+        d = skew(x.com - com)
+        inertia += x.inertia - x.mass * d @ d
+    return Lump(mass, com, inertia)

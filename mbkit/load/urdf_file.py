@@ -1,0 +1,250 @@
+"""What stands in a URDF, checked before any parser in C++ sees it.
+
+`examine` finds all faults of a file at once and writes what is left of it, names and
+numbers to the letter, as plain XML: bodies and joints only. Meshes, textures, plugins
+and everything else that could point outside the file are gone from that text.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from mbkit.errors import ModelError
+from mbkit.load.attributes import Reader
+from mbkit.load.urdf_tree import UrdfJoint, check_mimics, check_names, check_size, check_tree
+from mbkit.load.xml import Element
+from mbkit.model import Body, Mimic
+from mbkit.model.physical import body_fault
+
+__all__ = ["UrdfFile", "examine"]
+
+_KINDS: Final = {
+    "fixed": "fixed",
+    "revolute": "revolute",
+    "continuous": "continuous",
+    "prismatic": "prismatic",
+    "floating": "free",
+    "planar": "planar",
+}
+_MOMENTS: Final = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+@dataclass(frozen=True)
+class UrdfFile:
+    """A URDF that was found sound.
+
+    Attributes
+    ----------
+    name : str
+        The robot's.
+    text : str
+        The file again, less everything but bodies and joints.
+    root : str
+        The link that no joint carries.
+    joints : tuple of UrdfJoint
+        In the file's order.
+    links : frozenset of str
+    odd_links : mapping of str to str
+        Links that no matter is like, seen alone, each with the reason. What is
+        fixed to them may heal them, so this is not yet a fault.
+    notes : tuple of str
+    """
+
+    name: str
+    text: str
+    root: str
+    joints: tuple[UrdfJoint, ...]
+    links: frozenset[str]
+    odd_links: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: bool, lenient: bool) -> UrdfFile:
+    """Check a <robot> element.
+
+    Parameters
+    ----------
+    robot : Element
+    source : str
+        The file's name, for messages.
+    floating_base : bool
+        Whether a robot without moving joints is still of use.
+    mimic_matters : bool
+        Whether a mimic tag that cannot be followed is a fault.
+    lenient : bool
+        Whether such a tag is noted instead.
+
+    Raises
+    ------
+    ModelError
+        With every fault of the file.
+    """
+    read = Reader()
+    name = robot.attributes.get("name", "")
+    if not name.strip():
+        read.fault('<robot> has no name; write <robot name="...">', robot)
+    macros = [e for e in robot.walk() if e.tag.startswith("xacro:")]
+    if macros:
+        read.fault(f"{len(macros)} xacro elements, such as <{macros[0].tag}>; run xacro on the file first", macros[0])
+
+    odd: dict[str, str] = {}
+    link_texts = [_link(e, read, odd) for e in robot.all("link")]
+    links = [e.attributes.get("name", "") for e in robot.all("link")]
+    made = [_joint(e, read) for e in robot.all("joint")]
+    joints = [j for j, _ in made]
+    check_names(links, joints, read)
+    root = check_tree(links, joints, read)
+    check_size(links, joints, floating_base, read)
+    joints, notes = check_mimics(joints, mimic_matters, lenient, read)
+    if floating_base and any(j.name == "root_joint" for j in joints):
+        read.fault("joint 'root_joint': floating_base=True adds a joint of that name; rename yours")
+    if read.faults:
+        raise ModelError(source, read.faults)
+    notes += _left_out(robot)
+    text = _written("robot", {"name": name}, [*link_texts, *(t for _, t in made)])
+    return UrdfFile(name, text, root, tuple(joints), frozenset(links), odd, tuple(notes))
+
+
+# Single elements. Each returns its text: numbers as they were written, one space
+# apart (urdfdom takes ' 1.5 ' for no number, and drops the link's inertia).
+
+
+def _written(tag: str, attributes: Mapping[str, str], inside: Iterable[str] = ()) -> str:
+    told = "".join(f" {k}={quoteattr(v)}" for k, v in attributes.items())
+    body = "".join(inside)
+    return f"<{tag}{told}>{body}</{tag}>" if body else f"<{tag}{told}/>"
+
+
+def _copied(element: Element, *names: str) -> str:
+    given = {n: " ".join(element.attributes[n].split()) for n in names if n in element.attributes}
+    return _written(element.tag, given)
+
+
+def _origin(owner: Element, who: str, read: Reader) -> list[str]:
+    origin = read.only(owner, "origin", who)
+    if origin is None:
+        return []
+    read.numbers(origin, "xyz", who, count=3, default=(0, 0, 0))
+    read.numbers(origin, "rpy", who, count=3, default=(0, 0, 0))
+    return [_copied(origin, "xyz", "rpy")]
+
+
+def _link(link: Element, read: Reader, odd: dict[str, str]) -> str:
+    name = read.name(link, "name", "a link")
+    who = f"link {name!r}"
+    inertial = read.only(link, "inertial", who)
+    if inertial is None:
+        return _written("link", {"name": name})
+    before = len(read.faults)
+    texts = _origin(inertial, who, read)
+    mass, moments = (read.only(inertial, tag, who) for tag in ("mass", "inertia"))
+    for tag, element in (("mass", mass), ("inertia", moments)):
+        if element is None:
+            read.fault(f"{who}: <inertial> has no <{tag}>; add it, or remove <inertial>", inertial)
+    if mass is None or moments is None:
+        return ""
+    kg = read.number(mass, "value", who)
+    ixx, ixy, ixz, iyy, iyz, izz = (read.number(moments, m, who) for m in _MOMENTS)
+    if kg < 0:
+        read.fault(f"{who}: mass {kg:g} kg is negative; expected 0 or more", mass)
+    if len(read.faults) == before:
+        inertia = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+        why = body_fault(Body(name, kg, np.zeros(3), inertia), point_masses=False)
+        if why:
+            odd[name] = why
+    texts += [_copied(mass, "value"), _copied(moments, *_MOMENTS)]
+    return _written("link", {"name": name}, [_written("inertial", {}, texts)])
+
+
+def _joint(joint: Element, read: Reader) -> tuple[UrdfJoint, str]:
+    name = read.name(joint, "name", "a joint")
+    who = f"joint {name!r}"
+    type_ = joint.attributes.get("type", "")
+    kind = _KINDS.get(type_, "")
+    if not kind:
+        read.fault(f"{who}: type {type_!r}; expected one of {', '.join(_KINDS)}", joint)
+    texts = _origin(joint, who, read)
+    ends = {tag: _end(joint, tag, who, read) for tag in ("parent", "child")}
+    texts += [_written(tag, {"link": link}) for tag, link in ends.items()]
+    texts += _axis(joint, kind, who, read)
+    texts += _limit(joint, kind, who, read)
+    dynamics = read.only(joint, "dynamics", who)
+    if dynamics is not None:
+        damping, friction = (read.number(dynamics, a, who, 0.0) for a in ("damping", "friction"))
+        if kind in ("free", "planar") and (damping or friction):
+            read.fault(f"{who}: damping or friction on a {type_} joint, which URDF's parsers drop; remove it", dynamics)
+        if kind not in ("", "fixed", "free", "planar") and {"damping", "friction"} & dynamics.attributes.keys():
+            texts.append(_copied(dynamics, "damping", "friction"))
+    mimic = None
+    follows = read.only(joint, "mimic", who)
+    if follows is not None:
+        leader = read.name(follows, "joint", who)
+        ratio, offset = read.number(follows, "multiplier", who, 1.0), read.number(follows, "offset", who, 0.0)
+        mimic = Mimic(leader, ratio, offset)
+    return UrdfJoint(name, kind, ends["parent"], ends["child"], mimic), _written(
+        "joint", {"name": name, "type": type_}, texts
+    )
+
+
+def _end(joint: Element, tag: str, who: str, read: Reader) -> str:
+    end = read.only(joint, tag, who)
+    if end is None:
+        read.fault(f'{who}: no <{tag}>; add <{tag} link="..."/>', joint)
+    return "" if end is None else read.name(end, "link", who)
+
+
+def _axis(joint: Element, kind: str, who: str, read: Reader) -> list[str]:
+    axis = read.only(joint, "axis", who)
+    before = len(read.faults)
+    vector = (1.0, 0.0, 0.0) if axis is None else read.numbers(axis, "xyz", who, count=3)
+    if kind in ("", "fixed", "free") or len(read.faults) > before:
+        return []
+    if axis is not None and not any(vector):
+        read.fault(f"{who}: axis is zero; expected a direction, such as 0 0 1", axis)
+    elif kind == "planar" and (vector[:2] != (0, 0) or vector[2] <= 0):
+        told = " ".join(f"{x:g}" for x in vector)
+        read.fault(
+            f"{who}: planar with the normal {told} (URDF's default is 1 0 0); only 0 0 1 is read: "
+            'turn the joint by <origin rpy="..."/> and write <axis xyz="0 0 1"/>',
+            axis or joint,
+        )
+    return [] if axis is None or kind == "planar" else [_copied(axis, "xyz")]
+
+
+def _limit(joint: Element, kind: str, who: str, read: Reader) -> list[str]:
+    limit = read.only(joint, "limit", who)
+    bounded = kind in ("revolute", "prismatic")
+    if limit is None:
+        if bounded:
+            remedy = "; or make it continuous" if kind == "revolute" else ""
+            read.fault(
+                f'{who}: a {kind} joint needs <limit lower="..." upper="..." effort="..." velocity="..."/>{remedy}',
+                joint,
+            )
+        return []
+    needed = None if bounded else 0.0
+    lower, upper = (read.number(limit, a, who, 0.0, bounded=False) for a in ("lower", "upper"))
+    for attribute in ("effort", "velocity"):
+        if read.number(limit, attribute, who, needed, bounded=False) < 0:
+            read.fault(f"{who}: limit {attribute} is negative; expected 0 or more", limit)
+    if bounded and lower > upper:
+        read.fault(f"{who}: lower limit {lower:g} above upper limit {upper:g}; swap them", limit)
+    if not bounded and not (kind == "continuous" and {"effort", "velocity"} <= limit.attributes.keys()):
+        return []
+    return [_copied(limit, "lower", "upper", "effort", "velocity")]
+
+
+def _left_out(robot: Element) -> list[str]:
+    """Say which elements were not looked at."""
+    counts = Counter(c.tag for c in robot.children if c.tag not in ("link", "joint"))
+    for part in (*robot.all("link"), *robot.all("joint")):
+        read = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
+        counts.update(c.tag for c in part.children if c.tag not in read)
+    told = ", ".join(f"{n} {tag}" for tag, n in sorted(counts.items()))
+    return [f"left out of the file, with every path in it: {told}"] if told else []

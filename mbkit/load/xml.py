@@ -1,0 +1,112 @@
+"""XML from strangers: read without entities, links or deep nesting, and with line numbers.
+
+A document type declaration is where entity bombs, external entities and file URLs
+live, and neither URDF nor MJCF needs one: it ends the reading before anything of it
+is looked at. What is left of XML then cannot refer to anything outside the text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, NoReturn
+from xml.parsers import expat
+
+from mbkit.errors import LoadError
+
+__all__ = ["Element", "parse", "read"]
+
+# Far above any robot, far below what would exhaust memory or the stack.
+_MOST_BYTES: Final = 64 * 2**20
+_MOST_LEVELS: Final = 250
+
+
+@dataclass
+class Element:
+    """An element as it was written: tag, attributes, line, children. Text is not kept."""
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    children: list[Element] = field(default_factory=list)
+
+    def all(self, tag: str) -> list[Element]:
+        """Return the children of this tag."""
+        return [c for c in self.children if c.tag == tag]
+
+    def first(self, tag: str) -> Element | None:
+        """Return the first child of this tag."""
+        return next((c for c in self.children if c.tag == tag), None)
+
+    def walk(self) -> Iterator[Element]:
+        """Yield this element and everything below it."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+
+def read(path: Path) -> Element:
+    """Return the root element of a file.
+
+    Raises
+    ------
+    LoadError
+        The file is missing, unreadable, empty, not well formed, or holds a
+        document type declaration.
+    """
+    try:
+        if not path.exists():
+            raise LoadError(f"{path}: no such file")
+        if not path.is_file():
+            what = "a folder" if path.is_dir() else "not a regular file"
+            raise LoadError(f"{path}: expected a URDF or MJCF file, this is {what}")
+        size = path.stat().st_size
+        if size > _MOST_BYTES:
+            raise LoadError(f"{path}: {size} bytes; a description of up to {_MOST_BYTES} bytes was expected")
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, LoadError):
+            raise
+        # ValueError: a null character in the name.
+        raise LoadError(f"{path!s}: cannot be read ({error})") from None
+    return parse(content, str(path))
+
+
+def parse(content: bytes, name: str) -> Element:
+    """Return the root element of a text; `name` begins every message."""
+    if not content.strip(b" \t\r\n\xef\xbb\xbf"):
+        raise LoadError(f"{name}: the file is empty; expected <robot> (URDF) or <mujoco> (MJCF)")
+    parser = expat.ParserCreate()
+    stack: list[Element] = []
+    roots: list[Element] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = Element(tag, attributes, parser.CurrentLineNumber)
+        (stack[-1].children if stack else roots).append(element)
+        stack.append(element)
+        if len(stack) > _MOST_LEVELS:
+            raise LoadError(f"{name}: line {element.line}: elements are nested more than {_MOST_LEVELS} deep")
+
+    def end(_: str) -> None:
+        stack.pop()
+
+    def doctype(*_: object) -> NoReturn:
+        raise LoadError(
+            f"{name}: line {parser.CurrentLineNumber}: a document type declaration (<!DOCTYPE ...>), which can hide "
+            "entities and links to other files, is not read; remove it, neither URDF nor MJCF needs one"
+        )
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        why = expat.errors.messages.get(error.code, str(error))
+        raise LoadError(f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}") from None
+    except (LookupError, ValueError) as error:
+        if isinstance(error, LoadError):
+            raise
+        raise LoadError(f"{name}: not readable as XML: {error}; save it as UTF-8") from None
+    return roots[0]

@@ -1,0 +1,576 @@
+"""Files that are wrong, broken or hostile: one clear error each, and nothing else happens."""
+
+# ruff: noqa: E501 -- a description is easier to read on one line
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import warnings
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
+from mbkit.load import load
+from mbkit.load.names import find
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
+LINK = f'<link name="a"/><link name="b">{INERTIAL}</link>'
+
+
+def joint(name: str, parent: str, child: str, inside: str = LIMIT, kind: str = "revolute") -> str:
+    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
+
+
+def robot(inside: str) -> str:
+    return f'<robot name="r">{inside}</robot>'
+
+
+def links(*names: str) -> str:
+    return "".join(f'<link name="{n}">{INERTIAL}</link>' for n in names)
+
+
+def with_inertial(mass: str = "1", moments: str = "1 0 0 1 0 1", origin: str = "") -> str:
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    told = " ".join(f'{n}="{x}"' for n, x in zip(names, moments.split(), strict=True))
+    body = f'<inertial>{origin}<mass value="{mass}"/><inertia {told}/></inertial>'
+    return robot(f'<link name="a"/><link name="b">{body}</link>' + joint("j", "a", "b"))
+
+
+def with_joint(inside: str, kind: str = "revolute") -> str:
+    return robot(LINK + joint("j", "a", "b", inside, kind))
+
+
+def raised(tmp_path: Path, text: str | bytes, name: str = "robot.urdf", **options: object) -> MbkitError:
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(MbkitError) as caught:
+        load(path, **options)
+    assert str(path) in str(caught.value)
+    return caught.value
+
+
+# What is wrong with the text of the file as such.
+
+TEXTS = {
+    "empty": (b"", "the file is empty"),
+    "blank": (b" \n\t ", "the file is empty"),
+    "byte_order_mark_only": (b"\xef\xbb\xbf", "the file is empty"),
+    "not_xml": (b"mass: 3\n", "line 1, column 1: not well-formed XML"),
+    "binary": (bytes(range(256)), "not well-formed XML"),
+    "unclosed": (b'<robot name="r">\n<link name="a"/>\n', "line 3, column 1: not well-formed XML: no element found"),
+    "mismatched": (b'<robot name="r">\n<link name="a">\n</robot>', "line 3.*mismatched tag"),
+    "attribute_without_value": (b'<robot name="r">\n<link name/></robot>', "line 2.*not well-formed"),
+    "attribute_twice": (b'<robot name="r" name="s"/>', "duplicate attribute"),
+    "two_roots": (b'<robot name="r"/><robot name="s"/>', "junk after document element"),
+    "unknown_entity": (b'<robot name="&who;"/>', "undefined entity"),
+    "wrong_encoding": (
+        b'<?xml version="1.0" encoding="klingon"?><robot name="r"/>',
+        "not readable as XML|unknown encoding",
+    ),
+    "broken_utf8": (b'<robot name="\xff\xfe"/>', "not well-formed"),
+    "null_character": (b'<robot name="r\x00"/>', "not well-formed"),
+    "sdf": (b'<sdf version="1.6"/>', "root element is <sdf>; expected <robot>"),
+    "html": (b"<html><body/></html>", "root element is <html>"),
+    "nested": (b"<robot>" + b"<link>" * 100_000, "nested more than 250 deep"),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_texts_that_are_no_description(case, tmp_path, capfd):
+    text, expected = TEXTS[case]
+    error = raised(tmp_path, text)
+    assert isinstance(error, LoadError)
+    assert re.search(expected, str(error)), str(error)
+    assert capfd.readouterr() == ("", "")
+
+
+# URDF. Each names the culprit, and what to do where that is not plain.
+
+URDFS = {
+    "no_name": ("<robot>" + LINK + joint("j", "a", "b") + "</robot>", ["<robot> has no name", 'name="..."']),
+    "no_links": (robot(""), ["no links"]),
+    "no_joints": (robot('<link name="a"/>'), ["no joints", "nq = 0", "floating_base=True"]),
+    "no_moving_joints": (robot(LINK + joint("j", "a", "b", "", "fixed")), ["all joints are fixed", "nq = 0"]),
+    "cycle": (
+        robot(links("a", "b", "c", "d") + joint("j", "b", "c") + joint("k", "c", "d") + joint("l", "d", "b")),
+        ["joints 'j', 'k', 'l' form a cycle", "cut the loop"],
+    ),
+    "no_root": (robot(links("a", "b") + joint("j", "a", "b") + joint("k", "b", "a")), ["form a cycle"]),
+    "own_child": (robot(links("a", "b") + joint("k", "a", "b") + joint("j", "b", "b")), ["'b': child of 2 joints"]),
+    "two_parents": (
+        robot(links("a", "b", "c") + joint("j", "a", "b") + joint("k", "a", "c") + joint("l", "c", "b")),
+        ["link 'b': child of 2 joints ('j', 'l')"],
+    ),
+    "two_roots": (robot(links("a", "b", "c") + joint("j", "a", "b")), ["2 links that no joint carries ('a', 'c')"]),
+    "same_joint_names": (
+        robot(links("a", "b", "c") + joint("j", "a", "b") + joint("j", "b", "c")),
+        ["joint 'j': declared 2 times"],
+    ),
+    "same_link_names": (robot(links("a", "b", "b") + joint("j", "a", "b")), ["link 'b': declared 2 times"]),
+    "unknown_link": (robot(LINK + joint("j", "a", "bb")), ["joint 'j': unknown link 'bb'; did you mean 'b'?"]),
+    "nameless_link": (robot("<link/>" + LINK + joint("j", "a", "b")), ["<link> has no name"]),
+    "nameless_joint": (robot(LINK + joint("", "a", "b")), ["<joint> has no name"]),
+    "no_parent": (robot(LINK + '<joint name="j" type="revolute"><child link="b"/></joint>'), ["'j': no <parent>"]),
+    "unknown_type": (with_joint(LIMIT, "hinge"), ["joint 'j': type 'hinge'", "expected one of fixed, revolute"]),
+    "no_limit": (with_joint(""), ["joint 'j': a revolute joint needs <limit", "continuous"]),
+    "no_effort": (with_joint('<limit lower="0" upper="1" velocity="1"/>'), ["joint 'j': limit effort: missing"]),
+    "limits_swapped": (
+        with_joint('<limit lower="2" upper="1" effort="1" velocity="1"/>'),
+        ["joint 'j': lower limit 2 above upper limit 1"],
+    ),
+    "negative_effort": (
+        with_joint('<limit lower="0" upper="1" effort="-1" velocity="1"/>'),
+        ["joint 'j': limit effort is negative"],
+    ),
+    "negative_damping": (with_joint(LIMIT + '<dynamics damping="-1"/>'), ["joint 'j': damping", "negative"]),
+    "zero_axis": (with_joint('<axis xyz="0 0 0"/>' + LIMIT), ["joint 'j': axis is zero"]),
+    "short_axis": (with_joint('<axis xyz="0 1"/>' + LIMIT), ["joint 'j': axis xyz: expected 3 numbers, got '0 1'"]),
+    "planar_across": (with_joint("", "planar"), ["joint 'j': planar with the normal 1 0 0", '<axis xyz="0 0 1"/>']),
+    "damped_floating": (with_joint('<dynamics damping="1"/>', "floating"), ["joint 'j': damping or friction"]),
+    "two_limits": (with_joint(LIMIT + LIMIT), ["joint 'j': 2 <limit> elements"]),
+    "mimic_unknown": (
+        with_joint(LIMIT + '<mimic joint="k"/>'),
+        ["joint 'j': mimics unknown joint 'k'", "mimic='free'"],
+    ),
+    "mimic_itself": (with_joint(LIMIT + '<mimic joint="j"/>'), ["joint 'j': mimics in a circle"]),
+    "mimic_nameless": (with_joint(LIMIT + "<mimic/>"), ["joint 'j': <mimic> has no joint"]),
+    "mimic_planar": (
+        robot(
+            links("a", "b", "c")
+            + joint("j", "a", "b", '<axis xyz="0 0 1"/>', "planar")
+            + joint("k", "b", "c", LIMIT + '<mimic joint="j"/>')
+        ),
+        ["joint 'k': mimics 'j', but both must have one velocity"],
+    ),
+    "mimic_fixed": (
+        robot(
+            links("a", "b", "c")
+            + joint("j", "a", "b", "", "fixed")
+            + joint("k", "b", "c", LIMIT + '<mimic joint="j"/>')
+        ),
+        ["joint 'k': mimics fixed joint 'j'"],
+    ),
+    "xacro": (
+        robot('<xacro:macro name="m"/>' + LINK + joint("j", "a", "b")),
+        ["1 xacro elements, such as <xacro:macro>", "run xacro"],
+    ),
+    "xacro_number": (with_inertial(mass="${m}"), ["link 'b': mass value: '${m}' is not a finite number; run xacro"]),
+    "negative_mass": (with_inertial(mass="-2"), ["link 'b': mass -2 kg is negative"]),
+    "no_mass_element": (
+        robot('<link name="a"/><link name="b"><inertial/></link>' + joint("j", "a", "b")),
+        ["link 'b': <inertial> has no <mass>", "link 'b': <inertial> has no <inertia>"],
+    ),
+    "missing_moment": (
+        with_inertial().replace(' iyz="0"', ""),
+        ["link 'b': inertia iyz: missing"],
+    ),
+    "zero_mass": (with_inertial(mass="0"), ["'b'", "no mass but inertia", 'nonphysical="warn"']),
+    "nothing_at_all": (
+        with_inertial(mass="0", moments="0 0 0 0 0 0"),
+        ["'b'", "no mass moves with joint 'j'", "M is singular", 'nonphysical="warn"'],
+    ),
+    "no_inertial": (robot('<link name="a"/><link name="b"/>' + joint("j", "a", "b")), ["'b'", "no mass moves"]),
+    "zero_inertia": (with_inertial(moments="0 0 0 0 0 0"), ["'b'", "mass without inertia", 'nonphysical="warn"']),
+    "triangle": (with_inertial(moments="1 0 0 1 0 3"), ["'b'", "violates A + B >= C", "1, 1, 3", 'nonphysical="warn"']),
+    "not_positive": (with_inertial(moments="-1 0 0 1 0 1"), ["'b'", "not positive", "-1, 1, 1", 'nonphysical="warn"']),
+    "off_diagonal": (with_inertial(moments="1 5 0 1 0 1"), ["'b'", "not positive"]),
+    "root_joint_taken": (robot(LINK + joint("root_joint", "a", "b")), ["joint 'root_joint'"]),
+    "huge": (with_inertial(mass="1e200"), ["link 'b': mass value: '1e200' is too large"]),
+    "thousands_of_joints": (
+        robot(
+            links(*(f"l{i}" for i in range(2002))) + "".join(joint(f"j{i}", f"l{i}", f"l{i + 1}") for i in range(2001))
+        ),
+        ["2001 joints; up to 2000"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", URDFS)
+def test_urdfs_with_a_fault(case, tmp_path, capfd):
+    text, expected = URDFS[case]
+    error = raised(tmp_path, text, floating_base=case == "root_joint_taken")
+    assert isinstance(error, ModelError)
+    for part in expected:
+        assert part in str(error), str(error)
+    # Nothing of what the parsers in C++ would have said reached the terminal.
+    assert capfd.readouterr() == ("", "")
+
+
+NUMBERS = {
+    "link 'b': mass value": with_inertial(mass="%s"),
+    "link 'b': inertia ixy": with_inertial(moments="1 %s 0 1 0 1"),
+    "link 'b': origin xyz": with_inertial(origin='<origin xyz="0 %s 0"/>'),
+    "link 'b': origin rpy": with_inertial(origin='<origin rpy="0 0 %s"/>'),
+    "joint 'j': origin xyz": with_joint('<origin xyz="%s 0 0"/>' + LIMIT),
+    "joint 'j': origin rpy": with_joint('<origin rpy="%s 0 0"/>' + LIMIT),
+    "joint 'j': axis xyz": with_joint('<axis xyz="%s 0 0"/>' + LIMIT),
+    "joint 'j': limit lower": with_joint('<limit lower="%s" upper="1" effort="1" velocity="1"/>'),
+    "joint 'j': limit upper": with_joint('<limit lower="0" upper="%s" effort="1" velocity="1"/>'),
+    "joint 'j': limit effort": with_joint('<limit lower="0" upper="1" effort="%s" velocity="1"/>'),
+    "joint 'j': limit velocity": with_joint('<limit lower="0" upper="1" effort="1" velocity="%s"/>'),
+    "joint 'j': dynamics damping": with_joint(LIMIT + '<dynamics damping="%s"/>'),
+    "joint 'j': dynamics friction": with_joint(LIMIT + '<dynamics friction="%s"/>'),
+    "joint 'j': mimic multiplier": with_joint(LIMIT + '<mimic joint="j" multiplier="%s"/>'),
+    "joint 'j': mimic offset": with_joint(LIMIT + '<mimic joint="j" offset="%s"/>'),
+}
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-Infinity", "1e999", "0x10", "1,5", "one", "1_0", "٣"])
+@pytest.mark.parametrize("where", NUMBERS)
+def test_numbers_that_are_none(where, value, tmp_path):
+    error = raised(tmp_path, NUMBERS[where].replace("%s", value))
+    assert f"{where}: {value!r} is not a finite number" in str(error)
+    assert "(line 1)" in str(error)
+
+
+def test_all_faults_come_at_once(tmp_path):
+    text = (
+        "<robot>"
+        + links("a", "a", "b")
+        + '<link name="c"><inertial><mass value="-1"/><inertia ixx="nan" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+        + joint("j", "a", "b", "")
+        + joint("j", "b", "nowhere", '<axis xyz="0 0 0"/>' + LIMIT)
+        + joint("k", "b", "c", LIMIT, "screw")
+        + "</robot>"
+    )
+    error = raised(tmp_path, text)
+    assert isinstance(error, ModelError)
+    expected = [
+        "no name",
+        "'a': declared 2",
+        "-1 kg",
+        "'nan'",
+        "needs <limit",
+        "'j': declared 2",
+        "'nowhere'",
+        "axis is zero",
+        "'screw'",
+    ]
+    for part in expected:
+        assert sum(part in fault for fault in error.faults) == 1, (part, error.faults)
+    assert str(error).count("\n  - ") == len(error.faults) == len(expected)
+
+
+def test_nonphysical_links_come_in_one_error_and_load_with_a_warning(tmp_path):
+    text = robot(
+        '<link name="a"/>'
+        '<link name="heavy"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/></inertial></link>'
+        '<link name="empty"/>' + joint("j", "a", "heavy") + joint("k", "heavy", "empty")
+    )
+    error = raised(tmp_path, text)
+    assert isinstance(error, ModelError)
+    assert len(error.faults) == 2
+    assert "'heavy'" in error.faults[0]
+    assert "'empty'" in error.faults[1]
+    with pytest.warns(NonPhysicalWarning, match="heavy.*empty"):
+        model = load(tmp_path / "robot.urdf", nonphysical="warn")
+    assert [n for n, _ in model.nonphysical] == ["heavy", "empty"]
+
+
+def test_a_negative_mass_is_an_error_whatever_is_asked(tmp_path):
+    assert "negative" in str(raised(tmp_path, with_inertial(mass="-1"), nonphysical="warn"))
+    fused = robot(
+        links("a", "b")
+        + '<link name="c"><inertial><mass value="-.1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" '
+        'izz="1"/></inertial></link>' + joint("j", "a", "b") + joint("k", "b", "c", "", "fixed")
+    )
+    assert "link 'c': mass -0.1 kg is negative" in str(raised(tmp_path, fused, nonphysical="warn"))
+
+
+def test_massless_links_between_joints_are_no_fault(tmp_path):
+    text = robot(
+        '<link name="a"/><link name="cross"/>'
+        + links("b")
+        + joint("j", "a", "cross", '<axis xyz="0 1 0"/>' + LIMIT)
+        + joint("k", "cross", "b")
+    )
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load(path).body("cross").mass == 0
+
+
+# MJCF.
+
+
+def mjcf(inside: str, before: str = "", after: str = "") -> str:
+    return f"<mujoco>{before}<worldbody>{inside}</worldbody>{after}</mujoco>"
+
+
+BODY = '<body name="b"><joint name="j"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+MJCFS = {
+    "no_bodies": (mjcf(""), ["no bodies"]),
+    "no_joints": (mjcf('<body><geom size="1"/></body>'), ["no joints", "floating_base=True"]),
+    "include": (mjcf(BODY, '<include file="/etc/passwd"/>'), ["<include> is not read", "names another file"]),
+    "include_in_body": (mjcf('<body><include file="x.xml"/></body>'), ["<include> is not read"]),
+    "replicate": (mjcf(f'<replicate count="3">{BODY}</replicate>'), ["<replicate> is not read"]),
+    "mesh_inertia": (
+        mjcf(
+            '<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'
+        ),
+        ["body 'b'", "meshes are not opened", "add <inertial>"],
+    ),
+    "mesh_inertia_by_default": (
+        mjcf(
+            '<body name="b" childclass="v"><joint/><geom mesh="m"/></body>',
+            '<default><default class="v"><geom type="mesh"/></default></default>',
+        ),
+        ["body 'b'", "add <inertial>"],
+    ),
+    "unknown_class": (mjcf('<body childclass="k"><joint/></body>'), ["unknown default class 'k'; there are: main"]),
+    "same_names": (mjcf(BODY + BODY.replace('"b"', '"c"')), ["joint 'j': declared more than once"]),
+    "called_world": (mjcf(BODY.replace('"b"', '"world"')), ["body 'world': that name is the ground's"]),
+    "unknown_type": (mjcf(BODY.replace('name="j"', 'name="j" type="screw"')), ["joint 'j': type 'screw'"]),
+    "zero_axis": (mjcf(BODY.replace('name="j"', 'name="j" axis="0 0 0"')), ["joint 'j': axis is zero"]),
+    "zero_quaternion": (mjcf(BODY.replace('"b"', '"b" quat="0 0 0 0"')), ["body 'b': body quat: expected directions"]),
+    "two_orientations": (mjcf(BODY.replace('"b"', '"b" quat="1 0 0 0" euler="1 2 3"')), ["quat and euler; keep one"]),
+    "negative_mass": (mjcf(BODY.replace('mass="1"', 'mass="-1"')), ["body 'b': mass -1 kg is negative"]),
+    "negative_density": (
+        mjcf('<body name="b"><joint/><geom size=".1" density="-1"/></body>'),
+        ["body 'b'", "negative"],
+    ),
+    "zero_size": (mjcf('<body name="b"><joint/><geom size="0"/></body>'), ["body 'b': a sphere of size 0"]),
+    "few_sizes": (mjcf('<body name="b"><joint/><geom type="box" size="1 2"/></body>'), ["body 'b': geom size"]),
+    "unknown_shape": (
+        mjcf('<body name="b"><joint/><geom type="cone" size="1"/></body>'),
+        ["body 'b': geom type 'cone'"],
+    ),
+    "shell": (mjcf('<body name="b"><joint/><geom size="1" shellinertia="true"/></body>'), ["body 'b'", "shell"]),
+    "triangle": (mjcf(BODY.replace("1 1 1", "1 1 3")), ["'b'", "A + B >= C", 'nonphysical="warn"']),
+    "no_mass": (mjcf('<body name="b"><joint name="j"/></body>'), ["'b'", "no mass moves with joint 'j'"]),
+    "free_below": (
+        mjcf(BODY.replace("</body>", '<body name="c"><freejoint/><geom size="1"/></body></body>')),
+        ["body 'c': a free joint below 'b'"],
+    ),
+    "free_and_hinge": (
+        mjcf('<body name="b"><freejoint/><joint/><geom size="1"/></body>'),
+        ["body 'b': a free joint and others"],
+    ),
+    "armature_on_ball": (
+        mjcf(BODY.replace('name="j"', 'name="j" type="ball" armature="1"')),
+        ["joint 'j': armature on a ball joint"],
+    ),
+    "spring_on_ball": (
+        mjcf(BODY.replace('name="j"', 'name="j" type="ball" stiffness="1"')),
+        ["joint 'j': joint spring on a ball joint"],
+    ),
+    "curved_spring": (
+        mjcf(BODY.replace('name="j"', 'name="j" stiffness="1 2"')),
+        ["joint 'j': stiffness that depends"],
+    ),
+    "nan": (
+        mjcf(BODY.replace('pos="0 0 0"', 'pos="0 nan 0"')),
+        ["body 'b': inertial pos: 'nan' is not a finite number"],
+    ),
+    "degenerate_axes": (mjcf(BODY.replace('"b"', '"b" xyaxes="1 0 0 2 0 0"')), ["body 'b': body xyaxes"]),
+    "old_coordinates": (mjcf(BODY, '<compiler coordinate="global"/>'), ["compiler coordinate"]),
+    "raised_mass": (
+        mjcf(BODY, '<compiler boundmass="2"/>'),
+        ["body 'b': compiler boundmass would raise its mass 1 kg"],
+    ),
+    "raised_inertia": (mjcf(BODY, '<compiler boundinertia="2"/>'), ["body 'b': compiler boundinertia"]),
+    "range_without_limited": (
+        mjcf(BODY.replace('name="j"', 'name="j" range="0 1"'), '<compiler autolimits="false"/>'),
+        ["joint 'j': range without limited"],
+    ),
+    "two_inertials": (
+        mjcf(BODY.replace("</body>", '<inertial pos="0 0 0" mass="1"/></body>')),
+        ["body 'b': 2 <inertial>"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MJCFS)
+def test_mjcfs_with_a_fault(case, tmp_path, capfd):
+    text, expected = MJCFS[case]
+    error = raised(tmp_path, text, "robot.xml")
+    assert isinstance(error, ModelError)
+    for part in expected:
+        assert part in str(error), str(error)
+    assert capfd.readouterr() == ("", "")
+
+
+# Hostile files.
+
+SECRET = "the content of another file"
+BOMB = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "ha" * 10}">' for i in range(12))
+HOSTILE = {
+    "entity_bomb": f'<!DOCTYPE robot [{BOMB}]><robot name="&e11;"/>',
+    "quadratic_bomb": f'<!DOCTYPE robot [<!ENTITY e "{"x" * 50_000}">]><robot name="{"&e;" * 5000}"/>',
+    "file_url": '<!DOCTYPE robot [<!ENTITY e SYSTEM "file://{secret}">]><robot name="r">&e;</robot>',
+    "plain_path": '<!DOCTYPE robot [<!ENTITY e SYSTEM "{secret}">]><robot name="r">&e;</robot>',
+    "parameter_entity": '<!DOCTYPE robot [<!ENTITY % e SYSTEM "file://{secret}"> %e;]><robot name="r"/>',
+    "external_dtd": '<!DOCTYPE robot SYSTEM "http://127.0.0.1:1/robot.dtd"><robot name="r"/>',
+    "default_attribute": '<!DOCTYPE robot [<!ATTLIST robot name CDATA "r">]><robot/>',
+    "after_a_declaration": '<?xml version="1.0" standalone="no"?>\n<!-- x -->\n<!DOCTYPE robot SYSTEM "file://{secret}"><robot/>',
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+@pytest.mark.parametrize("root", ["robot", "mujoco"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_hostile_declarations_do_nothing(case, root, encoding, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_text(SECRET)
+    text = HOSTILE[case].replace("{secret}", str(secret)).replace("robot", root)
+    before = os.stat(secret).st_atime_ns
+    error = raised(tmp_path, text.encode(encoding))
+    assert isinstance(error, LoadError)
+    assert "document type declaration" in str(error)
+    assert "remove it" in str(error)
+    assert SECRET not in str(error)
+    assert len(str(error)) < 1000
+    assert os.stat(secret).st_atime_ns == before
+
+
+def test_inclusions_of_other_kinds_are_inert(tmp_path):
+    text = (
+        '<?xml-stylesheet href="file:///etc/passwd"?><robot name="r" xmlns:xi="http://www.w3.org/2001/XInclude">'
+        f'<xi:include href="file:///etc/passwd" parse="text"/>{LINK}{joint("j", "a", "b")}</robot>'
+    )
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    model = load(path)
+    assert model.nv == 1
+    assert any("1 xi:include" in n for n in model.notes)
+
+
+def test_names_are_only_names(tmp_path):
+    """What means something to XML or a path comes through as it is."""
+    odd = "../../b &lt;script&gt;&quot;'&amp;#10;é"
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        robot(f'<link name="a"/><link name="{odd}">{INERTIAL}</link>' + joint("j", "a", odd)), encoding="utf-8"
+    )
+    assert load(path).bodies[1].name == "../../b <script>\"'&#10;é"
+
+
+def test_long_values_are_cut_short_in_messages(tmp_path):
+    assert len(str(raised(tmp_path, with_inertial(mass="9" * 100_000)))) < 500
+    assert len(str(raised(tmp_path, with_inertial(mass="x" * 100_000)))) < 500
+
+
+# What is no file.
+
+
+def test_what_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.urdf")
+    for name, expected in (("pipe.urdf", "not a regular file"), (".", "a folder"), ("nowhere.urdf", "no such file")):
+        with pytest.raises(LoadError, match=expected):
+            load(tmp_path / name)
+    with pytest.raises(LoadError):
+        load("a\0b.urdf")
+    with pytest.raises(LoadError, match="expected a URDF or MJCF file"):
+        load(Path("/dev/zero"))
+    with pytest.raises(LoadError):
+        load(tmp_path / ("x" * 5000 + ".urdf"))
+
+
+@pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() == 0, reason="the superuser may read everything")
+def test_what_may_not_be_read(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(with_inertial())
+    path.chmod(0)
+    with pytest.raises(LoadError, match="cannot be read"):
+        load(path)
+
+
+def test_what_is_too_large(tmp_path):
+    path = tmp_path / "robot.urdf"
+    with path.open("wb") as file:
+        file.truncate(2**30)
+    with pytest.raises(LoadError, match=r"1073741824 bytes"):
+        load(path)
+
+
+# Whatever is changed in a file, loading it succeeds or raises an error of mbkit's.
+
+URDF = Path(find("double_pendulum_simple").path).read_bytes()
+MJCF = mjcf(
+    BODY
+    + '<body name="c" euler="1 2 3"><joint type="slide" axis="1 0 0" range="0 1"/><geom type="box" size="1 1 1"/></body>'
+).encode()
+WORDS = [
+    b"",
+    b"0",
+    b"-1",
+    b"nan",
+    b"1e308",
+    b"-1e-320",
+    b"<",
+    b">",
+    b'"',
+    b"/",
+    b"&amp;",
+    b"a",
+    b"1 2",
+    b"\x00",
+    b"\xff",
+    b" ",
+]
+
+
+@settings(
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    original=st.sampled_from([URDF, MJCF]),
+    edits=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 30), st.sampled_from(WORDS)), min_size=1, max_size=4),
+)
+def test_damaged_files_never_crash(tmp_path, original, edits):
+    text = original
+    for where, length, word in edits:
+        start = int(where * len(text))
+        text = text[:start] + word + text[start + length :]
+    path = tmp_path / "damaged.urdf"
+    path.write_bytes(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", NonPhysicalWarning)
+        for policy in ("error", "warn"):
+            with contextlib.suppress(MbkitError):
+                load(path, nonphysical=policy)
+
+
+@settings(
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_damaged_values_never_crash(tmp_path, data):
+    """As above, but the file stays XML, so that the checks behind the parser are reached."""
+    original = data.draw(st.sampled_from([URDF, MJCF]))
+    pieces = original.split(b'"')
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = 2 * data.draw(st.integers(0, len(pieces) // 2 - 1)) + 1
+        values = [
+            b"",
+            b"0",
+            b"0 0 0",
+            b"-1",
+            b"nan",
+            b"1e29",
+            b"-1e29 1e29 1",
+            b"1e-320",
+            b"world",
+            b"link1",
+            b"fixed",
+            b"planar",
+            b"free",
+            b"mesh",
+        ]
+        pieces[at] = data.draw(st.sampled_from([*values, pieces[1], pieces[-2]]))
+    path = tmp_path / "damaged.urdf"
+    path.write_bytes(b'"'.join(pieces))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", NonPhysicalWarning)
+        for policy in ("error", "warn"):
+            for floating in (False, True):
+                with contextlib.suppress(MbkitError):
+                    load(path, nonphysical=policy, floating_base=floating)
