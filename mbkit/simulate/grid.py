@@ -1,0 +1,111 @@
+"""The times of a run: steps that end exactly at the end, and which of them are kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbkit._check import Array, finite_array
+from mbkit.errors import InputError
+
+Indices = NDArray[np.intp]
+
+__all__ = ["Grid", "Indices", "check_room", "save_times"]
+
+# 8 GiB of float64: beyond it, a system that overcommits memory kills the process.
+_ROOM = 2**30
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Equal steps of `dt` from 0 to `duration`, the last one shortened if it must be.
+
+    Attributes
+    ----------
+    duration, dt, last : float
+        Of the run, of every step, and of the last one; s.
+    steps : int
+    """
+
+    duration: float
+    dt: float
+    steps: int
+    last: float
+
+    @classmethod
+    def of(cls, duration: float, dt: float) -> Grid:
+        """Count the steps; a remainder below rounding is no step of its own."""
+        ratio = duration / dt
+        if not ratio < 2**53:
+            raise InputError(f"dt: {dt:g} s makes {ratio:.3g} steps of {duration:g} s; expected a larger step")
+        whole = round(ratio)
+        if abs(ratio - whole) <= 4 * np.finfo(float).eps * ratio:
+            return cls(duration, dt, whole, dt)
+        steps = int(np.ceil(ratio))
+        return cls(duration, dt, steps, duration - (steps - 1) * dt)
+
+    def time(self, k: int) -> float:
+        """Time of the k-th state, s; k dt, so that rounding does not pile up."""
+        return self.duration if k == self.steps else k * self.dt
+
+    def step(self, k: int) -> float:
+        """Length of the k-th step, s."""
+        return self.last if k == self.steps - 1 else self.dt
+
+    def kept(self, save: ArrayLike | int | None, numbers: int) -> Indices:
+        """Return the indices of the states to keep.
+
+        Parameters
+        ----------
+        save : None, int or (K,) array_like
+            All; every n-th and the last; or the states at these times.
+        numbers : int
+            What one state holds, to refuse what no memory does.
+        """
+        if save is None:
+            return self._every(1, numbers)
+        if isinstance(save, (int, np.integer)) and not isinstance(save, bool):
+            if save < 1:
+                raise InputError(f"save: expected a count of at least 1 or a grid of times, got {save}")
+            return self._every(int(save), numbers)
+        times = save_times(save, self.duration)
+        index = np.minimum(np.rint(times / self.dt), self.steps).astype(np.intp)
+        index = np.where(times == self.duration, self.steps, index)
+        on_grid = np.array([self.time(int(k)) for k in index])
+        off = np.abs(on_grid - times) > 1e-6 * self.dt
+        if off.any():
+            raise InputError(
+                f"save: {times[np.argmax(off)]:.9g} s is not a step of dt = {self.dt:g} s; "
+                "give multiples of dt, or an adaptive method"
+            )
+        if np.any(np.diff(index) <= 0):
+            raise InputError(f"save: two times fall on one step of dt = {self.dt:g} s")
+        return index
+
+    def _every(self, n: int, numbers: int) -> Indices:
+        check_room(self.steps // n, numbers)
+        out = np.arange(0, self.steps + 1, n, dtype=np.intp)
+        return out if out[-1] == self.steps else np.append(out, self.steps)
+
+
+def save_times(save: ArrayLike, duration: float) -> Array:
+    """Return a grid of times, checked: increasing, within the run."""
+    if np.ndim(save) != 1 or not np.size(save):
+        raise InputError(f"save: expected increasing times of shape (K,), got shape {np.shape(save)}")
+    times = finite_array("save", save, np.shape(save))
+    if np.any(np.diff(times) <= 0):
+        raise InputError("save: expected increasing times")
+    if times[0] < 0 or times[-1] > duration * (1 + 1e-12):
+        raise InputError(f"save: expected times between 0 and {duration:g} s, got {times[0]:g} to {times[-1]:g}")
+    return np.minimum(times, duration)
+
+
+def check_room(states: int, numbers: int) -> None:
+    """Refuse to keep more numbers than a machine holds, before it is filled."""
+    if states * numbers > _ROOM:
+        raise InputError(
+            f"save: {states} states of {numbers} numbers would take {states * numbers * 8 / 2**30:.3g} GiB; "
+            "keep fewer with save=, an every-n-th count or a grid of times"
+        )

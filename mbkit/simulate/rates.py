@@ -1,0 +1,75 @@
+"""q̇ and v̇ as one vector, for integrators that know no manifold."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.errors import NumericalError
+from mbkit.model import Model
+from mbkit.simulate.torque import Force
+
+__all__ = ["Rates", "unit_quaternions"]
+
+
+class Rates:
+    """The right-hand side on y = (q, v) of one state, with quaternions of any length.
+
+    Nothing is shared with the fixed-step methods: quaternions are four numbers
+    with the rate D(q) v of their joint, and velocities are mbkit's own.
+
+    Attributes
+    ----------
+    evaluations : int
+        Of the forward dynamics so far.
+    why : str
+        What the engine said when it last failed.
+    """
+
+    def __init__(self, dyn: Dynamics) -> None:
+        self._model, self._forward = dyn.model, dyn.forward_dynamics
+        layout = dyn.model.layout
+        self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
+        self.evaluations = 0
+        self.why = ""
+
+    def __call__(self, t: float, y: Array, force: Force) -> Array:
+        """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
+        if not np.isfinite(y).all():
+            return np.full(len(y), np.nan)
+        nq = self._model.nq
+        q, lengths = unit_quaternions(self._model, y[:nq])
+        v = y[nq:]
+        tau = force if isinstance(force, np.ndarray) else force(t, q, v)
+        self.evaluations += 1
+        try:
+            a = self._forward(q, v, tau)
+        except NumericalError as error:
+            self.why = str(error)
+            return np.full(len(y), np.nan)
+        return np.concatenate([self._qdot(q, v, lengths), a])
+
+    def _qdot(self, q: Array, v: Array, lengths: Array) -> Array:
+        if not self._model.quaternions:
+            return v
+        out = np.empty(len(q))
+        for kind, a, b in self._joints:
+            out[a] = kind.qdot(q[a].tolist(), v[b].tolist())
+        # D is linear in the quaternion: with its own length put back, the drift
+        # of that length never bends the rotation.
+        for (start, _), length in zip(self._model.quaternions, lengths, strict=True):
+            out[start : start + 4] *= length
+        return out
+
+
+def unit_quaternions(model: Model, q: Array) -> tuple[Array, Array]:
+    """Return q with unit quaternions, and the lengths that they had."""
+    lengths = np.empty(len(model.quaternions))
+    if not model.quaternions:
+        return q, lengths
+    q = q.copy()
+    for i, (start, _) in enumerate(model.quaternions):
+        lengths[i] = np.linalg.norm(q[start : start + 4])
+        q[start : start + 4] /= lengths[i]
+    return q, lengths

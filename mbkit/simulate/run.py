@@ -1,0 +1,194 @@
+"""`simulate`: check what was asked, choose the integrator, wrap what it found."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of, real
+from mbkit.engines import Dynamics
+from mbkit.errors import InputError, MbkitWarning
+from mbkit.simulate.adaptive import run_dop853
+from mbkit.simulate.fixed import run_fixed
+from mbkit.simulate.grid import Grid, save_times
+from mbkit.simulate.methods import Method, method_of
+from mbkit.simulate.native import run_native
+from mbkit.simulate.outcome import Outcome
+from mbkit.simulate.progress import Progress, ProgressFunction
+from mbkit.simulate.stats import Stats
+from mbkit.simulate.torque import Torque, TorqueFunction
+from mbkit.simulate.trajectory import Trajectory
+
+__all__ = ["simulate"]
+
+# SciPy's solvers raise a smaller rtol to this by themselves.
+_TIGHTEST = 100 * float(np.finfo(float).eps)
+
+
+def simulate(
+    dyn: Dynamics,
+    q0: ArrayLike,
+    v0: ArrayLike,
+    duration: float,
+    method: str = "rk4",
+    dt: float = 1e-3,
+    rtol: float | None = None,
+    atol: float | None = None,
+    torque: ArrayLike | TorqueFunction | None = None,
+    save: ArrayLike | int | None = None,
+    progress: bool | ProgressFunction | None = None,
+) -> Trajectory:
+    """Integrate v̇ = forward_dynamics(q, v, τ), q̇ = D(q) v from one state or a batch.
+
+    Parameters
+    ----------
+    dyn : Dynamics
+        From `mbkit.dynamics`.
+    q0 : (nq,) or (N, nq) array_like
+    v0 : (nv,) or (N, nv) array_like
+        A single state beside a batch is repeated.
+    duration : float
+        s. The run ends exactly there: where it is no multiple of `dt`, the last
+        step is shorter.
+    method : str
+        ``"rk4"`` or ``"semi_implicit_euler"``, with MuJoCo 4's formulas on any
+        engine; ``"dop853"``, SciPy's; ``"mujoco_euler"``, ``"mujoco_rk4"``,
+        ``"mujoco_implicit"``, ``"mujoco_implicitfast"``, MuJoCo's own on its
+        engine. `mbkit.simulate.METHODS` describes them.
+    dt : float
+        Step of the methods that have one, s.
+    rtol, atol : float, optional
+        Tolerances of an adaptive method, from 2.3e-14 upwards; 1e-10, and `atol`
+        as `rtol`, when not given.
+    torque : array_like or callable, optional
+        Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv),
+        held over each step (for an adaptive method, each interval of `save`, which
+        then runs from 0 to `duration`); or a function of (t, q, v) that returns
+        (nv,), called for one state at a time, at each stage.
+    save : int or (K,) array_like, optional
+        Which states to keep: every n-th and the last, or those at these times (for a
+        fixed step, multiples of it). Everything when not given. An adaptive method
+        needs the times for a batch, and its steps then end on them.
+    progress : bool or callable, optional
+        True shows a bar when the run takes more than 2 s; a callable gets the
+        fraction done.
+
+    Returns
+    -------
+    Trajectory
+        Of a run that diverged, what there is up to then, with `stats.ended`,
+        `stats.reached` and `stats.message`, and an `MbkitWarning`. In a batch the
+        others go on.
+
+    Raises
+    ------
+    InputError
+        A wrong shape, state, time, tolerance or torque.
+    UnknownNameError
+        No method of this name.
+    UnsupportedError
+        The engine does not have this method, or not for this model.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> dyn = mb.dynamics(mb.catalog.pendulum())
+    >>> run = mb.simulate(dyn, [1.0], [0.0], duration=2.0, dt=1e-3)
+    >>> run.q.shape
+    (2001, 1)
+    >>> bool(abs(run.energy() - run.energy()[0]).max() < 1e-12)
+    True
+    """
+    if not isinstance(dyn, Dynamics):
+        raise InputError(f"dyn: expected a Dynamics, got {type(dyn).__name__}; mbkit.dynamics(model, engine) makes one")
+    chosen = method_of(method)
+    model = dyn.model
+    q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
+    batch = batch_of(q0=q, v0=v)
+    if batch is not None:
+        q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
+    duration, dt = real("duration", duration, nonnegative=True), real("dt", dt, positive=True)
+    bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
+    arguments: dict[str, Any] = {"batch": batch, "torque": torque, "save": save, "bar": bar}
+    started = time.perf_counter()
+    with bar:
+        if chosen.kind == "adaptive":
+            outcome = _adaptive(dyn, q, v, duration, rtol, atol, **arguments)
+        else:
+            _refuse_tolerances(chosen, rtol, atol)
+            outcome = _stepped(dyn, chosen, q, v, duration, dt, **arguments)
+    return _wrapped(dyn, chosen, outcome, time.perf_counter() - started)
+
+
+def _adaptive(
+    dyn: Dynamics,
+    q: Array,
+    v: Array,
+    duration: float,
+    rtol: float | None,
+    atol: float | None,
+    *,
+    batch: int | None,
+    torque: ArrayLike | TorqueFunction | None,
+    save: ArrayLike | int | None,
+    bar: Progress,
+) -> Outcome:
+    rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
+    if rtol < _TIGHTEST:
+        raise InputError(f"rtol: expected at least {_TIGHTEST:.3g}, got {rtol:g}; double precision holds no more")
+    atol = rtol if atol is None else real("atol", atol, positive=True)
+    if isinstance(save, (int, np.integer)):
+        raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
+    times = None if save is None else save_times(save, duration)
+    whole = times is not None and times[0] == 0 and times[-1] == duration
+    read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
+    return run_dop853(dyn, q, v, duration, rtol, atol, read, times, bar)
+
+
+def _refuse_tolerances(method: Method, rtol: float | None, atol: float | None) -> None:
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if value is not None:
+            raise InputError(f"{name}: {method.name} has a fixed step and no tolerance; give dt, or method='dop853'")
+
+
+def _stepped(
+    dyn: Dynamics,
+    method: Method,
+    q: Array,
+    v: Array,
+    duration: float,
+    dt: float,
+    *,
+    batch: int | None,
+    torque: ArrayLike | TorqueFunction | None,
+    save: ArrayLike | int | None,
+    bar: Progress,
+) -> Outcome:
+    model = dyn.model
+    grid = Grid.of(duration, dt)
+    kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
+    read = Torque(torque, model, batch, grid.steps)
+    if method.kind == "native":
+        outcome = run_native(dyn, method, q, v, grid, kept, read)
+        bar.update(1.0)
+        return outcome
+    return run_fixed(dyn, method.name, q, v, grid, kept, read, bar)
+
+
+def _wrapped(dyn: Dynamics, method: Method, outcome: Outcome, seconds: float) -> Trajectory:
+    reached = outcome.reached
+    stats = Stats(
+        steps=outcome.steps,
+        evaluations=outcome.evaluations,
+        seconds=seconds,
+        ended=outcome.ended,
+        reached=float(reached) if reached.ndim == 0 else tuple(reached.tolist()),
+        message=outcome.message,
+    )
+    if outcome.message:
+        warnings.warn(f"{dyn.model.name}: {method.name} {outcome.message}", MbkitWarning, stacklevel=3)
+    return Trajectory(outcome.t, outcome.q, outcome.v, dyn.model, method.name, dyn.engine, stats, dyn)

@@ -1,0 +1,125 @@
+"""One step of each fixed-step method, on the space of `mbkit.simulate.space`.
+
+A free joint's linear velocity is integrated in the axes of the joint's fixed
+frame and its position by addition (see `mbkit.simulate.free_joint`); a rotation
+is moved by the exponential of what its body-axes velocity adds up to, and inside
+a Runge-Kutta step the velocities are pulled back by the inverse of exp's
+differential (Munthe-Kaas 1999, High order Runge-Kutta methods on manifolds).
+MuJoCo 4 does the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.errors import InputError, NumericalError
+from mbkit.simulate.space import Space
+from mbkit.simulate.tableau import RK4, Tableau
+from mbkit.simulate.torque import Force
+
+__all__ = ["RAN_AWAY", "DivergenceError", "Field", "Step", "credible", "make_step"]
+
+#: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
+Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
+
+RAN_AWAY: Final = "the state grew beyond all bounds"
+_RUNAWAY: Final = 1e100
+
+
+class DivergenceError(Exception):
+    """A state or an acceleration is none any more; never leaves `mbkit.simulate`."""
+
+
+def credible(x: Array) -> NDArray[np.bool_]:
+    """Return, per state, whether all its numbers are finite and below 1e100.
+
+    No machine goes there, and energies of what lies below can still be computed.
+    """
+    return np.asarray((np.abs(x) < _RUNAWAY).all(axis=-1))
+
+
+def _finite(q: Array, v: Array) -> bool:
+    return bool(np.isfinite(q).all() and np.isfinite(v).all())
+
+
+class Field:
+    """ẇ of the integrators' state, from an engine's forward dynamics.
+
+    Attributes
+    ----------
+    evaluations : int
+        Of the forward dynamics so far, summed over a batch.
+    """
+
+    def __init__(self, dyn: Dynamics, space: Space) -> None:
+        self._forward, self._space = dyn.forward_dynamics, space
+        self.evaluations = 0
+
+    def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ, or raise `DivergenceError`."""
+        v = self._space.leave(q, w)
+        if not isinstance(force, np.ndarray):
+            # A user's function never sees a state that is none.
+            if not _finite(q, v):
+                raise DivergenceError(RAN_AWAY)
+            force = force(t, q, v)
+        self.evaluations += 1 if q.ndim == 1 else len(q)
+        try:
+            a = self._forward(q, v, force)
+        except NumericalError as error:
+            raise DivergenceError(_blamed(str(error), q, v)) from None
+        except InputError:
+            if _finite(q, v):
+                raise
+            raise DivergenceError(RAN_AWAY) from None
+        return self._space.acceleration(q, v, a)
+
+
+def _blamed(told: str, q: Array, v: Array) -> str:
+    # An engine overflows before its state does, and blames the model for it.
+    largest = max(float(np.abs(x).max()) for x in (q, v))
+    return told if largest < 1e50 else RAN_AWAY
+
+
+def make_step(method: str, field: Field, space: Space) -> Step:
+    """Return the step of a fixed-step method."""
+    if method in _TABLEAUS:
+        return _runge_kutta(_TABLEAUS[method], field, space)
+    return _semi_implicit_euler(field, space)
+
+
+def _semi_implicit_euler(field: Field, space: Space) -> Step:
+    def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        w = w + h * field(t, q, w, force)
+        return space.move(q, h * w), w
+
+    return step
+
+
+def _runge_kutta(tableau: Tableau, field: Field, space: Space) -> Step:
+    A, b, c, s, nv = tableau.A, tableau.b, tableau.c.tolist(), tableau.stages, space.nv
+
+    def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        # The rates (u̇, ẇ) of all stages; a row of A times them is one product.
+        rates = np.empty((s, *w.shape[:-1], 2 * nv))
+        flat = rates.reshape(s, -1)
+        rates[0, ..., :nv] = w
+        rates[0, ..., nv:] = field(t, q, w, force)
+        for i in range(1, s):
+            moved = ((h * A[i, :i]) @ flat[:i]).reshape(rates.shape[1:])
+            u, w_i = moved[..., :nv], w + moved[..., nv:]
+            rates[i, ..., :nv] = space.rate(u, w_i)
+            rates[i, ..., nv:] = field(t + c[i] * h, space.move(q, u), w_i, force)
+        moved = ((h * b) @ flat).reshape(rates.shape[1:])
+        return space.move(q, moved[..., :nv]), w + moved[..., nv:]
+
+    return step
+
+
+_TABLEAUS: Final = {"rk4": RK4}

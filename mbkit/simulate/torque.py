@@ -1,0 +1,134 @@
+"""The generalized force of a run: none, an array held over each step, or a callable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, finite_array
+from mbkit.errors import InputError
+from mbkit.model import Model
+from mbkit.simulate.grid import Indices
+
+__all__ = ["Force", "Torque", "TorqueFunction"]
+
+#: torque(t, q, v) -> (nv,), of one state
+TorqueFunction = Callable[[float, Array, Array], ArrayLike]
+
+#: What acts during one step: an array, or a function of (t, q, v) of one state or a batch.
+Force = Array | Callable[[float, Array, Array], Array]
+
+
+class Torque:
+    """What a caller gave as `torque`, checked, and read step by step.
+
+    Parameters
+    ----------
+    torque : None, (nv,), (steps, nv) or (N, steps, nv) array_like, or callable
+        A callable gets t in s and q, v of one state as copies of its own, and
+        returns (nv,); for a batch it is called once for each state.
+    model : Model
+    batch : int or None
+        Number of trajectories, None for a single state.
+    steps : int or None
+        Rows that an array must have; None where there are no rows, so that only
+        one constant (nv,) can be held.
+
+    Raises
+    ------
+    InputError
+        Wrong shape or not finite, here for an array, during the run for a callable.
+    """
+
+    def __init__(
+        self, torque: ArrayLike | TorqueFunction | None, model: Model, batch: int | None, steps: int | None
+    ) -> None:
+        self._nv, self._name = model.nv, model.name
+        self._batch = batch
+        self._function: TorqueFunction | None = None
+        self._zero = np.zeros(self._nv) if batch is None else np.zeros((batch, self._nv))
+        self._rows: Array | None = None
+        if torque is None:
+            return
+        if callable(torque):
+            self._function = torque
+            return
+        self._read(torque, steps)
+
+    def _read(self, torque: ArrayLike, steps: int | None) -> None:
+        nv, batch = self._nv, self._batch
+        shape = _shape(torque)
+        allowed: list[tuple[int, ...]] = [(nv,)]
+        if steps is not None:
+            allowed.append((steps, nv))
+            if batch is not None:
+                allowed.append((batch, steps, nv))
+        if shape not in allowed:
+            hint = "" if steps is not None else "; one row per interval needs save=, the grid of times"
+            raise InputError(
+                f"torque: expected shape {' or '.join(map(str, allowed))}, got {shape}; {self._name} has nv = {nv}"
+                + (f" and the run has {steps} steps" if steps is not None else hint)
+            )
+        array = finite_array("torque", torque, shape)
+        if array.ndim == 1:
+            self._zero = self._zero + array
+        else:
+            self._rows = array
+
+    @property
+    def held(self) -> bool:
+        """Whether it jumps between steps."""
+        return self._rows is not None
+
+    @property
+    def callable(self) -> bool:
+        """Whether a function of the state gives it."""
+        return self._function is not None
+
+    def during(self, k: int, members: Indices | None) -> Force:
+        """Return what acts during step k on a single state, or on these members of a batch."""
+        if self._function is not None:
+            return self._of_single if members is None else self._of_batch
+        if self._rows is None:
+            return self._zero if members is None else self._zero[members]
+        if self._rows.ndim == 3:
+            return np.asarray(self._rows[members, k])
+        row = self._rows[k]
+        return row if members is None else np.broadcast_to(row, (len(members), self._nv))
+
+    def of_member(self, i: int | None) -> Callable[[int], Force]:
+        """Return a function of the step that gives what acts on one state (of a batch)."""
+        if i is None or self._function is not None:
+            return lambda k: self.during(k, None)
+        return lambda k: np.asarray(self.during(k, np.array([i])))[0]
+
+    def over(self, start: int, stop: int) -> Array | None:
+        """Return the rows of steps start to stop, (steps, nv) or (N, steps, nv); None where all are zero."""
+        if self._rows is not None:
+            return self._rows[..., start:stop, :]
+        if not self._zero.any():
+            return None
+        # A constant (nv,) is the same for every member.
+        one = self._zero if self._zero.ndim == 1 else self._zero[0]
+        return np.broadcast_to(one, (stop - start, self._nv)).copy()
+
+    def _of_single(self, t: float, q: Array, v: Array) -> Array:
+        assert self._function is not None
+        given: Any = self._function(t, q.copy(), v.copy())
+        try:
+            return finite_array("torque", given, (self._nv,))
+        except InputError as error:
+            raise InputError(f"{error}; it is what the callable returned at t = {t:.9g} s") from None
+
+    def _of_batch(self, t: float, q: Array, v: Array) -> Array:
+        return np.array([self._of_single(t, *state) for state in zip(q, v, strict=True)]).reshape(-1, self._nv)
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    try:
+        return np.shape(value)
+    except ValueError:
+        raise InputError("torque: expected an array or a callable, got rows of different lengths") from None

@@ -1,0 +1,745 @@
+# Torques and stub engines have the signature they are called with.
+# ruff: noqa: ARG001, ARG002, ARG005
+"""Integrators: their order, MuJoCo's own steps, published figures, and runs that go wrong."""
+
+from __future__ import annotations
+
+import csv
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit import catalog
+from mbkit.engines import Dynamics, dynamics
+from mbkit.errors import InputError, MbkitWarning, NumericalError, OutputError, UnknownNameError, UnsupportedError
+from mbkit.model import Model, ModelBuilder
+from mbkit.simulate import METHODS, RK4, Tableau, Trajectory, rotation, simulate
+from mbkit.simulate.grid import Grid
+from mbkit.simulate.space import Space
+from mbkit.simulate.tableau import rooted_trees
+from validation import closed_forms
+
+EPS = np.finfo(float).eps
+FIXED = ("rk4", "semi_implicit_euler")
+NATIVE = {"rk4": "mujoco_rk4", "semi_implicit_euler": "mujoco_euler"}
+
+
+def tumbling() -> tuple[Model, np.ndarray, np.ndarray]:
+    """A free body with everything on: gravity, off-centre, moving and turning fast."""
+    b = ModelBuilder("tumbling")
+    b.add_body("body", mass=2.0, com=(0.1, -0.2, 0.05), inertia=(0.3, 0.4, 0.6))
+    b.add_joint("float", "free", parent="world", child="body", translation=(0, 0, 1), rpy=(0.3, -0.2, 1.0))
+    b.add_body("arm", mass=0.7, com=(0.2, 0.1, 0.0), inertia=(0.02, 0.03, 0.04))
+    b.add_joint("shoulder", "ball", parent="body", child="arm", translation=(0.3, 0.0, 0.1))
+    b.add_body("hand", mass=0.3, com=(0.1, 0.0, 0.1), inertia=(0.01, 0.01, 0.01))
+    b.add_joint("elbow", "revolute", parent="arm", child="hand", translation=(0.4, 0.0, 0.0), axis=(0, 1, 0))
+    model = b.build()
+    q, v = model.random_state(np.random.default_rng(3))
+    return model, q, v
+
+
+def stiff(stiffness: float = 1e9) -> Dynamics:
+    b = ModelBuilder("stiff")
+    b.add_body("mass", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=stiffness)
+    return dynamics(b.build())
+
+
+def slope(steps: list[float], errors: list[float]) -> float:
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+
+
+# Tableaus
+
+
+def test_rooted_trees_are_counted_as_cayley_did() -> None:
+    assert [len(rooted_trees(n)) for n in range(1, 9)] == [1, 1, 2, 4, 9, 20, 48, 115]
+
+
+def test_tableaus_check_themselves() -> None:
+    eighths = Tableau(
+        "3/8", [[0, 0, 0, 0], [1 / 3, 0, 0, 0], [-1 / 3, 1, 0, 0], [1, -1, 1, 0]], [1 / 8, 3 / 8, 3 / 8, 1 / 8], 4
+    )
+    assert eighths.c == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    with pytest.raises(InputError, match="order 5"):
+        Tableau("rk4", RK4.A, RK4.b, 5)
+    with pytest.raises(InputError, match="order 4 condition"):
+        # Kutta's third-order weights pass for order 4 where only the quadrature is looked at.
+        Tableau("simpson", [[0, 0, 0], [0.5, 0, 0], [-1, 2, 0]], [1 / 6, 2 / 3, 1 / 6], 4)
+    with pytest.raises(InputError, match="order 1"):
+        Tableau("misprint", RK4.A, [1 / 6, 1 / 3, 1 / 3, 1 / 3], 4)
+    with pytest.raises(InputError, match="not explicit"):
+        Tableau("midpoint", [[0.5]], [1.0], 2)
+    with pytest.raises(InputError, match=r"expected A \(s, s\)"):
+        Tableau("ragged", [[0.0]], [0.5, 0.5], 1)
+    assert np.array_equal(pickle.loads(pickle.dumps(RK4)).A, RK4.A)
+
+
+# Rotations and the space
+
+
+def test_dexp_inverse_is_the_rate_of_the_rotation_vector() -> None:
+    """exp(u(t)) turning with body velocity w: u̇ found by differences of the logarithm."""
+    from mbkit import spatial
+
+    rng = np.random.default_rng(0)
+    for size in (1e-9, 0.05, 0.0999, 0.1001, 1.0, 3.0):
+        u = rng.standard_normal(3)
+        u *= size / np.linalg.norm(u)
+        w = rng.standard_normal(3)
+        h = 1e-6
+        ends = [
+            spatial.log_quaternion(spatial.multiply(spatial.exp_quaternion(u), spatial.exp_quaternion(s * h * w)))
+            for s in (-1, 1)
+        ]
+        rate = (ends[1] - ends[0]) / (2 * h)
+        got = np.array(rotation.dexp_inverse(u.tolist(), w.tolist()))
+        assert got == pytest.approx(rate, abs=2e-9)
+        # One state and a batch, and the repository's other formula, give the same.
+        batch = np.array(rotation.dexp_inverse([np.full(2, x) for x in u], [np.full(2, x) for x in w]))
+        assert batch[:, 0] == pytest.approx(got, abs=8 * EPS)
+        assert got == pytest.approx(spatial.left_jacobian_inverse(-u) @ w, abs=1e-13)
+
+
+def test_space_round_trip_and_parent_axes() -> None:
+    model, q, v = tumbling()
+    space = Space(model)
+    w = space.enter(q, v)
+    assert w[:3] == pytest.approx(closed_rotation(q[3:7]) @ v[:3], abs=1e-14)
+    assert np.array_equal(w[3:], v[3:])
+    assert space.leave(q, w) == pytest.approx(v, abs=1e-14)
+    many = np.stack([q, q]), np.stack([v, 2 * v])
+    assert space.enter(*many) == pytest.approx(np.stack([w, 2 * w]), abs=1e-14)
+    moved = space.move(*many)
+    assert moved[0] == pytest.approx(space.move(q, v), abs=1e-14)
+    model.check_q(moved)
+
+
+def closed_rotation(quaternion: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
+
+
+# Order of convergence
+
+
+def order_cases() -> dict[str, tuple[Model, np.ndarray, np.ndarray, float]]:
+    rng = np.random.default_rng(2)
+    top = catalog.heavy_top()
+    box = catalog.free_body()
+    model, q, v = tumbling()
+    return {
+        "double pendulum": (catalog.double_pendulum(), np.array([0.6, 0.3]), np.array([0.5, -0.5]), 1.0),
+        "heavy top": (top, top.random_state(rng)[0], np.array([1.0, 20.0, -4.0]), 0.5),
+        "free body": (box, box.random_state(rng)[0], np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1]), 1.0),
+        "tumbling arm": (model, q, 3 * v, 0.5),
+    }
+
+
+@pytest.mark.parametrize("case", order_cases())
+@pytest.mark.parametrize("method", FIXED)
+def test_observed_order(case: str, method: str) -> None:
+    model, q, v, duration = order_cases()[case]
+    dyn = dynamics(model)
+    truth = simulate(dyn, q, v, duration, "dop853", rtol=3e-14, save=[0.0, duration])
+    counts = (60, 90, 140, 200) if method == "rk4" else (300, 450, 700, 1000)
+    steps, errors = [], []
+    for n in counts:
+        run = simulate(dyn, q, v, duration, method, dt=duration / n)
+        steps.append(duration / n)
+        apart = [model.difference(truth.q[-1], run.q[-1]), run.v[-1] - truth.v[-1]]
+        errors.append(float(np.linalg.norm(np.concatenate(apart))))
+    assert slope(steps, errors) == pytest.approx(METHODS[method].order, abs=0.2)
+
+
+# MuJoCo's own integrators
+
+
+def assert_as_mujoco(model: Model, q: np.ndarray, v: np.ndarray, duration: float = 1.0, dt: float = 1e-3) -> None:
+    engines = {name: dynamics(model, name) for name in ("pinocchio", "mujoco")}
+    for method in FIXED:
+        own = simulate(engines["mujoco"], q, v, duration, NATIVE[method], dt)
+        for dyn in engines.values():
+            run = simulate(dyn, q, v, duration, method, dt)
+            assert run.stats.finished
+            assert own.stats.finished
+            assert np.array_equal(run.t, own.t)
+            assert np.abs(run.q - own.q).max() <= 1e-12, (method, dyn.engine)
+            assert np.abs(run.v - own.v).max() <= 1e-10, (method, dyn.engine)
+
+
+@pytest.mark.parametrize("name", catalog.systems())
+def test_rollouts_of_the_catalog_are_mujocos(name: str) -> None:
+    model = catalog.get(name)()
+    q, v = model.random_state(np.random.default_rng(1))
+    assert_as_mujoco(model, q, v)
+
+
+def test_rollouts_of_every_rotation_are_mujocos() -> None:
+    model, q, v = tumbling()
+    # Long steps: at 1 ms the last term of dexp⁻¹ is below rounding.
+    assert_as_mujoco(model, q, 3 * v, duration=0.3035, dt=0.01)
+
+
+def test_rollouts_of_every_joint_that_mujoco_has_are_mujocos() -> None:
+    b = ModelBuilder("kinds")
+    kinds: list[tuple[str, dict[str, Any]]] = [
+        ("planar", {}),
+        ("universal", {"axis": (1, 0, 0), "axis2": (0, 1, 0)}),
+        ("ball", {}),
+        ("prismatic", {"axis": (0, 1, 1)}),
+        ("spherical_zyx", {}),
+        ("revolute", {"axis": (1, 1, 0)}),
+        ("free", {}),
+    ]
+    parent = "world"
+    for kind, axes in kinds:
+        place: dict[str, Any] = {"translation": (0.1, 0.2, 0.3), "rpy": (0.1, 0.2, 0.3), **axes}
+        b.add_body(f"{kind} body", mass=1.0, com=(0.1, 0.05, -0.1), inertia=(0.1, 0.12, 0.15))
+        b.add_joint(kind, kind, parent="world" if kind == "free" else parent, child=f"{kind} body", **place)
+        parent = f"{kind} body"
+    model = b.build()
+    q, v = model.random_state(np.random.default_rng(0))
+    assert_as_mujoco(model, q, v, duration=0.2)
+
+
+def test_rollouts_with_damping_and_springs_are_mujocos() -> None:
+    b = ModelBuilder("damped")
+    b.add_body("a", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+    b.add_body("b", mass=0.5, com=(0, 0, -0.3), inertia=(0.03, 0.03, 0.01))
+    b.add_joint("j1", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.7, stiffness=3.0, rest=0.2)
+    b.add_joint("j2", "revolute", parent="a", child="b", axis=(1, 0, 0), translation=(0, 0, -1), damping=0.1)
+    assert_as_mujoco(b.build(), np.array([1.0, -0.5]), np.array([2.0, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ("robot", "options"),
+    [("ur5", {}), ("panda", {"mimic": "free"}), ("anymal_b", {"floating_base": True})],
+)
+def test_rollouts_of_robots_are_mujocos(robot: str, options: dict[str, Any]) -> None:
+    model = mb.load(robot, **options).without("damping")
+    # Errors grow along a motion: from faster starts the Panda multiplies rounding by 1e4 within 1 s.
+    q, v = model.random_state(np.random.default_rng(5))
+    assert_as_mujoco(model, q, 0.1 * v)
+
+
+def test_native_batches_torques_and_implicit_methods() -> None:
+    model = catalog.double_pendulum()
+    dyn = dynamics(model, "mujoco")
+    q, v = model.random_state(np.random.default_rng(0), 3)
+    tau = np.random.default_rng(1).standard_normal((3, 50, 2))
+    own = simulate(dyn, q, v, 0.05, "mujoco_rk4", torque=tau, save=10)
+    run = simulate(dynamics(model), q, v, 0.05, "rk4", torque=tau, save=10)
+    assert own.q.shape == (3, 6, 2)
+    assert own.q == pytest.approx(run.q, abs=1e-13)
+    assert own.stats.steps == run.stats.steps == 150
+    assert own.stats.evaluations == run.stats.evaluations == 600
+    for method in ("mujoco_implicit", "mujoco_implicitfast"):
+        other = simulate(dyn, q, v, 0.05, method, torque=tau, save=10)
+        assert 1e-9 < np.abs(other.q - own.q).max() < 1e-1
+    constant = simulate(dyn, q, v, 0.05, "mujoco_euler", torque=[0.3, -0.2])
+    assert constant.q == pytest.approx(simulate(dyn, q, v, 0.05, FIXED[1], torque=[0.3, -0.2]).q, abs=1e-13)
+
+
+def test_native_methods_elsewhere_and_callables_are_refused() -> None:
+    model = catalog.pendulum()
+    with pytest.raises(UnsupportedError, match=r"mujoco_rk4: .*pinocchio has not; use mbkit.dynamics\(model, 'mujoco'"):
+        simulate(dynamics(model), [0.1], [0.0], 1.0, "mujoco_rk4")
+    with pytest.raises(UnsupportedError, match="cannot call back"):
+        simulate(dynamics(model, "mujoco"), [0.1], [0.0], 1.0, "mujoco_rk4", torque=lambda t, q, v: -v)
+
+
+# Conservation and published figures
+
+
+def test_energy_and_momentum_are_kept() -> None:
+    model = catalog.double_pendulum()
+    run = simulate(dynamics(model), [2.0, 0.5], [0.0, 0.0], 5.0, dt=1e-3)
+    energy = run.energy()
+    assert energy.shape == run.t.shape
+    scale = 2 * 9.81
+    assert np.ptp(energy) < 1e-7 * scale
+    # On a separable system semi-implicit Euler is symplectic: an error, but no drift. Explicit Euler would drift.
+    loose = simulate(dynamics(catalog.pendulum()), [2.0], [0.0], 20.0, "semi_implicit_euler", dt=2e-3).energy()
+    assert 1e-3 < np.ptp(loose[:5000]) < 1e-1
+    assert np.ptp(loose[-5000:]) == pytest.approx(np.ptp(loose[:5000]), rel=0.02)
+
+    box = catalog.free_body()
+    q, v = box.neutral(), np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1])
+    flight = simulate(dynamics(box), q, v, 2.0)
+    world = Space(box).enter(flight.q, flight.v)
+    assert np.abs(world[:, :3] - v[:3]).max() < 1e-12
+    assert flight.q[-1, :3] == pytest.approx(2 * v[:3], abs=1e-12)
+
+
+def test_pendulum_follows_the_elliptic_functions() -> None:
+    dyn = dynamics(catalog.pendulum())
+    t = np.linspace(0, 10, 21)
+    theta, speed = closed_forms.pendulum_solution(t, -np.pi / 2)
+    tight = simulate(dyn, [-np.pi / 2], [0.0], 10.0, "dop853", rtol=3e-14, save=t)
+    assert tight.q[:, 0] == pytest.approx(theta, abs=1e-11)
+    assert tight.v[:, 0] == pytest.approx(speed, abs=1e-11)
+    fixed = simulate(dyn, [-np.pi / 2], [0.0], 10.0, "rk4", dt=1e-3, save=t)
+    assert fixed.q[:, 0] == pytest.approx(theta, abs=1e-9)
+    figures = closed_forms.published()["iftomm_A01_pendulum"]["exact"]["t=10 x,y"]
+    assert [np.sin(tight.q[-1, 0]), -np.cos(tight.q[-1, 0])] == pytest.approx([float(x) for x in figures], abs=1e-11)
+
+
+def test_heavy_top_reaches_the_published_attitude() -> None:
+    top = closed_forms.published()["heavy_top"]
+    model = catalog.heavy_top()
+    w, x, y, z = top["published_quaternion_wxyz_t0p2_rk4"]
+    for options in ({"method": "dop853", "rtol": 1e-12}, {"method": "rk4", "dt": 1e-4}):
+        run = simulate(dynamics(model), model.neutral(), top["w0_body"], 0.2, **options)
+        got = run.q[-1]
+        got = got * np.sign(got @ [x, y, z, w])
+        assert got == pytest.approx([x, y, z, w], abs=1.5e-5)
+
+
+def test_dzhanibekov_box_follows_the_jacobi_functions() -> None:
+    box = closed_forms.published()["dzhanibekov_box"]
+    model = catalog.free_body(mass=box["m"], sides=box["dims"])
+    w0 = np.array(box["w0"], dtype=float)
+    period = float(box["exact_period"])
+    t = np.linspace(0, period, 13)
+    exact, _ = closed_forms.free_spin(t, np.array(box["I"]), w0)
+    v0 = np.concatenate([np.zeros(3), w0])
+    run = simulate(dynamics(model), model.neutral(), v0, period, "dop853", rtol=3e-14, save=t)
+    assert run.v[:, 3:] == pytest.approx(exact, abs=1e-10)
+    fixed = simulate(dynamics(model), model.neutral(), v0, period, "rk4", dt=period / 3000)
+    assert fixed.v[::250, 3:] == pytest.approx(exact, abs=1e-8)
+
+
+def test_light_cart_pole_is_the_published_one() -> None:
+    figures = closed_forms.published()["light_cart_pole"]
+    model = catalog.cart_pole(cart_mass=figures["M"], pole_mass=figures["m"], length=figures["l"])
+    times = [0.0, *(float(k) for k in figures["published"])]
+    run = simulate(dynamics(model), [0.0, np.pi / 2], [0.0, 0.0], 8.0, "dop853", rtol=1e-12, atol=1e-14, save=times)
+    wanted = np.array(list(figures["published"].values()))
+    assert run.q[1:] == pytest.approx(wanted, abs=1e-7)
+    cart = closed_forms.light_cart_pole_cart(run.q[:, 1], np.pi / 2, figures["M"], figures["m"], figures["l"])
+    assert run.q[:, 0] == pytest.approx(cart, abs=1e-8)
+
+
+# DOP853
+
+
+def test_dop853_and_rk4_come_to_the_same_by_different_roads() -> None:
+    model, q, v = tumbling()
+    dyn = dynamics(model)
+    run = simulate(dyn, q, v, 0.3, "dop853", rtol=1e-13)
+    fine = simulate(dyn, q, v, 0.3, "rk4", dt=2e-4)
+    assert run.t[0] == 0
+    assert run.t[-1] == 0.3
+    assert run.stats.steps == len(run.t) - 1
+    assert run.stats.evaluations >= 12 * run.stats.steps
+    assert np.abs(model.difference(fine.q[-1], run.q[-1])).max() < 1e-9
+    model.check_q(run.q)
+
+
+def test_dop853_tolerance_rules_the_error() -> None:
+    dyn = dynamics(catalog.pendulum())
+    exact = closed_forms.pendulum_solution(np.array([5.0]), 2.0)[0][0]
+    errors, cost = [], []
+    for rtol in (1e-4, 1e-7, 1e-10):
+        run = simulate(dyn, [2.0], [0.0], 5.0, "dop853", rtol=rtol)
+        errors.append(abs(run.q[-1, 0] - exact))
+        cost.append(run.stats.evaluations)
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+    assert cost[0] < cost[1] < cost[2]
+
+
+def test_dop853_holds_torques_over_the_intervals_of_save() -> None:
+    model = catalog.double_pendulum()
+    dyn = dynamics(model)
+    grid = np.linspace(0, 0.2, 5)
+    tau = np.random.default_rng(0).standard_normal((4, 2))
+    run = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.2, "dop853", rtol=1e-12, torque=tau, save=grid)
+    fine = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.2, "rk4", dt=5e-4, torque=np.repeat(tau, 100, axis=0), save=grid)
+    assert np.array_equal(run.t, grid)
+    assert run.q == pytest.approx(fine.q, abs=1e-10)
+    q = np.array([[0.5, 0.2], [0.1, 0.0]])
+    both = simulate(dyn, q, [0.0, 0.0], 0.2, "dop853", rtol=1e-12, torque=np.stack([tau, -tau]), save=grid)
+    assert both.q.shape == (2, 5, 2)
+    assert both.q[0] == pytest.approx(run.q, abs=1e-13)
+    with pytest.raises(InputError, match="one row per interval needs save="):
+        simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.2, "dop853", torque=tau)
+
+
+# Grids
+
+
+@pytest.mark.parametrize("method", [*FIXED, "mujoco_rk4"])
+@pytest.mark.parametrize(
+    ("duration", "dt", "steps"), [(0.0105, 1e-3, 11), (0.1, 0.03, 4), (0.3, 0.1, 3), (0.0, 0.1, 0)]
+)
+def test_runs_end_exactly(method: str, duration: float, dt: float, steps: int) -> None:
+    dyn = dynamics(catalog.pendulum(), "mujoco")
+    run = simulate(dyn, [1.0], [0.0], duration, method, dt)
+    assert run.t[-1] == duration
+    assert len(run.t) == steps + 1
+    assert run.stats.steps == steps
+    if method != "semi_implicit_euler" and duration:
+        exact = closed_forms.pendulum_solution(run.t, 1.0)[0]
+        assert run.q[:, 0] == pytest.approx(exact, abs=5e-5)
+
+
+def test_equal_steps_are_not_split_by_rounding() -> None:
+    for duration, dt in ((1.0, 1e-3), (10.0, 1e-3), (0.7, 0.1), (1.0, 1 / 3), (2.4, 0.8), (1e4, 1e-3)):
+        grid = Grid.of(duration, dt)
+        assert grid.steps == round(duration / dt)
+        assert grid.last == dt
+
+
+def test_save_keeps_the_same_states() -> None:
+    model, q, v = tumbling()
+    dyn = dynamics(model)
+    every = simulate(dyn, q, v, 0.0205)
+    some = simulate(dyn, q, v, 0.0205, save=5)
+    assert np.array_equal(some.t, every.t[[0, 5, 10, 15, 20, 21]])
+    assert np.array_equal(some.q, every.q[[0, 5, 10, 15, 20, 21]])
+    named = simulate(dyn, q, v, 0.0205, save=[0.003, 0.02, 0.0205])
+    assert np.array_equal(named.v, every.v[[3, 20, 21]])
+
+
+# Batches
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco"])
+@pytest.mark.parametrize("method", FIXED)
+def test_a_batch_is_its_states_one_by_one(engine: str, method: str) -> None:
+    model, _, _ = tumbling()
+    dyn = dynamics(model, engine)
+    q, v = model.random_state(np.random.default_rng(1), 3)
+    tau = np.random.default_rng(2).standard_normal((3, 20, model.nv))
+    batch = simulate(dyn, q, v, 0.02, method, torque=tau)
+    assert batch.q.shape == (3, 21, model.nq)
+    assert batch.energy().shape == (3, 21)
+    for i in range(3):
+        one = simulate(dyn, q[i], v[i], 0.02, method, torque=tau[i])
+        assert batch.q[i] == pytest.approx(one.q, abs=1e-13)
+        assert batch.v[i] == pytest.approx(one.v, abs=1e-12)
+        assert batch.energy()[i] == pytest.approx(one.energy(), abs=1e-12)
+    assert batch.stats.steps == 60
+
+
+def test_one_state_beside_a_batch_and_an_empty_batch() -> None:
+    dyn = dynamics(catalog.pendulum())
+    run = simulate(dyn, [[0.1], [0.2]], [0.0], 0.01)
+    assert run.q.shape == (2, 11, 1)
+    assert simulate(dyn, np.empty((0, 1)), [0.0], 0.01).q.shape == (0, 11, 1)
+    native = simulate(dynamics(catalog.pendulum(), "mujoco"), np.empty((0, 1)), [0.0], 0.01, "mujoco_rk4")
+    assert native.q.shape == (0, 11, 1)
+    assert simulate(dyn, [[0.1], [0.2]], [0.0], 0.01, "dop853", save=[0, 0.01]).q.shape == (2, 2, 1)
+
+
+# Torques
+
+
+@pytest.mark.parametrize("method", FIXED)
+def test_torques_as_arrays_and_callables(method: str) -> None:
+    model = catalog.double_pendulum()
+    dyn = dynamics(model)
+    q, v, tau = [0.5, -0.2], [0.0, 0.3], np.array([0.4, -0.7])
+
+    def run(torque: Any, q: Any = q) -> Trajectory:
+        return simulate(dyn, q, v, 0.05, method, torque=torque)
+
+    held = run(tau)
+    assert np.abs(held.q - run(None).q).max() > 1e-6
+    assert np.array_equal(run(np.tile(tau, (50, 1))).q, held.q)
+    assert np.array_equal(run(lambda t, q, v: tau).q, held.q)
+    assert run(tau, [q, q]).q[1] == pytest.approx(held.q, abs=1e-15)
+    assert run(np.tile(tau, (50, 1)), [q, q]).q[1] == pytest.approx(held.q, abs=1e-15)
+    assert run(lambda t, q, v: tau.tolist(), [q, q]).q[0] == pytest.approx(held.q, abs=1e-15)
+    late = np.zeros((50, 2))
+    late[25:] = tau
+    assert np.array_equal(run(late).q[:26], run(None).q[:26])
+    assert np.array_equal(run(late).q, run(lambda t, q, v: tau if t >= 0.025 - 1e-9 else 0 * tau).q) == (
+        method == "semi_implicit_euler"
+    ), "an array is held over the step; a callable is asked at each stage"
+
+
+def test_a_callable_sees_stage_times_and_body_velocities() -> None:
+    model, q0, v0 = tumbling()
+    dyn = dynamics(model)
+    seen: list[tuple[float, np.ndarray, np.ndarray]] = []
+
+    def drag(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        seen.append((t, q.copy(), v.copy()))
+        q[:], v_old = 0.0, v.copy()  # what it is given is its own
+        return -0.5 * v_old
+
+    run = simulate(dyn, q0, v0, 0.002, "rk4", torque=drag)
+    assert [t for t, _, _ in seen] == pytest.approx([0, 5e-4, 5e-4, 1e-3, 1e-3, 1.5e-3, 1.5e-3, 2e-3], abs=1e-18)
+    assert np.array_equal(seen[0][1], q0)
+    assert seen[0][2] == pytest.approx(v0, abs=1e-14)
+    assert seen[4][2] == pytest.approx(run.v[1], abs=1e-13)
+    # The same drag by the independent road.
+    fine = simulate(dyn, q0, v0, 0.01, "rk4", dt=1e-4, torque=lambda t, q, v: -0.5 * v)
+    other = simulate(dyn, q0, v0, 0.01, "dop853", rtol=1e-13, torque=lambda t, q, v: -0.5 * v)
+    assert fine.v[-1] == pytest.approx(other.v[-1], abs=1e-10)
+    assert np.abs(fine.v[-1] - simulate(dyn, q0, v0, 0.01, "rk4", dt=1e-4).v[-1]).max() > 1e-3
+
+
+@pytest.mark.parametrize("method", [*FIXED, "dop853"])
+@pytest.mark.parametrize("states", [[0.1], [[0.1], [0.2]]])
+def test_torque_callables_that_misbehave(method: str, states: Any) -> None:
+    dyn = dynamics(catalog.pendulum())
+    save = [0.0, 1.0]
+    for wrong, message in (
+        (lambda t, q, v: [0.0, 0.0], r"torque: expected shape \(1,\), got \(2,\); it is what the callable returned at"),
+        (lambda t, q, v: [np.nan], r"torque: nan at index .*the callable returned"),
+        (lambda t, q, v: None, r"torque: expected real numbers.*the callable returned"),
+        (lambda t, q, v: 0.0, r"torque: expected shape \(1,\), got \(\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulate(dyn, states, [0.0], 1.0, method, torque=wrong, save=save)
+
+    def raising(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        simulate(dyn, states, [0.0], 1.0, method, torque=raising, save=save)
+
+    def interrupted(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        if t > 0.5:
+            raise KeyboardInterrupt
+        return np.zeros(1)
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(dyn, states, [0.0], 1.0, method, torque=interrupted, save=save, progress=True)
+
+
+# Divergence
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco"])
+@pytest.mark.parametrize("method", FIXED)
+def test_a_diverging_run_keeps_what_it_has(engine: str, method: str) -> None:
+    dyn = dynamics(stiff().model, engine)
+    with pytest.warns(MbkitWarning, match="diverged after t = .*beyond all bounds; dt = 0.001 s may be too long"):
+        run = simulate(dyn, [1.0], [0.0], 1.0, method)
+    assert run.stats.ended == "diverged"
+    assert not run.stats.finished
+    assert isinstance(run.stats.reached, float)
+    assert 0.01 < run.stats.reached < 0.5
+    assert run.t[-1] == run.stats.reached
+    assert run.q.shape == (len(run.t), 1)
+    assert np.isfinite(run.q).all()
+    assert np.isfinite(run.v).all()
+    assert run.stats.steps == len(run.t) - 1
+
+
+def test_one_divergence_does_not_stop_the_others() -> None:
+    dyn = stiff()
+    q = [[0.0], [1.0], [0.0], [1e-150]]
+    with pytest.warns(MbkitWarning, match="2 of 4 trajectories diverged"):
+        run = simulate(dyn, q, [0.0], 0.2)
+    assert run.t[-1] == 0.2
+    reached = run.stats.reached
+    assert isinstance(reached, tuple)
+    assert reached[0] == reached[2] == 0.2
+    assert reached[1] < reached[3] < 0.2
+    for i in (1, 3):
+        with pytest.warns(MbkitWarning):
+            alone = simulate(dyn, q[i], [0.0], 0.2)
+        n = len(alone.t)
+        assert run.q[i, :n] == pytest.approx(alone.q, rel=1e-12)
+        assert np.isnan(run.q[i, n:]).all()
+        assert np.isnan(run.energy()[i, n:]).all()
+    assert np.isfinite(run.q[[0, 2]]).all()
+    with pytest.warns(MbkitWarning):
+        lost = simulate(dyn, [[1.0], [2.0]], [0.0], 0.2)
+    assert len(lost.t) < 201
+    assert lost.t[-1] == max(lost.stats.reached)  # type: ignore[type-var]
+
+
+def test_native_divergence_is_void_from_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log where it stands
+    dyn = dynamics(stiff().model, "mujoco")
+    with pytest.warns(MbkitWarning, match="mujoco_rk4 diverged after t = .*2 of 4"):
+        run = simulate(dyn, [[0.0], [1.0], [0.0], [1e-150]], [0.0], 0.1005, "mujoco_rk4")
+    assert run.t[-1] == 0.1005
+    for row, end in zip(run.q, run.stats.reached, strict=True):  # type: ignore[arg-type]
+        assert np.array_equal(np.isfinite(row[:, 0]), run.t <= end)
+    with pytest.warns(MbkitWarning, match="diverged"):
+        alone = simulate(dyn, [1.0], [0.0], 0.1, "mujoco_euler")
+    assert np.isfinite(alone.q).all()
+    assert alone.t[-1] == alone.stats.reached < 0.1
+
+
+class _Broken(Dynamics):
+    """Closed-form pendulum whose engine fails past an angle; not in the registry."""
+
+    engine = "broken"
+
+    def _forward_dynamics(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        if np.any(q > 1.0):
+            raise NumericalError("broken: no acceleration past 1 rad")
+        return tau - 9.81 * np.sin(q)
+
+    def _kinetic_energy(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.asarray(v[..., 0] ** 2 / 2)
+
+    def _potential_energy(self, q: np.ndarray) -> np.ndarray:
+        return np.asarray(-9.81 * np.cos(q[..., 0]))
+
+    def _other(self, *_: Any) -> np.ndarray:
+        raise NotImplementedError
+
+    _mass_matrix = _gravity = _nle = _passive = _inverse_dynamics = _pose = _jacobian = _other
+
+
+@pytest.mark.parametrize("method", [*FIXED, "dop853"])
+def test_an_engine_that_fails_ends_the_run(method: str) -> None:
+    dyn = _Broken(catalog.pendulum())
+    with pytest.warns(MbkitWarning, match="no acceleration past 1 rad"):
+        run = simulate(dyn, [0.9], [2.0], 1.0, method)
+    assert run.stats.ended == "diverged"
+    assert 0.04 < run.stats.reached < 0.08  # type: ignore[operator]
+    assert run.q.max() <= 1.0 + 2e-3
+    with pytest.warns(MbkitWarning):
+        start = simulate(dyn, [1.1], [0.0], 1.0, method)
+    assert len(start.t) == 1
+    assert start.stats.reached == 0.0
+    # An engine outside the registry travels with its trajectory.
+    again = pickle.loads(pickle.dumps(simulate(dyn, [0.1], [0.0], 0.1, method)))
+    assert np.ptp(again.energy()) < 1e-3
+
+
+@pytest.mark.parametrize("method", [*FIXED, "dop853"])
+def test_a_rotation_that_overflows_is_a_divergence(method: str) -> None:
+    box = catalog.free_body()
+    with pytest.warns(MbkitWarning):
+        run = simulate(dynamics(box), box.neutral(), [0, 0, 0, 0, 0, 1e155], 1.0, method)
+    assert not run.stats.finished
+    assert len(run.t) < 3
+    assert np.isfinite(run.q).all()
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dt": 0.0}, r"dt: expected a number above 0"),
+        ({"dt": -1e-3}, r"dt: expected a number above 0"),
+        ({"dt": np.nan}, r"dt: expected a finite number"),
+        ({"dt": "fast"}, r"dt: expected a number"),
+        ({"dt": 1e-300}, r"dt: .* expected a larger step"),
+        ({"dt": 1e-12}, r"save: .* GiB; keep fewer"),
+        ({"duration": -1.0}, r"duration: expected a number of at least 0"),
+        ({"duration": np.inf}, r"duration: expected a finite number"),
+        ({"q0": [0.0]}, r"q0: expected shape \(7,\) or \(N, 7\), got \(1,\); free_body has nq = 7"),
+        ({"v0": np.zeros(7)}, r"v0: expected shape \(6,\)"),
+        ({"q0": [0, 0, 0, 0, 0, 0, 2.0]}, r"q0: the quaternion of joint 'float'.*norm 2"),
+        ({"q0": [np.nan, 0, 0, 0, 0, 0, 1]}, r"q0: nan at index \(0,\)"),
+        ({"v0": [np.inf, 0, 0, 0, 0, 0]}, r"v0: inf at index \(0,\)"),
+        ({"q0": np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1)), "v0": np.zeros((3, 6))}, r"batches of different sizes"),
+        ({"torque": np.zeros(5)}, r"torque: expected shape \(6,\) or \(10, 6\), got \(5,\).*10 steps"),
+        ({"torque": np.zeros((11, 6))}, r"torque: expected shape .*\(10, 6\), got \(11, 6\)"),
+        ({"torque": np.full(6, np.nan)}, r"torque: nan"),
+        ({"torque": [[0.0], [0.0, 1.0]]}, r"torque: .*different lengths"),
+        ({"save": 0}, r"save: expected a count of at least 1"),
+        ({"save": True}, r"save: expected increasing times"),
+        ({"save": []}, r"save: expected increasing times"),
+        ({"save": [0.0, 0.0005]}, r"save: 0.0005 s is not a step"),
+        ({"save": [0.005, 0.001]}, r"save: expected increasing times"),
+        ({"save": [0.0, 0.02]}, r"save: expected times between 0 and 0.01"),
+        ({"rtol": 1e-6}, r"rtol: rk4 has a fixed step"),
+        ({"method": "dop853", "rtol": 1e-15}, r"rtol: expected at least 2.22e-14"),
+        ({"method": "dop853", "rtol": -1.0}, r"rtol: expected a number above 0"),
+        ({"method": "dop853", "atol": 0.0}, r"atol: expected a number above 0"),
+        ({"method": "dop853", "save": 5}, r"save: expected a grid of times for an adaptive method"),
+        ({"method": "dop853", "q0": np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1))}, r"save: expected a grid of times"),
+        ({"method": 4}, r"method: expected a name"),
+        ({"progress": 3}, r"progress: expected None, True or a callable"),
+    ],
+)
+def test_bad_input_is_named(change: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {"q0": [0, 0, 0, 0, 0, 0, 1], "v0": np.zeros(6), "duration": 0.01, **change}
+    with pytest.raises(InputError, match=message):
+        simulate(dynamics(catalog.free_body()), **arguments)
+
+
+def test_unknown_methods_and_wrong_objects() -> None:
+    dyn = dynamics(catalog.pendulum())
+    with pytest.raises(UnknownNameError, match="unknown method 'RK-4'; did you mean 'rk4'"):
+        simulate(dyn, [0.1], [0.0], 1.0, "RK-4")
+    with pytest.raises(InputError, match="dyn: expected a Dynamics, got Model"):
+        simulate(catalog.pendulum(), [0.1], [0.0], 1.0)  # type: ignore[arg-type]
+
+
+# Trajectories
+
+
+def test_trajectories_are_frozen_and_travel() -> None:
+    model, q, v = tumbling()
+    run = simulate(dynamics(model, "lagrangian"), q, v, 0.01)
+    with pytest.raises(ValueError, match="read-only"):
+        run.q[0, 0] = 1.0
+    with pytest.raises(AttributeError):
+        run.t = run.t  # type: ignore[misc]
+    data = pickle.dumps(run)
+    again = pickle.loads(data)
+    assert np.array_equal(again.q, run.q)
+    assert again.stats == run.stats
+    assert again.model == model
+    assert again.energy() == pytest.approx(run.energy(), abs=0)
+    for told in ("tumbling", "lagrangian", "rk4", "10 steps, 40 evaluations"):
+        assert told in repr(run)
+        assert told in run._repr_html_()
+
+
+def test_csv_holds_every_digit(tmp_path: Path) -> None:
+    model, q, v = tumbling()
+    run = simulate(dynamics(model), q, v, 0.003)
+    run.to_csv(tmp_path / "run.csv")
+    with (tmp_path / "run.csv").open(encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header == ["t", *(f"q.{n}" for n in model.coordinate_names), *(f"v.{n}" for n in model.velocity_names)]
+    assert np.array_equal(np.array(rows, dtype=float), np.column_stack([run.t, run.q, run.v]))
+    both = simulate(dynamics(model), np.stack([q, q]), v, 0.003)
+    both.to_csv(tmp_path / "both.csv")
+    with (tmp_path / "both.csv").open(encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header[:2] == ["trajectory", "t"]
+    assert [row[0] for row in rows] == ["0"] * 4 + ["1"] * 4
+    with pytest.raises(OutputError, match="cannot write"):
+        run.to_csv(tmp_path / "missing" / "run.csv")
+
+
+def test_plot_draws_both_and_closes_nothing(tmp_path: Path) -> None:
+    run = simulate(dynamics(catalog.double_pendulum()), [[0.1, 0.2], [0.3, 0.4]], [0.0, 0.0], 0.01)
+    figure = run.plot()
+    assert [len(axis.lines) for axis in figure.axes] == [4, 4]
+    figure.savefig(tmp_path / "run.png")
+    assert (tmp_path / "run.png").stat().st_size > 1000
+
+
+def test_progress_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mbkit.simulate import progress
+
+    monkeypatch.setattr(progress, "_PERIOD", 0.0)
+    dyn = dynamics(catalog.pendulum())
+    for method, save in (("rk4", None), ("dop853", [0.0, 0.5])):
+        told: list[float] = []
+        simulate(dyn, [1.0], [0.0], 0.5, method, save=save, progress=told.append)
+        assert len(told) > 3
+        assert told == sorted(told)
+        assert told[-1] == 1.0
+    monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    assert simulate(dyn, [1.0], [0.0], 0.05, progress=True).stats.finished
+
+
+def test_the_same_inputs_give_the_same_bits() -> None:
+    model, q, v = tumbling()
+    runs = [simulate(dynamics(model), q, v, 0.05).q for _ in range(2)]
+    assert np.array_equal(*runs)

@@ -1,0 +1,96 @@
+"""What a single call through mbkit costs beside the bare call of the engine.
+
+Run ``python -m validation.bench_single_calls``. Both sides are timed in turn in one
+process, so that the machine's mood meets them alike; ratios are what to read. The
+budget: at most the bare call + 1 µs, and 1.5 times it for Panda's inverse dynamics,
+nle and forward dynamics.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pinocchio as pin
+
+import mbkit as mb
+from mbkit.studies.stamp import processor, versions
+
+ROUNDS, CALLS = 41, 2000
+
+
+def pair(ours, bare):
+    """Return median µs of each, and the median of the rounds' ratios."""
+    times, ratios = ([], []), []
+    for f in (ours, bare):
+        for _ in range(200):
+            f()
+    for _ in range(ROUNDS):
+        spent = []
+        for k, f in enumerate((ours, bare)):
+            start = time.perf_counter()
+            for _ in range(CALLS):
+                f()
+            spent.append((time.perf_counter() - start) / CALLS * 1e6)
+            times[k].append(spent[-1])
+        ratios.append(spent[0] / spent[1])
+    return *(statistics.median(t) for t in times), statistics.median(ratios)
+
+
+def import_seconds():
+    """Return the median time of a fresh ``import mbkit`` and of a fresh ``import numpy``, s."""
+    out = {}
+    for module in ("mbkit", "numpy"):
+        code = f"import time; t = time.perf_counter(); import {module}; print(time.perf_counter() - t)"
+        runs = [
+            float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout) for _ in range(9)
+        ]
+        out[module] = statistics.median(runs)
+    return out
+
+
+def calls(dyn, m, d, model, q, v, a):
+    """Return (name, through mbkit, bare) of every call."""
+    Q, V, A = model.layout.expand_q(q), model.layout.expand_v(v), model.layout.expand_v(a)
+    return (
+        ("inverse_dynamics", lambda: dyn.inverse_dynamics(q, v, a), lambda: pin.rnea(m, d, Q, V, A)),
+        ("nle", lambda: dyn.nle(q, v), lambda: pin.nonLinearEffects(m, d, Q, V)),
+        ("forward_dynamics", lambda: dyn.forward_dynamics(q, v, a), lambda: pin.aba(m, d, Q, V, A)),
+        ("mass_matrix", lambda: dyn.mass_matrix(q), lambda: pin.crba(m, d, Q)),
+        ("gravity", lambda: dyn.gravity(q), lambda: pin.computeGeneralizedGravity(m, d, Q)),
+    )
+
+
+def main():
+    rows = []
+    cases = (
+        ("ur5", mb.load("ur5")),
+        ("panda, mimic free", mb.load("panda", mimic="free")),
+        ("panda, mimic free, undamped", mb.load("panda", mimic="free").without("damping")),
+        ("panda, mimic reduced", mb.load("panda")),
+        ("anymal_b, floating", mb.load("anymal_b", floating_base=True)),
+    )
+    for label, model in cases:
+        dyn = mb.dynamics(model, "pinocchio")
+        m = dyn.pin_model
+        rng = np.random.default_rng(0)
+        q, v = model.random_state(rng)
+        a = rng.standard_normal(model.nv)
+        for name, ours, bare in calls(dyn, m, m.createData(), model, q, v, a):
+            mine, theirs, ratio = pair(ours, bare)
+            rows.append({"model": label, "call": name, "mbkit_us": mine, "bare_us": theirs, "ratio": ratio})
+            print(
+                f"{label:30} {name:18} {mine:7.2f} µs  bare {theirs:7.2f} µs  + {mine - theirs:5.2f} µs  × {ratio:.2f}"
+            )
+    imports = import_seconds()
+    print(f"import mbkit {imports['mbkit']:.3f} s (numpy alone {imports['numpy']:.3f} s)")
+    with open("validation/single_calls.json", "w", encoding="utf-8") as f:
+        json.dump({"rows": rows, "import_s": imports, "versions": versions(), "processor": processor()}, f, indent=1)
+
+
+if __name__ == "__main__":
+    main()
