@@ -19,7 +19,9 @@ def all_finite(array: Array) -> bool:
     flat = array.ravel()
     # One pass of multiply and add is several times cheaper than isfinite; huge but
     # finite numbers overflow it and are looked at again.
-    return bool(flat.dot(flat) < np.inf) or bool(np.isfinite(array).all())
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = flat.dot(flat)
+    return bool(size < np.inf) or bool(np.isfinite(array).all())
 
 
 def _as_float(name: str, value: ArrayLike) -> Array:

@@ -159,7 +159,7 @@ class Dynamics(ABC):
         self._require("function")
         return self._function(name)
 
-    def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
+    def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:  # noqa: ARG002  # for the engines that override it
         """Return how far the engine's own formula amplifies rounding in M, per sample.
 
         Σ |terms| / M_jj of the sum that makes the worst diagonal entry, (N,) or a

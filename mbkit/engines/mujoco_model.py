@@ -25,6 +25,7 @@ __all__ = ["MujocoModel", "build"]
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _X, _Y, _Z = np.eye(3)
+# A ball joint can only be the last of a stack: its quaternion is in the body's own axes.
 _STACKABLE: Final = ("revolute", "continuous", "prismatic", "universal", "spherical_zyx", "planar")
 # MuJoCo's compiler refuses principal moments below this (mjMINVAL).
 _SMALLEST: Final = 1e-15
@@ -166,7 +167,7 @@ def _add_tree(spec: Any, description: Model) -> _Placed:
             massless
             and joint.kind in _STACKABLE
             and len(below) == 1
-            and below[0].kind in _STACKABLE
+            and below[0].kind in (*_STACKABLE, "ball")
             and body.name not in sprung
         ):
             at[body.name] = (owner, R, p, stack)

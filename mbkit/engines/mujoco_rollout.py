@@ -63,8 +63,9 @@ class Rollout:
         single = q0.ndim == 1
         q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
         n = len(q0)
-        if not steps:
-            q, v = q0[:, None], v0[:, None]
+        if not steps or not n:
+            # Nothing to do, and MuJoCo does not survive an empty batch.
+            q, v = (np.repeat(x[:, None], steps + 1, axis=1) for x in (q0, v0))
             return (q[0], v[0]) if single else (q, v)
         start = np.zeros((n, mujoco.mj_stateSize(self._m, _STATE)))
         nq = self._m.nq

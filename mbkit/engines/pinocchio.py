@@ -1,13 +1,14 @@
 """Pinocchio behind the protocol: CRBA for M, RNEA for nle, ABA for forward dynamics.
 
 Carpentier et al. 2019, "The Pinocchio C++ library"; the algorithms are those of
-Featherstone 2008, ch. 5 to 7. The public single-state calls go straight to
-Pinocchio: its own error explains a wrong size (the slow path then words it), and
-a NaN anywhere shows in the result.
+Featherstone 2008, ch. 5 to 7. Where the description's coordinates are Pinocchio's,
+single states take the short way of `pinocchio_direct`.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
@@ -18,14 +19,14 @@ from mbkit._check import Array
 from mbkit.engines import defects
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.passive import JointPassive
+from mbkit.engines.pinocchio_direct import direct_calls
 from mbkit.engines.pinocchio_model import PinModel, build
 from mbkit.engines.pinocchio_springs import PointSprings
 from mbkit.model import Model
 
 __all__ = ["PinocchioDynamics"]
 
-_INFINITY: Final = float("inf")
-_NEAR_UNIT: Final = 1e-9
+_DIRECT: Final = ("mass_matrix", "gravity", "nle", "inverse_dynamics", "forward_dynamics")
 
 
 class PinocchioDynamics(Dynamics):
@@ -51,74 +52,21 @@ class PinocchioDynamics(Dynamics):
         self._passive_any = model.needs.springs or model.needs.damping
         #: Whether q and v go to Pinocchio as they are.
         self._direct = self._pin.ordered and not self._reduced
-        self._starts = tuple(start for start, _ in model.quaternions)
-        # A NaN in a coordinate that the algorithm never reads (the position of a
-        # floating base) would pass unseen, and so would a quaternion off the unit
-        # sphere: such models look at their arguments too.
-        self._guarded = bool(self._starts) or (self._direct and not self._shows_nan())
-
-    def _shows_nan(self) -> bool:
-        def call(q: Array, v: Array) -> Array:
-            return np.array([np.sum(f(self._m, self._d, q, v, v)) for f in (pin.rnea, pin.aba)])
-
-        q, v = self.model.neutral(), np.zeros(self.model.nv)
-        for state in (q, v):
-            for i in range(state.size):
-                state[i], kept = np.nan, state[i]
-                if not np.isnan(call(q, v)).all():
-                    return False
-                state[i] = kept
-        return True
-
-    # The direct way: one state, straight into Pinocchio.
-
-    def nle(self, q: Any, v: Any) -> Array:
         if self._direct:
-            try:
-                out: Array = pin.nonLinearEffects(self._m, self._d, q, v)
-            except Exception:  # Pinocchio's own errors vary; the checked path words them
-                return super().nle(q, v)
-            if out.dot(out) < _INFINITY and q.ndim == v.ndim == 1 and (not self._guarded or self._sound(q, v)):
-                return out
-        return super().nle(q, v)
+            passive: Callable[[Array, Array], Array] | None = self._full_passive if self._passive_any else None
+            if passive is not None and self._springs is None and not model.needs.springs:
+                passive = self._damping_alone()
+            checked = {name: getattr(self, name) for name in _DIRECT}
+            for name, call in direct_calls(model, self._m, self._d, passive, checked).items():
+                setattr(self, name, functools.update_wrapper(call, checked[name]))
 
-    def inverse_dynamics(self, q: Any, v: Any, a: Any) -> Array:
-        if self._direct:
-            try:
-                out: Array = pin.rnea(self._m, self._d, q, v, a)
-                if self._passive_any:
-                    out -= self._full_passive(q, v)
-            except Exception:  # as above
-                return super().inverse_dynamics(q, v, a)
-            if (
-                out.dot(out) < _INFINITY
-                and q.ndim == v.ndim == a.ndim == 1
-                and (not self._guarded or self._sound(q, v))
-            ):
-                return out
-        return super().inverse_dynamics(q, v, a)
+    def _damping_alone(self) -> Callable[[Array, Array], Array]:
+        against = -self._joint_passive.damping
 
-    def forward_dynamics(self, q: Any, v: Any, tau: Any) -> Array:
-        if self._direct:
-            try:
-                total = tau + self._full_passive(q, v) if self._passive_any else tau
-                out: Array = pin.aba(self._m, self._d, q, v, total)
-            except Exception:  # as above
-                return super().forward_dynamics(q, v, tau)
-            if (
-                out.dot(out) < _INFINITY
-                and q.ndim == v.ndim == tau.ndim == 1
-                and (not self._guarded or self._sound(q, v))
-            ):
-                return out
-        return super().forward_dynamics(q, v, tau)
+        def force(_q: Array, v: Array) -> Array:
+            return against * v
 
-    def _sound(self, q: Array, v: Array) -> bool:
-        for start in self._starts:
-            x = q[start : start + 4]
-            if not abs(x.dot(x) - 1.0) <= _NEAR_UNIT:
-                return False
-        return bool(q.dot(q) + v.dot(v) < _INFINITY)
+        return force
 
     # Between the description's coordinates and Pinocchio's.
 
@@ -251,7 +199,9 @@ class PinocchioDynamics(Dynamics):
         def one(q: Array) -> Array:
             q = self._full_q(q)
             if carrier:
-                J = X_JF.toActionMatrixInverse() @ pin.computeJointJacobian(self._m, self._d, q, carrier)
+                # One column comes back as a vector.
+                own = pin.computeJointJacobian(self._m, self._d, q, carrier).reshape(6, self._m.nv)
+                J = X_JF.toActionMatrixInverse() @ own
             else:
                 J = np.zeros((6, self._m.nv))
             if axes == "world":

@@ -56,6 +56,7 @@ class PointSprings:
     def _point_jacobian(m: Any, d: Any, joint: int, point: Array) -> Array:
         if not joint:
             return np.zeros((3, m.nv))
-        J = pin.getJointJacobian(m, d, joint, pin.LOCAL)
+        # One column comes back as a vector.
+        J = pin.getJointJacobian(m, d, joint, pin.LOCAL).reshape(6, m.nv)
         R = d.oMi[joint].rotation
         return np.asarray(R @ (J[:3] - pin.skew(point) @ J[3:]))

@@ -20,8 +20,9 @@ import numpy as np
 from mbkit.errors import UnknownNameError
 from mbkit.lagrangian import energies
 from mbkit.lagrangian.factorize import solve
-from mbkit.lagrangian.kinematics import Kinematics
+from mbkit.lagrangian.kinematics import Kinematics, add, constant_times
 from mbkit.model import Model
+from mbkit.model.kinds import cross3
 
 __all__ = ["FUNCTIONS", "Equations"]
 
@@ -194,13 +195,10 @@ class Equations:
         """Return the Jacobian of a frame's velocity, linear then angular."""
         f = self.model.frame(frame)
         linear, angular = self.kin.twists[f.body]
-        arm = ca.SX(f.translation)
-        linear_B, angular_B = ca.vertcat(*linear), ca.vertcat(*angular)
-        linear_B = linear_B + ca.cross(angular_B, arm)
+        linear = add(linear, cross3(angular, [float(x) for x in f.translation]))
         if axes == "world":
-            halves = [self.kin.to_world(f.body, [x[i] for i in range(3)], 0.0) for x in (linear_B, angular_B)]
-            twist = ca.vertcat(*halves[0], *halves[1])
+            halves = [self.kin.to_world(f.body, x, 0.0) for x in (linear, angular)]
         else:
-            R = ca.SX(f.rotation.T)
-            twist = ca.vertcat(R @ linear_B, R @ angular_B)
-        return self.named("jacobian", ["q"], [self.q], ca.jacobian(ca.SX(twist), self.v))
+            halves = [constant_times(f.rotation.T, x) for x in (linear, angular)]
+        twist = ca.vertcat(*(ca.SX(x) for half in halves for x in half))
+        return self.named("jacobian", ["q"], [self.q], ca.jacobian(twist, self.v))

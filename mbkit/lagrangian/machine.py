@@ -34,7 +34,9 @@ class Machine:
             buffer: Any
             buffer, run = f.buffer()
             inputs: list[Any] = [np.zeros((n, self.function.size1_in(i))) for i in range(f.n_in())]
-            outputs: list[Any] = [np.zeros((n, self.function.size2_out(i), self.function.size1_out(i))) for i in range(f.n_out())]
+            outputs: list[Any] = [
+                np.zeros((n, self.function.size2_out(i), self.function.size1_out(i))) for i in range(f.n_out())
+            ]
             # An empty array has no memory to hand over, and CasADi reads none.
             for i, x in enumerate(inputs):
                 if x.size:

@@ -135,7 +135,4 @@ def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
                 break
             seen.add(at.name)
             at = by_name[at.mimic.joint]
-        else:
-            if at.name in seen:
-                out.append(f"{who}: mimics itself")
     return out

@@ -242,7 +242,7 @@ class _Terms:
         if passed and relative > self.tolerance:
             reason = (
                 f"{relative:.1e} at {joint} is above {self.tolerance:.0e}, and within the rounding of {engine}'s own "
-                f"formula ({allowed:.0e}): it sums terms {allowed / (_ROUNDINGS * _EPS):.0e} times as large as the result"
+                f"formula ({allowed:.0e}): its terms are {allowed / (_ROUNDINGS * _EPS):.0e} times the result"
             )
         if not passed:
             bad = [n for n, e in zip(self.joint_of, per, strict=False) if e > self.tolerance] if per.size else []

@@ -1,0 +1,331 @@
+"""The judgement: it passes what agrees, and names what does not."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.engines.mujoco import MujocoDynamics
+from mbkit.engines.pinocchio import PinocchioDynamics
+from mbkit.errors import InputError, OutputError, UnknownNameError
+from mbkit.studies.measure import Scales, force_errors, matrix_errors
+from mbkit.studies.rollouts import rollouts
+from mbkit.studies.states import states as study_states
+from mbkit.studies.terms import TERMS
+from mbkit.studies.timing import interleaved
+from tests.random_trees import random_tree
+
+TERM_NAMES = {t.name for t in TERMS} | {"power balance"}
+SOUND_IN_BOTH = ("revolute", "continuous", "prismatic", "ball", "planar", "free", "fixed")
+
+
+def terms(model, **kwargs):
+    return mb.compare(model, samples=16, terms_only=True, **kwargs)
+
+
+@pytest.mark.parametrize("robot", ["double_pendulum", "ur5", "panda", "kinova", "human", "tiago_no_hand"])
+def test_robots_agree(robot):
+    result = terms(mb.load(robot))
+    assert result.passed, result.verdict
+    assert result.engines == ("pinocchio", "lagrangian", "mujoco")
+    assert {r.term for r in result.rows} == TERM_NAMES
+    assert len(result.rows) == 3 * len(TERM_NAMES)
+    for row in result.rows:
+        # What an engine's own formula cannot do better is said aloud, and only there.
+        assert row.relative <= 1e-12 or (row.term == "M" and "own formula" in row.reason)
+        assert row.samples > 16
+
+
+@pytest.mark.parametrize("robot", ["talos", "anymal_b", "solo12"])
+def test_floating_robots_agree(robot):
+    result = terms(mb.load(robot, floating_base=True))
+    assert result.passed, result.verdict
+    assert all(r.relative <= 1e-12 for r in result.rows)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_trees_agree_with_everything_that_acts(seed):
+    model = random_tree(seed, 9, SOUND_IN_BOTH)
+    # Armature off the positive axes is a known defect, tested by itself.
+    result = terms(model.without("armature"))
+    assert result.passed, result.verdict
+    assert result.facts["needs"]["springs"]
+    assert result.facts["needs"]["damping"]
+
+
+def test_armature_damping_and_both_kinds_of_spring_agree():
+    b = mb.ModelBuilder("sprung")
+    b.add_body("a", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.02))
+    b.add_joint(
+        "j", "revolute", parent="world", child="a", axis=(0, 1, 0), armature=0.3, damping=0.2, stiffness=4.0, rest=0.1
+    )
+    b.add_body("b", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.02))
+    b.add_joint(
+        "k", "revolute", parent="a", child="b", axis=(1, 0, 0), translation=(0, 0, -1), armature=0.1, damping=0.1
+    )
+    b.add_spring(
+        "s", body_a="world", body_b="b", point_a=(1, 0, 0), point_b=(0, 0, -1), stiffness=20, rest_length=0.4, damping=1
+    )
+    model = b.build()
+    for variant in (model, model.without("gravity")):
+        result = mb.compare(variant, samples=16)
+        assert result.passed, result.verdict
+        assert all(r.relative <= 1e-12 for r in result.rows)
+
+
+def planted(monkeypatch, engine, method, change):
+    original = getattr(engine, method)
+    monkeypatch.setattr(engine, method, lambda self, *a: change(original(self, *a)))
+
+
+@pytest.mark.parametrize("size", [1e-11, 1e-6, 1.0])
+@pytest.mark.parametrize(
+    ("method", "term"),
+    [("_gravity", "g"), ("_nle", "nle"), ("_inverse_dynamics", "inverse dynamics"), ("_passive", "passive")],
+)
+def test_a_planted_error_in_one_joint_is_found_and_named(monkeypatch, method, term, size):
+    model = mb.load("ur5")
+    k = 2
+
+    def spoil(x):
+        x = np.array(x)
+        # Relative to the whole vector, on one joint.
+        x[..., k] += size * (1 + np.abs(x).max(axis=-1)) * 100
+        return x
+
+    planted(monkeypatch, MujocoDynamics, method, spoil)
+    result = terms(model)
+    failed = {(r.term, r.engine): r for r in result.rows if not r.passed}
+    assert (term, "mujoco") in failed
+    assert failed[term, "mujoco"].joint == model.joint_names[k]
+    assert model.joint_names[k] in failed[term, "mujoco"].reason
+    assert model.joint_names[0] not in failed[term, "mujoco"].reason
+    assert "mujoco differs" in result.verdict
+    assert result.worst is not None
+    assert not result.worst.passed
+
+
+def test_a_planted_error_in_the_accelerations_breaks_the_power_balance(monkeypatch):
+    planted(monkeypatch, PinocchioDynamics, "forward_dynamics", lambda a: a * (1 + 1e-8))
+    failed = {(r.term, r.engine) for r in terms(mb.load("ur5")).rows if not r.passed}
+    assert failed == {("forward dynamics", "pinocchio"), ("power balance", "pinocchio")}
+
+
+def test_a_wrong_mass_matrix_entry_is_found_however_small_the_link(monkeypatch):
+    model = mb.load("panda")
+
+    def spoil(M):
+        M = np.array(M)
+        M[..., 7, 7] *= 1 + 1e-9
+        return M
+
+    planted(monkeypatch, PinocchioDynamics, "_mass_matrix", spoil)
+    failed = [r for r in terms(model).rows if not r.passed]
+    assert [(r.term, r.engine, r.joint) for r in failed] == [("M", "pinocchio", model.joint_names[7])]
+
+
+def test_a_wrong_integrator_is_found(monkeypatch):
+    model = mb.load("double_pendulum")
+    original = MujocoDynamics.rollout
+
+    def late(self, integrator, q0, v0, dt, tau, steps, **more):
+        return original(self, integrator, q0, v0, dt * (1 + 1e-9), tau, steps, **more)
+
+    monkeypatch.setattr(MujocoDynamics, "rollout", late)
+    made = {n: mb.dynamics(model, n) for n in ("pinocchio", "lagrangian", "mujoco")}
+    rows = [r for r in rollouts(model, made, 0, "") if math.isfinite(r.tolerance)]
+    assert rows
+    assert not any(r.passed for r in rows)
+
+
+# The panda's wrist whirls when it falls limp: its rollouts are conditioned worst.
+READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4, 0.02, 0.02])
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
+@pytest.mark.parametrize(("method", "native"), [("rk4", "mujoco_rk4"), ("semi_implicit_euler", "mujoco_euler")])
+@pytest.mark.parametrize("robot", ["double_pendulum", "ur5", "panda", "anymal_b"])
+def test_rollouts_equal_mujocos_own_to_1e_12(robot, method, native, engine):
+    model = mb.load(robot, mimic="free", floating_base=robot == "anymal_b").without("damping")
+    rng = np.random.default_rng(0)
+    q0, v0 = model.random_state(rng)
+    if robot == "panda":
+        q0, v0 = READY, 0 * v0
+    ours = mb.simulate(mb.dynamics(model, engine), q0, v0, 1.0, method, 1e-3)
+    theirs = mb.simulate(mb.dynamics(model, "mujoco"), q0, v0, 1.0, native, 1e-3)
+    assert len(ours.t) == len(theirs.t) == 1001
+    assert np.abs(model.difference(theirs.q, ours.q)).max() <= 1e-12
+
+
+def test_mujocos_implicit_damping_is_shown_for_what_it_is():
+    result = mb.compare(mb.load("double_pendulum"), samples=4)
+    shown = [r for r in result.rollouts if "implicit" in r.against]
+    assert len(shown) == 1
+    assert shown[0].error > 1e-4
+    assert "(M + h D)" in shown[0].note
+    assert result.passed
+
+
+def test_a_whole_comparison_has_rollouts_costs_and_omissions():
+    result = mb.compare(mb.load("panda"), samples=4)
+    assert result.passed, result.verdict
+    assert all("mimic joints free" in r.note for r in result.rollouts if "explicit" not in r.method)
+    assert {o.need for o in result.omissions} == {
+        "contacts",
+        "geometry",
+        "limits",
+        "dry friction",
+        "damping",
+        "springs",
+        "gravity",
+        "loops",
+        "Coriolis matrix",
+    }
+    assert all(o.unchanged for o in result.omissions)
+    # Fourth order, seen on the cost points themselves.
+    rk4 = [p for p in result.costs if p.engine == "mujoco" and p.method == "mujoco_rk4"]
+    steps = np.log([float(p.setting.split()[1]) for p in rk4])
+    errors = np.log([p.error for p in rk4])
+    keep = errors > np.log(100 * max(result.reference_floor, 1e-14))
+    assert np.polyfit(steps[keep][:3], errors[keep][:3], 1)[0] == pytest.approx(4, abs=0.4)
+    assert result.reference_floor < 1e-10
+
+
+def test_what_was_left_out_would_show_if_it_mattered():
+    """Limits that act at the state, switched on, must change the accelerations."""
+    from mbkit.engines.mujoco_variants import Variant
+
+    b = mb.ModelBuilder("stopped")
+    b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), lower=-0.1, upper=0.1, friction=2.0)
+    model = b.build()
+    dyn = mb.dynamics(model, "mujoco")
+    q, v = np.array([0.5]), np.array([0.3])
+    lean = Variant(dyn).accelerations(q, v)
+    assert abs(Variant(dyn, ("LIMIT", "CONSTRAINT")).accelerations(q, v) - lean) > 1
+    assert abs(Variant(dyn, ("FRICTIONLOSS", "CONSTRAINT")).accelerations(q, v) - lean) > 0.1
+    assert lean == pytest.approx(mb.dynamics(model).forward_dynamics(q, v, [0.0]), rel=1e-14)
+
+
+def test_a_refused_body_is_named_and_the_others_are_compared():
+    with pytest.warns(mb.errors.NonPhysicalWarning):
+        model = mb.load("icub")
+    result = terms(model)
+    assert result.passed
+    assert result.engines == ("pinocchio", "lagrangian")
+    refusal = next(r for r in result.refusals if r.engine == "mujoco")
+    assert "body 'r_upper_leg'" in refusal.reason
+    assert "A + B >= C" in refusal.reason
+
+
+def test_results_can_be_kept(tmp_path):
+    result = terms(mb.load("ur5"), seed=3)
+    data = json.loads(result.to_json(tmp_path / "r.json"))
+    assert data == json.loads((tmp_path / "r.json").read_text())
+    assert data["passed"] is True
+    assert data["seed"] == 3
+    assert data["versions"]["pin"]
+    assert len(data["rows"][0]["worst_q"]) == 6
+    assert pickle.loads(pickle.dumps(result)).to_json() == result.to_json()
+    assert "| forward dynamics | mujoco |" in result.to_markdown()
+    assert "<script>" not in replace(result, model="<script>")._repr_html_()
+    with pytest.raises(OutputError, match="result itself is kept"):
+        result.to_json(tmp_path / "r.json" / "below_a_file.json")
+
+
+def test_the_same_seed_gives_the_same_numbers_and_another_other_states():
+    model = mb.load("ur5")
+    first, again, other = (terms(model, seed=s) for s in (1, 1, 2))
+
+    def numbers(r):
+        return [(x.term, x.engine, x.relative, x.worst_q) for x in r.rows]
+
+    assert numbers(first) == numbers(again)
+    assert numbers(first) != numbers(other)
+
+
+def test_progress_is_told_and_grows():
+    told = []
+    terms(mb.load("ur5"), progress=lambda fraction, text: told.append((fraction, text)))
+    fractions = [f for f, _ in told]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert any("nle" in text for _, text in told)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"engines": ("pinocchio",)}, InputError, "at least two"),
+        ({"engines": "pinocchio"}, InputError, "several names"),
+        ({"engines": ("pinocchio", "mujocco")}, UnknownNameError, "'mujoco'"),
+        ({"samples": 0}, InputError, "samples"),
+        ({"tolerance": -1.0}, InputError, "tolerance"),
+    ],
+)
+def test_misuse_is_explained(kwargs, error, message):
+    with pytest.raises(error, match=message):
+        mb.compare(mb.load("ur5"), **kwargs)
+
+
+def test_hard_states_are_hard():
+    model = random_tree(0, 6, ("spherical_zyx", "revolute", "prismatic"))
+    limited = random_tree(0, 6, ("spherical_zyx", "revolute", "prismatic"))
+    at = study_states(limited, 16, 0)
+    assert set(at.kinds) == {"random", "neutral", "at limits", "near singular"}
+    part = model.layout.q[next(j.name for j in model.joints if j.kind == "spherical_zyx")]
+    middle = at.q[[k == "near singular" for k in at.kinds], part.start + 1]
+    assert np.allclose(np.abs(np.cos(middle)), 1e-4, rtol=1e-3)
+    ur5 = mb.load("ur5")
+    at = study_states(ur5, 16, 0)
+    edge = at.q[[k == "at limits" for k in at.kinds]]
+    assert np.allclose(np.abs(edge), np.pi)
+
+
+# How errors are measured
+
+
+def test_no_unit_changes_the_error_of_a_mass_matrix():
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((5, 4, 4))
+    M = A @ A.swapaxes(1, 2) + np.eye(4)
+    E = 1e-9 * rng.standard_normal(M.shape)
+    v = rng.standard_normal((5, 4))
+    D = np.diag([1e3, 1e-3, 1.0, 7.0])
+    plain = matrix_errors(M + E, M, Scales.of(M, v))
+    scaled = matrix_errors(D @ (M + E) @ D, D @ M @ D, Scales.of(D @ M @ D, v))
+    assert plain.relative == pytest.approx(scaled.relative)
+    assert plain.relative == pytest.approx(
+        [(abs(e) / np.sqrt(np.outer(np.diag(m), np.diag(m)))).max() for e, m in zip(E, M, strict=True)]
+    )
+
+
+def test_a_vanishing_term_is_measured_by_the_forces_at_play():
+    M, v = np.eye(2)[None], np.array([[3.0, 4.0]])
+    scales = Scales.of(M, v)
+    errors = force_errors(np.array([[1e-15, 0.0]]), np.zeros((1, 2)), scales)
+    assert errors.relative == pytest.approx([1e-15 / 25])
+    assert force_errors(np.zeros((1, 2)), np.zeros((1, 2)), Scales.of(M, 0 * v)).relative == [0.0]
+
+
+def test_forward_dynamics_is_allowed_its_condition_and_no_more():
+    M, v = np.diag([1.0, 1.0])[None] + 0.999 * np.array([[[0, 1], [1, 0]]]), np.ones((1, 2))
+    scales = Scales.of(M, v)
+    assert scales.condition == pytest.approx([1999.0])
+    a = np.array([[1.0, -1.0]])
+    errors = force_errors(a * (1 + 1e-10), a, scales, by_condition=True)
+    assert errors.relative == pytest.approx([1e-10 / 1999.0])
+
+
+def test_timings_are_positive_and_ordered():
+    import time
+
+    times = interleaved({"fast": lambda: None, "slow": lambda: time.sleep(1e-3)}, rounds=3)
+    assert 0 < times["fast"][0] < times["slow"][0]
+    assert times["slow"][0] > 1e6

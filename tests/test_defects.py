@@ -1,0 +1,96 @@
+"""Values that engines are known to get wrong: returned, announced, and failed by name."""
+
+from __future__ import annotations
+
+import warnings
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.errors import KnownDefectWarning
+from tests.random_trees import off, random_tree, states
+
+PINOCCHIO = version("pin")
+in_this_version = pytest.mark.skipif(PINOCCHIO != "4.1.0", reason="reproduced in Pinocchio 4.1.0 only")
+
+
+def one_joint(kind, armature=0.0, **axes):
+    b = mb.ModelBuilder(kind)
+    b.add_body("a", mass=1.3, com=(0.1, 0.2, -0.4), inertia=(0.3, 0.4, 0.5))
+    b.add_joint("odd", kind, parent="world", child="a", armature=armature, **axes)
+    b.add_body("b", mass=0.7, com=(0.3, 0, 0.1), inertia=(0.2, 0.2, 0.3))
+    b.add_joint("plain", "revolute", parent="a", child="b", axis=(1, 0, 0), translation=(0, 0, -1))
+    return b.build()
+
+
+CORIOLIS = {
+    "spherical_zyx": {},
+    "universal": {"axis": (1, 0, 0), "axis2": (0, 1, 0)},
+}
+
+
+@in_this_version
+@pytest.mark.parametrize("kind", list(CORIOLIS))
+def test_pinocchios_coriolis_matrix_is_returned_with_a_warning_that_names_the_joint(kind):
+    model = one_joint(kind, **CORIOLIS[kind])
+    q, v, _, _ = (x[0] for x in states(model, 1))
+    dyn, own = mb.dynamics(model), mb.dynamics(model, "lagrangian")
+    with pytest.warns(KnownDefectWarning, match="coriolis_matrix.*'odd'") as caught:
+        C = dyn.coriolis_matrix(q, v)
+    # The warning points here, at the caller.
+    assert caught[0].filename == __file__
+    right = dyn.nle(q, v) - dyn.gravity(q)
+    assert off(C @ v, right) > 1e-3
+    assert off(own.coriolis_matrix(q, v) @ v, right) < 1e-14
+
+
+@in_this_version
+@pytest.mark.parametrize("kind", list(CORIOLIS))
+def test_a_comparison_fails_the_coriolis_defect_by_name(kind):
+    result = mb.compare(one_joint(kind, **CORIOLIS[kind]), samples=8, terms_only=True)
+    assert not result.passed
+    failed = [r for r in result.rows if not r.passed]
+    assert [(r.term, r.engine) for r in failed] == [("C v", "pinocchio")]
+    assert "known defect of pinocchio 4.1.0" in failed[0].reason
+    assert "odd" in failed[0].reason
+    assert "pinocchio differs in C v" in result.verdict
+
+
+@in_this_version
+@pytest.mark.parametrize("axis", [(0, 0, -1), (1, 1, 0)])
+def test_pinocchios_kinetic_energy_without_armature_is_failed_by_name(axis):
+    model = one_joint("revolute", armature=0.8, axis=axis)
+    q, v, _, _ = (x[0] for x in states(model, 1))
+    dyn, own = mb.dynamics(model), mb.dynamics(model, "lagrangian")
+    with pytest.warns(KnownDefectWarning, match="kinetic_energy.*armature.*'odd'"):
+        wrong = dyn.kinetic_energy(q, v)
+    right = 0.5 * v @ dyn.mass_matrix(q) @ v
+    assert wrong == pytest.approx(right - 0.5 * 0.8 * v[0] ** 2)
+    assert own.kinetic_energy(q, v) == pytest.approx(right, rel=1e-14)
+    result = mb.compare(model, samples=8, terms_only=True)
+    failed = [r for r in result.rows if not r.passed]
+    assert [(r.term, r.engine) for r in failed] == [("kinetic energy", "pinocchio")]
+    assert "armature" in failed[0].reason
+
+
+def test_models_that_the_defects_do_not_touch_get_no_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for model in (one_joint("revolute", armature=0.8, axis=(0, 0, 1)), one_joint("ball"), mb.load("panda")):
+            q, v, _, _ = (x[0] for x in states(model, 1))
+            dyn = mb.dynamics(model)
+            assert off(dyn.coriolis_matrix(q, v) @ v, dyn.nle(q, v) - dyn.gravity(q)) < 1e-12
+            dyn.kinetic_energy(q, v)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_own_answers_are_right_where_pinocchios_are_not(seed):
+    model = random_tree(seed, 12)
+    own = mb.dynamics(model, "lagrangian")
+    q, v, _, _ = states(model, 4)
+    C = own.coriolis_matrix(q, v)
+    assert off(np.einsum("nij,nj->ni", C, v), own.nle(q, v) - own.gravity(q)) < 1e-13
+    half = 0.5 * np.einsum("ni,nij,nj->n", v, own.mass_matrix(q), v)
+    assert off(own.kinetic_energy(q, v), half) < 1e-14

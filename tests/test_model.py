@@ -1,0 +1,386 @@
+"""Descriptions: frozen, checked at once, and at home on their manifold."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import FrozenInstanceError, fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mbkit as mb
+from mbkit.errors import InputError, ModelError, NonPhysicalWarning, UnknownNameError
+from mbkit.model import KINDS, Mimic
+from mbkit.model.physical import sample_mass_matrix
+from tests.random_trees import off, random_tree, states
+
+I3 = (1.0, 1.0, 1.0)
+
+
+def pendulum(**joint):
+    b = mb.ModelBuilder("pendulum")
+    b.add_body("bob", mass=1.0, com=(0, 0, -1))
+    b.add_joint("hinge", "revolute", parent="world", child="bob", axis=(0, 1, 0), **joint)
+    return b
+
+
+# The manifold
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_difference_undoes_integrate(seed):
+    model = random_tree(seed % 7, 10, springs=False)
+    rng = np.random.default_rng(seed)
+    q, dq = model.random_state(rng, 3)
+    # Rotations come back whole up to half a turn.
+    dq *= 0.9
+    for joint in model.independent_joints:
+        if joint.type.quaternion is not None:
+            w = slice(model.layout.v[joint.name].stop - 3, model.layout.v[joint.name].stop)
+            dq[:, w] *= np.minimum(1, 3.0 / np.linalg.norm(dq[:, w], axis=1, keepdims=True))
+    moved = model.integrate(q, dq)
+    assert off(model.difference(q, moved), dq) < 1e-14
+    model.check_q(moved)
+
+
+def test_integrate_is_the_flow_of_constant_velocity():
+    """Steps along one twist add up: exp((s + t) ξ) = exp(s ξ) exp(t ξ)."""
+    model = random_tree(1, 4, ("free", "ball", "planar", "revolute"))
+    q, v, _, _ = states(model, 5)
+    once = model.integrate(q, v)
+    twice = model.integrate(model.integrate(q, 0.3 * v), 0.7 * v)
+    assert off(model.difference(once, twice), 0 * v) < 1e-14
+
+
+def test_integrate_starts_off_along_d_times_v():
+    model = random_tree(2, 6, ("free", "ball", "universal", "planar"))
+    (q, v), h = (x[0] for x in states(model, 1)[:2]), 1e-6
+    rate = (model.integrate(q, h * v) - model.integrate(q, -h * v)) / (2 * h)
+    for joint in model.independent_joints:
+        iq, iv = model.layout.q[joint.name], model.layout.v[joint.name]
+        assert np.allclose(rate[iq], joint.type.qdot(list(q[iq]), list(v[iv])), atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-160, 1e-12, 1e-8, 9.99e-3, 1.001e-2, 0.0999, 0.1001, 1.0, 3.1415])
+def test_exponentials_keep_their_digits_at_every_size(angle):
+    b = mb.ModelBuilder("free")
+    b.add_body("a", mass=1.0, inertia=I3)
+    b.add_joint("j", "free", parent="world", child="a")
+    model = b.build()
+    axis = np.array([0.6, -0.48, 0.64])
+    dq = np.concatenate([[0.3, -0.2, 0.5], angle * axis])
+    back = model.difference(model.neutral(), model.integrate(model.neutral(), dq))
+    assert np.allclose(back, dq, rtol=3e-15, atol=3e-16)
+    assert np.allclose(back[3:], dq[3:], rtol=3e-14, atol=0)
+
+
+def test_random_states_keep_to_the_limits_and_fill_them():
+    b = pendulum(lower=-0.5, upper=7.0)
+    b.add_body("slider", mass=1.0)
+    b.add_joint("slide", "prismatic", parent="bob", child="slider", axis=(1, 0, 0))
+    b.add_body("far", mass=1.0, com=(0, 1, 0))
+    b.add_joint("wound", "revolute", parent="slider", child="far", axis=(1, 0, 0), lower=4.0, upper=9.0)
+    q, v = b.build().random_state(np.random.default_rng(0), 4000)
+    assert -0.5 <= q[:, 0].min() < -0.49
+    assert np.pi - 0.01 < q[:, 0].max() <= np.pi
+    assert -1 <= q[:, 1].min() < -0.99
+    assert 0.99 < q[:, 1].max() <= 1
+    # A range that lies beyond the clip is kept as it is.
+    assert 4.0 <= q[:, 2].min() < q[:, 2].max() <= 9.0
+    assert abs(v.mean()) < 0.05
+    assert abs(v.std() - 1) < 0.05
+
+
+def test_random_states_repeat_and_have_the_asked_shape():
+    model = random_tree(0, 10)
+    for size, lead in ((None, ()), (0, (0,)), (3, (3,))):
+        q, v = model.random_state(np.random.default_rng(5), size)
+        assert q.shape == (*lead, model.nq)
+        assert v.shape == (*lead, model.nv)
+    first, again = (model.random_state(np.random.default_rng(5), 3) for _ in range(2))
+    assert np.array_equal(first[0], again[0])
+    with pytest.raises(InputError, match="Generator"):
+        model.random_state(0)
+    with pytest.raises(InputError, match="size"):
+        model.random_state(np.random.default_rng(0), -1)
+
+
+# Frozen data
+
+
+def test_a_model_is_frozen_and_survives_pickling_and_comparison():
+    model = random_tree(4, 10, mimic=True)
+    copy = pickle.loads(pickle.dumps(model))
+    assert copy == model
+    assert hash(copy) == hash(model)
+    assert copy.digest == model.digest
+    assert copy.joints[0] == model.joints[0]
+    with pytest.raises(FrozenInstanceError):
+        model.name = "other"
+    for array in (copy.gravity, copy.bodies[0].com, copy.joints[0].rotation):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+@pytest.mark.parametrize("part", ["bodies", "joints", "springs", "frames"])
+def test_the_digest_changes_with_every_number(part):
+    model = random_tree(4, 10, mimic=True)
+    digests = {model.digest}
+    for k, thing in enumerate(getattr(model, part)):
+        for f in fields(thing):
+            value = getattr(thing, f.name)
+            if isinstance(value, np.ndarray) and value.size:
+                changed = value.copy()
+                first = changed.flat[0]
+                changed.flat[0] = 7.0 if np.isinf(first) else np.nextafter(first, 9)
+            elif isinstance(value, float):
+                changed = float(np.nextafter(value, 9))
+            elif isinstance(value, Mimic):
+                changed = Mimic(value.joint, value.ratio, value.offset + 1)
+            else:
+                continue
+            things = list(getattr(model, part))
+            things[k] = replace(thing, **{f.name: changed})
+            new = replace(model, **{part: tuple(things)}).digest
+            assert new not in digests, (thing.name, f.name)
+            digests.add(new)
+    assert replace(model, gravity=model.gravity + 1e-9).digest != model.digest
+    assert replace(model, notes=("read me",)).digest == model.digest
+
+
+def test_without_takes_out_what_it_names_and_nothing_else():
+    model = random_tree(5, 12)
+    for feature in ("damping", "springs", "armature", "gravity"):
+        assert getattr(model.needs, feature)
+        less = model.without(feature)
+        flags, before = less.needs.as_dict(), model.needs.as_dict()
+        assert {k for k in flags if flags[k] != before[k]} == {feature}
+    assert model.without().digest == model.digest
+    assert not model.without("springs", "damping").springs
+    with pytest.raises(UnknownNameError, match="damping"):
+        model.without("dampin")
+
+
+def test_needs_are_read_off_the_description():
+    bare = pendulum().build()
+    assert [k for k, on in bare.needs.as_dict().items() if on] == ["gravity"]
+    assert pendulum(friction=1.0).build().needs.friction
+    assert pendulum(lower=-1.0).build().needs.limits
+    assert random_tree(0, 4, ("ball", "revolute")).needs.quaternions
+    timed = pendulum()
+    timed.prescribe("hinge", amplitude=0.1, frequency=2.0)
+    assert timed.build().needs.time
+
+
+def test_names_address_coordinates():
+    model = random_tree(3, 10)
+    assert len(model.coordinate_names) == model.nq
+    assert len(model.velocity_names) == model.nv
+    assert len(set(model.coordinate_names)) == model.nq
+    for joint in model.independent_joints:
+        part = model.layout.q[joint.name]
+        assert all(n.startswith(joint.name) for n in model.coordinate_names[part])
+    with pytest.raises(UnknownNameError, match="j3"):
+        model.joint("j33")
+
+
+def test_models_show_themselves():
+    model = random_tree(3, 4, ("revolute", "prismatic"), mimic=True)
+    assert f"nv={model.nv}" in repr(model)
+    page = replace(model, name="<script>")._repr_html_()
+    assert "<script>" not in page
+    assert "j0" in page
+
+
+# Mimic joints
+
+
+def test_chains_of_mimics_are_resolved_to_free_joints():
+    b = pendulum()
+    for i, (leader, ratio, offset) in enumerate((("hinge", 2.0, 0.1), ("m0", -3.0, 0.5), ("m1", 0.5, 0.0))):
+        b.add_body(f"c{i}", mass=1.0, com=(0, 0, -1))
+        b.add_joint(f"m{i}", "revolute", parent="bob", child=f"c{i}", axis=(0, 1, 0), mimic=(leader, ratio, offset))
+    model = b.build()
+    assert model.nq == 1
+    q = 0.7
+    y0 = 2 * q + 0.1
+    y1 = -3 * y0 + 0.5
+    assert model.layout.expand_q(np.array([q])) == pytest.approx([q, y0, y1, 0.5 * y1])
+    assert model.layout.expand_v(np.array([1.0])) == pytest.approx([1, 2, -6, -3])
+
+
+def test_reduced_mass_matrix_is_that_of_the_constrained_motion():
+    model = random_tree(1, 10, mimic=True, springs=False)
+    assert model.needs.mimic
+    free = replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))
+    G, q = model.layout.G, model.random_state(np.random.default_rng(0))[0]
+    M_full = mb.dynamics(free).mass_matrix(model.layout.expand_q(q))
+    assert off(mb.dynamics(model).mass_matrix(q), G.T @ M_full @ G) < 1e-15
+
+
+# The builder's checks
+
+
+def bad_axis(b):
+    b.add_joint("k", "revolute", parent="bob", child="c", axis=(0, 0, 0))
+
+
+def two_parents(b):
+    b.add_joint("k", "ball", parent="world", child="bob")
+
+
+def cycle(b):
+    b.add_body("c", mass=1.0, inertia=I3)
+    b.add_body("d", mass=1.0, inertia=I3)
+    b.add_joint("k", "ball", parent="c", child="d")
+    b.add_joint("l", "ball", parent="d", child="c")
+
+
+def body_c(**kwargs):
+    def change(b):
+        b.add_body("c", **kwargs)
+        b.add_joint("k", "revolute", parent="bob", child="c", axis=(1, 0, 0))
+
+    return change
+
+
+def joint_k(kind="revolute", **kwargs):
+    def change(b):
+        b.add_body("c", mass=1.0, com=(0, 1, 1), inertia=I3)
+        if KINDS.get(kind) and KINDS[kind].n_axes and "axis" not in kwargs:
+            kwargs["axis"] = (1, 0, 0)
+        b.add_joint("k", kind, parent="bob", child="c", **kwargs)
+
+    return change
+
+
+FAULTS = {
+    "negative mass": (body_c(mass=-1.0), "body 'c': mass -1 is negative"),
+    "NaN mass": (body_c(mass=np.nan), "body 'c': mass: expected a finite number"),
+    "text as mass": (body_c(mass="heavy"), "body 'c': mass: expected a number, got 'heavy'"),
+    "negative inertia": (body_c(mass=1.0, inertia=(-1, 1, 1)), "body 'c': inertia is not positive"),
+    "triangle": (body_c(mass=1.0, inertia=(1, 1, 3)), "body 'c': inertia violates A \\+ B >= C"),
+    "asymmetric": (body_c(mass=1.0, inertia=np.triu(np.ones((3, 3)))), "body 'c': inertia is not symmetric"),
+    "inertia without mass": (body_c(inertia=I3), "body 'c': no mass but inertia"),
+    "inertia of a wrong shape": (body_c(mass=1.0, inertia=np.ones(6)), r"body 'c': inertia: expected shape \(3, 3\)"),
+    "massless end": (body_c(), "body 'c': no mass moves with joint 'k'"),
+    "point on its axis": (body_c(mass=1.0, com=(1, 0, 0)), "body 'c': no mass moves with joint 'k'"),
+    "two bodies of a name": (lambda b: b.add_body("bob", mass=1.0), "body 'bob': declared 2 times"),
+    "body called world": (lambda b: b.add_body("world", mass=1.0), "body 'world'"),
+    "body without joint": (lambda b: b.add_body("c", mass=1.0), "body 'c': no joint carries it"),
+    "two parents": (two_parents, "body 'bob': carried by 2 joints \\('hinge', 'k'\\)"),
+    "cycle": (cycle, "body 'c': not connected to the world"),
+    "world as child": (lambda b: b.add_joint("k", "ball", parent="bob", child="world"), "the world cannot be a child"),
+    "unknown kind": (joint_k("revolut"), "joint 'k': unknown kind 'revolut'; use one of revolute"),
+    "unknown parent": (
+        lambda b: b.add_joint("k", "ball", parent="bib", child="bob"),
+        "joint 'k': unknown body 'bib'; did you mean 'bob'",
+    ),
+    "zero axis": (bad_axis, "joint 'k': axis is zero"),
+    "missing axis": (
+        lambda b: b.add_joint("k", "revolute", parent="bob", child="c"),
+        "revolute joint takes axis; 0 given",
+    ),
+    "axis too many": (joint_k("ball", axis=(1, 0, 0)), "ball joint takes no axis; 1 given"),
+    "NaN axis": (joint_k(axis=(np.nan, 0, 0)), "joint 'k': axis: nan at index"),
+    "two joints of a name": (
+        lambda b: b.add_joint("hinge", "ball", parent="bob", child="c"),
+        "joint 'hinge': declared 2 times",
+    ),
+    "crossed limits": (joint_k(lower=1.0, upper=-1.0), "joint 'k': lower limit .* above upper"),
+    "NaN limit": (joint_k(lower=np.nan), "joint 'k': lower: expected 1 numbers"),
+    "negative damping": (joint_k(damping=-1.0), "joint 'k': damping .* is negative"),
+    "armature on a ball": (joint_k("ball", armature=1.0), "joint 'k': armature on a ball joint"),
+    "armature on a planar": (joint_k("planar", armature=1.0), "joint 'k': armature on a planar joint"),
+    "armature on a free": (joint_k("free", armature=1.0), "joint 'k': armature on a free joint"),
+    "spring on a ball": (joint_k("ball", stiffness=1.0), "joint 'k': joint spring on a ball joint"),
+    "pitch on a hinge": (joint_k(pitch=0.1), "joint 'k': pitch 0.1 on a revolute joint"),
+    "skewed rotation": (joint_k(rotation=2 * np.eye(3)), "joint 'k': rotation is not a rotation matrix"),
+    "reflection": (joint_k(rotation=np.diag([1, 1, -1])), "joint 'k': rotation is not a rotation matrix"),
+    "rotation twice": (joint_k(rotation=np.eye(3), rpy=(0, 0, 0)), "both rotation and rpy"),
+    "mimics nobody": (joint_k(mimic=("hinje", 1.0, 0.0)), "joint 'k': mimics unknown joint 'hinje'; near: 'hinge'"),
+    "mimics itself": (joint_k(mimic=("k", 1.0, 0.0)), "joint 'k': mimics in a circle"),
+    "mimic on a ball": (
+        joint_k("ball", mimic=("hinge", 1.0, 0.0)),
+        "joint 'k': mimics 'hinge', but both must have one",
+    ),
+    "mimic in parts": (joint_k(mimic=("hinge",)), "joint 'k': mimic: expected"),
+    "spring to nowhere": (lambda b: b.add_spring("s", body_a="bob", body_b="bb"), "spring 's': unknown body 'bb'"),
+    "spring to itself": (lambda b: b.add_spring("s", body_a="bob", body_b="bob"), "spring 's': both ends on 'bob'"),
+    "soft spring": (
+        lambda b: b.add_spring("s", body_a="bob", body_b="world", stiffness=-1.0),
+        "spring 's': stiffness: expected a number of at least 0",
+    ),
+    "frame nowhere": (lambda b: b.add_frame("f", body="bub"), "frame 'f': unknown body 'bub'"),
+    "loop kind": (lambda b: b.add_loop("l", "line", body_a="bob", body_b="world"), "loop 'l': unknown kind 'line'"),
+    "prescribed nothing": (lambda b: b.prescribe("hing"), "prescribed 'hing': expected a joint of one velocity"),
+}
+
+
+@pytest.mark.parametrize("name", list(FAULTS))
+def test_each_fault_is_named_with_its_remedy(name):
+    change, message = FAULTS[name]
+    b = pendulum()
+    change(b)
+    with pytest.raises(ModelError, match=message) as caught:
+        b.build()
+    assert str(caught.value).startswith("pendulum")
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert again.faults == caught.value.faults
+
+
+def test_all_faults_come_in_one_error():
+    b = mb.ModelBuilder("many", gravity=(0, 0, np.nan))
+    b.add_body("a", mass=-1.0)
+    b.add_body("b", mass=1.0, inertia=(1, 1, 3))
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 0, 0), lower=2, upper=1)
+    with pytest.raises(ModelError, match="6 faults") as caught:
+        b.build()
+    told = " ".join(caught.value.faults)
+    for culprit in ("gravity", "body 'a'", "body 'b': inertia", "body 'b': no joint", "axis", "lower limit"):
+        assert culprit in told
+
+
+def test_impossible_bodies_can_be_kept_with_a_warning_but_not_negative_masses():
+    b = pendulum()
+    body_c(mass=1.0, com=(0, 1, 0), inertia=(1, 1, 3))(b)
+    with pytest.warns(NonPhysicalWarning, match="'c': inertia violates"):
+        model = b.build(nonphysical="warn")
+    assert model.nonphysical[0][0] == "c"
+    b.add_body("d", mass=-1.0)
+    b.add_joint("l", "fixed", parent="c", child="d")
+    with pytest.raises(ModelError, match="negative"):
+        b.build(nonphysical="warn")
+
+
+def test_thin_rods_plates_and_points_are_matter():
+    for inertia in ((1.0, 1.0, 0.0), (1.0, 1.0, 2.0), (0.1 + 0.2, 0.1, 0.2), None):
+        b = pendulum()
+        body_c(mass=1.0, com=(0, 1, 1), inertia=inertia)(b)
+        b.build()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_builders_own_mass_matrix_is_right(seed):
+    """The definition Σ Jᵀ I J that finds idle joints agrees with CRBA."""
+    model = random_tree(seed, 12, mimic=seed % 2 == 1)
+    q, _ = model.random_state(np.random.default_rng(0))
+    assert off(sample_mass_matrix(model), mb.dynamics(model).mass_matrix(q)) < 1e-14
+
+
+@pytest.mark.parametrize("call", ["integrate", "difference"])
+def test_wrong_configurations_are_explained(call):
+    model = random_tree(1, 4, ("free", "revolute"))
+    q, v, _, _ = (x[0] for x in states(model, 1))
+    second = v if call == "integrate" else q
+    with pytest.raises(InputError, match="expected shape"):
+        getattr(model, call)(q[:-1], second)
+    with pytest.raises(InputError, match="finite"):
+        getattr(model, call)(q * np.nan, second)
+    with pytest.raises(InputError, match="norm"):
+        getattr(model, call)(2 * q, second)
+    with pytest.raises(InputError, match="different sizes"):
+        getattr(model, call)(np.stack([q] * 2), np.stack([second] * 3))
