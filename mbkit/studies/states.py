@@ -58,13 +58,13 @@ def states(model: Model, samples: int, seed: int) -> States:
     return States(q, v, a, tau, tuple(kinds))
 
 
-def inside(model: Model, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return a random state in the middle half of the limits."""
+def inside(model: Model, rng: np.random.Generator, share: float = 0.5) -> tuple[Array, Array]:
+    """Return a random state in the middle `share` of the limits."""
     q, v = model.random_state(rng)
     lower, upper = limits_box(model)
     bounded = np.isfinite(lower)
     middle = 0.5 * (lower[bounded] + upper[bounded])
-    q[bounded] = middle + 0.5 * (q[bounded] - middle)
+    q[bounded] = middle + share * (q[bounded] - middle)
     return q, v
 
 

@@ -1,0 +1,345 @@
+"""The command: what it prints, what it writes, how it ends."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from mbkit.cli import cli
+from mbkit.errors import OutputError, UnknownNameError
+from mbkit.studies import all_robots as sweeps
+from mbkit.studies.all_robots import RobotOutcome, all_robots
+from mbkit.studies.workers import WorkerDiedError, run
+
+QUICK = ("--no-rollouts", "--samples", "4")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder of the test's own, and the import path as it was."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return tmp_path
+
+
+def call(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, arguments)
+
+
+def module(folder: Path, name: str, text: str) -> None:
+    (folder / f"{name}.py").write_text(textwrap.dedent(text))
+
+
+def test_a_robot_agrees_and_is_written(here):
+    result = call("check", "ur5", *QUICK)
+    assert result.exit_code == 0, result.output
+    assert "agree to" in result.stdout.splitlines()[0]
+    assert "forward dynamics" in result.stdout
+    data = json.loads((here / "mbkit-report" / "ur5.json").read_text())
+    assert data["passed"]
+    assert "<svg" in (here / "mbkit-report" / "ur5.html").read_text()
+    assert "mbkit-report/ur5.html" in result.stdout
+
+
+def test_everything_from_a_cold_start(tmp_path):
+    made = subprocess.run(
+        [sys.executable, "-m", "mbkit", "check", "panda", "--out", "out"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        timeout=120,
+    )
+    text = made.stdout.decode("utf-8")
+    assert made.returncode == 0, text + made.stderr.decode()
+    for wanted in ("✓ panda", "Rollouts", "Error against run time", "Left out", "contacts"):
+        assert wanted in text
+    assert made.stderr == b""
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"panda.html", "panda.json"}
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_import_of_the_command_is_light():
+    heavy = "{'numpy', 'pinocchio', 'mujoco', 'casadi', 'scipy', 'matplotlib', 'rich', 'jinja2'}"
+    code = f"import sys, mbkit.cli; print({heavy} & set(sys.modules))"
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout == "set()\n"
+
+
+def test_a_robots_file_has_the_name_that_was_asked_for(here):
+    assert call("check", "double_pendulum", *QUICK).exit_code == 0
+    assert (here / "mbkit-report" / "double_pendulum.html").exists()
+
+
+def test_json_is_all_there_is_on_stdout(here):
+    module(
+        here,
+        "talkative",
+        "import mbkit\nprint('import')\ndef f():\n    print('call')\n    return mbkit.catalog.pendulum()",
+    )
+    result = call("check", "talkative:f", "--json", *QUICK)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["model"] == "pendulum"
+    assert "call" in result.stderr
+    assert "pendulum.html" in result.stderr
+
+
+def test_a_catalog_system_a_file_and_a_model_itself(here):
+    assert call("check", "cart_pole", *QUICK).exit_code == 0
+    module(here, "ready", "import mbkit\nmodel = mbkit.catalog.pendulum()")
+    assert call("check", "ready:model", *QUICK).exit_code == 0
+    from mbkit.load.names import find
+
+    robot = find("ur5")
+    assert robot is not None
+    assert call("check", str(robot.path), "--floating-base", *QUICK).exit_code == 0
+    assert "nv 12" in call("check", "ur5", "--floating-base", *QUICK).stdout
+
+
+@pytest.mark.usefixtures("here")
+def test_options_of_files_are_refused_for_what_is_no_file():
+    result = call("check", "pendulum", "--floating-base")
+    assert result.exit_code == 2
+    assert "floating_base" in result.stderr
+
+
+def test_a_known_defect_is_a_named_failure_and_exit_1(here):
+    module(
+        here,
+        "armature",
+        """
+        import mbkit
+
+        def arm():
+            b = mbkit.ModelBuilder("arm")
+            b.add_body("link", mass=1.0, com=(0.1, 0, -0.2), inertia=(0.1, 0.1, 0.1))
+            b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, 0.6, 0.8), armature=0.5)
+            return b.build()
+        """,
+    )
+    result = call("check", "armature:arm", *QUICK)
+    assert result.exit_code == 1, result.output
+    assert result.stdout.startswith("✗ arm")
+    assert "kinetic energy, pinocchio: differs" in result.stdout
+    assert "armature" in result.stdout
+    assert result.stderr == ""
+    assert "crossed out" in (here / "mbkit-report" / "arm.html").read_text()
+
+
+@pytest.mark.usefixtures("here")
+def test_warnings_are_one_line():
+    result = call("check", "romeo_small", *QUICK)
+    assert result.exit_code == 0
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("warning: romeo")
+    assert "mujoco left out" in " ".join(result.stdout.split())
+    assert "'RShoulderYawLink'" in result.stdout
+
+
+@pytest.mark.usefixtures("here")
+def test_two_engines_must_hold_the_model():
+    result = call("check", "romeo_small", "--engines", "pinocchio,mujoco", *QUICK)
+    assert result.exit_code == 2
+    assert "two engines" in result.stderr
+    assert "RShoulderYawLink" in result.stdout
+
+
+MODULES = {
+    "gives_3": "def f(): return 3",
+    "divides": "def f(): return 1 / 0",
+    "unfinished": "def f(:",
+    "needs": "import no_such_package",
+    "leaves": "import sys; sys.exit(0)",
+    "wants": "def f(x): return x",
+    "faulty": "import mbkit\ndef f(): return mbkit.ModelBuilder('empty').build()",
+}
+BAD = [
+    (["check"], "give a TARGET"),
+    (["check", ""], "empty"),
+    (["check", "pandaa"], "did you mean 'panda'"),
+    (["check", "duoble_pendulum"], "double_pendulum"),
+    (["check", "cart_pol"], "cart_pole"),
+    (["check", "qqqqqqqq"], "mbkit robots"),
+    (["check", "nothing.urdf"], "nothing.urdf: no such file"),
+    (["check", "."], "."),
+    (["check", "empty.urdf"], "empty"),
+    (["check", "cut.urdf"], "line 1"),
+    (["check", "nameless.urdf"], "no name"),
+    (["check", "bomb.urdf"], "document type"),
+    (["check", "negative.urdf"], "mass"),
+    (["check", "nowhere:f"], "No module named 'nowhere'"),
+    (["check", "gives_3:g"], "unknown function 'g'"),
+    (["check", "gives_3:f"], "expected a Model, got int"),
+    (["check", "divides:f"], "ZeroDivisionError"),
+    (["check", "unfinished:f"], "SyntaxError"),
+    (["check", "needs:f"], "no_such_package"),
+    (["check", "leaves:f"], "SystemExit"),
+    (["check", "wants:f"], "TypeError"),
+    (["check", "faulty:f"], "no bodies"),
+    (["check", "panda", "--engines", "pinocchio,bullet"], "unknown engine 'bullet'"),
+    (["check", "panda", "--engines", "pinocchio"], "at least two"),
+    (["check", "panda", "--engines", ","], "at least two"),
+    (["check", "panda", "--samples", "0"], "--samples"),
+    (["check", "panda", "--seed", "-1"], "--seed"),
+    (["check", "panda", "--mimic", "maybe"], "--mimic"),
+    (["check", "panda", "--jobs", "2"], "--all"),
+    (["check", "panda", "--out", "regular/below"], "regular is not a folder"),
+    (["check", "--all", "--out", "regular"], "is not a folder"),
+    (["check", "--all", "panda"], "without a TARGET"),
+    (["check", "--all", "--engines", "bullet,pinocchio"], "unknown engine"),
+    (["chekc", "panda"], "No such command"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "told"), BAD, ids=[" ".join(a) or "empty" for a, _ in BAD])
+def test_bad_input_is_one_message_and_exit_2(here, arguments, told):
+    for name, text in MODULES.items():
+        module(here, name, text)
+        sys.modules.pop(name, None)
+    (here / "regular").write_text("")
+    (here / "empty.urdf").write_text("")
+    (here / "cut.urdf").write_text("<robot name='r'><link")
+    (here / "nameless.urdf").write_text("<robot><link name='a'/></robot>")
+    (here / "bomb.urdf").write_text('<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>')
+    (here / "negative.urdf").write_text(
+        '<robot name="r"><link name="a"/><link name="b"><inertial><mass value="-1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/></joint></robot>'
+    )
+    result = call(*arguments)
+    assert result.exit_code == 2, result.output
+    assert told in result.stderr
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+    assert not (here / "mbkit-report").exists()
+
+
+@pytest.mark.usefixtures("here")
+def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
+    def full(*_: object) -> Path:
+        raise OutputError("cannot write there: No space left on device")
+
+    monkeypatch.setattr("mbkit.report.folder.write", full)
+    for more in ((), ("--json",)):
+        result = call("check", "pendulum", *QUICK, *more)
+        assert result.exit_code == 2
+        assert "No space left" in result.stderr
+        assert "forward dynamics" in result.stdout
+    assert json.loads(result.stdout)["passed"]
+
+
+def test_robots_lists_all_and_says_why_some_do_not_load():
+    listed = json.loads(call("robots", "--json").stdout)
+    assert len(listed) == 69
+    by_name = {r["name"]: r for r in listed}
+    assert by_name["panda_description/panda"]["nv"] == 8
+    assert "no name" in by_name["ur_description/ur3"]["reason"]
+    table = call("robots")
+    assert table.exit_code == 0
+    assert "69 robots" in table.stdout
+    assert "talos_reduced" in table.stdout
+    assert "cart_pole" in table.stdout
+
+
+@pytest.mark.usefixtures("here")
+def test_interrupting_one_check_says_that_nothing_was_finished(monkeypatch):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mbkit.studies.compare", interrupted)
+    result = call("check", "pendulum")
+    assert result.exit_code == 130
+    assert "interrupted" in result.stderr
+
+
+def outcomes(*statuses: str, interrupt: bool = False):
+    def made(**_: object):
+        for k, status in enumerate(statuses):
+            yield RobotOutcome(f"folder/robot{k}", status, "because" if status != "agree" else "")
+        if interrupt:
+            raise KeyboardInterrupt
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("statuses", "status"), [(["agree", "refused"], 0), (["agree", "differ"], 1), (["refused", "failed"], 1)]
+)
+def test_all_ends_by_what_its_robots_end_in(here, monkeypatch, statuses, status):
+    monkeypatch.setattr("mbkit.load.robots", lambda: ("a", "b"))
+    monkeypatch.setattr(sweeps, "all_robots", outcomes(*statuses))
+    result = call("check", "--all")
+    assert result.exit_code == status, result.output
+    assert "2 robots" in result.stdout
+    assert {p.name for p in (here / "mbkit-report").iterdir()} == {"all.html", "all.json"}
+
+
+def test_interrupting_all_shows_and_writes_what_is_finished(here, monkeypatch):
+    monkeypatch.setattr(sweeps, "all_robots", outcomes("agree", "refused", interrupt=True))
+    result = call("check", "--all", "--json")
+    assert result.exit_code == 130
+    assert "2 of 69" in result.stderr
+    assert len(json.loads(result.stdout)["robots"]) == 2
+    assert (here / "mbkit-report" / "all.html").exists()
+
+
+# Many robots.
+
+
+def test_robots_end_in_agreement_or_a_named_reason_in_any_executor():
+    with ThreadPoolExecutor(1) as executor:
+        found = {o.robot: o for o in all_robots(["ur3", "hector", "romeo_small"], samples=4, executor=executor)}
+    assert found["ur_description/ur3_robot"].status == "agree"
+    assert found["hector_description/quadrotor_base"].status == "refused"
+    assert found["hector_description/quadrotor_base"].reason.startswith("no joints")
+    small = found["romeo_description/romeo_small"]
+    assert small.status == "agree"
+    assert "RShoulderYawLink" in small.reason
+    with pytest.raises(UnknownNameError, match="panda"):
+        next(all_robots(["pandaa"]))
+
+
+def test_what_should_not_happen_to_one_robot_does_not_end_the_others(monkeypatch):
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("a defect of ours")
+
+    monkeypatch.setattr(sweeps, "compare", broken)
+    with ThreadPoolExecutor(1) as executor:
+        found = list(all_robots(["ur3", "ur5"], executor=executor))
+    assert [o.status for o in found] == ["failed", "failed"]
+    assert found[0].reason == "ZeroDivisionError: a defect of ours"
+
+
+def test_a_dying_process_is_named_and_takes_no_other_down():
+    calls = {"good": partial(abs, -3), "raises": partial(int, "x"), "dies": partial(os._exit, 1)}
+    calls |= {f"good{k}": partial(abs, k) for k in range(4)}
+    found = dict(run(calls, jobs=2))
+    assert isinstance(found.pop("dies"), WorkerDiedError)
+    assert isinstance(found.pop("raises"), ValueError)
+    assert found == {"good": 3, "good0": 0, "good1": 1, "good2": 2, "good3": 3}
+
+
+def test_an_executor_that_takes_no_more_leaves_a_reason():
+    with ThreadPoolExecutor(1) as executor:
+        pass
+    found = dict(run({"a": partial(abs, 1)}, executor=executor))
+    assert isinstance(found["a"], WorkerDiedError)
+
+
+def test_leaving_the_loop_ends_the_processes():
+    import multiprocessing
+    import time
+
+    begun = time.perf_counter()
+    for name, _ in run({"quick": partial(abs, 1), "slow": partial(time.sleep, 60)}, jobs=2):
+        assert name == "quick"
+        break
+    assert time.perf_counter() - begun < 30
+    assert not multiprocessing.active_children()

@@ -1,0 +1,293 @@
+"""Where engines differ and fail: a user of mbkit meets none of it. One test a trap.
+
+Known defects have a file of their own, test_defects.py.
+"""
+
+from __future__ import annotations
+
+import os
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import mbkit as mb
+from mbkit.errors import MbkitWarning, ModelError, UnsupportedError
+from mbkit.spatial import matrix_from_quaternion
+from tests.random_trees import off, random_tree, states
+
+FREE_URDF = """<robot name="box"><link name="base"><inertial><origin xyz="0.1 0.2 0.3"/><mass value="2"/>
+<inertia ixx="0.3" iyy="0.4" izz="0.5" ixy="0.01" ixz="0.02" iyz="0.03"/></inertial></link>
+<link name="arm"><inertial><origin xyz="0 0 -0.3"/><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="5" velocity="5"/></joint></robot>"""
+
+
+@pytest.fixture
+def floating(tmp_path):
+    path = tmp_path / "box.urdf"
+    path.write_text(FREE_URDF)
+    return mb.load(path, floating_base=True)
+
+
+def test_mujocos_dense_jacobians_are_asked_for_and_its_solver_is_off():
+    dyn = mb.dynamics(random_tree(0, 6, ("revolute", "ball")), "mujoco")
+    assert dyn.mj_model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE
+    for bit in ("CONSTRAINT", "CONTACT", "LIMIT", "FRICTIONLOSS", "EQUALITY", "EULERDAMP", "AUTORESET"):
+        assert dyn.mj_model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}"), bit
+
+
+def test_a_free_joints_numbers_are_converted_whole(floating):
+    """Quaternion order, world against body axes, and ω × v in the accelerations."""
+    q, v, _, tau = (x[0] for x in states(floating, 1))
+    dyn = mb.dynamics(floating, "mujoco")
+    m, d = dyn.mj_model, mujoco.MjData(dyn.mj_model)
+    R = matrix_from_quaternion(q[3:7])
+    d.qpos[:] = [*q[:3], q[6], *q[3:6], *q[7:]]
+    d.qvel[:] = [*(R @ v[:3]), *v[3:]]
+    d.qfrc_applied[:] = [*(R @ tau[:3]), *tau[3:]]
+    mujoco.mj_forward(m, d)
+    a = np.array(d.qacc)
+    a[:3] = R.T @ a[:3] - np.cross(v[3:6], v[:3])
+    assert off(dyn.forward_dynamics(q, v, tau), a) < 1e-14
+    assert off(mb.dynamics(floating).forward_dynamics(q, v, tau), a) < 1e-13
+    naive = np.array(d.qacc)
+    naive[:3] = R.T @ naive[:3]
+    assert off(naive, a) > 1e-2
+
+
+def test_continuous_joints_are_one_plain_angle_everywhere():
+    model = mb.load("kinova")
+    assert model.nq == model.nv == 6
+    q = np.full(6, 0.3)
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        dyn = mb.dynamics(model, engine)
+        assert off(dyn.gravity(q + 2 * np.pi), dyn.gravity(q)) < 1e-14
+    turns = mb.simulate(mb.dynamics(model.without("gravity")), q, 20 * np.eye(6)[5], 1.0, dt=1e-2)
+    assert turns.q[-1, 5] > 2 * np.pi
+
+
+def test_planar_velocities_are_the_derivatives_of_the_coordinates():
+    b = mb.ModelBuilder("puck")
+    b.add_body("puck", mass=2.0, com=(0.3, 0, 0), inertia=(0.1, 0.1, 0.2))
+    b.add_joint("slide", "planar", parent="world", child="puck")
+    model = b.build()
+    q, v = np.array([1.0, 2.0, 0.7]), np.array([0.1, -0.2, 0.3])
+    # T by hand: the centre of mass moves with (ẋ, ẏ) + θ̇ ẑ × R c.
+    c = 0.3 * np.array([np.cos(0.7), np.sin(0.7)])
+    speed = v[:2] + v[2] * np.array([-c[1], c[0]])
+    expected = 0.5 * 2 * speed @ speed + 0.5 * 0.2 * v[2] ** 2
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        assert mb.dynamics(model, engine).kinetic_energy(q, v) == pytest.approx(expected, rel=1e-14)
+
+
+def test_helical_pitch_is_metres_per_radian():
+    b = mb.ModelBuilder("screw")
+    b.add_body("nut", mass=2.0, inertia=(1, 1, 1))
+    b.add_joint("thread", "helical", parent="world", child="nut", axis=(0, 0, 1), pitch=0.5)
+    model = b.build()
+    for engine in ("pinocchio", "lagrangian"):
+        dyn = mb.dynamics(model, engine)
+        assert dyn.mass_matrix([0.2])[0, 0] == pytest.approx(1 + 2 * 0.25)
+        assert dyn.pose([2.0], "nut")[2, 3] == pytest.approx(1.0)
+        assert dyn.gravity([0.2]) == pytest.approx([2 * 9.81 * 0.5])
+
+
+def test_siblings_are_addressed_by_name_whatever_their_order(tmp_path):
+    """Pinocchio's parser sorts siblings by the alphabet, MuJoCo keeps them as declared."""
+    link = '<link name="{0}"><inertial><mass value="{1}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    joint = (
+        '<joint name="{0}" type="continuous"><parent link="base"/><child link="{0}"/><origin xyz="{1} 0 0"/>'
+        '<axis xyz="1 0 0"/></joint>'
+    )
+    path = tmp_path / "siblings.urdf"
+    path.write_text(
+        '<robot name="r"><link name="base"/>'
+        + link.format("zebra", 1)
+        + link.format("ant", 3)
+        + joint.format("zebra", 1)
+        + joint.format("ant", 2)
+        + "</robot>"
+    )
+    model = mb.load(path)
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        X = mb.dynamics(model, engine).pose(model.neutral(), "ant")
+        assert X[0, 3] == pytest.approx(2.0)
+    assert model.body("ant").mass == 3
+    assert model.joint("ant").child == "ant"
+
+
+def test_armature_counts_once_in_every_engine():
+    b = mb.ModelBuilder("geared")
+    b.add_body("a", mass=1.0, com=(0, 0, -1))
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), armature=0.25)
+    model = b.build()
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        dyn = mb.dynamics(model, engine)
+        assert dyn.mass_matrix([0.3])[0, 0] == pytest.approx(1.25)
+        assert dyn.inverse_dynamics([0.0], [0.0], [2.0]) == pytest.approx([2.5])
+        assert dyn.forward_dynamics([0.0], [0.0], [2.5]) == pytest.approx([2.0])
+
+
+def test_damping_acts_in_forward_dynamics_of_every_engine_and_not_in_nle():
+    b = mb.ModelBuilder("damped")
+    b.add_body("a", mass=1.0, com=(0, 0, -1))
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.5)
+    model = b.build()
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        dyn = mb.dynamics(model, engine)
+        assert dyn.passive([0.0], [2.0]) == pytest.approx([-1.0])
+        assert dyn.forward_dynamics([0.0], [2.0], [0.0]) == pytest.approx([-1.0])
+        assert dyn.inverse_dynamics([0.0], [2.0], [-1.0]) == pytest.approx([0.0])
+        assert dyn.nle([0.0], [2.0]) == pytest.approx([0.0])
+    # Pinocchio's own aba leaves it out: that is what the adapter adds.
+    raw = mb.dynamics(model).pin_model
+    bare = pin.aba(raw, raw.createData(), np.zeros(1), np.full(1, 2.0), np.zeros(1))
+    assert bare == pytest.approx([0.0])
+
+
+def test_dry_friction_and_limits_are_data_and_act_nowhere():
+    def made(**data):
+        b = mb.ModelBuilder("rubbing")
+        b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
+        b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), **data)
+        return b.build()
+
+    plain = made()
+    marked = made(friction=3.0, lower=-0.1, upper=0.1, effort_limit=1.0, velocity_limit=1.0)
+    assert marked.needs.friction
+    assert marked.needs.limits
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        a, b = (mb.dynamics(m, engine).forward_dynamics([0.4], [2.0], [7.0]) for m in (plain, marked))
+        assert np.array_equal(a, b)
+
+
+def test_the_base_links_mass_is_not_dropped(tmp_path, floating):
+    path = tmp_path / "box.urdf"
+    assert floating.mass == pytest.approx(3.0)
+    assert mb.load(path).mass == pytest.approx(3.0)
+    # MuJoCo's own import of the same file does drop it.
+    assert mujoco.MjModel.from_xml_path(str(path)).body_mass.sum() == pytest.approx(1.0)
+    dyn = mb.dynamics(floating, "mujoco")
+    assert dyn.mj_model.body_mass.sum() == pytest.approx(3.0)
+
+
+def test_every_bodys_inertia_arrives_in_mujoco(monkeypatch):
+    """The adapter checks this itself; here the check is checked."""
+    from mbkit.engines import mujoco_model
+
+    model = mb.load("ur5")
+    monkeypatch.setattr(mujoco_model, "_set_constants", lambda made, *_: made.body_inertia.__imul__(1 + 1e-9))
+    with pytest.raises(mb.MbkitError, match="inertia of body"):
+        mb.dynamics(model, "mujoco")
+
+
+def test_bodies_without_mass_are_named_and_never_nan(tmp_path):
+    b = mb.ModelBuilder("hollow")
+    b.add_body("shell")
+    b.add_joint("j", "revolute", parent="world", child="shell", axis=(0, 1, 0))
+    with pytest.raises(ModelError, match="'shell': no mass moves with joint 'j'"):
+        b.build()
+    # Between two joints a body may be massless: a Cardan cross, which MuJoCo holds too.
+    b = mb.ModelBuilder("cross")
+    b.add_body("cross")
+    b.add_joint("first", "revolute", parent="world", child="cross", axis=(1, 0, 0))
+    b.add_body("arm", mass=1.0, com=(0.1, 0.2, -1), inertia=(0.1, 0.2, 0.25))
+    b.add_joint("second", "revolute", parent="cross", child="arm", axis=(0, 1, 0), translation=(0.1, 0, 0.2), rpy=(0.3, 0, 1))
+    model = b.build()
+    q, v, _, tau = states(model, 3)
+    own = mb.dynamics(model, "lagrangian").forward_dynamics(q, v, tau)
+    for engine in ("pinocchio", "mujoco"):
+        assert off(mb.dynamics(model, engine).forward_dynamics(q, v, tau), own) < 1e-13
+    with pytest.raises(UnsupportedError, match="rides on 'cross'"):
+        mb.dynamics(model, "mujoco").pose(q[0], "cross")
+
+
+def test_points_rods_and_plates_reach_mujoco_as_they_are():
+    for inertia in (None, (0.1, 0.1, 0.0), (0.1, 0.2, 0.3), (0.1 + 0.2, 0.1, 0.2)):
+        b = mb.ModelBuilder("thin")
+        b.add_body("a", mass=1.0, com=(0, 0.1, -1), inertia=inertia)
+        b.add_joint("j", "universal", parent="world", child="a", axis=(1, 0, 0), axis2=(0, 1, 0))
+        model = b.build()
+        q, v, _, tau = states(model, 3)
+        dyn, own = mb.dynamics(model, "mujoco"), mb.dynamics(model, "lagrangian")
+        condition = np.linalg.cond(own.mass_matrix(q)).max()
+        assert off(dyn.mass_matrix(q), own.mass_matrix(q)) < 1e-14
+        assert off(dyn.forward_dynamics(q, v, tau), own.forward_dynamics(q, v, tau)) < 1e-14 * condition
+
+
+def test_native_rollouts_of_mimic_joints_are_refused_and_free_ones_run():
+    model = mb.load("panda")
+    dyn = mb.dynamics(model, "mujoco")
+    with pytest.raises(UnsupportedError, match="panda_finger_joint2.*soft equality.*mimic='free'"):
+        dyn.rollout("rk4", model.neutral(), np.zeros(8), 1e-3, None, 10)
+    free = mb.load("panda", mimic="free")
+    q, _ = mb.dynamics(free, "mujoco").rollout("rk4", free.neutral(), np.zeros(9), 1e-3, None, 10)
+    assert q.shape == (11, 9)
+
+
+def test_forces_on_a_floating_base_are_refused_in_native_rollouts(floating):
+    dyn = mb.dynamics(floating, "mujoco")
+    tau = np.zeros((5, floating.nv))
+    tau[:, 0] = 1.0
+    with pytest.raises(UnsupportedError, match="world axes"):
+        dyn.rollout("rk4", floating.neutral(), np.zeros(floating.nv), 1e-3, tau, 5)
+    tau[:, 0], tau[:, 4] = 0.0, 1.0
+    dyn.rollout("rk4", floating.neutral(), np.zeros(floating.nv), 1e-3, tau, 5)
+
+
+@pytest.mark.parametrize("batch", [None, 3])
+def test_a_diverging_native_run_ends_as_nan_and_writes_no_log(tmp_path, monkeypatch, batch, capfd):
+    monkeypatch.chdir(tmp_path)
+    model = mb.load("panda", mimic="free").without("damping")
+    dyn = mb.dynamics(model, "mujoco")
+    q0, v0 = model.neutral(), np.full(9, 3000.0)
+    if batch:
+        q0, v0 = np.stack([q0] * batch), np.stack([v0, v0, 0 * v0])
+    q, v = dyn.rollout("rk4", q0, v0, 1e-2, None, 200)
+    fast = q[0] if batch else q
+    gone = ~np.isfinite(fast).all(axis=1)
+    assert gone.any()
+    # From the first bad step on, everything is.
+    assert gone[np.argmax(gone) :].all()
+    assert np.array_equal(np.isnan(q).any(axis=-1), np.isnan(v).any(axis=-1))
+    if batch:
+        assert np.isfinite(q[2]).all()
+    assert os.listdir(tmp_path) == []
+    assert "WARNING" not in capfd.readouterr().err
+    with pytest.warns(MbkitWarning, match="diverged"):
+        run = mb.simulate(dyn, model.neutral(), np.full(9, 3000.0), 2.0, "mujoco_rk4", 1e-2)
+    assert not run.stats.finished
+    assert np.isfinite(run.q).all()
+    assert run.t[-1] < 2.0
+
+
+def test_rk4_on_rotations_is_of_fourth_order_in_mujoco_and_here():
+    """Second order up to MuJoCo 3.3; both sides are measured against a tight reference."""
+    model = mb.catalog.free_body()
+    q0, v0 = model.neutral(), np.array([0, 0, 0, 1.0, 2.0, 0.5])
+    end = mb.simulate(mb.dynamics(model), q0, v0, 1.0, "dop853", rtol=1e-13, save=[0.0, 1.0]).q[-1]
+    for engine, method in (("mujoco", "mujoco_rk4"), ("pinocchio", "rk4")):
+        errors = []
+        for dt in (0.05, 0.025):
+            run = mb.simulate(mb.dynamics(model, engine), q0, v0, 1.0, method, dt)
+            errors.append(np.linalg.norm(model.difference(end, run.q[-1])))
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.2)
+
+
+def test_pinocchios_live_views_are_not_handed_out():
+    dyn = mb.dynamics(mb.load("ur5"))
+    q = np.zeros(6)
+    M = dyn.mass_matrix(q)
+    M[:] = 0
+    assert dyn.mass_matrix(q)[0, 0] != 0
+    assert M is not dyn.mass_matrix(q)
+
+
+def test_versions_are_in_every_result():
+    result = mb.compare(mb.load("ur5"), samples=2, terms_only=True)
+    assert {"pin", "mujoco", "casadi", "numpy", "mbkit", "python", "example-robot-data"} <= set(result.versions)
+    assert "not installed" not in result.versions.values()
+    assert result.processor
