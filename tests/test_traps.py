@@ -97,7 +97,10 @@ def test_helical_pitch_is_metres_per_radian():
 
 def test_siblings_are_addressed_by_name_whatever_their_order(tmp_path):
     """Pinocchio's parser sorts siblings by the alphabet, MuJoCo keeps them as declared."""
-    link = '<link name="{0}"><inertial><mass value="{1}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    link = (
+        '<link name="{0}"><inertial><mass value="{1}"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
     joint = (
         '<joint name="{0}" type="continuous"><parent link="base"/><child link="{0}"/><origin xyz="{1} 0 0"/>'
         '<axis xyz="1 0 0"/></joint>'
@@ -184,7 +187,7 @@ def test_every_bodys_inertia_arrives_in_mujoco(monkeypatch):
         mb.dynamics(model, "mujoco")
 
 
-def test_bodies_without_mass_are_named_and_never_nan(tmp_path):
+def test_bodies_without_mass_are_named_and_never_nan():
     b = mb.ModelBuilder("hollow")
     b.add_body("shell")
     b.add_joint("j", "revolute", parent="world", child="shell", axis=(0, 1, 0))
@@ -195,7 +198,8 @@ def test_bodies_without_mass_are_named_and_never_nan(tmp_path):
     b.add_body("cross")
     b.add_joint("first", "revolute", parent="world", child="cross", axis=(1, 0, 0))
     b.add_body("arm", mass=1.0, com=(0.1, 0.2, -1), inertia=(0.1, 0.2, 0.25))
-    b.add_joint("second", "revolute", parent="cross", child="arm", axis=(0, 1, 0), translation=(0.1, 0, 0.2), rpy=(0.3, 0, 1))
+    place = {"translation": (0.1, 0, 0.2), "rpy": (0.3, 0, 1)}
+    b.add_joint("second", "revolute", parent="cross", child="arm", axis=(0, 1, 0), **place)
     model = b.build()
     q, v, _, tau = states(model, 3)
     own = mb.dynamics(model, "lagrangian").forward_dynamics(q, v, tau)
@@ -221,7 +225,7 @@ def test_points_rods_and_plates_reach_mujoco_as_they_are():
 def test_native_rollouts_of_mimic_joints_are_refused_and_free_ones_run():
     model = mb.load("panda")
     dyn = mb.dynamics(model, "mujoco")
-    with pytest.raises(UnsupportedError, match="panda_finger_joint2.*soft equality.*mimic='free'"):
+    with pytest.raises(UnsupportedError, match=r"panda_finger_joint2.*soft equality.*mimic='free'"):
         dyn.rollout("rk4", model.neutral(), np.zeros(8), 1e-3, None, 10)
     free = mb.load("panda", mimic="free")
     q, _ = mb.dynamics(free, "mujoco").rollout("rk4", free.neutral(), np.zeros(9), 1e-3, None, 10)

@@ -56,10 +56,16 @@ def import_seconds():
 def calls(dyn, m, d, model, q, v, a):
     """Return (name, through mbkit, bare) of every call."""
     Q, V, A = model.layout.expand_q(q), model.layout.expand_v(v), model.layout.expand_v(a)
+    D = np.concatenate([j.damping for j in model.joints])
+    if D.any():
+        # The same number by hand: Pinocchio's rnea and aba know no damping.
+        inverse, forward = lambda: pin.rnea(m, d, Q, V, A) + D * V, lambda: pin.aba(m, d, Q, V, A - D * V)
+    else:
+        inverse, forward = lambda: pin.rnea(m, d, Q, V, A), lambda: pin.aba(m, d, Q, V, A)
     return (
-        ("inverse_dynamics", lambda: dyn.inverse_dynamics(q, v, a), lambda: pin.rnea(m, d, Q, V, A)),
+        ("inverse_dynamics", lambda: dyn.inverse_dynamics(q, v, a), inverse),
         ("nle", lambda: dyn.nle(q, v), lambda: pin.nonLinearEffects(m, d, Q, V)),
-        ("forward_dynamics", lambda: dyn.forward_dynamics(q, v, a), lambda: pin.aba(m, d, Q, V, A)),
+        ("forward_dynamics", lambda: dyn.forward_dynamics(q, v, a), forward),
         ("mass_matrix", lambda: dyn.mass_matrix(q), lambda: pin.crba(m, d, Q)),
         ("gravity", lambda: dyn.gravity(q), lambda: pin.computeGeneralizedGravity(m, d, Q)),
     )

@@ -1,8 +1,7 @@
 """Pinocchio behind the protocol: CRBA for M, RNEA for nle, ABA for forward dynamics.
 
 Carpentier et al. 2019, "The Pinocchio C++ library"; the algorithms are those of
-Featherstone 2008, ch. 5 to 7. Where the description's coordinates are Pinocchio's,
-single states take the short way of `pinocchio_direct`.
+Featherstone 2008, ch. 5 to 7. Single states take the short way of `pinocchio_direct`.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from mbkit._check import Array
 from mbkit.engines import defects
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.passive import JointPassive
-from mbkit.engines.pinocchio_direct import direct_calls
+from mbkit.engines.pinocchio_direct import direct_calls, unread_coordinates
 from mbkit.engines.pinocchio_model import PinModel, build
 from mbkit.engines.pinocchio_springs import PointSprings
 from mbkit.model import Model
 
 __all__ = ["PinocchioDynamics"]
 
-_DIRECT: Final = ("mass_matrix", "gravity", "nle", "inverse_dynamics", "forward_dynamics")
+_SHORT: Final = ("mass_matrix", "gravity", "nle", "inverse_dynamics", "forward_dynamics")
 
 
 class PinocchioDynamics(Dynamics):
@@ -46,117 +45,127 @@ class PinocchioDynamics(Dynamics):
         self._pin: PinModel = build(model)
         self.pin_model = self._m = self._pin.model
         self._d = self._m.createData()
-        self._joint_passive = JointPassive(model)
+        self._joint_passive = JointPassive(model, self._pin.q_order, self._pin.v_order)
         self._springs = PointSprings(model, self._pin) if model.springs else None
         self._reduced = model.layout.reduced
-        self._passive_any = model.needs.springs or model.needs.damping
-        #: Whether q and v go to Pinocchio as they are.
+        #: Whether q and v go to Pinocchio as they are; else as G_q q + c and G v.
         self._direct = self._pin.ordered and not self._reduced
+        layout = model.layout
+        self._G_q, self._c = layout.G_q[self._pin.q_order], layout.offsets[self._pin.q_order]
+        self._G = layout.G[self._pin.v_order]
+        self._Gt = np.ascontiguousarray(self._G.T)
+        self._take_short_way()
+
+    def _take_short_way(self) -> None:
+        m, d = self._m, self._d
+        bare: dict[str, Callable[..., Any]] = {name: getattr(self, f"_one_{name}") for name in _SHORT}
+        # What is mixed by G_q q spreads a NaN to every coordinate.
+        unread: tuple[int, ...] = ()
         if self._direct:
-            passive: Callable[[Array, Array], Array] | None = self._full_passive if self._passive_any else None
-            if passive is not None and self._springs is None and not model.needs.springs:
-                passive = self._damping_alone()
-            checked = {name: getattr(self, name) for name in _DIRECT}
-            for name, call in direct_calls(model, self._m, self._d, passive, checked).items():
-                setattr(self, name, functools.update_wrapper(call, checked[name]))
+            unread = unread_coordinates(m, d, self.model.neutral())
+            terms = {"mass_matrix": pin.crba, "gravity": pin.computeGeneralizedGravity, "nle": pin.nonLinearEffects}
+            needs = self.model.needs
+            if not (needs.springs or needs.damping):
+                terms |= {"inverse_dynamics": pin.rnea, "forward_dynamics": pin.aba}
+            elif not needs.springs and self._springs is None:
+                bare |= self._damped_only()
+            bare |= {name: functools.partial(function, m, d) for name, function in terms.items()}
+        checked = {name: getattr(self, name) for name in _SHORT}
+        for name, call in direct_calls(self.model, unread, bare, checked).items():
+            setattr(self, name, functools.update_wrapper(call, checked[name]))
 
-    def _damping_alone(self) -> Callable[[Array, Array], Array]:
-        against = -self._joint_passive.damping
+    def _damped_only(self) -> dict[str, Callable[..., Any]]:
+        m, d, damping, rnea, aba = self._m, self._d, self._joint_passive.damping, pin.rnea, pin.aba
 
-        def force(_q: Array, v: Array) -> Array:
-            return against * v
+        def inverse_dynamics(q: Array, v: Array, a: Array) -> Any:
+            out = rnea(m, d, q, v, a)
+            out += damping * v
+            return out
 
-        return force
+        def forward_dynamics(q: Array, v: Array, tau: Array) -> Any:
+            return aba(m, d, q, v, tau - damping * v)
+
+        return {"inverse_dynamics": inverse_dynamics, "forward_dynamics": forward_dynamics}
 
     # Between the description's coordinates and Pinocchio's.
 
     def _full_q(self, q: Array) -> Array:
-        return q if self._direct else np.ascontiguousarray(self.model.layout.expand_q(q)[self._pin.q_order])
+        return q if self._direct else self._G_q.dot(q) + self._c
 
     def _full_v(self, v: Array) -> Array:
-        return v if self._direct else np.ascontiguousarray(self.model.layout.expand_v(v)[self._pin.v_order])
+        return v if self._direct else self._G.dot(v)
 
     def _force(self, f: Array) -> Array:
-        if self._direct:
-            return f
-        full = np.empty_like(f)
-        full[self._pin.v_order] = f
-        return self.model.layout.G.T @ full if self._reduced else full
+        return f if self._direct else self._Gt.dot(f)
 
     def _matrix(self, A: Array) -> Array:
-        if self._direct:
-            return A
-        full = np.empty_like(A)
-        full[np.ix_(self._pin.v_order, self._pin.v_order)] = A
-        G = self.model.layout.G
-        return np.asarray(G.T @ full @ G) if self._reduced else full
+        return A if self._direct else self._Gt.dot(A).dot(self._G)
 
     def _columns(self, J: Array) -> Array:
-        if self._direct:
-            return J
-        full = np.empty_like(J)
-        full[:, self._pin.v_order] = J
-        return np.asarray(full @ self.model.layout.G) if self._reduced else full
+        return J if self._direct else J @ self._G
+
+    # Terms at one state.
+
+    def _one_mass_matrix(self, q: Array) -> Array:
+        return self._matrix(pin.crba(self._m, self._d, self._full_q(q)))
+
+    def _one_gravity(self, q: Array) -> Array:
+        return self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q)))
+
+    def _one_nle(self, q: Array, v: Array) -> Array:
+        return self._force(pin.nonLinearEffects(self._m, self._d, self._full_q(q), self._full_v(v)))
+
+    def _one_inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        q, v = self._full_q(q), self._full_v(v)
+        out: Array = pin.rnea(self._m, self._d, q, v, self._full_v(a))
+        out -= self._full_passive(q, v)
+        return self._force(out)
+
+    def _one_forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        q, v = self._full_q(q), self._full_v(v)
+        m, d, passive = self._m, self._d, self._full_passive(q, v)
+        if not self._reduced:
+            # G only puts the joints in order, so its transpose puts them back.
+            return self._force(pin.aba(m, d, q, v, self._full_v(tau) + passive))
+        # ABA knows no mimic joints: solve GᵀMG a = τ + Gᵀ(passive - nle).
+        M, h = self._matrix(pin.crba(m, d, q)), pin.nonLinearEffects(m, d, q, v)
+        return np.asarray(np.linalg.solve(M, tau + self._force(passive - h)))
+
+    def _full_passive(self, q: Array, v: Array) -> Array:
+        out = self._joint_passive.force(q, v)
+        if self._springs is not None:
+            out += self._springs.force(self._m, self._d, q, v)
+        return out
 
     # The protocol.
 
     def _mass_matrix(self, q: Array) -> Array:
-        return per_sample(lambda q: self._matrix(pin.crba(self._m, self._d, self._full_q(q))), q)
+        return per_sample(self._one_mass_matrix, q)
 
     def _gravity(self, q: Array) -> Array:
-        return per_sample(lambda q: self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q))), q)
+        return per_sample(self._one_gravity, q)
 
     def _nle(self, q: Array, v: Array) -> Array:
-        return per_sample(
-            lambda q, v: self._force(pin.nonLinearEffects(self._m, self._d, self._full_q(q), self._full_v(v))), q, v
-        )
+        return per_sample(self._one_nle, q, v)
+
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        return per_sample(self._one_inverse_dynamics, q, v, a)
+
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        return per_sample(self._one_forward_dynamics, q, v, tau)
+
+    def _passive(self, q: Array, v: Array) -> Array:
+        return per_sample(lambda q, v: self._force(self._full_passive(self._full_q(q), self._full_v(v))), q, v)
 
     def _coriolis_matrix(self, q: Array, v: Array) -> Array:
         if self._coriolis_wrong:
-            announce = ", ".join(repr(j.name) for j in self._suspect_joints)
-            defects.announce(defects.CORIOLIS, f"joint {announce}")
+            joints = ", ".join(repr(j.name) for j in self._suspect_joints)
+            defects.announce(defects.CORIOLIS, f"joint {joints}")
         return per_sample(
             lambda q, v: self._matrix(pin.computeCoriolisMatrix(self._m, self._d, self._full_q(q), self._full_v(v))),
             q,
             v,
         )
-
-    def _passive(self, q: Array, v: Array) -> Array:
-        return per_sample(lambda q, v: self._force(self._full_passive(self._full_q(q), self._full_v(v))), q, v)
-
-    def _full_passive(self, q: Array, v: Array) -> Array:
-        # In Pinocchio's order; the joints' part is kept in the description's.
-        if self._pin.ordered:
-            out = self._joint_passive.force(q, v)
-        else:
-            q_full, v_full = np.empty_like(q), np.empty_like(v)
-            q_full[self._pin.q_order], v_full[self._pin.v_order] = q, v
-            out = self._joint_passive.force(q_full, v_full)[self._pin.v_order]
-        if self._springs is not None:
-            out += self._springs.force(self._m, self._d, q, v)
-        return out
-
-    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        def one(q: Array, v: Array, a: Array) -> Array:
-            q, v = self._full_q(q), self._full_v(v)
-            return self._force(pin.rnea(self._m, self._d, q, v, self._full_v(a)) - self._full_passive(q, v))
-
-        return per_sample(one, q, v, a)
-
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        return per_sample(self._forward_reduced if self._reduced else self._forward_tree, q, v, tau)
-
-    def _forward_tree(self, q: Array, v: Array, tau: Array) -> Array:
-        q, v = self._full_q(q), self._full_v(v)
-        a = pin.aba(self._m, self._d, q, v, self._full_v(tau) + self._full_passive(q, v))
-        return self._force(a)
-
-    def _forward_reduced(self, q: Array, v: Array, tau: Array) -> Array:
-        # ABA knows no mimic joints: solve GᵀMG a = τ + Gᵀ(passive - nle).
-        q, v = self._full_q(q), self._full_v(v)
-        M = self._matrix(pin.crba(self._m, self._d, q))
-        h = pin.nonLinearEffects(self._m, self._d, q, v)
-        return np.asarray(np.linalg.solve(M, tau + self._force(self._full_passive(q, v) - h)))
 
     def _kinetic_energy(self, q: Array, v: Array) -> Array:
         if self._kinetic_wrong:
@@ -170,11 +179,10 @@ class PinocchioDynamics(Dynamics):
         ground = -float(self.model.gravity @ self._pin.ground_moment)
 
         def one(q: Array) -> Any:
-            full = self.model.layout.expand_q(q)
             q = self._full_q(q)
-            stored = self._joint_passive.energy(full)
+            stored = self._joint_passive.energy(q)
             if self._springs is not None:
-                stored = stored + self._springs.energy(self._m, self._d, q)
+                stored += self._springs.energy(self._m, self._d, q)
             return pin.computePotentialEnergy(self._m, self._d, q) + stored + ground
 
         return per_sample(one, q)

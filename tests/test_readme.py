@@ -1,0 +1,57 @@
+"""The README tells the truth: its code runs, and its commands do what they say."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from mbkit.cli import cli
+
+TOP = Path(__file__).parent.parent
+TEXT = (TOP / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", TEXT, flags=re.M | re.S)
+
+
+def test_python_blocks_run_in_their_order(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    blocks = [code for language, code in BLOCKS if language == "python"]
+    assert blocks
+    names: dict[str, object] = {}
+    for code in blocks:
+        exec(compile(code, "README.md", "exec"), names)
+
+
+COMMANDS = [
+    line.removeprefix("$ ").split("#")[0].split()
+    for language, code in BLOCKS
+    if language == "console"
+    for line in code.splitlines()
+    if line.startswith("$ mbkit")
+]
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if "--all" not in c], ids=" ".join)
+def test_commands_end_well(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(cli, command[1:])
+    assert result.exit_code == 0, result.output
+
+
+def test_the_set_up_names_what_the_package_declares():
+    project = tomllib.loads((TOP / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    setup = [line for language, code in BLOCKS if language == "sh" for line in code.splitlines()]
+    assert any("mbkit check panda" in line for line in setup)
+    extras = {e for line in setup for group in re.findall(r"\[(\w[\w,]*)\]", line) for e in group.split(",")}
+    assert extras <= set(project["optional-dependencies"])
+
+
+def test_every_dependency_is_given_a_reason():
+    project = tomllib.loads((TOP / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for requirement in project["dependencies"]:
+        name = re.match(r"[\w-]+", requirement)
+        assert name
+        assert f"`{name.group()}`" in TEXT, requirement
