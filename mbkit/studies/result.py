@@ -256,8 +256,10 @@ class Comparison:
     @property
     def digits(self) -> float:
         """Decimal digits on which all terms agree, at most 16."""
-        worst = max((r.relative for r in self.rows), default=math.nan)
-        return float(-math.log10(max(worst, 1e-16)))
+        errors = [r.relative for r in self.rows]
+        if not errors or any(math.isnan(e) for e in errors):
+            return math.nan
+        return -math.log10(max(*errors, 1e-16))
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""

@@ -1,0 +1,133 @@
+"""What is read from a comparison: the headline, what failed, rows term by term."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from mbkit.studies.result import Comparison, CostPoint, Omission, Refusal, RolloutRow, Row
+
+__all__ = [
+    "Failure",
+    "Notice",
+    "allowances",
+    "by_term",
+    "curves",
+    "failures",
+    "headline",
+    "judged",
+    "notices",
+    "omission_state",
+    "reached",
+    "told",
+]
+
+# Rounding stays far below this, and anything that acts is far above.
+_VISIBLE: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Failure:
+    """One thing that differs, or may; `row` is there for terms."""
+
+    what: str
+    reason: str
+    row: Row | None = None
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something an engine could not do, for all the terms that it meets."""
+
+    engine: str
+    terms: tuple[str, ...]
+    reason: str
+
+
+def headline(result: Comparison) -> str:
+    """Return the verdict in one sentence that stays short however much differs."""
+    if not result.rows:
+        return result.verdict
+    absent = [r.engine for r in result.refusals if not r.term and r.engine not in result.engines]
+    without = f"; {', '.join(dict.fromkeys(absent))} left out, see the notes" if absent else ""
+    if result.passed:
+        return result.verdict + without
+    parts = []
+    for some, all_, what in (
+        (sum(not r.passed for r in result.rows), len(result.rows), "comparisons of terms"),
+        (sum(not r.passed for r in result.rollouts), len(judged(result)), "rollouts"),
+        (sum(not o.unchanged for o in result.omissions), len(result.omissions), "omissions"),
+    ):
+        parts += [f"{some} of {all_} {what}"] if some else []
+    return f"{', '.join(result.engines)} differ: {', '.join(parts)}{without}"
+
+
+def judged(result: Comparison) -> list[RolloutRow]:
+    """Return the rollouts that can fail."""
+    return [r for r in result.rollouts if math.isfinite(r.tolerance)]
+
+
+def told(result: Comparison) -> list[RolloutRow]:
+    """Return the rollouts that are there for information, with an infinite tolerance."""
+    return [r for r in result.rollouts if not math.isfinite(r.tolerance)]
+
+
+def omission_state(omission: Omission) -> Literal["on", "same", "chosen", "changed"]:
+    """Return whether the thing was on, off without effect, off by choice, or off to an effect."""
+    if math.isnan(omission.change):
+        return "on"
+    if not omission.unchanged:
+        return "changed"
+    return "chosen" if omission.present and omission.change > _VISIBLE else "same"
+
+
+def failures(result: Comparison) -> list[Failure]:
+    """Return everything that differs, with its reason."""
+    out = [Failure(f"{r.term}, {r.engine}", r.reason or "differs", r) for r in result.rows if not r.passed]
+    for r in result.rollouts:
+        if not r.passed:
+            reason = f"differs from {r.against} by {r.error:.1e} in q, {r.tolerance:.0e} expected"
+            out.append(Failure(f"rollout {r.method}, {r.engine}", reason + (f"; {r.note}" if r.note else "")))
+    out += [
+        Failure(f"leaving out {o.need}", f"changes the accelerations by {o.change:.1e}")
+        for o in result.omissions
+        if not o.unchanged
+    ]
+    return out
+
+
+def allowances(result: Comparison) -> list[Failure]:
+    """Return the rows that passed above the tolerance, with the reason why."""
+    return [Failure(f"{r.term}, {r.engine}", r.reason, r) for r in result.rows if r.passed and r.reason]
+
+
+def by_term(result: Comparison) -> dict[str, dict[str, Row]]:
+    """Return term -> engine -> row, terms in their order."""
+    out: dict[str, dict[str, Row]] = {}
+    for row in result.rows:
+        out.setdefault(row.term, {})[row.engine] = row
+    return out
+
+
+def notices(refusals: Iterable[Refusal]) -> list[Notice]:
+    """Return refusals with those of one reason taken together."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for r in refusals:
+        found.setdefault((r.engine, r.reason), []).extend([r.term] if r.term else [])
+    return [Notice(engine, tuple(dict.fromkeys(terms)), reason) for (engine, reason), terms in found.items()]
+
+
+def curves(result: Comparison) -> dict[tuple[str, str], list[CostPoint]]:
+    """Return (engine, method) -> points by run time, of those that have a place on log axes."""
+    out: dict[tuple[str, str], list[CostPoint]] = {}
+    for point in result.costs:
+        if 0 < point.seconds < math.inf and 0 <= point.error < math.inf:
+            out.setdefault((point.engine, point.method), []).append(point)
+    return {key: sorted(points, key=lambda p: p.seconds) for key, points in out.items()}
+
+
+def reached(points: Iterable[CostPoint], error: float) -> CostPoint | None:
+    """Return the fastest run with at most this error."""
+    return min((p for p in points if p.error <= error), key=lambda p: p.seconds, default=None)

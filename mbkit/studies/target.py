@@ -1,0 +1,106 @@
+"""What a person asks about: a robot, a catalog system, a file, or a function of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from mbkit import catalog
+from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError
+from mbkit.load import load
+from mbkit.load.names import find
+from mbkit.model import Model
+
+__all__ = ["model_of"]
+
+_FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
+
+
+def model_of(target: str, options: Mapping[str, Any] | None = None) -> Model:
+    """Return the model that a text names.
+
+    Parameters
+    ----------
+    target : str
+        A robot's name, a catalog system's, a path, or ``package.module:function``
+        for a function without arguments that returns a `Model`; the current folder
+        is looked in first.
+    options : mapping, optional
+        Keyword arguments of `mbkit.load`, for robots and files only.
+
+    Raises
+    ------
+    UnknownNameError, LoadError, ModelError
+        With the culprit; whatever a user's function raises is told in a `LoadError`.
+    """
+    options = options or {}
+    if _FUNCTION.fullmatch(target) and not os.path.exists(target):
+        _refuse(options, "a function")
+        return _from_function(*target.split(":"))
+    systems = catalog.systems()
+    if target in systems:
+        if find(target) is None:
+            _refuse(options, "a catalog system")
+            return systems[target]()
+        told = f"{target!r} is a robot and a catalog system; this is the robot, mbkit.catalog:{target} is the other"
+        warnings.warn(told, MbkitWarning, stacklevel=2)
+    try:
+        return load(target, **options)
+    except UnknownNameError as error:
+        hint = "(mbkit robots lists them; a path ends in .urdf or .xml, a function is package.module:function)"
+        raise UnknownNameError("robot or catalog system", target, [*systems, *error.known], hint) from None
+
+
+def _refuse(options: Mapping[str, Any], what: str) -> None:
+    if options:
+        told = ", ".join(options)
+        raise InputError(f"{told}: only for robots and files; the target is {what}, which makes its own model")
+
+
+def _from_function(module_name: str, name: str) -> Model:
+    target = f"{module_name}:{name}"
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    with _blamed(f"{target}: cannot import {module_name!r}"):
+        made: Any = importlib.import_module(module_name)
+    where = module_name
+    for part in name.split("."):
+        if not hasattr(made, part):
+            raise UnknownNameError("function", part, [n for n in dir(made) if n[0] != "_"], f"(in {where})")
+        made, where = getattr(made, part), f"{where}.{part}"
+    if callable(made):
+        with _blamed(f"{target}: the function failed"):
+            made = made()
+    if not isinstance(made, Model):
+        told = f"expected a Model, got {type(made).__name__}; return mbkit.load(...) or builder.build()"
+        raise LoadError(f"{target}: {told}")
+    return made
+
+
+@contextlib.contextmanager
+def _blamed(what: str) -> Iterator[None]:
+    """Turn any exception of a user's code into a `LoadError` that says where it was."""
+    try:
+        # What it prints must not end up among a caller's JSON.
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise LoadError(f"{what}: {type(error).__name__}: {error}{_place(error)}") from error
+
+
+def _place(error: BaseException) -> str:
+    """Return where a user's code failed, unless the message itself says it or the fault is not in code."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    ours = place.filename == __file__ or place.filename.startswith("<frozen")
+    if ours or isinstance(error, (SyntaxError, MbkitError)):
+        return ""
+    return f" ({place.filename}, line {place.lineno})"
