@@ -219,7 +219,7 @@ class Dynamics(ABC):
         if self.refuses:
             self._require(quantity)
         checked = {k: (self.model.check_q(x) if k == "q" else self.model.check_v(x, k)) for k, x in arguments.items()}
-        size = None if all(x.ndim == 1 for x in checked.values()) else batch_of(**checked)
+        size = batch_of(**checked)
         if size is not None:
             checked = {k: np.broadcast_to(x, (size, x.shape[-1])) for k, x in checked.items()}
         try:

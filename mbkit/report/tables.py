@@ -132,7 +132,7 @@ def _term_cell(row: Row | None) -> Text:
 
 
 def _rollouts(result: Comparison) -> list[RenderableType]:
-    table = _table("integrator", "engine", *_right("horizon", "growth", "difference", "run time", "MuJoCo's"), "")
+    table = _table("integrator", "engine", *_right("horizon", "condition", "difference", "run time", "MuJoCo's"), "")
     # Eighty columns are enough without it.
     table.padding = 0
     notes: dict[str, int] = {}
@@ -142,7 +142,7 @@ def _rollouts(result: Comparison) -> list[RenderableType]:
             Text(inline(r.method)),
             Text(r.engine),
             time_text(r.duration),
-            count_text(r.growth) + ("×" if math.isfinite(r.growth) else ""),
+            count_text(r.condition),
             Text(f"{mark} {error_text(r.error):>7}", style=style),
             time_text(r.seconds),
             time_text(r.seconds_against),

@@ -93,7 +93,7 @@ class RolloutRow:
         Step and compared horizon, s.
     error : float
         Largest difference of q over the horizon (on the manifold).
-    growth : float
+    condition : float
         The rollout's condition: how far q moves per relative disturbance of the
         forces, see `mbkit.studies.rollouts`.
     tolerance : float
@@ -111,7 +111,7 @@ class RolloutRow:
     dt: float
     duration: float
     error: float
-    growth: float
+    condition: float
     tolerance: float
     steps: int
     seconds: float

@@ -73,11 +73,11 @@ def rollouts(model: Model, made: Mapping[str, Dynamics], seed: int, note: str) -
     q0, v0 = start_state(model, seed)
     for method, native in _PAIRS:
         theirs = quiet_simulate(engines["mujoco"], q0, v0, DURATION, native, STEP)
-        growth = _condition(engines["mujoco"], engines[ours_on[0]], native, theirs)
-        last = _safe(growth)
+        condition = _condition(engines["mujoco"], engines[ours_on[0]], native, theirs)
+        last = _safe(condition)
         for name in ours_on:
             ours = quiet_simulate(engines[name], q0, v0, STEP * last, method, STEP)
-            rows.append(_row(model, method, name, native, ours, theirs, growth, last, note))
+            rows.append(_row(model, method, name, native, ours, theirs, condition, last, note))
     if model.needs.damping:
         rows.append(_implicit_damping(model, engines["mujoco"], q0, v0))
     return tuple(rows)
@@ -102,10 +102,10 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
     return np.asarray(np.maximum.accumulate(off))
 
 
-def _safe(growth: Array) -> int:
+def _safe(condition: Array) -> int:
     """Return the last step before the condition says too little."""
-    beyond = np.flatnonzero(growth > _CHAOS)
-    return int(beyond[0]) - 1 if beyond.size else len(growth) - 1
+    beyond = np.flatnonzero(condition > _CHAOS)
+    return int(beyond[0]) - 1 if beyond.size else len(condition) - 1
 
 
 def _row(
@@ -115,19 +115,19 @@ def _row(
     native: str,
     ours: Trajectory,
     theirs: Trajectory,
-    growth: Array,
+    condition: Array,
     last: int,
     note: str,
 ) -> RolloutRow:
     n = min(len(ours.t), last + 1)
-    grown = float(growth[:n].max(initial=0.0))
+    grown = float(condition[:n].max(initial=0.0))
     tolerance = max(TOLERANCE, _ROUNDINGS * _EPS * grown)
     error = float(np.abs(model.difference(theirs.q[:n], ours.q[:n])).max()) if n > 1 else 0.0
     notes = [note] if note else []
     if n <= last:
         notes.append(f"stopped at t = {ours.t[-1]:.3g} s: {ours.stats.message}")
     if last < round(DURATION / STEP):
-        why = "rounding grows too much" if last + 1 < len(growth) else "MuJoCo's own run diverges"
+        why = "rounding grows too much" if last + 1 < len(condition) else "MuJoCo's own run diverges"
         notes.append(f"horizon cut to {last * STEP:.3g} s, where {why}")
     return RolloutRow(
         method=method,
@@ -136,7 +136,7 @@ def _row(
         dt=STEP,
         duration=(n - 1) * STEP,
         error=error,
-        growth=grown,
+        condition=grown,
         tolerance=tolerance,
         steps=n - 1,
         seconds=ours.stats.seconds,
@@ -160,7 +160,7 @@ def _implicit_damping(model: Model, dyn: Dynamics, q0: Array, v0: Array) -> Roll
         dt=STEP,
         duration=(n - 1) * STEP,
         error=difference,
-        growth=float("nan"),
+        condition=float("nan"),
         tolerance=float("inf"),
         steps=n - 1,
         seconds=begun.stats.seconds,
