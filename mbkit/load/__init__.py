@@ -2,7 +2,7 @@
 
 from mbkit._callable import make_callable
 from mbkit.load.loader import load
-from mbkit.load.names import Robot, robots
+from mbkit.load.records import Robot, robots
 
 __all__ = ["Robot", "load", "robots"]
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import importlib.metadata
-import warnings
 from collections import Counter
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from mbkit.errors import LoadError, MbkitError, MbkitWarning, ModelError, UnknownNameError
+from mbkit.errors import LoadError, UnknownNameError
 
-__all__ = ["Robot", "find", "robots"]
+__all__ = ["Entry", "entries", "find", "unknown"]
 
 _PACKAGE: Final = "example-robot-data"
 
@@ -46,83 +44,27 @@ _SHORT: Final = {
 }
 
 
-@dataclass(frozen=True)
-class Robot:
-    """A URDF of example-robot-data; its size is read when first asked for.
-
-    Attributes
-    ----------
-    name : str
-        Folder and file, such as ``"panda_description/panda"``.
-    aliases : tuple of str
-        Shorter names, the usual one first.
-    path : pathlib.Path
-    """
+class Entry(NamedTuple):
+    """A URDF of example-robot-data: folder and file, shorter names, and where it is."""
 
     name: str
     aliases: tuple[str, ...]
     path: Path
 
-    @cached_property
-    def _facts(self) -> tuple[int | None, int | None, float | None, str | None]:
-        from mbkit.load.loader import load
 
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", MbkitWarning)
-                model = load(self.name)
-        except ModelError as error:
-            return None, None, None, "; ".join(error.faults)
-        except MbkitError as error:
-            return None, None, None, str(error)
-        return model.nq, model.nv, model.mass, None
-
-    @property
-    def nq(self) -> int | None:
-        """Number of coordinates, mimic joints reduced; None if it does not load."""
-        return self._facts[0]
-
-    @property
-    def nv(self) -> int | None:
-        """Number of velocities; None if it does not load."""
-        return self._facts[1]
-
-    @property
-    def mass(self) -> float | None:
-        """Total mass in kg; None if it does not load."""
-        return self._facts[2]
-
-    @property
-    def reason(self) -> str | None:
-        """Why it does not load; None if it does."""
-        return self._facts[3]
-
-
-def robots() -> tuple[Robot, ...]:
-    """Return a record of every robot of example-robot-data, by name.
-
-    Returns
-    -------
-    tuple of Robot
-        Each with ``name``, ``aliases``, ``path``, and ``nq``, ``nv``, ``mass`` or the
-        ``reason`` why it does not load; the last four are found when first asked for.
-
-    Raises
-    ------
-    LoadError
-        example-robot-data is not installed.
-    """
+def entries() -> tuple[Entry, ...]:
+    """Return every URDF, by name; `LoadError` where example-robot-data is not installed."""
     return _table()[0]
 
 
-def find(name: str) -> Robot | None:
+def find(name: str) -> Entry | None:
     """Return the robot of this name, or None; case and ``-`` or ``_`` do not matter."""
     return _table()[1].get(_key(name))
 
 
 def unknown(name: str) -> UnknownNameError:
     """Return the error for a name that is neither a robot nor a path."""
-    known = sorted({(r.aliases or (r.name,))[0] for r in robots()} | _SHORT.keys() | {r.name for r in robots()})
+    known = sorted({(r.aliases or (r.name,))[0] for r in entries()} | _SHORT.keys() | {r.name for r in entries()})
     return UnknownNameError(
         "robot", name, known, "(a path to a file ends in .urdf or .xml; mbkit robots lists all names)"
     )
@@ -153,7 +95,7 @@ def _files() -> list[tuple[str, str, Path]]:
 
 
 @lru_cache(maxsize=1)
-def _table() -> tuple[tuple[Robot, ...], dict[str, Robot]]:
+def _table() -> tuple[tuple[Entry, ...], dict[str, Entry]]:
     files = _files()
     stems = Counter(_key(stem) for _, stem, _ in files)
     short = {_key(alias) for alias in _SHORT}
@@ -163,8 +105,8 @@ def _table() -> tuple[tuple[Robot, ...], dict[str, Robot]]:
         aliases = [a for a, full in _SHORT.items() if full == name]
         if stems[_key(stem)] == 1 and _key(stem) not in short:
             aliases.append(stem)
-        made.append(Robot(name, tuple(aliases), path))
-    by_key: dict[str, Robot] = {}
+        made.append(Entry(name, tuple(aliases), path))
+    by_key: dict[str, Entry] = {}
     for robot in made:
         folder, stem = robot.name.split("/")
         for name in (robot.name, f"{_short_folder(folder)}/{stem}", *robot.aliases):

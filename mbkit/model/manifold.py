@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import InputError
-
-if TYPE_CHECKING:
-    from mbkit.model.model import Model
+from mbkit.model.layout import Layout
+from mbkit.model.parts import Joint
 
 __all__ = ["check_quaternions", "difference", "integrate", "limits_box", "neutral", "random_state"]
 
@@ -20,7 +19,26 @@ __all__ = ["check_quaternions", "difference", "integrate", "limits_box", "neutra
 _UNIT = 1e-9
 
 
-def check_quaternions(model: Model, q: Array, name: str = "q") -> None:
+class Jointed(Protocol):
+    """What has coordinates: a `Model`."""
+
+    @property
+    def nq(self) -> int: ...
+    @property
+    def nv(self) -> int: ...
+    @property
+    def layout(self) -> Layout: ...
+    @property
+    def independent_joints(self) -> tuple[Joint, ...]: ...
+    @property
+    def quaternions(self) -> tuple[tuple[int, str], ...]: ...
+    @property
+    def lower(self) -> Array: ...
+    @property
+    def upper(self) -> Array: ...
+
+
+def check_quaternions(model: Jointed, q: Array, name: str = "q") -> None:
     """Raise `InputError` where a quaternion in q is not of unit length."""
     for start, joint in model.quaternions:
         if q.ndim == 1:
@@ -37,7 +55,7 @@ def check_quaternions(model: Model, q: Array, name: str = "q") -> None:
             )
 
 
-def neutral(model: Model) -> Array:
+def neutral(model: Jointed) -> Array:
     """Return zeros with identity quaternions, shape (nq,)."""
     q = np.zeros(model.nq)
     for start, _ in model.quaternions:
@@ -45,7 +63,7 @@ def neutral(model: Model) -> Array:
     return q
 
 
-def limits_box(model: Model) -> tuple[Array, Array]:
+def limits_box(model: Jointed) -> tuple[Array, Array]:
     """Return lower and upper ends of the box that `random_state` draws from."""
     lower, upper = np.array(model.lower), np.array(model.upper)
     for joint in model.independent_joints:
@@ -67,7 +85,7 @@ def _clipped(lower: float, upper: float, reach: float) -> tuple[float, float]:
     return max(lower, upper - 2 * reach), min(upper, lower + 2 * reach)
 
 
-def random_state(model: Model, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
+def random_state(model: Jointed, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
     """Draw q uniformly within the limits and v from the standard normal."""
     n = 1 if size is None else size
     lower, upper = limits_box(model)
@@ -81,7 +99,7 @@ def random_state(model: Model, rng: np.random.Generator, size: int | None = None
     return (q[0], v[0]) if size is None else (q, v)
 
 
-def integrate(model: Model, q: Array, dq: Array) -> Array:
+def integrate(model: Jointed, q: Array, dq: Array) -> Array:
     """Return q ⊕ dq."""
     if not model.quaternions:
         return np.asarray(q + dq)
@@ -107,7 +125,7 @@ def integrate(model: Model, q: Array, dq: Array) -> Array:
     return out
 
 
-def difference(model: Model, q0: Array, q1: Array) -> Array:
+def difference(model: Jointed, q0: Array, q1: Array) -> Array:
     """Return the dq with integrate(q0, dq) = q1."""
     if not model.quaternions:
         return np.asarray(q1 - q0)
