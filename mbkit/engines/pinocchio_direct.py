@@ -105,30 +105,52 @@ def _of_q(bare: Call, checked: Call, sound: Sound) -> Call:
 
 
 def _of_q_v(bare: Call, checked: Call, sound: Sound) -> Call:
-    looks = sound is not _always
+    if sound is _always:
 
-    def call(q: Any, v: Any) -> Any:
+        def call(q: Any, v: Any) -> Any:
+            try:
+                out = bare(q, v)
+                if out.dot(out) < _INFINITY and q.ndim == 1 == v.ndim:
+                    return out
+            except Exception:  # as above
+                pass
+            return checked(q, v)
+
+        return call
+
+    def guarded(q: Any, v: Any) -> Any:
         try:
             out = bare(q, v)
-            if out.dot(out) < _INFINITY and q.ndim == 1 == v.ndim and (not looks or sound(q)):
+            if out.dot(out) < _INFINITY and q.ndim == 1 == v.ndim and sound(q):
                 return out
         except Exception:  # as above
             pass
         return checked(q, v)
 
-    return call
+    return guarded
 
 
 def _of_q_v_x(bare: Call, checked: Call, sound: Sound) -> Call:
-    looks = sound is not _always
+    if sound is _always:
 
-    def call(q: Any, v: Any, x: Any) -> Any:
+        def call(q: Any, v: Any, x: Any) -> Any:
+            try:
+                out = bare(q, v, x)
+                if out.dot(out) < _INFINITY and q.ndim == 1 == v.ndim == x.ndim:
+                    return out
+            except Exception:  # as above
+                pass
+            return checked(q, v, x)
+
+        return call
+
+    def guarded(q: Any, v: Any, x: Any) -> Any:
         try:
             out = bare(q, v, x)
-            if out.dot(out) < _INFINITY and q.ndim == 1 == v.ndim == x.ndim and (not looks or sound(q)):
+            if out.dot(out) < _INFINITY and q.ndim == 1 == v.ndim == x.ndim and sound(q):
                 return out
         except Exception:  # as above
             pass
         return checked(q, v, x)
 
-    return call
+    return guarded
