@@ -274,6 +274,14 @@ def test_misuse_is_explained(kwargs, error, message):
         mb.compare(mb.load("ur5"), **kwargs)
 
 
+def test_a_model_in_which_nothing_moves_is_told_so():
+    b = mb.ModelBuilder("rock")
+    b.add_body("a", mass=1.0)
+    b.add_joint("f", "fixed", parent="world", child="a")
+    with pytest.raises(InputError, match="nothing moves in rock"):
+        mb.compare(b.build())
+
+
 def test_hard_states_are_hard():
     model = random_tree(0, 6, ("spherical_zyx", "revolute", "prismatic"))
     limited = random_tree(0, 6, ("spherical_zyx", "revolute", "prismatic"))

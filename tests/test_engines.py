@@ -180,6 +180,21 @@ def test_shapes_are_as_documented_for_one_velocity_too(engine, n):
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))
+def test_a_model_without_velocities_has_empty_terms_and_poses(engine):
+    b = mb.ModelBuilder("rock")
+    b.add_body("a", mass=1.0, com=(0, 0, 0.3))
+    b.add_joint("f", "fixed", parent="world", child="a", translation=(1, 0, 0))
+    b.add_frame("top", body="a", translation=(0, 0, 1))
+    dyn, none = mb.dynamics(b.build(), engine), np.zeros(0)
+    assert dyn.mass_matrix(none).shape == (0, 0)
+    assert dyn.mass_matrix(np.zeros((3, 0))).shape == (3, 0, 0)
+    assert dyn.forward_dynamics(none, none, none).shape == (0,)
+    assert dyn.potential_energy(none) == pytest.approx(0.3 * 9.81)
+    assert dyn.pose(none, "top")[:3, 3] == pytest.approx([1, 0, 1])
+    assert dyn.jacobian(none, "top").shape == (6, 0)
+
+
+@pytest.mark.parametrize("engine", list(ENGINES))
 def test_results_are_not_views_of_the_next_call(engine):
     model = mb.load("ur5")
     dyn = mb.dynamics(model, engine)

@@ -121,6 +121,8 @@ def _silent(_fraction: float, _text: str) -> None:
 def _checked(model: Model, engines: Sequence[str], samples: int, tolerance: float) -> tuple[str, ...]:
     if not isinstance(model, Model):
         raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    if not model.nv:
+        raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to compare; add a joint")
     if isinstance(engines, str):
         raise InputError(f"engines: expected several names, got the string {engines!r}; write ({engines!r}, ...)")
     for name in engines:
