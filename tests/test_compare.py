@@ -14,7 +14,7 @@ import mbkit as mb
 from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.pinocchio import PinocchioDynamics
 from mbkit.errors import InputError, OutputError, UnknownNameError
-from mbkit.studies.measure import Scales, force_errors, matrix_errors
+from mbkit.studies.measure import Scales, acceleration_errors, force_errors, matrix_errors
 from mbkit.studies.rollouts import rollouts
 from mbkit.studies.states import states as study_states
 from mbkit.studies.terms import TERMS
@@ -306,8 +306,8 @@ def test_no_unit_changes_the_error_of_a_mass_matrix():
     E = 1e-9 * rng.standard_normal(M.shape)
     v = rng.standard_normal((5, 4))
     D = np.diag([1e3, 1e-3, 1.0, 7.0])
-    plain = matrix_errors(M + E, M, Scales.of(M, v))
-    scaled = matrix_errors(D @ (M + E) @ D, D @ M @ D, Scales.of(D @ M @ D, v))
+    plain = matrix_errors(M + E, M, Scales.of(M, v, v))
+    scaled = matrix_errors(D @ (M + E) @ D, D @ M @ D, Scales.of(D @ M @ D, v, v))
     assert plain.relative == pytest.approx(scaled.relative)
     assert plain.relative == pytest.approx(
         [(abs(e) / np.sqrt(np.outer(np.diag(m), np.diag(m)))).max() for e, m in zip(E, M, strict=True)]
@@ -316,19 +316,42 @@ def test_no_unit_changes_the_error_of_a_mass_matrix():
 
 def test_a_vanishing_term_is_measured_by_the_forces_at_play():
     M, v = np.eye(2)[None], np.array([[3.0, 4.0]])
-    scales = Scales.of(M, v)
-    errors = force_errors(np.array([[1e-15, 0.0]]), np.zeros((1, 2)), scales)
-    assert errors.relative == pytest.approx([1e-15 / 25])
-    assert force_errors(np.zeros((1, 2)), np.zeros((1, 2)), Scales.of(M, 0 * v)).relative == [0.0]
+    none, e = np.zeros((1, 2)), np.array([[1e-15, 0.0]])
+    assert force_errors(e, none, Scales.of(M, v, none)).relative == pytest.approx([1e-15 / 25])
+    assert force_errors(none, none, Scales.of(M, 0 * v, none)).relative == [0.0]
+    # |g| √m = 30 on two joints of unit inertia.
+    heavy = Scales.of(M, v, none, 30.0)
+    assert force_errors(e, none, heavy, heavy=True).relative == pytest.approx([1e-15 / (30 * np.sqrt(2))])
+    assert force_errors(e, none, heavy).relative == pytest.approx([1e-15 / 25])
+
+
+@pytest.mark.parametrize("system", ["pendulum", "cart_pole", "double_pendulum", "heavy_top", "free_body", "chain"])
+def test_small_systems_agree_at_very_many_states(system):
+    """A lone joint meets every cancellation there is: at rest, straight down, at zero energy."""
+    result = mb.compare(getattr(mb.catalog, system)(), samples=2000, terms_only=True)
+    assert result.passed, result.verdict
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_gravity_exerts_no_more_than_its_scale(seed):
+    model = random_tree(seed, 8, springs=False, damping=False, armature=False)
+    dyn = mb.dynamics(model, "lagrangian")
+    q, v = model.random_state(np.random.default_rng(0), 50)
+    weight = np.linalg.norm(model.gravity) * np.sqrt(model.mass)
+    scales = Scales.of(dyn.mass_matrix(q), v, v, weight)
+    assert (np.abs(dyn.gravity(q)) <= weight * np.sqrt(scales.diagonal) * (1 + 1e-12)).all()
 
 
 def test_forward_dynamics_is_allowed_its_condition_and_no_more():
     M, v = np.diag([1.0, 1.0])[None] + 0.999 * np.array([[[0, 1], [1, 0]]]), np.ones((1, 2))
-    scales = Scales.of(M, v)
+    scales = Scales.of(M, v, 0 * v)
     assert scales.condition == pytest.approx([1999.0])
     a = np.array([[1.0, -1.0]])
-    errors = force_errors(a * (1 + 1e-10), a, scales, by_condition=True)
+    errors = acceleration_errors(a * (1 + 1e-10), a, scales)
     assert errors.relative == pytest.approx([1e-10 / 1999.0])
+    # Forces a thousand times what is left of them round as what they are.
+    cancelled = acceleration_errors(a * (1 + 1e-10), a, Scales.of(M, v, 1e3 * v))
+    assert cancelled.relative == pytest.approx([1e-13 / 1999.0])
 
 
 def test_timings_are_positive_and_ordered():

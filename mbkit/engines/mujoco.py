@@ -156,7 +156,13 @@ class MujocoDynamics(Dynamics):
         return per_sample(one, q, v)
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
-        return self._nle(q, v) - self._gravity(q)
+        # With gravity off, so that nothing cancels.
+        flags = self._m.opt.disableflags
+        self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+        try:
+            return self._nle(q, v)
+        finally:
+            self._m.opt.disableflags = flags
 
     def _times_mass(self, x: Array) -> Array:
         out = np.zeros(self._m.nv)

@@ -176,8 +176,10 @@ class _Terms:
         self.model, self.made, self.reference = model, made, reference
         self.at, self.tolerance = at, tolerance
         self.refusals: list[Refusal] = []
-        M = made[reference].mass_matrix(at.q)
-        self.scales = Scales.of(M, at.v)
+        dyn = made[reference]
+        acting = np.abs(at.tau) + np.abs(dyn.nle(at.q, at.v)) + np.abs(dyn.passive(at.q, at.v))
+        heavy = float(np.linalg.norm(model.gravity)) * np.sqrt(model.mass)
+        self.scales = Scales.of(dyn.mass_matrix(at.q), at.v, acting, heavy)
         #: The joint of each velocity.
         self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
 

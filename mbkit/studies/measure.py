@@ -1,10 +1,15 @@
 """How errors are measured: per sample, relative to a scale that does not vanish.
 
 For a vector x with error e the error is ‖e‖ / max(‖x‖, ‖M‖ ‖v‖²): a term that
-happens to be small is compared with the forces at play. M's is the largest
-|e_ij| / √(M_ii M_jj), which no unit can change. Forward dynamics loses cond(M)
-in any arithmetic, so its error is divided by that (Higham 2002, Accuracy and
-Stability of Numerical Algorithms, ch. 7). Beside each stands a figure per joint.
+happens to be small is compared with the forces at play. Where gravity is among
+them, so is what it could do: |g| √(m M_jj) is the most that it exerts on joint j
+(Cauchy and Schwarz on Σ m_i g · J_ij), and what rounds with it where a pendulum
+hangs straight down. M's error is the largest |e_ij| / √(M_ii M_jj), which no unit
+can change. Forward dynamics loses cond(M) in any arithmetic, so its error is
+divided by that (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 7),
+on a scale that the forces which cancel in M a keep from vanishing. An energy,
+whose zero is arbitrary, is measured by the largest of all samples. Beside each
+stands a figure per joint.
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ import numpy as np
 
 from mbkit._check import Array
 
-__all__ = ["Errors", "Scales", "force_errors", "matrix_errors", "scalar_errors"]
+__all__ = ["Errors", "Scales", "acceleration_errors", "energy_errors", "force_errors", "matrix_errors"]
 
 
 @dataclass(frozen=True)
@@ -26,24 +31,34 @@ class Scales:
     ----------
     diagonal : (N, nv) array
         Of M.
-    floor : (N,) array
+    inertial : (N,) array
         ‖M‖ ‖v‖².
+    weight : (N,) array
+        The norm over j of |g| √(m M_jj).
+    acting : (N, nv) array
+        |τ| + |nle| + |τ_passive|, what cancels in M a.
     condition : (N,) array
         cond(M), after scaling to a unit diagonal (no unit can change it).
     """
 
     diagonal: Array
-    floor: Array
+    inertial: Array
+    weight: Array
+    acting: Array
     condition: Array
 
     @classmethod
-    def of(cls, M: Array, v: Array) -> Scales:
-        """Take the scales from the reference's M at the samples."""
+    def of(cls, M: Array, v: Array, acting: Array, weight: float = 0.0) -> Scales:
+        """Take the scales from the reference's values at the samples.
+
+        `weight` is |g| √m.
+        """
         diagonal = np.einsum("nii->ni", M).copy()
         norm = np.linalg.norm(M, 2, axis=(1, 2))
         root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled = M / (root[:, :, None] * root[:, None, :])
-        return cls(diagonal, norm * np.sum(v * v, axis=1), np.linalg.cond(scaled))
+        heavy = weight * np.sqrt(np.sum(np.abs(diagonal), axis=1))
+        return cls(diagonal, norm * np.sum(v * v, axis=1), heavy, acting, np.linalg.cond(scaled))
 
 
 @dataclass(frozen=True)
@@ -65,23 +80,29 @@ def _ratio(e: Array, scale: Array) -> Array:
     return np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
 
 
-def force_errors(x: Array, reference: Array, scales: Scales, *, by_condition: bool = False) -> Errors:
-    """Compare vectors of generalized forces, or accelerations with `by_condition`."""
+def force_errors(x: Array, reference: Array, scales: Scales, *, heavy: bool = False) -> Errors:
+    """Compare vectors of generalized forces; `heavy` where gravity is among them."""
     e = np.abs(x - reference)
-    size = np.linalg.norm(reference, axis=1)
-    if by_condition:
-        # The natural norm of an acceleration is the energy's: √(M_jj) a_j.
-        root = np.sqrt(scales.diagonal)
-        weighted = np.linalg.norm(root * (x - reference), axis=1)
-        relative = _ratio(weighted, np.linalg.norm(root * reference, axis=1) * scales.condition)
-        own = np.abs(reference) * scales.condition[:, None]
-    else:
-        relative = _ratio(np.linalg.norm(x - reference, axis=1), np.maximum(size, scales.floor))
-        # A joint's own scale: its force, or what its own inertia makes of v².
-        trace = scales.diagonal.sum(axis=1, keepdims=True)
-        share = np.sqrt(scales.diagonal / np.where(trace > 0, trace, 1.0))
-        own = np.maximum(np.abs(reference), scales.floor[:, None] * share)
+    floor = np.maximum(scales.inertial, scales.weight) if heavy else scales.inertial
+    relative = _ratio(np.linalg.norm(e, axis=1), np.maximum(np.linalg.norm(reference, axis=1), floor))
+    # A joint's own scale: its force, or its share of what is at play.
+    trace = scales.diagonal.sum(axis=1, keepdims=True)
+    share = np.sqrt(scales.diagonal / np.where(trace > 0, trace, 1.0))
+    own = np.maximum(np.abs(reference), floor[:, None] * share)
     return Errors(e.max(axis=1, initial=0.0), relative, _ratio(e, own).max(axis=0))
+
+
+def acceleration_errors(x: Array, reference: Array, scales: Scales) -> Errors:
+    """Compare accelerations in the norm √M_jj a_j, per cond(M)."""
+    e, root = np.abs(x - reference), np.sqrt(scales.diagonal)
+    pushed = np.linalg.norm(scales.acting / np.where(root > 0, root, np.inf), axis=1)
+    size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
+    own = np.maximum(np.abs(reference), scales.acting / np.where(scales.diagonal > 0, scales.diagonal, np.inf))
+    return Errors(
+        e.max(axis=1, initial=0.0),
+        _ratio(np.linalg.norm(root * e, axis=1), size * scales.condition),
+        _ratio(e, own * scales.condition[:, None]).max(axis=0),
+    )
 
 
 def matrix_errors(M: Array, reference: Array, scales: Scales) -> Errors:
@@ -92,7 +113,8 @@ def matrix_errors(M: Array, reference: Array, scales: Scales) -> Errors:
     return Errors(e.max(axis=(1, 2), initial=0.0), ratio.max(axis=(1, 2), initial=0.0), ratio.max(axis=(0, 1)))
 
 
-def scalar_errors(x: Array, reference: Array, scale: Array) -> Errors:
-    """Compare energies, each by its own scale."""
+def energy_errors(x: Array, reference: Array, scales: Scales) -> Errors:
+    """Compare energies, by the largest of all samples."""
     e = np.abs(x - reference)
-    return Errors(e, _ratio(e, np.maximum(np.abs(reference), scale)), np.empty(0))
+    scale = np.maximum(np.abs(reference).max(initial=0.0), scales.inertial)
+    return Errors(e, _ratio(e, scale), np.empty(0))

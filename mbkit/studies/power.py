@@ -38,6 +38,6 @@ def power_rows(made: Mapping[str, Dynamics], at: States, scales: Scales) -> Iter
         root = np.sqrt(scales.diagonal)
         speed, size = np.linalg.norm(root * at.v, axis=1), np.linalg.norm(root * a, axis=1)
         pushes = np.linalg.norm(inertial, axis=1) + np.linalg.norm(at.tau, axis=1) + np.linalg.norm(damping, axis=1)
-        scale = speed * size + np.linalg.norm(at.v, axis=1) * pushes + scales.floor
+        scale = speed * size + np.linalg.norm(at.v, axis=1) * pushes + scales.inertial
         relative = np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
         yield name, Errors(e, relative, np.empty(0))

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.studies.measure import Errors, Scales, force_errors, matrix_errors, scalar_errors
+from mbkit.studies.measure import (
+    Errors,
+    Scales,
+    acceleration_errors,
+    energy_errors,
+    force_errors,
+    matrix_errors,
+)
 from mbkit.studies.states import States
 
 __all__ = ["TERMS", "Term"]
@@ -48,22 +56,16 @@ class Term:
         return lambda: method(*arguments)
 
 
-def _accelerations(x: Array, reference: Array, scales: Scales) -> Errors:
-    return force_errors(x, reference, scales, by_condition=True)
-
-
-def _energies(x: Array, reference: Array, scales: Scales) -> Errors:
-    return scalar_errors(x, reference, scales.floor)
-
+_HEAVY: Final = partial(force_errors, heavy=True)
 
 TERMS: Final = (
     Term("M", "mass_matrix", ("q",), matrix_errors),
-    Term("g", "gravity", ("q",), force_errors),
-    Term("nle", "nle", ("q", "v"), force_errors),
+    Term("g", "gravity", ("q",), _HEAVY),
+    Term("nle", "nle", ("q", "v"), _HEAVY),
     Term("C v", "coriolis_force", ("q", "v"), force_errors),
     Term("passive", "passive", ("q", "v"), force_errors),
-    Term("inverse dynamics", "inverse_dynamics", ("q", "v", "a"), force_errors),
-    Term("forward dynamics", "forward_dynamics", ("q", "v", "tau"), _accelerations),
-    Term("kinetic energy", "kinetic_energy", ("q", "v"), _energies),
-    Term("potential energy", "potential_energy", ("q",), _energies),
+    Term("inverse dynamics", "inverse_dynamics", ("q", "v", "a"), _HEAVY),
+    Term("forward dynamics", "forward_dynamics", ("q", "v", "tau"), acceleration_errors),
+    Term("kinetic energy", "kinetic_energy", ("q", "v"), energy_errors),
+    Term("potential energy", "potential_energy", ("q",), energy_errors),
 )
