@@ -18,6 +18,7 @@ from mbkit._version import __version__ as __version__
 if TYPE_CHECKING:
     from mbkit import catalog as catalog
     from mbkit import errors as errors
+    from mbkit import lagrangian as lagrangian
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
     from mbkit.errors import MbkitError as MbkitError
@@ -44,7 +45,7 @@ _HOME = {
     "robots": "mbkit.load",
     "simulate": "mbkit.simulate",
 }
-_MODULES = ("catalog", "errors")
+_MODULES = ("catalog", "errors", "lagrangian")
 
 __all__ = sorted([*_HOME, *_MODULES, "__version__"])
 

@@ -13,7 +13,7 @@ from mbkit.errors import InputError
 Array = NDArray[np.float64]
 _FEW: Final = 64
 
-__all__ = ["Array", "all_finite", "batch_of", "finite_array", "real", "require_finite", "rows"]
+__all__ = ["Array", "all_finite", "batch_of", "count", "finite_array", "real", "require_finite", "rows"]
 
 
 def all_finite(array: Array) -> bool:
@@ -79,8 +79,17 @@ def batch_of(**arrays: Array) -> int | None:
     return next(iter(sizes.values()), None)
 
 
+def count(name: str, value: Any, *, least: int = 0) -> int:
+    """Return `value` as a whole number of at least `least`."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+    return int(value)
+
+
 def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = False) -> float:
     """Return `value` as a finite float, optionally of a required sign."""
+    if isinstance(value, (str, bytes, bool)):
+        raise InputError(f"{name}: expected a number, got {value!r}")
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -1,6 +1,7 @@
 """The command `mbkit`: checks arguments, calls the library, prints, and says how it ended.
 
-Exit status: 0 the engines agree, 1 they differ, 2 misuse or bad input, 130 interrupted.
+Exit status: 0 the engines agree, 1 they differ, 2 misuse or bad input, 70 a fault of
+mbkit's own, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import contextlib
 import os
 import sys
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -27,6 +29,7 @@ __all__ = ["cli", "main"]
 AGREE: Final = 0
 DIFFER: Final = 1
 MISUSE: Final = 2
+INTERNAL: Final = 70
 INTERRUPTED: Final = 130
 
 
@@ -43,6 +46,13 @@ class _Door(click.Group):
         except KeyboardInterrupt:
             _say("interrupted", "nothing was finished")
             ctx.exit(INTERRUPTED)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except Exception:
+            # A status of its own: "differ" is a verdict, and this is none.
+            traceback.print_exc()
+            _say("error", "this is a fault of mbkit's; please report it with the lines above")
+            ctx.exit(INTERNAL)
 
 
 @click.group(cls=_Door, context_settings={"help_option_names": ["-h", "--help"]})
@@ -233,31 +243,46 @@ def _check_engines(names: tuple[str, ...]) -> None:
 def _show(
     data: str, table: Callable[[], RenderableType], page: Callable[[str], str], out: Path, stem: str, as_json: bool
 ) -> bool:
-    """Print a result, then write it; return whether it could be written."""
+    """Write a result and print it; return whether it could be written."""
     from mbkit.report import folder
 
-    console = _console()
-    if as_json:
-        click.echo(data)
-    else:
-        console.print(table())
+    paths: list[Path] = []
+    failure = ""
     try:
-        paths = [folder.write(out, f"{stem}.json", data + "\n")]
+        paths.append(folder.write(out, f"{stem}.json", data + "\n"))
         paths.append(folder.write(out, f"{stem}.html", page(f"{stem}.json")))
     except OutputError as error:
-        _say("error", f"{error}; the result itself is printed on stdout")
-        return False
-    if as_json:
+        failure = str(error)
+    try:
+        if as_json:
+            click.echo(data)
+        else:
+            console = _console()
+            console.print(table())
+            if not failure:
+                console.print(f"page {paths[1]}\ndata {paths[0]}", markup=False, highlight=False, soft_wrap=True)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever reads may stop early (head); the verdict stands all the same, and
+        # what is still buffered must not complain at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if failure:
+        _say("error", f"{failure}; the result itself is printed on stdout")
+    elif as_json:
         _say("written", " ".join(map(str, paths)))
-    else:
-        console.print(f"page {paths[1]}\ndata {paths[0]}", markup=False, highlight=False, soft_wrap=True)
-    return True
+    return not failure
 
 
 def _console() -> Console:
     from rich.console import Console
 
-    console = Console(highlight=False)
+    class Patient(Console):
+        """Leaves a closed pipe to the caller; rich itself would end with status 1."""
+
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    console: Console = Patient(highlight=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         # A file has no width; rich would fold at 80.
         console.width = 140

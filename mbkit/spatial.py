@@ -1,6 +1,7 @@
 """Rotations, quaternions (x, y, z, w) and rigid motions, on batches.
 
-Every function works along the last axes and broadcasts over leading ones.
+Functions of arrays work along the last axes and broadcast over leading ones; the two
+that begin with a matrix or three angles take one at a time.
 Series replace closed forms near zero where those lose digits; each says where.
 """
 

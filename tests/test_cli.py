@@ -37,6 +37,27 @@ def module(folder: Path, name: str, text: str) -> None:
     (folder / f"{name}.py").write_text(textwrap.dedent(text))
 
 
+def test_a_reader_that_stops_early_does_not_change_the_verdict(tmp_path):
+    check = f"{sys.executable} -m mbkit check pendulum --no-rollouts --out {tmp_path}"
+    piped = f"{check} | head -n 1; exit ${{PIPESTATUS[0]}}"
+    run = subprocess.run(["bash", "-c", piped], capture_output=True, text=True, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "agree" in run.stdout
+    assert not run.stderr
+    assert (tmp_path / "pendulum.html").exists()
+
+
+def test_a_fault_of_the_library_has_a_status_of_its_own(monkeypatch, tmp_path):
+    def broken(*_args, **_kwargs):
+        raise ZeroDivisionError("planted")
+
+    monkeypatch.setattr("mbkit.studies.compare", broken)
+    result = CliRunner().invoke(cli, ["check", "pendulum", "--out", str(tmp_path)])
+    assert result.exit_code == 70
+    assert "planted" in result.stderr
+    assert "please report" in result.stderr
+
+
 def test_a_robot_agrees_and_is_written(here):
     result = call("check", "ur5", *QUICK)
     assert result.exit_code == 0, result.output

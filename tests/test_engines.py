@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -261,7 +263,10 @@ def test_no_entry_that_is_not_finite_passes_unseen(engine, value):
     b.add_joint("x", "prismatic", parent="world", child="a", axis=(1, 0, 0))
     b.add_body("b", mass=1.0, com=(0, 0, 1), inertia=(1, 1, 1))
     b.add_joint("y", "revolute", parent="a", child="b", axis=(0, 1, 0))
-    for model in (b.build(), mb.load("solo12", floating_base=True)):
+    alone = mb.ModelBuilder("alone")
+    alone.add_body("a", mass=1.0)
+    alone.add_joint("x", "prismatic", parent="world", child="a", axis=(0, 0, 1))
+    for model in (b.build(), alone.build(), mb.load("solo12", floating_base=True)):
         dyn = mb.dynamics(model, engine)
         for name, letters in VECTORS.items():
             good = [model.neutral() if x == "q" else np.zeros(model.nv) for x in letters]
@@ -298,6 +303,10 @@ def test_unknown_names_suggest_near_ones():
         mb.dynamics(model, "pinochio")
     with pytest.raises(UnknownNameError, match="wrist_3_link"):
         mb.dynamics(model).pose(model.neutral(), "wrist3_link")
+    with pytest.raises(InputError, match="frame: expected a name"):
+        mb.dynamics(model).pose(model.neutral(), 3)
+    for engine in ENGINES:
+        assert np.array_equal(mb.dynamics(model, engine).pose(model.neutral(), "world"), np.eye(4))
     with pytest.raises(InputError, match="axes"):
         mb.dynamics(model).jacobian(model.neutral(), "wrist_3_link", "local")
     with pytest.raises(InputError, match="Model"):
@@ -334,6 +343,33 @@ def test_dynamics_can_be_pickled(engine):
     dyn = mb.dynamics(model, engine)
     q, v, _, _ = (x[0] for x in states(model, 1))
     assert np.array_equal(pickle.loads(pickle.dumps(dyn)).nle(q, v), dyn.nle(q, v))
+
+
+@pytest.mark.parametrize("engine", list(ENGINES))
+def test_threads_that_share_an_engine_get_right_numbers_or_are_told(engine):
+    """MuJoCo's and CasADi's engines lock; Pinocchio's calls hold the interpreter's own lock."""
+    model = mb.load("panda")
+    dyn = mb.dynamics(model, engine)
+    q, v, _, tau = states(model, 40)
+    expected = [dyn.forward_dynamics(*x) for x in zip(q, v, tau, strict=True)]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            got = list(pool.map(dyn.forward_dynamics, q, v, tau))
+            assert np.array_equal(got, expected)
+
+
+def test_mujoco_writes_no_log_and_gives_no_number_where_there_is_none(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    b = mb.ModelBuilder("twice")
+    b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(1, 1, 1))
+    b.add_joint("j", "universal", parent="world", child="a", axis=(1, 0, 0), axis2=(1, 0, 0))
+    with pytest.warns(mb.errors.NonPhysicalWarning):
+        model = b.build(nonphysical="warn")
+    dyn = mb.dynamics(model, "mujoco")
+    with pytest.raises(NumericalError):
+        dyn.forward_dynamics(np.zeros(2), np.ones(2), np.ones(2))
+    assert os.listdir(tmp_path) == []
+    assert "WARNING" not in capfd.readouterr().err
 
 
 def test_a_singular_mass_matrix_is_named_and_never_nan():

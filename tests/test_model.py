@@ -94,6 +94,35 @@ def test_random_states_keep_to_the_limits_and_fill_them():
     assert abs(v.std() - 1) < 0.05
 
 
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [(5.0, None), (None, -5.0), (5.0, 30.0), (-30.0, -5.0), (7.0, 1e308), (-1e308, -9.0), (1e300, 1e301), (2.0, 2.0)],
+)
+def test_limits_far_from_zero_are_kept(kind, lower, upper):
+    b = mb.ModelBuilder("far")
+    b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("j", kind, parent="world", child="a", axis=(0, 1, 0), lower=lower, upper=upper)
+    model = b.build()
+    q, _ = model.random_state(np.random.default_rng(0), 100)
+    assert (q >= model.lower).all()
+    assert (q <= model.upper).all()
+    near = lower if lower is not None and lower > 0 else upper
+    assert (np.abs(q - near) <= 2 * np.pi + abs(near) * 1e-12).all()
+
+
+def test_limits_of_a_follower_bound_its_leader():
+    b = pendulum(lower=-1.0, upper=1.0)
+    b.add_body("c", mass=1.0, com=(0, 0, -1))
+    follower = {"mimic": ("hinge", -2.0, 0.5), "lower": 0.1, "upper": 0.9}
+    b.add_joint("m", "revolute", parent="bob", child="c", axis=(0, 1, 0), **follower)
+    model = b.build()
+    q, _ = model.random_state(np.random.default_rng(0), 500)
+    y = model.layout.expand_q(q)[:, 1]
+    assert 0.1 <= y.min() < 0.11
+    assert 0.89 < y.max() <= 0.9
+
+
 def test_random_states_repeat_and_have_the_asked_shape():
     model = random_tree(0, 10)
     for size, lead in ((None, ()), (0, (0,)), (3, (3,))):
@@ -120,6 +149,13 @@ def test_a_model_is_frozen_and_survives_pickling_and_comparison():
     assert copy.joints[0] == model.joints[0]
     with pytest.raises(FrozenInstanceError):
         model.name = "other"
+    assert model.bodies[0] == replace(model.bodies[0], com=model.bodies[0].com + 0.0)
+    assert Mimic("j", 1, 0) == Mimic("j", 1.0, -0.0)
+    assert hash(Mimic("j", 1, 0)) == hash(Mimic("j", 1.0, -0.0))
+    for array in (model.lower, model.upper, model.layout.G, model.layout.G_q, model.layout.offsets):
+        if array.size:
+            with pytest.raises(ValueError, match="read-only"):
+                array.flat[0] = 1.0
     for array in (copy.gravity, copy.bodies[0].com, copy.joints[0].rotation):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
@@ -298,6 +334,13 @@ FAULTS = {
     "armature on a free": (joint_k("free", armature=1.0), "joint 'k': armature on a free joint"),
     "spring on a ball": (joint_k("ball", stiffness=1.0), "joint 'k': joint spring on a ball joint"),
     "pitch on a hinge": (joint_k(pitch=0.1), "joint 'k': pitch 0.1 on a revolute joint"),
+    "text as limit": (joint_k(lower="abc"), "joint 'k': lower: expected 1 numbers"),
+    "ragged limit": (joint_k(lower=[1, [2]]), "joint 'k': lower: expected 1 numbers"),
+    "ragged damping": (joint_k(damping=[1, [2]]), "joint 'k': damping: expected an array of numbers"),
+    "ragged inertia": (body_c(mass=1.0, inertia=[[1, 2], [3]]), "body 'c': inertia: expected an array of numbers"),
+    "kind as list": (lambda b: b.add_joint("k", ["a"], parent="bob", child="c"), "joint 'k': unknown kind"),
+    "limits on a quaternion": (joint_k("ball", lower=-1.0), "joint 'k': limits on the quaternion"),
+    "frame of the ground": (lambda b: b.add_frame("world", body="bob"), "frame 'world'"),
     "skewed rotation": (joint_k(rotation=2 * np.eye(3)), "joint 'k': rotation is not a rotation matrix"),
     "reflection": (joint_k(rotation=np.diag([1, 1, -1])), "joint 'k': rotation is not a rotation matrix"),
     "rotation twice": (joint_k(rotation=np.eye(3), rpy=(0, 0, 0)), "both rotation and rpy"),

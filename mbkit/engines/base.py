@@ -88,8 +88,9 @@ class Dynamics(ABC):
     def coriolis_matrix(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return C(q, v) with Ṁ - 2C skew, shape (nv, nv) or (N, nv, nv).
 
-        Coriolis matrices are not unique; this one is Christoffel's. Compare C v
-        between engines, not the entries.
+        Coriolis matrices are not unique; mbkit's own is Christoffel's. Compare C v
+        between engines, not the entries. A value that an engine is known to get
+        wrong comes with a `KnownDefectWarning`.
         """
         return self._evaluate("coriolis_matrix", self._coriolis_matrix, q=q, v=v)
 
@@ -244,9 +245,14 @@ class Dynamics(ABC):
     def _blame(self) -> str:
         suspects = [f"{name!r} ({why})" for name, why in self.model.nonphysical]
         # A joint that moves no mass is the likeliest cause; say it first.
-        suspects.sort(key=lambda text: "moves no mass" not in text)
+        suspects.sort(key=lambda text: "no mass moves" not in text)
         more = f" and {len(suspects) - 3} more" if len(suspects) > 3 else ""
-        return f"; suspect: {', '.join(suspects[:3])}{more}" if suspects else "; look at massless links there"
+        if suspects:
+            return f"; suspect: {', '.join(suspects[:3])}{more}"
+        springs = [repr(s.name) for s in self.model.springs if s.rest_length or s.damping]
+        if springs:
+            return f"; perhaps a point spring of no length there has no direction: {', '.join(springs[:3])}"
+        return "; perhaps links without mass, or numbers so large that they overflow"
 
     @staticmethod
     def _scalar(value: Array) -> Any:

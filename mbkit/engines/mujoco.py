@@ -9,6 +9,8 @@ a_mj = T a + b with b = R (ω × v).
 from __future__ import annotations
 
 import copy
+import threading
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import mujoco
@@ -16,12 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import Array, batch_of, count, real
 from mbkit.engines.base import Dynamics, per_sample
-from mbkit.engines.mujoco_api import full_mass_matrix, make_mass_matrix
+from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel, build
 from mbkit.engines.mujoco_rollout import Rollout
-from mbkit.errors import UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
 
 __all__ = ["MujocoDynamics"]
@@ -52,6 +54,15 @@ class MujocoDynamics(Dynamics):
         self.disabled = self._made.disabled
         self._d = mujoco.MjData(self._m)
         self._reduced = model.layout.reduced
+        self._lock = threading.RLock()
+
+    def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+        # One MjData and one handler of warnings: two threads in here end the process.
+        with self._lock, heard_warnings() as heard:
+            out = super()._evaluate(quantity, method, **arguments)
+        if heard:
+            raise NumericalError(f"mujoco: {quantity} of {self.model.name}: {heard[0].strip()}{self._blame()}")
+        return out
 
     # Between the description's numbers and MuJoCo's.
 
@@ -110,7 +121,7 @@ class MujocoDynamics(Dynamics):
         self._set(q)
         mujoco.mj_kinematics(self._m, self._d)
         mujoco.mj_comPos(self._m, self._d)
-        make_mass_matrix(self._m, self._d)
+        mujoco.mj_makeM(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
 
     def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
@@ -309,6 +320,14 @@ class MujocoDynamics(Dynamics):
                 f"mujoco: native rollouts of mimic joints ({names}) would follow a soft equality, not the reduced "
                 "equations; load with mimic='free', or use method='rk4' on this engine"
             )
+        q0, v0 = self.model.check_q(q0, "q0"), self.model.check_v(v0, "v0")
+        size = batch_of(q0=q0, v0=v0)
+        if size is not None:
+            q0, v0 = (np.broadcast_to(x, (size, x.shape[-1])) for x in (q0, v0))
+        real("dt", dt, positive=True)
+        count("steps", steps)
+        if tau is not None and np.shape(tau) not in ((steps, self.model.nv), (size, steps, self.model.nv)):
+            raise InputError(f"tau: expected shape ({steps}, {self.model.nv}), one row a step, got {np.shape(tau)}")
         model = copy.copy(self._m)
         if euler_damping:
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)

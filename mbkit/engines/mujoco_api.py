@@ -1,30 +1,38 @@
-"""The differences between MuJoCo versions, detected once."""
+"""What differs between versions of MuJoCo and what is global in it, in one place.
+
+4.0 is the first whose Runge–Kutta on rotations is of fourth order, and the lower
+bound. `mj_fullM` took the matrix itself before 3.10, and takes the data since.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Final
+import contextlib
+from collections.abc import Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from mbkit._check import Array
 
-__all__ = ["full_mass_matrix", "make_mass_matrix"]
-
-# 3.10 put the data in front of the destination; before, the matrix itself was given.
-_FULL_TAKES_DATA: Final = "d: mujoco._structs.MjData" in (mujoco.mj_fullM.__doc__ or "")
-
-# 4.0 made one entry that also sums tendon armature; before, it was mj_crb.
-make_mass_matrix: Final[Any] = getattr(mujoco, "mj_makeM", None) or mujoco.mj_crb
+__all__ = ["full_mass_matrix", "heard_warnings"]
 
 
 def full_mass_matrix(model: Any, data: Any) -> Array:
-    """Return the dense mass matrix of the last `make_mass_matrix`."""
+    """Return the dense mass matrix of the last `mj_makeM`."""
     out = np.zeros((model.nv, model.nv))
-    if not model.nv:
-        return out
-    if _FULL_TAKES_DATA:
+    if model.nv:
         mujoco.mj_fullM(model, data, out)
-    else:
-        mujoco.mj_fullM(model, out, data.qM)
     return out
+
+
+@contextlib.contextmanager
+def heard_warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, instead of prints and a MUJOCO_LOG.TXT in the working folder."""
+    heard: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(heard.append)
+    try:
+        yield heard
+    finally:
+        mujoco.set_mju_user_warning(before)

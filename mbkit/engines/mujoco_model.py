@@ -9,7 +9,7 @@ between two joints becomes such a stack too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
@@ -57,7 +57,6 @@ class MujocoModel:
     bodies: dict[str, int]
     absorbed: frozenset[str]
     disabled: tuple[str, ...]
-    notes: tuple[str, ...] = field(default=())
 
 
 def build(description: Model, *, spheres: bool = False) -> MujocoModel:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterator
 from typing import Any, Final
 
 import mujoco
@@ -13,6 +11,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel
 from mbkit.errors import UnknownNameError, UnsupportedError
 from mbkit.model import Model
@@ -27,24 +26,6 @@ INTEGRATORS: Final = {
 }
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _FORCE: Final = mujoco.mjtState.mjSTATE_QFRC_APPLIED
-
-
-@contextlib.contextmanager
-def _own_warnings() -> Iterator[None]:
-    """Keep MuJoCo from printing and from writing MUJOCO_LOG.TXT into the working folder.
-
-    A divergence is read off the states themselves.
-    """
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_heard)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
-
-
-def _heard(_message: str) -> None:
-    """Take a warning that the states tell as well."""
 
 
 class Rollout:
@@ -74,7 +55,8 @@ class Rollout:
         control = None if tau is None else self._forces(tau, n, steps)
         threads = max(1, min(n, os.cpu_count() or 1))
         data = [mujoco.MjData(self._m) for _ in range(threads)]
-        with _own_warnings():
+        # A divergence is read off the states themselves.
+        with heard_warnings():
             states, _ = mujoco.rollout.rollout(
                 self._m, data, start, control, control_spec=int(_FORCE), nstep=steps, skip_checks=False
             )

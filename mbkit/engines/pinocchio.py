@@ -62,7 +62,10 @@ class PinocchioDynamics(Dynamics):
         # What is mixed by G_q q spreads a NaN to every coordinate.
         unread: tuple[int, ...] = ()
         if self._direct:
-            unread = unread_coordinates(m, d, self.model.neutral())
+            unread, velocities_unread = unread_coordinates(m, d, self.model.neutral())
+            if velocities_unread:
+                # A lone slide: nothing depends on v, so it must be looked at.
+                return
             terms = {"mass_matrix": pin.crba, "gravity": pin.computeGeneralizedGravity, "nle": pin.nonLinearEffects}
             needs = self.model.needs
             if not (needs.springs or needs.damping):

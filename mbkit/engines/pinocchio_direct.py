@@ -52,16 +52,30 @@ def direct_calls(
     return {name: make(bare[name], checked[name], sound) for name, make in makers.items()}
 
 
-def unread_coordinates(m: Any, d: Any, neutral: Array) -> tuple[int, ...]:
-    """Return the coordinates in which a NaN leaves some answer of Pinocchio finite."""
-    q, v = neutral.copy(), np.zeros(m.nv)
-    found = []
-    for i in range(q.size):
-        q[i], kept = np.nan, q[i]
-        if not all(np.isnan(f(m, d, q, v, v)).any() for f in (pin.rnea, pin.aba)):
-            found.append(i)
-        q[i] = kept
-    return tuple(found)
+def unread_coordinates(m: Any, d: Any, neutral: Array) -> tuple[tuple[int, ...], bool]:
+    """Return where a NaN leaves some answer of Pinocchio finite.
+
+    Returns
+    -------
+    tuple of int
+        Such coordinates.
+    bool
+        Whether there is such a velocity.
+    """
+    q, v, zero = neutral.copy(), np.zeros(m.nv), np.zeros(m.nv)
+
+    def shown() -> bool:
+        answers = (pin.rnea(m, d, q, v, zero), pin.aba(m, d, q, v, zero), pin.nonLinearEffects(m, d, q, v))
+        return all(np.isnan(x).any() for x in answers)
+
+    hidden: list[list[int]] = [[], []]
+    for found, state in zip(hidden, (q, v), strict=True):
+        for i in range(state.size):
+            state[i], kept = np.nan, state[i]
+            if not shown():
+                found.append(i)
+            state[i] = kept
+    return tuple(hidden[0]), bool(hidden[1])
 
 
 def _always(_q: Array) -> bool:

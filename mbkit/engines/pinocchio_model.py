@@ -34,7 +34,7 @@ class PinModel:
         Pinocchio's coordinate i is full coordinate ``q_order[i]``.
     ordered : bool
         Whether both orders are the identity.
-    ground_energy_slope : (3,) array
+    ground_moment : (3,) array
         Σ m p over bodies fixed to the world: Pinocchio's energy leaves them out.
     unaligned_armature : tuple of str
         Revolute joints off the positive axes that have armature.

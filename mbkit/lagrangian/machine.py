@@ -54,6 +54,9 @@ class Machine:
         if n == 0:
             f = self.function
             return [np.empty((0, f.size1_out(i), f.size2_out(i))) for i in range(f.n_out())]
+        for i, x in enumerate(arguments):
+            if x.shape[-1] != self.function.size1_in(i):
+                raise ValueError(f"argument {i}: expected {self.function.size1_in(i)} entries, got shape {x.shape}")
         with self._lock:
             _, run, inputs, outputs = self._prepared(n)
             for held, given in zip(inputs, arguments, strict=True):

@@ -76,7 +76,7 @@ class ModelBuilder:
         """
         who = f"body {name!r}"
         raw = np.zeros((3, 3)) if inertia is None else inertia
-        if np.shape(raw) == (3,):
+        if _shape(raw) == (3,):
             matrix = np.diag(self._vector(f"{who}: inertia", raw, 3))
         else:
             matrix = self._matrix(f"{who}: inertia", raw)
@@ -145,7 +145,7 @@ class ModelBuilder:
             The joint that this one follows.
         """
         who = f"joint {name!r}"
-        if kind not in KINDS:
+        if not isinstance(kind, str) or kind not in KINDS:
             near = nearest(str(kind), KINDS) or list(KINDS)
             self._faults.append(f"{who}: unknown kind {kind!r}; use one of {', '.join(near)}")
             # The other faults of this call would only be echoes of this one.
@@ -349,7 +349,7 @@ class ModelBuilder:
 
     def _vector(self, name: str, value: ArrayLike, n: int) -> Array:
         try:
-            if np.ndim(value) == 0:
+            if _shape(value) == ():
                 value = np.full(n, real(name, value))
             return finite_array(name, value, (n,))
         except InputError as error:
@@ -373,7 +373,10 @@ class ModelBuilder:
     def _limits(self, name: str, value: ArrayLike | None, n: int, default: float) -> Array:
         if value is None:
             return np.full(n, default)
-        array = np.asarray(value, dtype=float)
+        try:
+            array = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            array = np.full(n, np.nan)
         if array.ndim == 0:
             array = np.full(n, float(array))
         if array.shape != (n,) or np.isnan(array).any():
@@ -435,3 +438,11 @@ def _resolved(joints: list[Joint]) -> list[Joint]:
             mimic = Mimic(leader.joint, mimic.ratio * leader.ratio, mimic.ratio * leader.offset + mimic.offset)
         out.append(joint if mimic == joint.mimic else replace(joint, mimic=mimic))
     return out
+
+
+def _shape(value: ArrayLike) -> tuple[int, ...] | None:
+    """Return the shape, or None of what has none, such as a ragged list."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        return None

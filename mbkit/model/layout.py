@@ -76,6 +76,7 @@ class Layout:
         for j in self.joints:
             if j.mimic:
                 c[self.full_q[j.name]] = j.mimic.offset
+        c.setflags(write=False)
         return c
 
     @cached_property
@@ -96,6 +97,7 @@ class Layout:
             else:
                 part = rows[j.name]
                 G[part, columns[j.name]] = np.eye(part.stop - part.start)
+        G.setflags(write=False)
         return G
 
     def expand_q(self, q: Array) -> Array:

@@ -45,13 +45,13 @@ def check_quaternions(model: Jointed, q: Array, name: str = "q") -> None:
             x = q[start : start + 4]
             if abs(x.dot(x) - 1.0) <= _UNIT:
                 continue
-        square = np.einsum("...i,...i->...", q[..., start : start + 4], q[..., start : start + 4])
-        off = np.abs(square - 1)
+        norms = np.linalg.norm(q[..., start : start + 4], axis=-1)
+        off = np.abs(norms - 1)
         if np.any(off > _UNIT):
-            norm = float(np.sqrt(np.ravel(square)[np.argmax(off)]))
+            norm = float(np.ravel(norms)[np.argmax(off)])
             raise InputError(
                 f"{name}: the quaternion of joint {joint!r} ({name}[{start}:{start + 4}], order x, y, z, w) "
-                f"has norm {norm:.9g}; expected 1: divide it by its norm"
+                f"has norm {norm:.12g}; expected 1: divide it by its norm"
             )
 
 
@@ -64,8 +64,19 @@ def neutral(model: Jointed) -> Array:
 
 
 def limits_box(model: Jointed) -> tuple[Array, Array]:
-    """Return lower and upper ends of the box that `random_state` draws from."""
+    """Return lower and upper ends of the box that `random_state` draws from.
+
+    The limits of a joint that mimics another bound the one that it follows, as long
+    as that leaves a range.
+    """
     lower, upper = np.array(model.lower), np.array(model.upper)
+    for joint in model.layout.joints:
+        if joint.mimic and joint.mimic.ratio:
+            k = model.layout.q[joint.mimic.joint].start
+            ends = sorted((x - joint.mimic.offset) / joint.mimic.ratio for x in (joint.lower[0], joint.upper[0]))
+            low, high = max(lower[k], ends[0]), min(upper[k], ends[1])
+            if low < high:
+                lower[k], upper[k] = low, high
     for joint in model.independent_joints:
         part = model.layout.q[joint.name]
         for i in joint.type.angular:
@@ -78,11 +89,13 @@ def limits_box(model: Jointed) -> tuple[Array, Array]:
 
 
 def _clipped(lower: float, upper: float, reach: float) -> tuple[float, float]:
-    # A range that lies wholly beyond the clip is kept: an empty one helps nobody.
-    low, high = max(lower, -reach), min(upper, reach)
-    if low <= high:
-        return low, high
-    return max(lower, upper - 2 * reach), min(upper, lower + 2 * reach)
+    # Of a range that lies wholly beyond the clip its near end is kept: an empty one
+    # helps nobody.
+    if lower > reach:
+        return lower, min(upper, lower + 2 * reach)
+    if upper < -reach:
+        return max(lower, upper - 2 * reach), upper
+    return max(lower, -reach), min(upper, reach)
 
 
 def random_state(model: Jointed, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
@@ -90,7 +103,7 @@ def random_state(model: Jointed, rng: np.random.Generator, size: int | None = No
     n = 1 if size is None else size
     lower, upper = limits_box(model)
     finite = np.isfinite(lower)
-    q = np.empty((n, model.nq))
+    q = np.tile(neutral(model), (n, 1))
     q[:, finite] = rng.uniform(lower[finite], upper[finite], size=(n, int(finite.sum())))
     for start, _ in model.quaternions:
         # A normal four-vector points uniformly over the sphere: a uniform rotation.

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, rows
+from mbkit._check import Array, batch_of, count, rows
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import manifold
 from mbkit.model.digest import digest
@@ -177,12 +177,12 @@ class Model:
     @cached_property
     def lower(self) -> Array:
         """Lower limits, shape (nq,)."""
-        return np.concatenate([np.empty(0), *(j.lower for j in self.independent_joints)])
+        return _joined([j.lower for j in self.independent_joints])
 
     @cached_property
     def upper(self) -> Array:
         """Upper limits, shape (nq,)."""
-        return np.concatenate([np.empty(0), *(j.upper for j in self.independent_joints)])
+        return _joined([j.upper for j in self.independent_joints])
 
     def body(self, name: str) -> Body:
         """Return the body of this name."""
@@ -199,11 +199,17 @@ class Model:
         raise UnknownNameError("joint", name, [j.name for j in self.joints])
 
     def frame(self, name: str) -> Frame:
-        """Return the frame of this name; a body's own frame has the body's name."""
+        """Return the frame of this name.
+
+        A body's own frame has the body's name, and the ground's is ``"world"``. A
+        declared frame of a body's name goes before it.
+        """
+        if not isinstance(name, str):
+            raise InputError(f"frame: expected a name, got {name!r}")
         for frame in self.frames:
             if frame.name == name:
                 return frame
-        if any(b.name == name for b in self.bodies):
+        if name == "world" or any(b.name == name for b in self.bodies):
             return Frame(name, name, np.eye(3), np.zeros(3))
         names = [f.name for f in self.frames] + [b.name for b in self.bodies]
         raise UnknownNameError("frame", name, names)
@@ -236,8 +242,8 @@ class Model:
         """
         if not isinstance(rng, np.random.Generator):
             raise InputError(f"rng: expected a numpy Generator, got {rng!r}; use numpy.random.default_rng(seed)")
-        if size is not None and (not isinstance(size, (int, np.integer)) or size < 0):
-            raise InputError(f"size: expected None or a count of at least 0, got {size!r}")
+        if size is not None:
+            count("size", size)
         return manifold.random_state(self, rng, size)
 
     def check_q(self, q: ArrayLike, name: str = "q") -> Array:
@@ -339,6 +345,12 @@ class Model:
             f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self.mass:.4g} kg; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
+
+
+def _joined(parts: list[Array]) -> Array:
+    out = np.concatenate([np.empty(0), *parts])
+    out.setflags(write=False)
+    return out
 
 
 def _named(joint: str, suffix: str) -> str:

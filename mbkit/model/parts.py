@@ -23,9 +23,12 @@ class _Frozen:
         for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
             value = getattr(self, f.name)
             if isinstance(value, np.ndarray):
-                value = np.array(value, dtype=np.float64)
+                # + 0.0 makes one of the two zeros, which are equal and hash apart.
+                value = np.array(value, dtype=np.float64) + 0.0
                 value.setflags(write=False)
                 object.__setattr__(self, f.name, value)
+            elif f.type == "float":
+                object.__setattr__(self, f.name, float(value) + 0.0)
 
     def _values(self) -> tuple[Any, ...]:
         return tuple(getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import types
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,7 +63,8 @@ def idle_joints(model: Model) -> list[str]:
         return []
     M = sample_mass_matrix(model)
     diagonal = np.diag(M)
-    zero = diagonal <= 1e-14 * float(diagonal.max())
+    # What is left of a mass on its own axis is the square of a rounded length.
+    zero = diagonal <= 1e-28 * float(diagonal.max())
     if not zero.any():
         scaled = M / np.sqrt(np.outer(diagonal, diagonal))
         values, vectors = np.linalg.eigh(scaled)
@@ -79,20 +79,18 @@ def sample_mass_matrix(model: Model) -> Array:
     q, _ = model.random_state(np.random.default_rng(0))
     q_full = model.layout.expand_q(q)
     n = model.layout.sizes[3]
-    numpy = types.ModuleType("numpy_scalars")
-    numpy.sin, numpy.cos = np.sin, np.cos  # type: ignore[attr-defined]
     jacobians = {"world": np.zeros((6, n))}
     M = np.zeros((n, n))
     bodies = {b.name: b for b in model.bodies}
     for joint in model.tree:
         part = model.layout.full_q[joint.name], model.layout.full_v[joint.name]
-        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(numpy, joint, list(q_full[part[0]])))
+        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, list(q_full[part[0]])))
         R, p = joint.rotation @ R_JC, joint.translation + joint.rotation @ p_JC
         parent = jacobians[joint.parent]
         J = np.vstack([R.T @ (parent[:3] - skew(p) @ parent[3:]), R.T @ parent[3:]])
         for k in range(joint.type.nv):
             unit = [float(i == k) for i in range(joint.type.nv)]
-            linear, angular = joint.type.twist(numpy, joint, list(q_full[part[0]]), unit)
+            linear, angular = joint.type.twist(np, joint, list(q_full[part[0]]), unit)
             J[:, part[1].start + k] += np.array([*linear, *angular], dtype=float)
         jacobians[joint.child] = J
         body = bodies[joint.child]

@@ -34,6 +34,8 @@ def structure_faults(
         ("loop", [x.name for x in loops]),
     ):
         faults += [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
+    if any(f.name == "world" for f in frames):
+        faults.append("frame 'world': that name is the ground's; choose another")
     if any(b.name == "world" for b in bodies):
         faults.append("body 'world': that name is the ground's; choose another")
     for joint in joints:
@@ -77,6 +79,10 @@ def _joint_faults(joint: Joint) -> list[str]:
         out.append(f"{who}: lower limit {joint.lower} above upper limit {joint.upper}")
     signed = ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
     out += [f"{who}: {n} {getattr(joint, n)} is negative" for n in signed if np.any(getattr(joint, n) < 0)]
+    if joint.type.quaternion is not None:
+        turning = slice(joint.type.quaternion, None)
+        if np.isfinite([joint.lower[turning], joint.upper[turning]]).any():
+            out.append(f"{who}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite")
     if np.any(joint.armature) and joint.type.nv != 1:
         out.append(
             f"{who}: armature on a {joint.kind} joint; expected a joint of one velocity "

@@ -52,7 +52,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         for name in ("t", "q", "v"):
-            array = np.ascontiguousarray(getattr(self, name))
+            array = np.array(getattr(self, name), order="C")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
 
@@ -63,16 +63,21 @@ class Trajectory:
         return type(self), (self.t, self.q, self.v, self.model, self.method, self.engine, self.stats, dyn)
 
     def energy(self) -> Array:
-        """Return kinetic plus potential energy in J, shape (K,) or (N, K), by the run's own engine."""
+        """Return kinetic plus potential energy in J, shape (K,) or (N, K), by the run's own engine.
+
+        The kinetic part is ½ vᵀ M v, which no known defect touches.
+        """
         dyn = self._dyn
         if dyn is None:
             dyn = dynamics(self.model, self.engine)
             object.__setattr__(self, "_dyn", dyn)
-        q, v = self.q.reshape(-1, self.model.nq), self.v.reshape(-1, self.model.nv)
+        n = int(np.prod(self.q.shape[:-1]))
+        q, v = self.q.reshape(n, self.model.nq), self.v.reshape(n, self.model.nv)
         good = np.isfinite(q).all(-1) & np.isfinite(v).all(-1)
         out = np.full(len(q), np.nan)
         if good.any():
-            out[good] = dyn.kinetic_energy(q[good], v[good]) + dyn.potential_energy(q[good])
+            kinetic = 0.5 * np.einsum("ni,nij,nj->n", v[good], dyn.mass_matrix(q[good]), v[good])
+            out[good] = kinetic + dyn.potential_energy(q[good])
         return out.reshape(self.q.shape[:-1])
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:

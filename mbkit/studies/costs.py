@@ -13,12 +13,15 @@ from mbkit.engines import Dynamics
 from mbkit.errors import MbkitError
 from mbkit.model import Model
 from mbkit.studies.result import CostPoint, Refusal
-from mbkit.studies.rollouts import quiet_simulate, start_state
+from mbkit.studies.rollouts import patience, quiet_simulate, start_state
 
 __all__ = ["costs"]
 
 DURATION: Final = 0.5
 _REPEATS: Final = 3
+#: Seconds that a run may take; a stiff scene needs other methods than these.
+_PATIENCE: Final = 5.0
+_REFERENCE_PATIENCE: Final = 10.0
 #: (engine, method, steps or tolerances)
 _SWEEP: Final = (
     ("pinocchio", "semi_implicit_euler", (1e-2, 3.125e-3, 1e-3, 3.125e-4)),
@@ -42,13 +45,17 @@ def costs(model: Model, made: Mapping[str, Dynamics], seed: int) -> tuple[tuple[
     grid = np.linspace(0.0, DURATION, 6)
     q0, v0 = start_state(model, seed)
     pair = [made[n] for n in ("lagrangian", "pinocchio", "mujoco") if n in made][:2]
+    if len(pair) < 2:
+        return (), float("nan"), [Refusal("", "error against run time", "a reference takes two engines")]
     try:
         tight = [
-            quiet_simulate(dyn, q0, v0, DURATION, "dop853", rtol=tol, atol=tol, save=grid)
+            quiet_simulate(
+                dyn, q0, v0, DURATION, "dop853", rtol=tol, atol=tol, save=grid, progress=patience(_REFERENCE_PATIENCE)
+            )
             for dyn, tol in zip(pair, (1e-13, 3e-13), strict=True)
         ]
     except MbkitError as error:
-        return (), float("nan"), [Refusal("reference", "error against run time", str(error))]
+        return (), float("nan"), [Refusal("", "error against run time", f"no reference: {error}")]
     for run in tight:
         if not run.stats.finished:
             return (), float("nan"), [Refusal(run.engine, "error against run time", run.stats.message)]
@@ -58,10 +65,13 @@ def costs(model: Model, made: Mapping[str, Dynamics], seed: int) -> tuple[tuple[
     for engine, method, settings in _SWEEP:
         if engine not in made:
             continue
-        try:
-            points += [_point(model, made[engine], method, s, q0, v0, grid, reference) for s in settings]
-        except MbkitError as error:
-            refusals.append(Refusal(engine, method, str(error).removeprefix(f"{engine}: ")))
+        for setting in settings:
+            try:
+                points.append(_point(model, made[engine], method, setting, q0, v0, grid, reference))
+            except MbkitError as error:
+                refusals.append(Refusal(engine, f"{method}, {setting:g}", str(error).removeprefix(f"{engine}: ")))
+                # The settings that follow take longer.
+                break
     return tuple(p for p in points if p is not None), floor, refusals
 
 
@@ -73,7 +83,9 @@ def _point(
     times = []
     for _ in range(_REPEATS):
         start = time.perf_counter()
-        run = quiet_simulate(dyn, q0, v0, DURATION, method, save=grid, **step, **tolerance)
+        run = quiet_simulate(
+            dyn, q0, v0, DURATION, method, save=grid, progress=patience(_PATIENCE), **step, **tolerance
+        )
         times.append(time.perf_counter() - start)
         if not run.stats.finished:
             # A step too large for the scene has no error to show.

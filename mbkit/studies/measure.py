@@ -7,7 +7,8 @@ them, so is what it could do: |g| √(m M_jj) is the most that it exerts on join
 hangs straight down. M's error is the largest |e_ij| / √(M_ii M_jj), which no unit
 can change. Forward dynamics loses cond(M) in any arithmetic, so its error is
 divided by that (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 7),
-on a scale that the forces which cancel in M a keep from vanishing. An energy,
+on a scale that the forces which cancel in M a keep from vanishing; and M e, the
+force that the error amounts to, must be small beside M a whatever cond(M) is. An energy,
 whose zero is arbitrary, is measured by the largest of all samples. Beside each
 stands a figure per joint.
 """
@@ -29,6 +30,7 @@ class Scales:
 
     Attributes
     ----------
+    M : (N, nv, nv) array
     diagonal : (N, nv) array
         Of M.
     inertial : (N,) array
@@ -37,14 +39,18 @@ class Scales:
         The norm over j of |g| √(m M_jj).
     acting : (N, nv) array
         |τ| + |nle| + |τ_passive|, what cancels in M a.
+    size : (N,) array
+        Norm of M scaled to a unit diagonal.
     condition : (N,) array
-        cond(M), after scaling to a unit diagonal (no unit can change it).
+        cond(M), scaled likewise (no unit can change it).
     """
 
+    M: Array
     diagonal: Array
     inertial: Array
     weight: Array
     acting: Array
+    size: Array
     condition: Array
 
     @classmethod
@@ -58,7 +64,9 @@ class Scales:
         root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled = M / (root[:, :, None] * root[:, None, :])
         heavy = weight * np.sqrt(np.sum(np.abs(diagonal), axis=1))
-        return cls(diagonal, norm * np.sum(v * v, axis=1), heavy, acting, np.linalg.cond(scaled))
+        inertial = norm * np.sum(v * v, axis=1)
+        size = np.linalg.norm(scaled, 2, axis=(1, 2))
+        return cls(M, diagonal, inertial, heavy, acting, size, np.linalg.cond(scaled))
 
 
 @dataclass(frozen=True)
@@ -98,9 +106,12 @@ def acceleration_errors(x: Array, reference: Array, scales: Scales) -> Errors:
     pushed = np.linalg.norm(scales.acting / np.where(root > 0, root, np.inf), axis=1)
     size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
     own = np.maximum(np.abs(reference), scales.acting / np.where(scales.diagonal > 0, scales.diagonal, np.inf))
+    force = np.einsum("nij,nj->ni", scales.M, x - reference) / np.where(root > 0, root, np.inf)
+    backward = _ratio(np.linalg.norm(force, axis=1), scales.size * size)
+    forward = _ratio(np.linalg.norm(root * e, axis=1), size * scales.condition)
     return Errors(
         e.max(axis=1, initial=0.0),
-        _ratio(np.linalg.norm(root * e, axis=1), size * scales.condition),
+        np.maximum(forward, backward),
         _ratio(e, own * scales.condition[:, None]).max(axis=0),
     )
 

@@ -107,8 +107,9 @@ def _coriolis(model: Model, q: Array, v: Array) -> Omission:
     matrix = Machine(equations.function("coriolis_matrix"))
     setup = time.perf_counter() - start
     times = interleaved({"matrix": lambda: matrix(q, v), "nle": lambda: nle(q, v)})
-    force = nle(q, v)[0][:, 0]
-    change = float(np.abs(matrix(q, v)[0] @ v - force).max(initial=0.0) / max(np.abs(force).max(initial=0.0), 1e-300))
+    force, M = nle(q, v)[0][:, 0], Machine(equations.function("mass_matrix"))(q)[0]
+    scale = max(float(np.linalg.norm(force)), float(np.linalg.norm(M, 2) * (v @ v)))
+    change = float(np.linalg.norm(matrix(q, v)[0] @ v - force)) / scale
     return Omission(
         "Coriolis matrix",
         False,

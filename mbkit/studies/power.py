@@ -29,11 +29,11 @@ def power_rows(made: Mapping[str, Dynamics], at: States, scales: Scales) -> Iter
         try:
             a = dyn.forward_dynamics(at.q, at.v, at.tau)
             damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
+            inertial, rate = own.inverse_dynamics(at.q, at.v, a), energy_rate(at.q, at.v, a)
         except MbkitError:
             # Told already, as the refusal of the term itself.
             continue
-        inertial = own.inverse_dynamics(at.q, at.v, a)
-        e = np.abs(energy_rate(at.q, at.v, a) - np.sum((at.tau + damping) * at.v, axis=1))
+        e = np.abs(rate - np.sum((at.tau + damping) * at.v, axis=1))
         # M a is as large as M's norm lets it be, and that is where it is rounded.
         root = np.sqrt(scales.diagonal)
         speed, size = np.linalg.norm(root * at.v, axis=1), np.linalg.norm(root * a, axis=1)

@@ -204,7 +204,7 @@ class Comparison:
     omissions : tuple of Omission
     refusals : tuple of Refusal
     setup : dict
-        Seconds each engine took to be made, and to derive its terms.
+        Seconds each engine took to be made; the derivation works when first asked.
     versions : dict
     processor : str
     seconds : float
@@ -246,12 +246,19 @@ class Comparison:
         if not self.rows:
             return f"nothing compared: {'; '.join(r.reason for r in self.refusals) or 'no engines'}"
         if self.passed:
-            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits"
+            left = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
+            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits{left}"
         failed = [r for r in self.rows if not r.passed]
         parts = [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
         parts += [f"rollout {r.method} on {r.engine} differs" for r in self.rollouts if not r.passed]
         parts += [f"leaving out {o.need} changes the accelerations" for o in self.omissions if not o.unchanged]
         return "; ".join(parts)
+
+    @property
+    def not_compared(self) -> tuple[str, ...]:
+        """Terms that no engine could give, as where M is singular; `refusals` has the reasons."""
+        given = {r.term for r in self.rows}
+        return tuple(dict.fromkeys(r.term for r in self.refusals if r.engine and r.term and r.term not in given))
 
     @property
     def digits(self) -> float:
