@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import mbkit as mb
 from mbkit import spatial
 from mbkit.errors import InputError, LoadError, ModelError, NonPhysicalWarning, UnknownNameError
 from mbkit.load import load, robots
@@ -806,3 +807,18 @@ def test_solids_against_counting_points(shape, size, inside):
     lump = solid(shape, size)
     assert lump.mass == pytest.approx(mass, rel=0.02)
     np.testing.assert_allclose(np.diag(lump.inertia), np.diag(inertia) * (0.6 / 120) ** 3, rtol=0.03)
+
+
+@pytest.mark.parametrize("flags", ['spring="disable"', 'damper="disable"', 'spring="disable" damper="disable"'])
+def test_mjcf_flags_that_change_the_motion_are_honoured(tmp_path: Path, flags: str) -> None:
+    text = f"""<mujoco><option><flag {flags}/></option><worldbody><body name="a"><joint name="j" axis="0 1 0"
+    stiffness="7" damping="3"/><inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>"""
+    path = tmp_path / "flags.xml"
+    path.write_text(text)
+    model = mb.load(path)
+    theirs = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(theirs)
+    data.qpos[:], data.qvel[:] = 0.3, 0.7
+    mujoco.mj_forward(theirs, data)
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        assert mb.dynamics(model, engine).passive([0.3], [0.7]) == pytest.approx(data.qfrc_passive)

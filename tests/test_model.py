@@ -206,6 +206,9 @@ def test_needs_are_read_off_the_description():
     assert pendulum(friction=1.0).build().needs.friction
     assert pendulum(lower=-1.0).build().needs.limits
     assert random_tree(0, 4, ("ball", "revolute")).needs.quaternions
+    pushed = pendulum(effort_limit=5.0).build()
+    assert pushed.needs.effort_limits
+    assert not pushed.without("limits").needs.effort_limits
     timed = pendulum()
     timed.prescribe("hinge", amplitude=0.1, frequency=2.0)
     assert timed.build().needs.time

@@ -31,6 +31,7 @@ _X, _Y, _Z = np.eye(3)
 _STACKABLE: Final = ("revolute", "continuous", "prismatic", "universal", "spherical_zyx", "planar")
 # MuJoCo's compiler refuses principal moments below this (mjMINVAL).
 _SMALLEST: Final = 1e-15
+_OPEN: Final = 1e10
 
 
 @dataclass
@@ -225,8 +226,10 @@ def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: _Placed, *, 
             j.damping[0], j.frictionloss = joint.damping[k], joint.friction[k]
             if joint.type.nv == 1:
                 j.armature = joint.armature[0]
-            if np.isfinite([joint.lower[k], joint.upper[k]]).all() and joint.lower[k] < joint.upper[k]:
-                j.limited, j.range = 1, [joint.lower[k], joint.upper[k]]
+            low, high = float(joint.lower[k]), float(joint.upper[k])
+            if np.isfinite([low, high]).any() and low < high:
+                # MuJoCo has no open end; this one is never reached.
+                j.limited, j.range = 1, [max(low, -_OPEN), min(high, _OPEN)]
         names.append(name)
 
     kind = joint.kind

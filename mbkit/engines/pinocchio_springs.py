@@ -42,13 +42,15 @@ class PointSprings:
         for spring, (i, a), (j, b) in self._ends:
             gap = d.oMi[j].act(b) - d.oMi[i].act(a)
             J = self._point_jacobian(m, d, j, b) - self._point_jacobian(m, d, i, a)
-            # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0.
+            # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0. Where one
+            # is needed and there is none, the answer is NaN, which the caller finds.
             length = float(np.linalg.norm(gap))
             pull = spring.stiffness * gap
-            if spring.rest_length:
-                pull = pull - spring.stiffness * spring.rest_length * gap / length
-            if spring.damping:
-                pull = pull + spring.damping * gap * float(gap @ (J @ v)) / length**2
+            with np.errstate(invalid="ignore", divide="ignore"):
+                if spring.rest_length:
+                    pull = pull - spring.stiffness * spring.rest_length * (gap / length)
+                if spring.damping:
+                    pull = pull + spring.damping * (gap / length) * float(gap @ (J @ v)) / np.float64(length)
             out -= J.T @ pull
         return out
 

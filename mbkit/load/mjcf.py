@@ -43,6 +43,10 @@ _REFUSED: Final = {
 _READ: Final = ("compiler", "default", "option", "worldbody", "size", "visual", "statistic", "asset")
 
 
+# Option flags that change the smooth equations; the others steer an engine.
+_HONOURED: Final = frozenset({"gravity", "spring", "damper", "passive"})
+
+
 def model_of_mjcf(
     mujoco: Element,
     path: Path,
@@ -77,9 +81,12 @@ def model_of_mjcf(
         if note:
             b.note(note)
     try:
-        return b.build(nonphysical=nonphysical, point_masses=False)
+        model = b.build(nonphysical=nonphysical, point_masses=False)
     except ModelError as error:
         raise ModelError(str(path), error.faults) from None
+    off = _disabled(mujoco)
+    features = {"spring": ("springs",), "damper": ("damping",), "passive": ("springs", "damping")}
+    return model.without(*(f for flag, names in features.items() if flag in off for f in names))
 
 
 def _refuse(mujoco: Element, read: Reader) -> None:
@@ -88,14 +95,17 @@ def _refuse(mujoco: Element, read: Reader) -> None:
             read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
 
 
+def _disabled(mujoco: Element) -> set[str]:
+    """Return the names of the flags that switch a part of the smooth motion off."""
+    flags = [flag.attributes for option in mujoco.all("option") for flag in option.all("flag")]
+    return {name for attributes in flags for name, value in attributes.items() if value == "disable"} & _HONOURED
+
+
 def _gravity(mujoco: Element, read: Reader) -> tuple[float, ...]:
     out: tuple[float, ...] = (0.0, 0.0, -9.81)
     for option in mujoco.all("option"):
         out = read.numbers(option, "gravity", "the file", count=3, default=out)
-        for flag in option.all("flag"):
-            if flag.attributes.get("gravity") == "disable":
-                return 0.0, 0.0, 0.0
-    return out
+    return (0.0, 0.0, 0.0) if "gravity" in _disabled(mujoco) else out
 
 
 def _float(scene: Scene) -> None:
@@ -223,7 +233,7 @@ def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
         if fluid:
             out.append(f"the forces of a fluid (option {', '.join(fluid)}) were left out")
         for flag in option.all("flag"):
-            told = ", ".join(f"{k}={v}" for k, v in sorted(flag.attributes.items()) if k != "gravity")
+            told = ", ".join(f"{k}={v}" for k, v in sorted(flag.attributes.items()) if k not in _HONOURED)
             if told:
                 out.append(f"option flags are an engine's, and were left out: {told}")
     if scene.unnamed:

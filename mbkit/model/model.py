@@ -313,10 +313,7 @@ class Model:
         if feature == "prescribed":
             return replace(self, prescribed=())
         if feature == "limits":
-            free = (
-                replace(j, lower=np.full(j.type.nq, -np.inf), upper=np.full(j.type.nq, np.inf)) for j in self.joints
-            )
-            return replace(self, joints=tuple(free))
+            return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
         name = _PER_VELOCITY[feature]
         joints = tuple(replace(j, **{name: np.zeros(j.type.nv)}) for j in self.joints)  # type: ignore[arg-type]
         springs: Iterable[PointSpring] = self.springs
@@ -345,6 +342,12 @@ class Model:
             f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self.mass:.4g} kg; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
+
+
+def _unlimited(joint: Joint) -> Joint:
+    """Return the joint without limits of any sort."""
+    open_q, open_v = np.full(joint.type.nq, np.inf), np.full(joint.type.nv, np.inf)
+    return replace(joint, lower=-open_q, upper=open_q, velocity_limit=open_v, effort_limit=open_v)
 
 
 def _joined(parts: list[Array]) -> Array:

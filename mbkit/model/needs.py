@@ -17,8 +17,8 @@ __all__ = ["Needs"]
 class Needs:
     """One flag per feature; True where the description has it.
 
-    Friction, limits and loops are kept as data and named here; the smooth terms
-    of every engine leave friction and limits out.
+    Friction, limits (of coordinates, and of efforts and velocities) and loops are kept
+    as data and named here; the smooth terms of every engine leave friction and limits out.
     """
 
     gravity: bool
@@ -27,6 +27,7 @@ class Needs:
     armature: bool
     friction: bool
     limits: bool
+    effort_limits: bool
     mimic: bool
     loops: bool
     quaternions: bool
@@ -50,6 +51,7 @@ class Needs:
             armature=any(np.any(j.armature) for j in joints),
             friction=any(np.any(j.friction) for j in joints),
             limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
+            effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),
             mimic=any(j.mimic is not None for j in joints),
             loops=bool(tuple(loops)),
             quaternions=any(j.type.quaternion is not None for j in joints),
