@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit import spatial
-from mbkit._check import Array, finite_array, real
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
+from mbkit.model.arguments import ArgumentReader, shape_of
 from mbkit.model.kinds import KINDS, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
@@ -48,8 +46,8 @@ class ModelBuilder:
 
     def __init__(self, name: str, gravity: ArrayLike = (0.0, 0.0, -9.81)) -> None:
         self._name = str(name)
-        self._faults: list[str] = []
-        self._gravity = self._vector("gravity", gravity, 3)
+        self._read = ArgumentReader()
+        self._gravity = self._read.vector("gravity", gravity, 3)
         self._bodies: list[Body] = []
         self._joints: list[Joint] = []
         self._frames: list[Frame] = []
@@ -76,15 +74,15 @@ class ModelBuilder:
         """
         who = f"body {name!r}"
         raw = np.zeros((3, 3)) if inertia is None else inertia
-        if _shape(raw) == (3,):
-            matrix = np.diag(self._vector(f"{who}: inertia", raw, 3))
+        if shape_of(raw) == (3,):
+            matrix = np.diag(self._read.vector(f"{who}: inertia", raw, 3))
         else:
-            matrix = self._matrix(f"{who}: inertia", raw)
+            matrix = self._read.matrix(f"{who}: inertia", raw)
             if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
-                self._faults.append(f"{who}: inertia is not symmetric; expected I = Iᵀ")
+                self._read.faults.append(f"{who}: inertia is not symmetric; expected I = Iᵀ")
             matrix = (matrix + matrix.T) / 2
         self._bodies.append(
-            Body(str(name), self._real(f"{who}: mass", mass), self._vector(f"{who}: com", com, 3), matrix)
+            Body(str(name), self._read.real(f"{who}: mass", mass), self._read.vector(f"{who}: com", com, 3), matrix)
         )
 
     def add_joint(
@@ -147,33 +145,33 @@ class ModelBuilder:
         who = f"joint {name!r}"
         if not isinstance(kind, str) or kind not in KINDS:
             near = nearest(str(kind), KINDS) or list(KINDS)
-            self._faults.append(f"{who}: unknown kind {kind!r}; use one of {', '.join(near)}")
+            self._read.faults.append(f"{who}: unknown kind {kind!r}; use one of {', '.join(near)}")
             # The other faults of this call would only be echoes of this one.
             kind, axis, axis2, pitch, mimic = "fixed", None, None, 0.0, None
             lower = upper = velocity_limit = effort_limit = None
             armature = damping = friction = stiffness = rest = 0.0
         type_ = kind_of(kind)
         if mimic is not None and not isinstance(mimic, Mimic):
-            mimic = self._mimic(who, mimic)
+            mimic = self._read.mimic(who, mimic)
         self._joints.append(
             Joint(
                 name=str(name),
                 kind=kind,
                 parent=str(parent),
                 child=str(child),
-                rotation=self._rotation(who, rotation, rpy),
-                translation=self._vector(f"{who}: translation", translation, 3),
-                axes=self._axes(who, kind, axis, axis2),
-                pitch=self._real(f"{who}: pitch", pitch),
-                lower=self._limits(f"{who}: lower", lower, type_.nq, -np.inf),
-                upper=self._limits(f"{who}: upper", upper, type_.nq, np.inf),
-                velocity_limit=self._limits(f"{who}: velocity_limit", velocity_limit, type_.nv, np.inf),
-                effort_limit=self._limits(f"{who}: effort_limit", effort_limit, type_.nv, np.inf),
-                armature=self._vector(f"{who}: armature", armature, type_.nv),
-                damping=self._vector(f"{who}: damping", damping, type_.nv),
-                friction=self._vector(f"{who}: friction", friction, type_.nv),
-                stiffness=self._vector(f"{who}: stiffness", stiffness, type_.nv),
-                rest=self._vector(f"{who}: rest", rest, type_.nv),
+                rotation=self._read.rotation(who, rotation, rpy),
+                translation=self._read.vector(f"{who}: translation", translation, 3),
+                axes=self._read.axes(who, kind, axis, axis2),
+                pitch=self._read.real(f"{who}: pitch", pitch),
+                lower=self._read.limits(f"{who}: lower", lower, type_.nq, -np.inf),
+                upper=self._read.limits(f"{who}: upper", upper, type_.nq, np.inf),
+                velocity_limit=self._read.limits(f"{who}: velocity_limit", velocity_limit, type_.nv, np.inf),
+                effort_limit=self._read.limits(f"{who}: effort_limit", effort_limit, type_.nv, np.inf),
+                armature=self._read.vector(f"{who}: armature", armature, type_.nv),
+                damping=self._read.vector(f"{who}: damping", damping, type_.nv),
+                friction=self._read.vector(f"{who}: friction", friction, type_.nv),
+                stiffness=self._read.vector(f"{who}: stiffness", stiffness, type_.nv),
+                rest=self._read.vector(f"{who}: rest", rest, type_.nv),
                 mimic=mimic,
             )
         )
@@ -189,8 +187,8 @@ class ModelBuilder:
     ) -> None:
         """Name a frame that is fixed to a body, for poses and Jacobians."""
         who = f"frame {name!r}"
-        place = self._vector(f"{who}: translation", translation, 3)
-        self._frames.append(Frame(str(name), str(body), self._rotation(who, rotation, rpy), place))
+        place = self._read.vector(f"{who}: translation", translation, 3)
+        self._frames.append(Frame(str(name), str(body), self._read.rotation(who, rotation, rpy), place))
 
     def add_spring(
         self,
@@ -225,12 +223,12 @@ class ModelBuilder:
             PointSpring(
                 str(name),
                 str(body_a),
-                self._vector(f"{who}: point_a", point_a, 3),
+                self._read.vector(f"{who}: point_a", point_a, 3),
                 str(body_b),
-                self._vector(f"{who}: point_b", point_b, 3),
-                self._real(f"{who}: stiffness", stiffness, nonnegative=True),
-                self._real(f"{who}: rest_length", rest_length, nonnegative=True),
-                self._real(f"{who}: damping", damping, nonnegative=True),
+                self._read.vector(f"{who}: point_b", point_b, 3),
+                self._read.real(f"{who}: stiffness", stiffness, nonnegative=True),
+                self._read.real(f"{who}: rest_length", rest_length, nonnegative=True),
+                self._read.real(f"{who}: damping", damping, nonnegative=True),
             )
         )
 
@@ -249,17 +247,17 @@ class ModelBuilder:
         """Close a loop: two points, or two frames, of two bodies stay together."""
         who = f"loop {name!r}"
         if kind not in ("point", "frame"):
-            self._faults.append(f"{who}: unknown kind {kind!r}; use 'point' or 'frame'")
+            self._read.faults.append(f"{who}: unknown kind {kind!r}; use 'point' or 'frame'")
         self._loops.append(
             Loop(
                 str(name),
                 kind,
                 str(body_a),
-                self._rotation(who, rotation_a, None),
-                self._vector(f"{who}: translation_a", translation_a, 3),
+                self._read.rotation(who, rotation_a, None),
+                self._read.vector(f"{who}: translation_a", translation_a, 3),
                 str(body_b),
-                self._rotation(who, rotation_b, None),
-                self._vector(f"{who}: translation_b", translation_b, 3),
+                self._read.rotation(who, rotation_b, None),
+                self._read.vector(f"{who}: translation_b", translation_b, 3),
             )
         )
 
@@ -276,7 +274,7 @@ class ModelBuilder:
         """Move a one-velocity joint in time: offset + rate t + amplitude sin(frequency t + phase)."""
         names = ("offset", "rate", "amplitude", "frequency", "phase")
         values = (offset, rate, amplitude, frequency, phase)
-        numbers = [self._real(f"prescribed {joint!r}: {n}", x) for n, x in zip(names, values, strict=True)]
+        numbers = [self._read.real(f"prescribed {joint!r}: {n}", x) for n, x in zip(names, values, strict=True)]
         self._prescribed.append(Prescribed(str(joint), *numbers))
 
     def note(self, text: str) -> None:
@@ -302,7 +300,7 @@ class ModelBuilder:
         """
         if nonphysical not in ("error", "warn"):
             raise InputError(f"nonphysical: expected 'error' or 'warn', got {nonphysical!r}")
-        faults = list(self._faults)
+        faults = list(self._read.faults)
         faults += structure_faults(
             self._bodies, self._joints, self._frames, self._springs, self._loops, self._prescribed
         )
@@ -344,85 +342,6 @@ class ModelBuilder:
             nonphysical=suspects,
         )
 
-    # Readers of single arguments: a fault is noted and a harmless value returned,
-    # so that the next faults are found too.
-
-    def _vector(self, name: str, value: ArrayLike, n: int) -> Array:
-        try:
-            if _shape(value) == ():
-                value = np.full(n, real(name, value))
-            return finite_array(name, value, (n,))
-        except InputError as error:
-            self._faults.append(str(error))
-            return np.zeros(n)
-
-    def _matrix(self, name: str, value: ArrayLike) -> Array:
-        try:
-            return finite_array(name, value, (3, 3))
-        except InputError as error:
-            self._faults.append(str(error))
-            return np.eye(3)
-
-    def _real(self, name: str, value: Any, *, nonnegative: bool = False) -> float:
-        try:
-            return real(name, value, nonnegative=nonnegative)
-        except InputError as error:
-            self._faults.append(str(error))
-            return 0.0
-
-    def _limits(self, name: str, value: ArrayLike | None, n: int, default: float) -> Array:
-        if value is None:
-            return np.full(n, default)
-        try:
-            array = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            array = np.full(n, np.nan)
-        if array.ndim == 0:
-            array = np.full(n, float(array))
-        if array.shape != (n,) or np.isnan(array).any():
-            self._faults.append(f"{name}: expected {n} numbers (infinite where there is no limit), got {value!r}")
-            return np.full(n, default)
-        return array
-
-    def _rotation(self, who: str, rotation: ArrayLike | None, rpy: ArrayLike | None) -> Array:
-        if rotation is not None and rpy is not None:
-            self._faults.append(f"{who}: both rotation and rpy given; give one")
-        if rpy is not None:
-            return spatial.matrix_from_rpy(*self._vector(f"{who}: rpy", rpy, 3))
-        if rotation is None:
-            return np.eye(3)
-        R = self._matrix(f"{who}: rotation", rotation)
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0:
-            self._faults.append(f"{who}: rotation is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
-            return np.eye(3)
-        return R
-
-    def _axes(self, who: str, kind: str, axis: ArrayLike | None, axis2: ArrayLike | None) -> Array:
-        wanted = kind_of(kind).n_axes
-        given: list[ArrayLike] = [a for a in (axis, axis2) if a is not None]
-        if len(given) != wanted:
-            names = ("no axis", "axis", "axis and axis2")[wanted]
-            self._faults.append(f"{who}: a {kind} joint takes {names}; {len(given)} given")
-            given = list(np.eye(3)[:wanted])
-        out = np.zeros((wanted, 3))
-        for i, a in enumerate(given):
-            vector = self._vector(f"{who}: axis", a, 3)
-            length = float(np.linalg.norm(vector))
-            if not length:
-                self._faults.append(f"{who}: axis is zero; expected a direction")
-                vector, length = np.array([1.0, 0.0, 0.0]), 1.0
-            # An axis that is a unit vector to rounding is kept to the bit.
-            out[i] = vector if abs(length - 1) < 1e-15 else vector / length
-        return out
-
-    def _mimic(self, who: str, value: Iterable[Any]) -> Mimic | None:
-        try:
-            joint, ratio, offset = value
-            return Mimic(str(joint), float(ratio), float(offset))
-        except (TypeError, ValueError):
-            self._faults.append(f"{who}: mimic: expected (joint, ratio, offset), got {value!r}")
-            return None
-
 
 def _idle(joint: str) -> str:
     return f"no mass moves with joint {joint!r}, so M is singular: give mass, inertia or armature"
@@ -438,11 +357,3 @@ def _resolved(joints: list[Joint]) -> list[Joint]:
             mimic = Mimic(leader.joint, mimic.ratio * leader.ratio, mimic.ratio * leader.offset + mimic.offset)
         out.append(joint if mimic == joint.mimic else replace(joint, mimic=mimic))
     return out
-
-
-def _shape(value: ArrayLike) -> tuple[int, ...] | None:
-    """Return the shape, or None of what has none, such as a ragged list."""
-    try:
-        return np.shape(value)
-    except ValueError:
-        return None

@@ -1,0 +1,121 @@
+"""Reading what a builder's caller wrote: a fault is noted, and a harmless value goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit import spatial
+from mbkit._check import Array, finite_array, real
+from mbkit.errors import InputError
+from mbkit.model.kinds import kind_of
+from mbkit.model.parts import Mimic
+
+__all__ = ["ArgumentReader", "shape_of"]
+
+
+class ArgumentReader:
+    """Turns arguments into arrays and numbers, and collects their faults.
+
+    Attributes
+    ----------
+    faults : list of str
+        One sentence per fault, so that the next ones are found too.
+    """
+
+    def __init__(self) -> None:
+        self.faults: list[str] = []
+
+    def vector(self, name: str, value: ArrayLike, n: int) -> Array:
+        """Return n finite numbers; a single one is repeated."""
+        try:
+            if shape_of(value) == ():
+                value = np.full(n, real(name, value))
+            return finite_array(name, value, (n,))
+        except InputError as error:
+            self.faults.append(str(error))
+            return np.zeros(n)
+
+    def matrix(self, name: str, value: ArrayLike) -> Array:
+        """Return a finite 3 by 3 matrix."""
+        try:
+            return finite_array(name, value, (3, 3))
+        except InputError as error:
+            self.faults.append(str(error))
+            return np.eye(3)
+
+    def real(self, name: str, value: Any, *, nonnegative: bool = False) -> float:
+        """Return a finite number."""
+        try:
+            return real(name, value, nonnegative=nonnegative)
+        except InputError as error:
+            self.faults.append(str(error))
+            return 0.0
+
+    def limits(self, name: str, value: ArrayLike | None, n: int, default: float) -> Array:
+        """Return n numbers, infinite ones among them; `default` where nothing is given."""
+        if value is None:
+            return np.full(n, default)
+        try:
+            array = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            array = np.full(n, np.nan)
+        if array.ndim == 0:
+            array = np.full(n, float(array))
+        if array.shape != (n,) or np.isnan(array).any():
+            self.faults.append(f"{name}: expected {n} numbers (infinite where there is no limit), got {value!r}")
+            return np.full(n, default)
+        return array
+
+    def rotation(self, who: str, rotation: ArrayLike | None, rpy: ArrayLike | None) -> Array:
+        """Return a rotation matrix, given as such or as roll, pitch, yaw."""
+        if rotation is not None and rpy is not None:
+            self.faults.append(f"{who}: both rotation and rpy given; give one")
+        if rpy is not None:
+            return spatial.matrix_from_rpy(*self.vector(f"{who}: rpy", rpy, 3))
+        if rotation is None:
+            return np.eye(3)
+        R = self.matrix(f"{who}: rotation", rotation)
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0:
+            self.faults.append(f"{who}: rotation is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
+            return np.eye(3)
+        return R
+
+    def axes(self, who: str, kind: str, axis: ArrayLike | None, axis2: ArrayLike | None) -> Array:
+        """Return the unit axes that a joint of this kind takes."""
+        wanted = kind_of(kind).n_axes
+        given: list[ArrayLike] = [a for a in (axis, axis2) if a is not None]
+        if len(given) != wanted:
+            names = ("no axis", "axis", "axis and axis2")[wanted]
+            self.faults.append(f"{who}: a {kind} joint takes {names}; {len(given)} given")
+            given = list(np.eye(3)[:wanted])
+        out = np.zeros((wanted, 3))
+        for i, a in enumerate(given):
+            vector = self.vector(f"{who}: axis", a, 3)
+            length = float(np.linalg.norm(vector))
+            if not length:
+                self.faults.append(f"{who}: axis is zero; expected a direction")
+                vector, length = np.array([1.0, 0.0, 0.0]), 1.0
+            # An axis that is a unit vector to rounding is kept to the bit.
+            out[i] = vector if abs(length - 1) < 1e-15 else vector / length
+        return out
+
+    def mimic(self, who: str, value: Iterable[Any]) -> Mimic | None:
+        """Return whom a joint follows, or None where that is not said rightly."""
+        try:
+            joint, ratio, offset = value
+            return Mimic(str(joint), float(ratio), float(offset))
+        except (TypeError, ValueError):
+            self.faults.append(f"{who}: mimic: expected (joint, ratio, offset), got {value!r}")
+            return None
+
+
+def shape_of(value: ArrayLike) -> tuple[int, ...] | None:
+    """Return the shape, or None of what has none, such as a ragged list."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        return None
