@@ -93,5 +93,8 @@ def states(model: Model, n: int, seed: int = 0) -> tuple[np.ndarray, ...]:
 
 
 def off(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the normwise relative difference."""
-    return float(np.linalg.norm(np.asarray(x) - y) / max(np.linalg.norm(y), 1.0))
+    """Return the normwise relative difference, of a batch that of its worst sample."""
+    x, y = np.asarray(x), np.asarray(y)
+    if y.ndim > 1:
+        return max((off(a, b) for a, b in zip(x, y, strict=True)), default=0.0) if y.shape[0] else 0.0
+    return float(np.linalg.norm(x - y) / max(np.linalg.norm(y), 1.0))

@@ -17,7 +17,6 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit import spatial
 from mbkit._check import Array, batch_of, count, real
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
@@ -73,31 +72,33 @@ class MujocoDynamics(Dynamics):
         full = np.zeros(layout.sizes[3]) if v is None else layout.expand_v(v)
         qvel = full[self._made.v_index]
         b = np.zeros(self._m.nv)
-        for _, iv in self._made.free:
-            R = self._rotation(iv)
-            linear, angular = qvel[iv : iv + 3].copy(), qvel[iv + 3 : iv + 6]
-            b[iv : iv + 3] = R @ np.cross(angular, linear)
+        for iq, iv in self._made.free:
+            R = self._rotation(iq)
+            linear = qvel[iv : iv + 3].copy()
+            slip = np.empty(3)
+            mujoco.mju_cross(slip, qvel[iv + 3 : iv + 6], linear)
+            b[iv : iv + 3] = R @ slip
             qvel[iv : iv + 3] = R @ linear
         d.qvel[:] = qvel
         return qvel, b
 
-    def _rotation(self, start_v: int) -> Array:
-        iq = next(q for q, v in self._made.free if v == start_v)
-        w, x, y, z = self._d.qpos[iq + 3 : iq + 7]
-        return spatial.matrix_from_quaternion(np.array([x, y, z, w]))
+    def _rotation(self, start_q: int) -> Array:
+        R = np.empty(9)
+        mujoco.mju_quat2Mat(R, self._d.qpos[start_q + 3 : start_q + 7])
+        return R.reshape(3, 3)
 
     def _to_mujoco(self, x: Array) -> Array:
         """Return T x for a vector of full velocities or accelerations, after `_set`."""
         out = self.model.layout.expand_v(x)[self._made.v_index].copy()
-        for _, iv in self._made.free:
-            out[iv : iv + 3] = self._rotation(iv) @ out[iv : iv + 3]
+        for iq, iv in self._made.free:
+            out[iv : iv + 3] = self._rotation(iq) @ out[iv : iv + 3]
         return np.asarray(out)
 
     def _columns(self, J: Array) -> Array:
         """Return J T, in the description's order and reduced."""
         J = J.copy()
-        for _, iv in self._made.free:
-            J[:, iv : iv + 3] = J[:, iv : iv + 3] @ self._rotation(iv)
+        for iq, iv in self._made.free:
+            J[:, iv : iv + 3] = J[:, iv : iv + 3] @ self._rotation(iq)
         full = np.empty_like(J)
         full[:, self._made.v_index] = J
         return np.asarray(full @ self.model.layout.G) if self._reduced else full

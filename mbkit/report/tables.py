@@ -137,7 +137,7 @@ def _rollouts(result: Comparison) -> list[RenderableType]:
     table.padding = 0
     notes: dict[str, int] = {}
     for r in judged(result):
-        mark, style = _MARK[r.passed]
+        mark, style = _MARK[r.passed] if r.judged else ("–", "dim")
         table.add_row(
             Text(inline(r.method)),
             Text(r.engine),

@@ -53,7 +53,11 @@ class Judge:
             tell(k / (len(TERMS) + 1), term.name)
             rows += self._term(term)
         tell(len(TERMS) / (len(TERMS) + 1), "power balance")
-        for name, errors in power_rows(self.made, self.at, self.scales):
+
+        def refuse(engine: str, error: MbkitError) -> None:
+            self._refuse(engine, "power balance", error)
+
+        for name, errors in power_rows(self.made, self.at, self.scales, refuse):
             rows.append(self._row("power balance", name, errors, (np.nan, np.nan), ""))
         return rows, self.refusals
 

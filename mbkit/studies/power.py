@@ -7,7 +7,7 @@ dynamics or the energies are wrong, whatever two engines agree on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -19,8 +19,13 @@ from mbkit.studies.states import States
 __all__ = ["power_rows"]
 
 
-def power_rows(made: Mapping[str, Dynamics], at: States, scales: Scales) -> Iterator[tuple[str, Errors]]:
-    """Yield (engine, errors) for every engine, where the own derivation is at hand."""
+def power_rows(
+    made: Mapping[str, Dynamics], at: States, scales: Scales, refuse: Callable[[str, MbkitError], None]
+) -> Iterator[tuple[str, Errors]]:
+    """Yield (engine, errors) for every engine, where the own derivation is at hand.
+
+    What cannot be had is told to `refuse`.
+    """
     own = made.get("lagrangian")
     energy_rate = getattr(own, "energy_rate", None)
     if own is None or energy_rate is None:
@@ -30,8 +35,8 @@ def power_rows(made: Mapping[str, Dynamics], at: States, scales: Scales) -> Iter
             a = dyn.forward_dynamics(at.q, at.v, at.tau)
             damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
             inertial, rate = own.inverse_dynamics(at.q, at.v, a), energy_rate(at.q, at.v, a)
-        except MbkitError:
-            # Told already, as the refusal of the term itself.
+        except MbkitError as error:
+            refuse(name, error)
             continue
         e = np.abs(rate - np.sum((at.tau + damping) * at.v, axis=1))
         # M a is as large as M's norm lets it be, and that is where it is rounded.

@@ -103,6 +103,8 @@ class RolloutRow:
         Run times of the two.
     passed : bool
     note : str
+    judged : bool
+        False where too few steps are well conditioned to say anything.
     """
 
     method: str
@@ -118,6 +120,7 @@ class RolloutRow:
     seconds_against: float
     passed: bool
     note: str = ""
+    judged: bool = True
 
 
 @dataclass(frozen=True)

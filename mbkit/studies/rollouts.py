@@ -164,6 +164,7 @@ def _row(
         seconds_against=theirs.stats.seconds,
         passed=not judged or (n > last and error <= tolerance),
         note="; ".join(notes),
+        judged=judged,
     )
 
 
