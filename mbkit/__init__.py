@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mbkit.model import Mimic as Mimic
     from mbkit.model import Model as Model
     from mbkit.model import ModelBuilder as ModelBuilder
+    from mbkit.model import Parameter as Parameter
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import simulate as simulate
     from mbkit.studies.compare import compare as compare
@@ -38,6 +39,7 @@ _HOME = {
     "Mimic": "mbkit.model",
     "Model": "mbkit.model",
     "ModelBuilder": "mbkit.model",
+    "Parameter": "mbkit.model",
     "Trajectory": "mbkit.simulate",
     "compare": "mbkit.studies",
     "dynamics": "mbkit.engines",

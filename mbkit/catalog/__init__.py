@@ -1,7 +1,7 @@
 """Textbook and published systems, each a function that returns a `Model`.
 
-Every function takes keyword parameters in SI units; its docstring gives the
-coordinates, the zero pose and the source. Planar systems move in the x-z plane,
+Every function takes keyword parameters in SI units, numbers or `mbkit.Parameter`;
+its docstring gives the coordinates, the zero pose and the source. Planar systems move in the x-z plane,
 gravity along -z, with angles from the downward vertical that grow towards +x: a
 right-handed turn about -y.
 """

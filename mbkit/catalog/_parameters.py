@@ -3,39 +3,62 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Sequence
 from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from mbkit._check import finite_array, real
 from mbkit.errors import InputError
+from mbkit.model import Expression, Number, known, nominal
 
-__all__ = ["SWING", "count", "down", "moments", "point", "positive"]
+__all__ = ["SWING", "Vector", "count", "down", "moments", "point", "positive"]
+
+#: What a system takes for three numbers.
+Vector = ArrayLike | Sequence[Number]
 
 #: Axis of planar hinges: a positive turn about -y swings what hangs down towards +x.
 SWING: Final = (0.0, -1.0, 0.0)
 
 
-def positive(name: str, value: float) -> float:
-    """Return a number above zero: a length, a mass."""
-    return real(name, value, positive=True)
+def positive(name: str, value: Number) -> Number:
+    """Return a number above zero, or an expression that is above zero as far as is known: a length, a mass."""
+    if not isinstance(value, Expression):
+        return real(name, value, positive=True)
+    if known(value):
+        real(name, nominal(value), positive=True)
+    return value
 
 
-def down(value: float) -> tuple[float, float, float]:
+def down(value: Number) -> tuple[float, float, Number]:
     """Return the gravity vector of an acceleration of at least zero along -z."""
-    return (0.0, 0.0, -real("gravity", value, nonnegative=True))
+    if not isinstance(value, Expression):
+        value = real("gravity", value, nonnegative=True)
+    elif known(value):
+        real("gravity", nominal(value), nonnegative=True)
+    return (0.0, 0.0, -value)
 
 
-def point(name: str, value: Any) -> tuple[float, float, float]:
-    """Return three finite numbers."""
-    x, y, z = finite_array(name, value, (3,)).tolist()
+def point(name: str, value: Any) -> tuple[Number, Number, Number]:
+    """Return three finite numbers or expressions."""
+    if isinstance(value, (list, tuple, np.ndarray)) and any(isinstance(x, Expression) for x in value):
+        finite_array(name, [nominal(x) if known(x) else 0.0 for x in value], (3,))
+        x, y, z = value
+    else:
+        x, y, z = finite_array(name, value, (3,)).tolist()
     return (x, y, z)
 
 
-def moments(name: str, value: Any) -> tuple[float, float, float]:
+def moments(name: str, value: Any) -> tuple[Number, Number, Number]:
     """Return three principal moments of inertia that matter can have."""
-    a, b, c = point(name, value)
+    given = point(name, value)
+    if not all(known(x) for x in given):
+        return given
+    a, b, c = (nominal(x) for x in given)
     if min(a, b, c) < 0 or 2 * max(a, b, c) > (a + b + c) * (1 + 1e-12):
         raise InputError(f"{name}: expected moments of at least 0 with A + B >= C, got ({a:g}, {b:g}, {c:g}) kg m²")
-    return (a, b, c)
+    return given
 
 
 def count(name: str, value: int) -> int:

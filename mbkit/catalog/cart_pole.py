@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from mbkit.catalog._parameters import SWING, down, positive
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["cart_pole"]
 
 
-def cart_pole(*, cart_mass: float = 1.0, pole_mass: float = 1.0, length: float = 1.0, gravity: float = 9.81) -> Model:
+def cart_pole(
+    *, cart_mass: Number = 1.0, pole_mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81
+) -> Model:
     """Return a cart on a horizontal rail that carries a pole with a point mass at its end.
 
     Two coordinates: ``x``, the cart's position along +x, and ``theta``, the pole's
@@ -17,11 +19,11 @@ def cart_pole(*, cart_mass: float = 1.0, pole_mass: float = 1.0, length: float =
 
     Parameters
     ----------
-    cart_mass, pole_mass : float
+    cart_mass, pole_mass : float or Parameter
         kg.
-    length : float
+    length : float or Parameter
         m.
-    gravity : float
+    gravity : float or Parameter
         m/s², along -z.
 
     Raises

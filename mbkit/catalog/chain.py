@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from mbkit.catalog._parameters import SWING, count, down, positive
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["chain"]
 
 
-def chain(*, n: int = 5, length: float = 1.0, mass: float = 1.0, gravity: float = 9.81) -> Model:
+def chain(*, n: int = 5, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81) -> Model:
     """Return n equal thin rods hinged end to end, hanging from the origin.
 
     The model's name is ``chain_5`` for five. n coordinates: ``theta1``, the angle of the first rod from the downward
@@ -20,9 +20,9 @@ def chain(*, n: int = 5, length: float = 1.0, mass: float = 1.0, gravity: float 
     ----------
     n : int
         Number of rods.
-    length, mass : float
+    length, mass : float or Parameter
         Of each rod, m and kg.
-    gravity : float
+    gravity : float or Parameter
         m/s², along -z.
 
     Raises

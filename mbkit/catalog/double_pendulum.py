@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from mbkit.catalog._parameters import SWING, down, positive
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["double_pendulum"]
 
 
 def double_pendulum(
     *,
-    length1: float = 1.0,
-    mass1: float = 1.0,
-    length2: float = 1.0,
-    mass2: float = 1.0,
-    gravity: float = 9.81,
+    length1: Number = 1.0,
+    mass1: Number = 1.0,
+    length2: Number = 1.0,
+    mass2: Number = 1.0,
+    gravity: Number = 9.81,
 ) -> Model:
     """Return two point masses on massless rods, one below the other.
 
@@ -24,11 +24,11 @@ def double_pendulum(
 
     Parameters
     ----------
-    length1, length2 : float
+    length1, length2 : float or Parameter
         m.
-    mass1, mass2 : float
+    mass1, mass2 : float or Parameter
         kg.
-    gravity : float
+    gravity : float or Parameter
         m/s², along -z.
 
     Raises

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
-
-from mbkit.catalog._parameters import down, point, positive
+from mbkit.catalog._parameters import Vector, down, point, positive
 from mbkit.errors import InputError
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model, ModelBuilder, Number, nominal
 
 __all__ = ["free_body"]
 
 
-def free_body(*, mass: float = 10.0, sides: ArrayLike = (0.1, 0.4, 0.9), gravity: float = 0.0) -> Model:
+def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: Number = 0.0) -> Model:
     """Return a homogeneous box that floats freely.
 
     One free joint, ``float``: q is the centre's position and the quaternion
@@ -20,11 +18,11 @@ def free_body(*, mass: float = 10.0, sides: ArrayLike = (0.1, 0.4, 0.9), gravity
 
     Parameters
     ----------
-    mass : float
+    mass : float or Parameter
         kg.
     sides : (3,) array_like
         Along x, y and z, m.
-    gravity : float
+    gravity : float or Parameter
         m/s², along -z.
 
     Raises
@@ -40,8 +38,9 @@ def free_body(*, mass: float = 10.0, sides: ArrayLike = (0.1, 0.4, 0.9), gravity
     """
     mass = positive("mass", mass)
     a, b, c = point("sides", sides)
-    if min(a, b, c) <= 0:
-        raise InputError(f"sides: expected three lengths above 0, got ({a:g}, {b:g}, {c:g}) m")
+    told = [nominal(x) for x in (a, b, c)]
+    if any(x <= 0 for x in told):
+        raise InputError(f"sides: expected three lengths above 0, got ({', '.join(f'{x:g}' for x in told)}) m")
     inertia = tuple(mass / 12 * x for x in (b * b + c * c, a * a + c * c, a * a + b * b))
     builder = ModelBuilder("free_body", gravity=down(gravity))
     builder.add_body("box", mass=mass, inertia=inertia)

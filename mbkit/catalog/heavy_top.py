@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
-
-from mbkit.catalog._parameters import down, moments, point, positive
-from mbkit.model import Model, ModelBuilder
+from mbkit.catalog._parameters import Vector, down, moments, point, positive
+from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["heavy_top"]
 
 
 def heavy_top(
     *,
-    mass: float = 15.0,
-    inertia: ArrayLike = (0.234375, 0.46875, 0.234375),
-    com: ArrayLike = (0.0, 1.0, 0.0),
-    gravity: float = 9.81,
+    mass: Number = 15.0,
+    inertia: Vector = (0.234375, 0.46875, 0.234375),
+    com: Vector = (0.0, 1.0, 0.0),
+    gravity: Number = 9.81,
 ) -> Model:
     """Return a rigid body with one point fixed at the origin.
 
@@ -25,13 +23,13 @@ def heavy_top(
 
     Parameters
     ----------
-    mass : float
+    mass : float or Parameter
         kg.
     inertia : (3,) array_like
         Principal moments about the centre of mass, along the body's axes, kg m².
     com : (3,) array_like
         Centre of mass in body axes, m.
-    gravity : float
+    gravity : float or Parameter
         m/s², along -z.
 
     Raises

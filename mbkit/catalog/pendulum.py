@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from mbkit.catalog._parameters import SWING, down, positive
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["pendulum"]
 
 
-def pendulum(*, length: float = 1.0, mass: float = 1.0, gravity: float = 9.81) -> Model:
+def pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81) -> Model:
     """Return a point mass on a massless rod.
 
     One coordinate, ``theta``, the angle from the downward vertical: at zero the mass
@@ -16,11 +16,11 @@ def pendulum(*, length: float = 1.0, mass: float = 1.0, gravity: float = 9.81) -
 
     Parameters
     ----------
-    length : float
+    length : float or Parameter
         m.
-    mass : float
+    mass : float or Parameter
         kg.
-    gravity : float
+    gravity : float or Parameter
         m/s², along -z.
 
     Raises

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.substitution import moved
 
 __all__ = ["QUANTITIES", "Dynamics"]
 
@@ -57,8 +58,12 @@ class Dynamics(ABC):
     engine: ClassVar[str]
     #: Quantities this engine cannot give, each with the reason.
     refuses: ClassVar[dict[str, str]] = {}
+    #: Whether parameters' values may still be missing when the engine is made.
+    takes_parameters: ClassVar[bool] = False
 
     def __init__(self, model: Model) -> None:
+        if not self.takes_parameters:
+            model.require_values(self.engine)
         for needed, told in ((model.needs.loops, "loop closures"), (model.needs.time, "motions prescribed in time")):
             if needed:
                 remedy = "loops" if told.startswith("loop") else "prescribed"
@@ -78,6 +83,48 @@ class Dynamics(ABC):
 
     def __reduce__(self) -> tuple[type, tuple[Model]]:
         return type(self), (self.model,)
+
+    def at(self, /, **values: Any) -> Dynamics:
+        """Return the same dynamics at other values of the model's named parameters.
+
+        The lagrangian engine takes the values as arguments of what it has derived and
+        compiled once; the others are made anew.
+
+        Parameters
+        ----------
+        **values : float
+            By name; parameters that are not named keep their values. A number is
+            checked as `ModelBuilder.build` would, which takes a millisecond or so. The
+            lagrangian engine also takes (N,) arrays, one value per sample of a batch,
+            checked for finite numbers only.
+
+        Raises
+        ------
+        UnknownNameError
+            A name that is no parameter of the model.
+        InputError
+            A value that is not a finite number.
+        ModelError
+            No system of matter has these values, such as a negative mass.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> model = mb.catalog.pendulum(mass=mb.Parameter("m", 2.0))
+        >>> dyn = mb.dynamics(model, "lagrangian")
+        >>> float(dyn.mass_matrix([0.0])[0, 0]), float(dyn.at(m=3.0).mass_matrix([0.0])[0, 0])
+        (2.0, 3.0)
+        """
+        return type(self)(moved(self.model, values))
+
+    @property
+    def samples(self) -> int | None:
+        """Size of the batch that the parameters' values make, None where every sample has the same."""
+        return None
+
+    def of_samples(self, which: ArrayLike) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
+        """Return the dynamics of these samples of a batch, by index: itself, unless parameters differ between them."""
+        return self
 
     # Terms of the equation of motion
 
@@ -156,7 +203,11 @@ class Dynamics(ABC):
         return self._evaluate("jacobian", lambda q: self._jacobian(q, frame, axes), q=q)
 
     def function(self, name: str) -> Any:
-        """Return a quantity as a `casadi.Function`; the lagrangian engine only."""
+        """Return a quantity as a `casadi.Function`; the lagrangian engine only.
+
+        Of a model with parameters it takes them as its last argument, in the order
+        of ``model.parameters``.
+        """
         self._require("function")
         return self._function(name)
 

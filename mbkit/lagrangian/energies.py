@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 
 from mbkit.lagrangian.kinematics import Kinematics, add, constant_times, dot3
+from mbkit.lagrangian.values import is_zero
 from mbkit.model.kinds import cross3
 
 __all__ = ["damping_forces", "gravity_energy", "kinetic_energy", "spring_energy"]
@@ -17,13 +18,14 @@ def kinetic_energy(kin: Kinematics) -> Any:
     total: Any = ca.SX(0)
     for body in kin.model.bodies:
         linear, angular = kin.twists[body.name]
-        at_com = add(linear, cross3(angular, [float(x) for x in body.com]))
-        if body.mass:
-            total += 0.5 * body.mass * dot3(at_com, at_com)
-        total += 0.5 * dot3(angular, constant_times(body.inertia, angular))
+        values = kin.values.bodies[body.name]
+        at_com = add(linear, cross3(angular, values.com))
+        if not is_zero(values.mass):
+            total += 0.5 * values.mass * dot3(at_com, at_com)
+        total += 0.5 * dot3(angular, constant_times(values.inertia, angular))
     for joint in kin.model.joints:
-        for rotor, rate in zip(joint.armature, kin.velocities(joint), strict=True):
-            total += 0.5 * float(rotor) * rate * rate
+        for rotor, rate in zip(kin.values.joints[joint.name].armature, kin.velocities(joint), strict=True):
+            total += 0.5 * rotor * rate * rate
     return total
 
 
@@ -35,32 +37,36 @@ def gravity_energy(kin: Kinematics) -> Any:
     """
     model = kin.model
     moments: dict[str, list[Any]] = {"world": [0.0] * 3}
-    masses: dict[str, float] = {"world": 0.0}
+    masses: dict[str, Any] = {"world": 0.0}
     for body in model.bodies:
-        moments[body.name] = [body.mass * float(c) for c in body.com]
-        masses[body.name] = body.mass
+        values = kin.values.bodies[body.name]
+        moments[body.name] = [values.mass * c for c in values.com]
+        masses[body.name] = values.mass
     for joint in reversed(model.tree):
         moments[joint.parent] = add(
             moments[joint.parent], kin.to_parent(joint, moments[joint.child], masses[joint.child])
         )
         masses[joint.parent] += masses[joint.child]
-    return ca.SX(0) - dot3([float(g) for g in model.gravity], moments["world"])
+    return ca.SX(0) - dot3(kin.values.gravity, moments["world"])
 
 
 def spring_energy(kin: Kinematics) -> Any:
     """Return the energy stored in joint springs and point-to-point springs."""
     total: Any = ca.SX(0)
     for joint in kin.model.joints:
-        for k, stiffness in enumerate(joint.stiffness):
-            if stiffness:
-                stretch = kin.coordinates(joint)[k] - float(joint.rest[k])
-                total += 0.5 * float(stiffness) * stretch * stretch
+        values = kin.values.joints[joint.name]
+        for k, stiffness in enumerate(values.stiffness):
+            if not is_zero(stiffness):
+                stretch = kin.coordinates(joint)[k] - values.rest[k]
+                total += 0.5 * stiffness * stretch * stretch
     for spring, gap in _gaps(kin):
-        if spring.stiffness and spring.rest_length:
+        if is_zero(spring.stiffness):
+            continue
+        if is_zero(spring.rest_length):
+            total += 0.5 * spring.stiffness * dot3(gap, gap)
+        else:
             stretch = ca.sqrt(dot3(gap, gap)) - spring.rest_length
             total += 0.5 * spring.stiffness * stretch * stretch
-        elif spring.stiffness:
-            total += 0.5 * spring.stiffness * dot3(gap, gap)
     return total
 
 
@@ -68,10 +74,10 @@ def damping_forces(kin: Kinematics) -> Any:
     """Return -∂R/∂v for Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
     dissipation: Any = ca.SX(0)
     for joint in kin.model.joints:
-        for damping, rate in zip(joint.damping, kin.velocities(joint), strict=True):
-            dissipation += 0.5 * float(damping) * rate * rate
+        for damping, rate in zip(kin.values.joints[joint.name].damping, kin.velocities(joint), strict=True):
+            dissipation += 0.5 * damping * rate * rate
     for spring, gap in _gaps(kin):
-        if spring.damping:
+        if not is_zero(spring.damping):
             length = ca.sqrt(dot3(gap, gap))
             rate = ca.jtimes(length, kin.q, kin.qdot)
             dissipation += 0.5 * spring.damping * rate * rate
@@ -79,9 +85,11 @@ def damping_forces(kin: Kinematics) -> Any:
 
 
 def _gaps(kin: Kinematics) -> list[tuple[Any, list[Any]]]:
+    """Return each point spring's numbers, and the vector between its ends in the world."""
     out = []
     for spring in kin.model.springs:
-        a = kin.to_world(spring.body_a, [float(x) for x in spring.point_a])
-        b = kin.to_world(spring.body_b, [float(x) for x in spring.point_b])
-        out.append((spring, [y - x for x, y in zip(a, b, strict=True)]))
+        values = kin.values.springs[spring.name]
+        a = kin.to_world(spring.body_a, values.point_a)
+        b = kin.to_world(spring.body_b, values.point_b)
+        out.append((values, [y - x for x, y in zip(a, b, strict=True)]))
     return out

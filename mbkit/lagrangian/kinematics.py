@@ -11,11 +11,11 @@ from typing import Any
 
 import casadi as ca
 
-from mbkit._check import Array
+from mbkit.lagrangian.values import Constants, Values, is_zero
 from mbkit.model import Joint, Model
 from mbkit.model.kinds import cross3
 
-__all__ = ["Kinematics", "add", "constant_times", "dot3"]
+__all__ = ["Kinematics", "add", "constant_times", "constant_transposed_times", "dot3"]
 
 Vector = list[Any]
 
@@ -30,9 +30,14 @@ def dot3(a: Any, b: Any) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def constant_times(A: Array, x: Vector) -> Vector:
-    """Return A x for a matrix of numbers, leaving out its zeros."""
-    return [sum((float(A[i, k]) * x[k] for k in range(3) if A[i, k] != 0.0), 0.0) for i in range(3)]
+def constant_times(A: list[Vector], x: Vector) -> Vector:
+    """Return A x for a matrix of the model's numbers, leaving out its zeros."""
+    return [sum((A[i][k] * x[k] for k in range(3) if not is_zero(A[i][k])), 0.0) for i in range(3)]
+
+
+def constant_transposed_times(A: list[Vector], x: Vector) -> Vector:
+    """Return Aᵀ x for a matrix of the model's numbers, leaving out its zeros."""
+    return [sum((A[k][i] * x[k] for k in range(3) if not is_zero(A[k][i])), 0.0) for i in range(3)]
 
 
 class Kinematics:
@@ -42,10 +47,13 @@ class Kinematics:
     ----------
     q, v : casadi.SX
         The model's own (reduced) coordinates and velocities.
+    values : Values
+        The model's numbers.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, constants: Constants = "literal") -> None:
         self.model = model
+        self.values = Values(model, constants)
         self.q = ca.SX.sym("q", model.nq)
         self.v = ca.SX.sym("v", model.nv)
         layout = model.layout
@@ -55,8 +63,9 @@ class Kinematics:
             if joint.mimic:
                 leader_q = self.q[layout.q[joint.mimic.joint].start]
                 leader_v = self.v[layout.v[joint.mimic.joint].start]
-                self._q_of[joint.name] = [joint.mimic.ratio * leader_q + joint.mimic.offset]
-                self._v_of[joint.name] = [joint.mimic.ratio * leader_v]
+                values = self.values.joints[joint.name]
+                self._q_of[joint.name] = [values.ratio * leader_q + values.offset]
+                self._v_of[joint.name] = [values.ratio * leader_v]
             else:
                 self._q_of[joint.name] = [self.q[i] for i in _range(layout.q[joint.name])]
                 self._v_of[joint.name] = [self.v[i] for i in _range(layout.v[joint.name])]
@@ -73,7 +82,7 @@ class Kinematics:
     @cached_property
     def placements(self) -> dict[str, tuple[Any, Vector]]:
         """(R_JC, p_JC_J) of every joint."""
-        return {j.name: j.type.placement(ca, j, self._q_of[j.name]) for j in self.model.tree}
+        return {j.name: j.type.placement(ca, self.values.joints[j.name], self._q_of[j.name]) for j in self.model.tree}
 
     @cached_property
     def twists(self) -> dict[str, tuple[Vector, Vector]]:
@@ -81,11 +90,12 @@ class Kinematics:
         out: dict[str, tuple[Vector, Vector]] = {"world": ([0.0] * 3, [0.0] * 3)}
         for joint in self.model.tree:
             linear, angular = out[joint.parent]
-            at_joint = add(linear, cross3(angular, [float(x) for x in joint.translation]))
+            values = self.values.joints[joint.name]
+            at_joint = add(linear, cross3(angular, values.translation))
             R, p = self.placements[joint.name]
-            angular_J = constant_times(joint.rotation.T, angular)
-            linear_J = add(constant_times(joint.rotation.T, at_joint), cross3(angular_J, p))
-            own = joint.type.twist(ca, joint, self._q_of[joint.name], self._v_of[joint.name])
+            angular_J = constant_transposed_times(values.rotation, angular)
+            linear_J = add(constant_transposed_times(values.rotation, at_joint), cross3(angular_J, p))
+            own = joint.type.twist(ca, values, self._q_of[joint.name], self._v_of[joint.name])
             out[joint.child] = (
                 add(_transposed_times(R, linear_J), own[0]),
                 add(_transposed_times(R, angular_J), own[1]),
@@ -96,8 +106,9 @@ class Kinematics:
         """Return R_PC x + weight · p_PC: a point (weight 1), vector (0) or first moment (mass)."""
         R, p = self.placements[joint.name]
         in_J = add(_times(R, x), [weight * c for c in p])
-        in_P = constant_times(joint.rotation, in_J)
-        return add(in_P, [weight * float(c) for c in joint.translation])
+        values = self.values.joints[joint.name]
+        in_P = constant_times(values.rotation, in_J)
+        return add(in_P, [weight * c for c in values.translation])
 
     def to_world(self, body: str, x: Vector, weight: float = 1.0) -> Vector:
         """Return a point (weight 1) or vector (weight 0) of a body in world axes."""

@@ -4,11 +4,13 @@ from mbkit.model.builder import ModelBuilder
 from mbkit.model.kinds import KINDS, JointKind, kind_of
 from mbkit.model.model import Model
 from mbkit.model.needs import Needs
+from mbkit.model.parameter import Expression, Number, Parameter, known, nominal
 from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
 
 __all__ = [
     "KINDS",
     "Body",
+    "Expression",
     "Frame",
     "Joint",
     "JointKind",
@@ -17,7 +19,11 @@ __all__ = [
     "Model",
     "ModelBuilder",
     "Needs",
+    "Number",
+    "Parameter",
     "PointSpring",
     "Prescribed",
     "kind_of",
+    "known",
+    "nominal",
 ]

@@ -12,6 +12,7 @@ from mbkit import spatial
 from mbkit._check import Array, finite_array, real
 from mbkit.errors import InputError
 from mbkit.model.kinds import kind_of
+from mbkit.model.parameter import Expression, Number, nominal
 from mbkit.model.parts import Mimic
 
 __all__ = ["ArgumentReader", "shape_of"]
@@ -36,7 +37,7 @@ class ArgumentReader:
                 value = np.full(n, real(name, value))
             return finite_array(name, value, (n,))
         except InputError as error:
-            self.faults.append(str(error))
+            self._refuse(error, value)
             return np.zeros(n)
 
     def matrix(self, name: str, value: ArrayLike) -> Array:
@@ -44,7 +45,7 @@ class ArgumentReader:
         try:
             return finite_array(name, value, (3, 3))
         except InputError as error:
-            self.faults.append(str(error))
+            self._refuse(error, value)
             return np.eye(3)
 
     def real(self, name: str, value: Any, *, nonnegative: bool = False) -> float:
@@ -52,8 +53,54 @@ class ArgumentReader:
         try:
             return real(name, value, nonnegative=nonnegative)
         except InputError as error:
-            self.faults.append(str(error))
+            self._refuse(error, value)
             return 0.0
+
+    def _refuse(self, error: InputError, value: Any) -> None:
+        hint = "; no parameter can stand here, give a number" if _has_expressions(value) else ""
+        self.faults.append(f"{error}{hint}")
+
+    def quantity(self, name: str, value: Any, *, nonnegative: bool = False) -> Number:
+        """Return a finite number, or an expression of parameters."""
+        if not isinstance(value, Expression):
+            return self.real(name, value, nonnegative=nonnegative)
+        try:
+            nominal(value)
+        except InputError as error:
+            self.faults.append(f"{name}: {error}")
+            return 0.0
+        return value
+
+    def quantities(self, name: str, value: Any, n: int) -> Array:
+        """Return n finite numbers or expressions, of dtype object where there are any; a single one is repeated."""
+        if not _has_expressions(value):
+            return self.vector(name, value, n)
+        array = np.array(value, dtype=object)
+        if array.ndim == 0:
+            array = np.full(n, value, dtype=object)
+        if array.shape != (n,):
+            self.faults.append(f"{name}: expected shape ({n},), got {array.shape}")
+            return np.zeros(n)
+        return np.array([self.quantity(f"{name}[{i}]", x) for i, x in enumerate(array)], dtype=object)
+
+    def inertia(self, name: str, value: Any) -> Array:
+        """Return a symmetric 3 by 3 matrix, given as such or by its diagonal, or zeros for None."""
+        if value is None:
+            return np.zeros((3, 3))
+        if shape_of(value) == (3,):
+            return np.diag(self.quantities(name, value, 3))
+        if not _has_expressions(value):
+            matrix = self.matrix(name, value)
+            if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+                self.faults.append(f"{name} is not symmetric; expected I = Iᵀ")
+            return np.asarray((matrix + matrix.T) / 2)
+        if shape_of(value) != (3, 3):
+            self.faults.append(f"{name}: expected shape (3, 3), got {shape_of(value)}")
+            return np.eye(3)
+        matrix = np.array([self.quantities(name, row, 3) for row in np.array(value, dtype=object)], dtype=object)
+        if any(matrix[i, j] != matrix[j, i] for i, j in ((0, 1), (0, 2), (1, 2))):
+            self.faults.append(f"{name} is not symmetric; expected the same expression on both sides of the diagonal")
+        return matrix
 
     def limits(self, name: str, value: ArrayLike | None, n: int, default: float) -> Array:
         """Return n numbers, infinite ones among them; `default` where nothing is given."""
@@ -103,14 +150,29 @@ class ArgumentReader:
             out[i] = vector if abs(length - 1) < 1e-15 else vector / length
         return out
 
-    def mimic(self, who: str, value: Iterable[Any]) -> Mimic | None:
-        """Return whom a joint follows, or None where that is not said rightly."""
+    def mimic(self, who: str, value: Mimic | Iterable[Any]) -> tuple[str, Number, Number] | None:
+        """Return whom a joint follows, with ratio and offset, or None where that is not said rightly."""
+        if isinstance(value, Mimic):
+            value = (value.joint, value.ratio, value.offset)
         try:
             joint, ratio, offset = value
-            return Mimic(str(joint), float(ratio), float(offset))
         except (TypeError, ValueError):
             self.faults.append(f"{who}: mimic: expected (joint, ratio, offset), got {value!r}")
             return None
+        return (
+            str(joint),
+            self.quantity(f"{who}: mimic ratio", ratio),
+            self.quantity(f"{who}: mimic offset", offset),
+        )
+
+
+def _has_expressions(value: Any) -> bool:
+    """Return whether any entry of a number, array or nested sequence is an expression."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and any(_has_expressions(x) for x in value.flat)
+    if isinstance(value, (list, tuple)):
+        return any(_has_expressions(x) for x in value)
+    return isinstance(value, Expression)
 
 
 def shape_of(value: ArrayLike) -> tuple[int, ...] | None:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
-from mbkit.model.arguments import ArgumentReader, shape_of
+from mbkit.model.arguments import ArgumentReader
+from mbkit.model.binding import Binding, split
 from mbkit.model.kinds import KINDS, kind_of
 from mbkit.model.model import Model
+from mbkit.model.parameter import Number
 from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
-from mbkit.model.physical import body_fault, idle_joints
+from mbkit.model.physical import body_faults, suspects
 from mbkit.model.structure import structure_faults
 
 __all__ = ["ModelBuilder"]
@@ -25,7 +28,8 @@ class ModelBuilder:
 
     A faulty call is remembered and not raised: `build` reports all faults in one
     `ModelError`. Parts may be declared in any order; coordinates follow the
-    order in which the joints are declared.
+    order in which the joints are declared. Masses, lengths, inertias, constants of
+    springs and dampers, and gravity may be a `Parameter` or an expression of some.
 
     Parameters
     ----------
@@ -44,10 +48,11 @@ class ModelBuilder:
     1
     """
 
-    def __init__(self, name: str, gravity: ArrayLike = (0.0, 0.0, -9.81)) -> None:
+    def __init__(self, name: str, gravity: ArrayLike | Sequence[Number] = (0.0, 0.0, -9.81)) -> None:
         self._name = str(name)
         self._read = ArgumentReader()
-        self._gravity = self._read.vector("gravity", gravity, 3)
+        self._bindings: list[Binding] = []
+        self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
         self._bodies: list[Body] = []
         self._joints: list[Joint] = []
         self._frames: list[Frame] = []
@@ -57,7 +62,12 @@ class ModelBuilder:
         self._notes: list[str] = []
 
     def add_body(
-        self, name: str, *, mass: float = 0.0, com: ArrayLike = (0.0, 0.0, 0.0), inertia: ArrayLike | None = None
+        self,
+        name: str,
+        *,
+        mass: Number = 0.0,
+        com: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        inertia: ArrayLike | Sequence[Any] | None = None,
     ) -> None:
         """Add a rigid body.
 
@@ -73,17 +83,14 @@ class ModelBuilder:
             Without it the body is a point mass.
         """
         who = f"body {name!r}"
-        raw = np.zeros((3, 3)) if inertia is None else inertia
-        if shape_of(raw) == (3,):
-            matrix = np.diag(self._read.vector(f"{who}: inertia", raw, 3))
-        else:
-            matrix = self._read.matrix(f"{who}: inertia", raw)
-            if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
-                self._read.faults.append(f"{who}: inertia is not symmetric; expected I = Iᵀ")
-            matrix = (matrix + matrix.T) / 2
-        self._bodies.append(
-            Body(str(name), self._read.real(f"{who}: mass", mass), self._read.vector(f"{who}: com", com, 3), matrix)
+        numbers = self._numbers(
+            "bodies",
+            str(name),
+            mass=self._read.quantity(f"{who}: mass", mass),
+            com=self._read.quantities(f"{who}: com", com, 3),
+            inertia=self._read.inertia(f"{who}: inertia", inertia),
         )
+        self._bodies.append(Body(str(name), **numbers))
 
     def add_joint(
         self,
@@ -92,22 +99,22 @@ class ModelBuilder:
         *,
         parent: str,
         child: str,
-        translation: ArrayLike = (0.0, 0.0, 0.0),
+        translation: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
         rotation: ArrayLike | None = None,
         rpy: ArrayLike | None = None,
         axis: ArrayLike | None = None,
         axis2: ArrayLike | None = None,
-        pitch: float = 0.0,
+        pitch: Number = 0.0,
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
         velocity_limit: ArrayLike | None = None,
         effort_limit: ArrayLike | None = None,
-        armature: ArrayLike = 0.0,
-        damping: ArrayLike = 0.0,
+        armature: ArrayLike | Sequence[Number] | Number = 0.0,
+        damping: ArrayLike | Sequence[Number] | Number = 0.0,
         friction: ArrayLike = 0.0,
-        stiffness: ArrayLike = 0.0,
-        rest: ArrayLike = 0.0,
-        mimic: Mimic | tuple[str, float, float] | None = None,
+        stiffness: ArrayLike | Sequence[Number] | Number = 0.0,
+        rest: ArrayLike | Sequence[Number] | Number = 0.0,
+        mimic: Mimic | tuple[str, Number, Number] | None = None,
     ) -> None:
         """Add the joint that carries `child`.
 
@@ -151,8 +158,20 @@ class ModelBuilder:
             lower = upper = velocity_limit = effort_limit = None
             armature = damping = friction = stiffness = rest = 0.0
         type_ = kind_of(kind)
-        if mimic is not None and not isinstance(mimic, Mimic):
-            mimic = self._read.mimic(who, mimic)
+        follows = None if mimic is None else self._read.mimic(who, mimic)
+        leader = None
+        if follows:
+            leader = Mimic(follows[0], **self._numbers("joints", str(name), ratio=follows[1], offset=follows[2]))
+        numbers = self._numbers(
+            "joints",
+            str(name),
+            translation=self._read.quantities(f"{who}: translation", translation, 3),
+            pitch=self._read.quantity(f"{who}: pitch", pitch),
+            armature=self._read.quantities(f"{who}: armature", armature, type_.nv),
+            damping=self._read.quantities(f"{who}: damping", damping, type_.nv),
+            stiffness=self._read.quantities(f"{who}: stiffness", stiffness, type_.nv),
+            rest=self._read.quantities(f"{who}: rest", rest, type_.nv),
+        )
         self._joints.append(
             Joint(
                 name=str(name),
@@ -160,19 +179,14 @@ class ModelBuilder:
                 parent=str(parent),
                 child=str(child),
                 rotation=self._read.rotation(who, rotation, rpy),
-                translation=self._read.vector(f"{who}: translation", translation, 3),
                 axes=self._read.axes(who, kind, axis, axis2),
-                pitch=self._read.real(f"{who}: pitch", pitch),
                 lower=self._read.limits(f"{who}: lower", lower, type_.nq, -np.inf),
                 upper=self._read.limits(f"{who}: upper", upper, type_.nq, np.inf),
                 velocity_limit=self._read.limits(f"{who}: velocity_limit", velocity_limit, type_.nv, np.inf),
                 effort_limit=self._read.limits(f"{who}: effort_limit", effort_limit, type_.nv, np.inf),
-                armature=self._read.vector(f"{who}: armature", armature, type_.nv),
-                damping=self._read.vector(f"{who}: damping", damping, type_.nv),
                 friction=self._read.vector(f"{who}: friction", friction, type_.nv),
-                stiffness=self._read.vector(f"{who}: stiffness", stiffness, type_.nv),
-                rest=self._read.vector(f"{who}: rest", rest, type_.nv),
-                mimic=mimic,
+                mimic=leader,
+                **numbers,
             )
         )
 
@@ -181,14 +195,15 @@ class ModelBuilder:
         name: str,
         *,
         body: str,
-        translation: ArrayLike = (0.0, 0.0, 0.0),
+        translation: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
         rotation: ArrayLike | None = None,
         rpy: ArrayLike | None = None,
     ) -> None:
         """Name a frame that is fixed to a body, for poses and Jacobians."""
         who = f"frame {name!r}"
-        place = self._read.vector(f"{who}: translation", translation, 3)
-        self._frames.append(Frame(str(name), str(body), self._read.rotation(who, rotation, rpy), place))
+        place = self._read.quantities(f"{who}: translation", translation, 3)
+        R = self._read.rotation(who, rotation, rpy)
+        self._frames.append(Frame(str(name), str(body), R, **self._numbers("frames", str(name), translation=place)))
 
     def add_spring(
         self,
@@ -196,11 +211,11 @@ class ModelBuilder:
         *,
         body_a: str,
         body_b: str,
-        point_a: ArrayLike = (0.0, 0.0, 0.0),
-        point_b: ArrayLike = (0.0, 0.0, 0.0),
-        stiffness: float = 0.0,
-        rest_length: float = 0.0,
-        damping: float = 0.0,
+        point_a: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        point_b: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        stiffness: Number = 0.0,
+        rest_length: Number = 0.0,
+        damping: Number = 0.0,
     ) -> None:
         """Add a spring and damper along the line between two points.
 
@@ -219,18 +234,16 @@ class ModelBuilder:
             N s/m, on the rate of the distance.
         """
         who = f"spring {name!r}"
-        self._springs.append(
-            PointSpring(
-                str(name),
-                str(body_a),
-                self._read.vector(f"{who}: point_a", point_a, 3),
-                str(body_b),
-                self._read.vector(f"{who}: point_b", point_b, 3),
-                self._read.real(f"{who}: stiffness", stiffness, nonnegative=True),
-                self._read.real(f"{who}: rest_length", rest_length, nonnegative=True),
-                self._read.real(f"{who}: damping", damping, nonnegative=True),
-            )
+        numbers = self._numbers(
+            "springs",
+            str(name),
+            point_a=self._read.quantities(f"{who}: point_a", point_a, 3),
+            point_b=self._read.quantities(f"{who}: point_b", point_b, 3),
+            stiffness=self._read.quantity(f"{who}: stiffness", stiffness, nonnegative=True),
+            rest_length=self._read.quantity(f"{who}: rest_length", rest_length, nonnegative=True),
+            damping=self._read.quantity(f"{who}: damping", damping, nonnegative=True),
         )
+        self._springs.append(PointSpring(str(name), body_a=str(body_a), body_b=str(body_b), **numbers))
 
     def add_loop(
         self,
@@ -304,23 +317,22 @@ class ModelBuilder:
         faults += structure_faults(
             self._bodies, self._joints, self._frames, self._springs, self._loops, self._prescribed
         )
-        suspects = [(b.name, why) for b in self._bodies if (why := body_fault(b, point_masses=point_masses))]
+        faults += self._two_valued()
+        # Joints that move nothing can only be found in a tree that holds together.
+        found = body_faults(self._bodies, point_masses=point_masses)
         if not faults:
-            named = {n for n, _ in suspects}
-            model = self._assemble(())
-            idle = [(model.joint(n).child, n) for n in idle_joints(model)]
-            suspects += [(child, _idle(n)) for child, n in idle if child not in named]
+            found = suspects(self._assemble(()), point_masses=point_masses)
         strict = nonphysical == "error"
         remedy = '; correct it, or take it as written with nonphysical="warn"'
         negative = {b.name for b in self._bodies if b.mass < 0}
-        faults += [f"body {n!r}: {why}{remedy}" for n, why in suspects if strict and n not in negative]
-        faults += [f"body {n!r}: {why}" for n, why in suspects if n in negative]
+        faults += [f"body {n!r}: {why}{remedy}" for n, why in found if strict and n not in negative]
+        faults += [f"body {n!r}: {why}" for n, why in found if n in negative]
         if faults:
             raise ModelError(self._name, faults)
-        model = self._assemble(tuple(suspects))
-        if suspects:
-            told = "; ".join(f"{n!r}: {why}" for n, why in suspects[:5])
-            more = f" and {len(suspects) - 5} more" if len(suspects) > 5 else ""
+        model = self._assemble(found)
+        if found:
+            told = "; ".join(f"{n!r}: {why}" for n, why in found[:5])
+            more = f" and {len(found) - 5} more" if len(found) > 5 else ""
             warnings.warn(
                 f"{self._name}: taken as written, though no matter is like this: {told}{more}",
                 NonPhysicalWarning,
@@ -328,32 +340,56 @@ class ModelBuilder:
             )
         return model
 
+    def _numbers(self, where: str, part: str, **fields: Any) -> dict[str, Any]:
+        """Return a part's fields as floats, and remember which of them stand for expressions."""
+        numbers, bindings = split(where, part, fields)
+        self._bindings += bindings
+        return numbers
+
+    def _two_valued(self) -> list[str]:
+        values: dict[str, float | None] = {}
+        return [
+            f"parameter {p.name!r}: two values, {values[p.name]} and {p.value}; one name is one parameter"
+            for p in dict.fromkeys(p for b in self._bindings for p in b.expression.parameters())
+            if values.setdefault(p.name, p.value) != p.value
+        ]
+
     def _assemble(self, suspects: tuple[tuple[str, str], ...]) -> Model:
+        joints, bindings = _resolved(self._joints, self._bindings)
         return Model(
             name=self._name,
             gravity=self._gravity,
             bodies=tuple(self._bodies),
-            joints=tuple(_resolved(self._joints)),
+            joints=joints,
             frames=tuple(self._frames),
             springs=tuple(self._springs),
             loops=tuple(self._loops),
             prescribed=tuple(self._prescribed),
             notes=tuple(self._notes),
             nonphysical=suspects,
+            bindings=bindings,
         )
 
 
-def _idle(joint: str) -> str:
-    return f"no mass moves with joint {joint!r}, so M is singular: give mass, inertia or armature"
-
-
-def _resolved(joints: list[Joint]) -> list[Joint]:
+def _resolved(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tuple[Joint, ...], tuple[Binding, ...]]:
     """Let every mimic joint point at a joint that is free itself."""
     by_name = {j.name: j for j in joints}
-    out = []
-    for joint in joints:
-        mimic = joint.mimic
-        while mimic is not None and (leader := by_name[mimic.joint].mimic) is not None:
-            mimic = Mimic(leader.joint, mimic.ratio * leader.ratio, mimic.ratio * leader.offset + mimic.offset)
-        out.append(joint if mimic == joint.mimic else replace(joint, mimic=mimic))
-    return out
+    bound: dict[tuple[str, str], Number] = {(b.part, b.field): b.expression for b in bindings if b.where == "joints"}
+    made = {}
+    kept = list(bindings)
+    for joint in by_name.values():
+        if joint.mimic is None:
+            continue
+        at, ratio, offset = _followed(joint.name, joint.mimic, bound)
+        while (further := by_name[at].mimic) is not None:
+            at, r, o = _followed(at, further, bound)
+            ratio, offset = ratio * r, ratio * o + offset
+        numbers, new = split("joints", joint.name, {"ratio": ratio, "offset": offset})
+        made[joint.name] = replace(joint, mimic=Mimic(at, **numbers))
+        kept = [b for b in kept if (b.where, b.part) != ("joints", joint.name) or b.field not in numbers]
+        kept += new
+    return tuple(made.get(j.name, j) for j in by_name.values()), tuple(kept)
+
+
+def _followed(joint: str, mimic: Mimic, bound: Mapping[tuple[str, str], Number]) -> tuple[str, Number, Number]:
+    return mimic.joint, bound.get((joint, "ratio"), mimic.ratio), bound.get((joint, "offset"), mimic.offset)

@@ -35,7 +35,7 @@ def _about(m: ModuleType, axis: Scalars, angle: Any) -> Rows:
     # Rodrigues with the diagonal as a² + (1 - a²) c: exact zeros and ones of an
     # axis along x, y or z stay exact and vanish from a symbolic graph.
     c, s = m.cos(angle), m.sin(angle)
-    x, y, z = (float(a) for a in axis)
+    x, y, z = axis
     xy, yz, zx = x * y * (1 - c), y * z * (1 - c), z * x * (1 - c)
     return [
         [x * x + (1 - x * x) * c, xy - z * s, zx + y * s],
@@ -157,7 +157,7 @@ class _Revolute(JointKind):
         return _about(m, joint.axes[0], q[0]), [0.0, 0.0, 0.0]
 
     def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        return [0.0, 0.0, 0.0], [float(a) * v[0] for a in joint.axes[0]]
+        return [0.0, 0.0, 0.0], [a * v[0] for a in joint.axes[0]]
 
 
 class _Continuous(_Revolute):
@@ -168,10 +168,10 @@ class _Prismatic(JointKind):
     name, nq, nv, n_axes, lengths = "prismatic", 1, 1, 1, (0,)
 
     def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
-        return _IDENTITY, [float(a) * q[0] for a in joint.axes[0]]
+        return _IDENTITY, [a * q[0] for a in joint.axes[0]]
 
     def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        return [float(a) * v[0] for a in joint.axes[0]], [0.0, 0.0, 0.0]
+        return [a * v[0] for a in joint.axes[0]], [0.0, 0.0, 0.0]
 
 
 class _Helical(_Revolute):
@@ -180,11 +180,10 @@ class _Helical(_Revolute):
     name = "helical"
 
     def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
-        return _about(m, joint.axes[0], q[0]), [joint.pitch * float(a) * q[0] for a in joint.axes[0]]
+        return _about(m, joint.axes[0], q[0]), [joint.pitch * a * q[0] for a in joint.axes[0]]
 
     def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        axis = [float(a) for a in joint.axes[0]]
-        return [joint.pitch * a * v[0] for a in axis], [a * v[0] for a in axis]
+        return [joint.pitch * a * v[0] for a in joint.axes[0]], [a * v[0] for a in joint.axes[0]]
 
 
 class _Universal(JointKind):
@@ -195,8 +194,8 @@ class _Universal(JointKind):
         return _matmul(_about(m, joint.axes[0], q[0]), _about(m, joint.axes[1], q[1])), [0.0, 0.0, 0.0]
 
     def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        first = _times_transposed(_about(m, joint.axes[1], q[1]), [float(a) for a in joint.axes[0]])
-        return [0.0, 0.0, 0.0], [first[i] * v[0] + float(joint.axes[1][i]) * v[1] for i in range(3)]
+        first = _times_transposed(_about(m, joint.axes[1], q[1]), joint.axes[0])
+        return [0.0, 0.0, 0.0], [first[i] * v[0] + joint.axes[1][i] * v[1] for i in range(3)]
 
 
 class _SphericalZYX(JointKind):

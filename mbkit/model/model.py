@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, rows
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.model import manifold
+from mbkit.model import manifold, substitution
+from mbkit.model.binding import Binding
 from mbkit.model.digest import digest
 from mbkit.model.layout import Layout
 from mbkit.model.needs import Needs
@@ -53,6 +55,9 @@ class Model:
         What the loader decided or met, for the user to read.
     nonphysical : tuple of (str, str)
         Bodies that no matter can have, each with the reason.
+    bindings : tuple of Binding
+        The numbers that stand for expressions of parameters. The parts hold them
+        at the parameters' nominal values, and NaN where one has none.
     """
 
     name: str
@@ -65,6 +70,7 @@ class Model:
     prescribed: tuple[Prescribed, ...] = ()
     notes: tuple[str, ...] = ()
     nonphysical: tuple[tuple[str, str], ...] = ()
+    bindings: tuple[Binding, ...] = ()
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -85,6 +91,7 @@ class Model:
             self.prescribed,
             self.notes,
             self.nonphysical,
+            self.bindings,
         )
 
     def __eq__(self, other: object) -> bool:
@@ -127,17 +134,41 @@ class Model:
 
     @property
     def mass(self) -> float:
-        """Total mass, kg."""
+        """Total mass, kg.
+
+        Raises
+        ------
+        InputError
+            It depends on a parameter without a value.
+        """
+        if any(np.isnan(b.mass) for b in self.bodies):
+            self.require_values("mass")
         return float(sum(b.mass for b in self.bodies))
+
+    @cached_property
+    def parameters(self) -> Mapping[str, float | None]:
+        """Nominal value of each named parameter, None where it has none."""
+        return MappingProxyType({p.name: p.value for b in self.bindings for p in b.expression.parameters()})
+
+    def require_values(self, what: str) -> None:
+        """Raise `InputError` that names the parameters without a value, if there are any."""
+        missing = [name for name, value in self.parameters.items() if value is None]
+        if missing:
+            told = ", ".join(repr(n) for n in missing)
+            raise InputError(
+                f"{what}: {self.name}: no value for parameter {told}; "
+                f"give it with model.with_parameters({', '.join(f'{n}=...' for n in missing)})"
+            )
 
     @cached_property
     def needs(self) -> Needs:
         """What this description needs from an engine."""
-        return Needs.of(self.gravity, self.joints, self.springs, self.loops, self.prescribed)
+        bound = (b.field for b in self.bindings)
+        return Needs.of(self.gravity, self.joints, self.springs, self.loops, self.prescribed, bound)
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over every name and number of the description (not the notes)."""
+        """SHA-256 over every name, number and parameter of the description (not the notes)."""
         return digest(
             self.name,
             self.gravity,
@@ -147,7 +178,13 @@ class Model:
             self.springs,
             self.loops,
             self.prescribed,
+            *self.bindings,
         )
+
+    @cached_property
+    def form_digest(self) -> str:
+        """The digest without the parameters' values: of what is derived once for all of them."""
+        return substitution.opened(self).digest if self.parameters else self.digest
 
     # Structure
 
@@ -305,9 +342,28 @@ class Model:
             model = model._without(feature)
         return model
 
+    def with_parameters(self, /, **values: float) -> Model:
+        """Return the same description with plain numbers for some or all parameters.
+
+        Parameters
+        ----------
+        **values : float
+            By the parameters' names.
+
+        Raises
+        ------
+        UnknownNameError
+            A name that is no parameter of this model.
+        InputError
+            A value that is not a finite number.
+        ModelError
+            No matter is like the result, as `ModelBuilder.build` would say.
+        """
+        return substitution.fixed(self, values)
+
     def _without(self, feature: str) -> Model:
         if feature == "gravity":
-            return replace(self, gravity=np.zeros(3))
+            return replace(self, gravity=np.zeros(3), bindings=self._bindings_without("gravity"))
         if feature == "loops":
             return replace(self, loops=())
         if feature == "prescribed":
@@ -321,13 +377,24 @@ class Model:
             springs = (replace(s, stiffness=0.0) for s in springs)
         if feature == "damping":
             springs = (replace(s, damping=0.0) for s in springs)
-        kept = tuple(s for s in springs if s.stiffness or s.damping)
-        return replace(self, joints=joints, springs=kept)
+        bindings = self._bindings_without(name)
+        bound = {b.part for b in bindings if b.where == "springs" and b.field in ("stiffness", "damping")}
+        kept = tuple(s for s in springs if s.stiffness or s.damping or s.name in bound)
+        names = {s.name for s in kept}
+        bindings = tuple(b for b in bindings if b.where != "springs" or b.part in names)
+        return replace(self, joints=joints, springs=kept, bindings=bindings)
+
+    def _bindings_without(self, field: str) -> tuple[Binding, ...]:
+        return tuple(b for b in self.bindings if b.field != field)
 
     # Reading
 
     def __repr__(self) -> str:
-        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self.mass:.4g} kg; {self.needs}>"
+        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._told_mass()}; {self.needs}>"
+
+    def _told_mass(self) -> str:
+        unknown = any(np.isnan(b.mass) for b in self.bodies)
+        return "mass not given yet" if unknown else f"{self.mass:.4g} kg"
 
     def _repr_html_(self) -> str:
         cells = "".join(
@@ -339,7 +406,7 @@ class Model:
         head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
         notes = "".join(f"<li>{html.escape(n)}</li>" for n in self.notes)
         return (
-            f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self.mass:.4g} kg; {self.needs}</p>"
+            f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._told_mass()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
 

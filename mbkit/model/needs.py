@@ -41,14 +41,21 @@ class Needs:
         springs: Iterable[PointSpring],
         loops: Iterable[Loop],
         prescribed: Iterable[Prescribed],
+        bound: Iterable[str] = (),
     ) -> Needs:
-        """Read the flags off the parts of a description."""
-        joints, springs = tuple(joints), tuple(springs)
+        """Read the flags off the parts of a description.
+
+        `bound` names the attributes that stand for parameters somewhere: what is
+        zero now may have another value when it is evaluated.
+        """
+        joints, springs, bound = tuple(joints), tuple(springs), frozenset(bound)
         return cls(
-            gravity=bool(np.any(gravity)),
-            springs=any(np.any(j.stiffness) for j in joints) or any(s.stiffness for s in springs),
-            damping=any(np.any(j.damping) for j in joints) or any(s.damping for s in springs),
-            armature=any(np.any(j.armature) for j in joints),
+            gravity="gravity" in bound or bool(np.any(gravity)),
+            springs="stiffness" in bound
+            or any(np.any(j.stiffness) for j in joints)
+            or any(s.stiffness for s in springs),
+            damping="damping" in bound or any(np.any(j.damping) for j in joints) or any(s.damping for s in springs),
+            armature="armature" in bound or any(np.any(j.armature) for j in joints),
             friction=any(np.any(j.friction) for j in joints),
             limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
             effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from mbkit.spatial import skew
 if TYPE_CHECKING:
     from mbkit.model.model import Model
 
-__all__ = ["body_fault", "idle_joints", "sample_mass_matrix"]
+__all__ = ["body_fault", "body_faults", "idle_joints", "sample_mass_matrix", "suspects"]
 
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
@@ -51,6 +52,34 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
 
 def _told(values: Array) -> str:
     return ", ".join(f"{x:.4g}" for x in values)
+
+
+def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[str, str], ...]:
+    """Return the bodies that cannot exist, each with the reason.
+
+    A body that waits for a parameter's value is not judged yet.
+    """
+    return tuple(
+        (b.name, why)
+        for b in bodies
+        if np.isfinite([b.mass, *b.inertia.flat]).all() and (why := body_fault(b, point_masses=point_masses))
+    )
+
+
+def suspects(model: Model, *, point_masses: bool) -> tuple[tuple[str, str], ...]:
+    """Return the bodies that cannot exist or that leave a joint idle, each with the reason.
+
+    What waits for a parameter's value is not judged yet.
+    """
+    found = dict(body_faults(model.bodies, point_masses=point_masses))
+    # A negative mass makes M indefinite, and joints look idle that are not.
+    if all(x is not None for x in model.parameters.values()) and not any(b.mass < 0 for b in model.bodies):
+        for name in idle_joints(model):
+            found.setdefault(
+                model.joint(name).child,
+                f"no mass moves with joint {name!r}, so M is singular: give mass, inertia or armature",
+            )
+    return tuple(found.items())
 
 
 def idle_joints(model: Model) -> list[str]:
