@@ -16,6 +16,7 @@ __all__ = [
     "MbkitError",
     "MbkitWarning",
     "ModelError",
+    "NoCompilerWarning",
     "NonPhysicalWarning",
     "NumericalError",
     "OutputError",
@@ -108,6 +109,10 @@ class MbkitWarning(UserWarning):
 
 class KnownDefectWarning(MbkitWarning):
     """An engine is known to return a wrong value here; it is returned as it is."""
+
+
+class NoCompilerWarning(MbkitWarning):
+    """There is no compiler: what would be compiled is interpreted, with the same results and slower."""
 
 
 class NonPhysicalWarning(MbkitWarning):

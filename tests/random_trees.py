@@ -40,8 +40,13 @@ def random_tree(
     armature: bool = True,
     mimic: bool = False,
     gravity: bool = True,
+    nearest: int | None = None,
 ) -> Model:
-    """Return a tree of n joints: the first ones of each kind in turn, the rest at random."""
+    """Return a tree of n joints: the first ones of each kind in turn, the rest at random.
+
+    Parents are drawn from all bodies, which makes a shallow tree, or from the
+    `nearest` last ones, which makes one as deep as it is large.
+    """
     rng = np.random.default_rng(seed)
     b = mb.ModelBuilder(f"tree{seed}", gravity=5 * rng.standard_normal(3) if gravity else np.zeros(3))
     bodies, leaders = ["world"], []
@@ -68,7 +73,7 @@ def random_tree(
             joint["mimic"] = (leaders[-1], float(rng.uniform(-2, 2)), 0.3)
         elif one:
             leaders.append(f"j{i}")
-        parent = "world" if i == 0 else str(rng.choice(bodies))
+        parent = "world" if i == 0 else str(rng.choice(bodies if nearest is None else bodies[-nearest:]))
         place = {"rotation": rotation(rng), "translation": 0.5 * rng.standard_normal(3)}
         b.add_joint(f"j{i}", kind, parent=parent, child=f"b{i}", **place, **joint)
         bodies.append(f"b{i}")

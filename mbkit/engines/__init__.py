@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from typing import Final
+import inspect
+from typing import Any, Final
 
 from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
@@ -16,18 +17,23 @@ ENGINES: Final = {
     "pinocchio": ("mbkit.engines.pinocchio", "PinocchioDynamics", "pin"),
     "lagrangian": ("mbkit.engines.lagrangian", "LagrangianDynamics", "casadi"),
     "mujoco": ("mbkit.engines.mujoco", "MujocoDynamics", "mujoco"),
+    "oracle": ("mbkit.engines.oracle", "OracleDynamics", "mpmath"),
 }
 
 
-def dynamics(model: Model, engine: str = "pinocchio") -> Dynamics:
+def dynamics(model: Model, engine: str = "pinocchio", **options: Any) -> Dynamics:
     """Return the model's dynamics as one engine computes them.
 
     Parameters
     ----------
     model : Model
-    engine : {"pinocchio", "lagrangian", "mujoco"}
+    engine : {"pinocchio", "lagrangian", "mujoco", "oracle"}
         Rigid-body algorithms of Pinocchio, mbkit's own derivation from energies,
-        or MuJoCo.
+        MuJoCo, or the own derivation at 34 digits, for measuring the others.
+
+    **options
+        The lagrangian engine's ``compile=`` (True or False) and ``threads=``; other
+        engines have none.
 
     Returns
     -------
@@ -51,5 +57,10 @@ def dynamics(model: Model, engine: str = "pinocchio") -> Dynamics:
         if error.name and error.name.startswith("mbkit"):
             raise
         raise UnsupportedError(f"{engine} is not installed ({error}); pip install {package}") from error
-    made: Dynamics = adapter(model)
+    known = [name for name in inspect.signature(adapter).parameters if name != "model"]
+    for name in options:
+        if name not in known:
+            told = f"it takes {', '.join(known)}" if known else "it takes none"
+            raise InputError(f"{name}: {engine} has no such option; {told}")
+    made: Dynamics = adapter(model, **options)
     return made

@@ -2,50 +2,127 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array
+from mbkit._check import Array, count
 from mbkit.engines.base import Dynamics
+from mbkit.engines.lagrangian_direct import short_way
+from mbkit.engines.parameters import ParameterValues
+from mbkit.errors import InputError
+from mbkit.lagrangian.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
 from mbkit.lagrangian.equations import Equations
+from mbkit.lagrangian.execution import compile_by_default, executable
+from mbkit.lagrangian.factorize import elimination_size
 from mbkit.lagrangian.machine import Machine
 from mbkit.model import Model
 
 __all__ = ["LagrangianDynamics"]
 
-# Written out, forward dynamics grows as the cube of a chain's length; beyond this
-# many multiplications forming M and solving in LAPACK is faster to build and run.
-_WRITTEN_OUT: Final = 6000
+# Written out, forward dynamics grows as the cube of a chain's length. Beyond these
+# many multiplications, forming M and solving in LAPACK is faster to make and run.
+_WRITTEN_OUT: Final = {False: 6000, True: 100_000}
+# Quantities with a short way, and how their result loses the axes that it does not need.
+_TRIM: Final[dict[str, Callable[[Array], Array]]] = {
+    **dict.fromkeys(("mass_matrix", "coriolis_matrix"), lambda x: x),
+    **dict.fromkeys(
+        ("coriolis_force", "gravity", "nle", "passive", "inverse_dynamics", "forward_dynamics"), lambda x: x[..., 0]
+    ),
+    **dict.fromkeys(("kinetic_energy", "potential_energy"), lambda x: x[..., 0, 0]),
+}
 
 
 class LagrangianDynamics(Dynamics):
     """Terms derived from T and V, each when it is first asked for.
 
-    Attributes
+    Parameters
     ----------
-    equations : mbkit.lagrangian.Equations
-        The expressions, free to read.
+    model : Model
+    compile : bool, optional
+        Whether to make machine code of what is derived, which is kept on disk; else
+        CasADi's machine interprets it, right for what is evaluated a few times. By
+        default compiled, unless the environment says ``MBKIT_COMPILE=0``.
+    threads : int, optional
+        Threads that share a large batch; by default as many as the process has cores.
     """
 
     engine = "lagrangian"
+    takes_parameters = True
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, *, compile: bool | None = None, threads: int | None = None) -> None:  # noqa: A002  # the word that users look for
         super().__init__(model)
-        self.equations = Equations(model)
-        self._machines: dict[tuple[str, ...], Machine] = {}
+        if compile is not None and not isinstance(compile, bool):
+            raise InputError(f"compile: expected True, False or None, got {compile!r}")
+        self.compile = compile_by_default() if compile is None else compile
+        self.threads = None if threads is None else count("threads", threads, least=1)
+        self._parameters = ParameterValues(model)
+        self._machines: dict[tuple[str, ...], Any] = {}
+        self._short: dict[str, Callable[..., Any]] = {}
 
-    def _machine(self, name: str, *extra: str) -> Machine:
+    @cached_property
+    def equations(self) -> Equations:
+        """The expressions, free to read."""
+        return Equations(self.model)
+
+    def code(self, name: str, *extra: str, make: Callable[[], Any] | None = None) -> Any:
+        """Return a `Compiled` or `Machine` of a quantity, or of what `make` derives from this model.
+
+        Its arguments are not checked.
+        """
         key = (name, *extra)
         if key not in self._machines:
-            if name in ("pose", "jacobian", "applied_function"):
-                made = getattr(self.equations, name)(*extra)
-            else:
-                made = self.equations.function(name)
-            self._machines[key] = Machine(made)
+
+            def derive() -> Any:
+                if make is not None:
+                    return make()
+                if name in ("pose", "jacobian", "applied_function", "side_by_side"):
+                    return getattr(self.equations, name)(*extra)
+                return self.equations.function(name)
+
+            code = executable((self.model.form_digest, *key), derive, compile=self.compile)
+            if name in _TRIM and not isinstance(code, Machine):
+                self._short[name] = short_way(self.model, code, _TRIM[name], self.threads)
+            self._machines[key] = code
         return self._machines[key]
+
+    def _machine(self, name: str, *extra: str) -> Callable[..., list[Array]]:
+        code = self.code(name, *extra)
+        return self._parameters.bound(lambda *given: code(*given, threads=self.threads))
+
+    def at(self, /, **values: ArrayLike) -> LagrangianDynamics:
+        """Return the same dynamics at other values of parameters, as `Dynamics.at` does; nothing is derived again."""
+        return self._with(self._parameters.at(values))
+
+    @property
+    def samples(self) -> int | None:
+        """Size of the batch that the parameters' values make, None where every sample has the same."""
+        return self._parameters.samples
+
+    def of_samples(self, which: ArrayLike) -> LagrangianDynamics:
+        """Return the dynamics of these samples of a batch, by index."""
+        return self._with(self._parameters.of_samples(which)) if self._parameters.batched else self
+
+    def _with(self, parameters: ParameterValues) -> LagrangianDynamics:
+        out = object.__new__(type(self))
+        # What is derived and compiled is shared, also what comes later.
+        out.__dict__.update(self.__dict__, equations=self.equations)
+        out._parameters, out.model = parameters, parameters.model
+        return out
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (self.model, self._parameters.batched, self.compile, self.threads)
+
+    def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+        if quantity in self._short:
+            own = tuple(arguments.values())
+            out = self._short[quantity](*own, *self._parameters.behind(own[0]))
+            if out is not None:
+                return np.asarray(out)
+        return super()._evaluate(quantity, method, **self._parameters.spread(arguments))
 
     def _vector(self, name: str, *arguments: Array) -> Array:
         return self._machine(name)(*arguments)[0][..., 0]
@@ -71,6 +148,32 @@ class LagrangianDynamics(Dynamics):
     def _nle(self, q: Array, v: Array) -> Array:
         return self._vector("nle", q, v)
 
+    def inverse_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> InverseDynamicsDerivatives:
+        """Return the partial derivatives of inverse dynamics: fields q, v and a, each (nv, nv) or (N, nv, nv).
+
+        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
+        with v and a held fixed. That by a is M.
+        """
+        out = self._evaluate("inverse_dynamics_derivatives", self._inverse_dynamics_derivatives, q=q, v=v, a=a)
+        return InverseDynamicsDerivatives(*np.split(out, 3, axis=-1))
+
+    def forward_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> ForwardDynamicsDerivatives:
+        """Return the partial derivatives of forward dynamics: fields q, v and tau, each (nv, nv) or (N, nv, nv).
+
+        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
+        with v and tau held fixed. That by tau is M⁻¹.
+        """
+        out = self._evaluate("forward_dynamics_derivatives", self._forward_dynamics_derivatives, q=q, v=v, tau=tau)
+        return ForwardDynamicsDerivatives(*np.split(out, 3, axis=-1))
+
+    def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
+        return self._machine("side_by_side", "inverse_dynamics_derivatives")(q, v, a)[0]
+
+    def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
+        if self._written_out:
+            return self._machine("side_by_side", "forward_dynamics_derivatives")(q, v, tau)[0]
+        return through_inverse(self._inverse_dynamics_derivatives(q, v, self._forward_dynamics(q, v, tau)))
+
     def _passive(self, q: Array, v: Array) -> Array:
         return self._vector("passive", q, v)
 
@@ -79,7 +182,7 @@ class LagrangianDynamics(Dynamics):
 
     @cached_property
     def _written_out(self) -> bool:
-        return self.equations.elimination_size() <= _WRITTEN_OUT
+        return elimination_size(self.model) <= _WRITTEN_OUT[self.compile]
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self._written_out:
@@ -101,3 +204,12 @@ class LagrangianDynamics(Dynamics):
 
     def _function(self, name: str) -> Any:
         return self.equations.function(name)
+
+
+def _remade(
+    model: Model,
+    batched: dict[str, Array],
+    compile: bool,  # noqa: A002  # as above
+    threads: int | None,
+) -> LagrangianDynamics:
+    return LagrangianDynamics(model, compile=compile, threads=threads).at(**batched)

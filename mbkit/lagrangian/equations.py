@@ -15,12 +15,12 @@ from functools import cached_property
 from typing import Any, Final
 
 import casadi as ca
-import numpy as np
 
 from mbkit.errors import UnknownNameError
-from mbkit.lagrangian import energies
-from mbkit.lagrangian.factorize import solve
-from mbkit.lagrangian.kinematics import Kinematics, add, constant_times
+from mbkit.lagrangian import derivatives, energies
+from mbkit.lagrangian.factorize import elimination_order, solve
+from mbkit.lagrangian.kinematics import Kinematics, add, constant_transposed_times
+from mbkit.lagrangian.values import Constants
 from mbkit.model import Model
 from mbkit.model.kinds import cross3
 
@@ -39,15 +39,39 @@ FUNCTIONS: Final = {
     "kinetic_energy": ("q", "v"),
     "potential_energy": ("q",),
     "energy_rate": ("q", "v", "a"),
+    "inverse_dynamics_derivatives": ("q", "v", "a"),
+    "forward_dynamics_derivatives": ("q", "v", "tau"),
 }
 
 
 class Equations:
-    """The equations of motion of a model as CasADi expressions and functions."""
+    """The equations of motion of a model as CasADi expressions and functions.
 
-    def __init__(self, model: Model) -> None:
+    Parameters
+    ----------
+    model : Model
+    constants : {"literal", "symbols"}
+        Whether the model's numbers stand in the expressions as floats, or as
+        symbols that become the last argument, ``"constants"``, of every function.
+
+    Attributes
+    ----------
+    q, v, a, tau : casadi.SX
+    parameters : (p, 1) casadi.SX
+        The model's named parameters in the order of `model.parameters`. If there are
+        any, they are the last argument, ``"parameters"``, of every function. With
+        constants as symbols they are among those instead, at their nominal values.
+    constants : (k, 1) casadi.SX
+        Empty with literal constants.
+    constant_values : (k,) array
+        What `constants` stands for.
+    """
+
+    def __init__(self, model: Model, constants: Constants = "literal") -> None:
         self.model = model
-        self.kin = Kinematics(model)
+        self.kin = Kinematics(model, constants)
+        self.parameters = self.kin.values.parameters
+        self.constants, self.constant_values = self.kin.values.constants, self.kin.values.constant_values
         self.q, self.v = self.kin.q, self.kin.v
         self.a = ca.SX.sym("a", model.nv)
         self.tau = ca.SX.sym("tau", model.nv)
@@ -155,15 +179,17 @@ class Equations:
     @cached_property
     def elimination_order(self) -> tuple[int, ...]:
         """Velocity indices with every parent before its children."""
-        parts = [self.model.layout.v[j.name] for j in self.model.tree]
-        return tuple(i for part in parts for i in range(part.start, part.stop))
+        return elimination_order(self.model)
 
-    def elimination_size(self) -> int:
-        """Return about how many multiplications `forward_dynamics` adds to M and nle."""
-        pattern = np.array(ca.DM(self.mass_matrix.sparsity(), 1).full(), dtype=bool)
-        order = list(self.elimination_order)
-        below = np.tril(pattern[np.ix_(order, order)]).sum(axis=1)
-        return int((below * below).sum())
+    @cached_property
+    def inverse_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
+        """∂ID/∂q on the manifold, ∂ID/∂v and ∂ID/∂a = M."""
+        return derivatives.inverse_dynamics(self)
+
+    @cached_property
+    def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
+        """∂FD/∂q on the manifold, ∂FD/∂v and ∂FD/∂τ = M⁻¹."""
+        return derivatives.forward_dynamics(self)
 
     def function(self, name: str) -> ca.Function:
         """Return a quantity as a function of its arguments."""
@@ -173,32 +199,56 @@ class Equations:
         names = FUNCTIONS[name]
         return self.named(name, names, [symbols[n] for n in names], getattr(self, name))
 
+    def side_by_side(self, name: str) -> ca.Function:
+        """Return a quantity's several results as one matrix, to be evaluated into one array."""
+        f = self.function(name)
+        given = f.sx_in()
+        return ca.Function(name, given, [ca.horzcat(*f.call(given))], f.name_in(), [name])
+
     def applied_function(self) -> ca.Function:
         """Return M and τ_passive - nle together, for a numerical solution."""
         outs = [ca.densify(self.mass_matrix), ca.densify(self.applied)]
-        return ca.Function("mass_and_force", [self.q, self.v], outs, ["q", "v"], ["M", "f"], {"cse": True})
+        given = {"q": self.q, "v": self.v, **self.trailing}
+        return ca.Function("mass_and_force", list(given.values()), outs, list(given), ["M", "f"], {"cse": True})
 
-    def named(self, name: str, argument_names: Any, arguments: list[ca.SX], out: ca.SX) -> ca.Function:
-        """Return one dense output as a function."""
-        return ca.Function(name, arguments, [ca.densify(out)], list(argument_names), [name], {"cse": True})
+    @property
+    def trailing(self) -> dict[str, ca.SX]:
+        """What every function takes behind its own arguments, by name."""
+        given = {"parameters": self.parameters, "constants": self.constants}
+        return {name: symbols for name, symbols in given.items() if symbols.numel()}
+
+    def named(self, name: str, argument_names: Any, arguments: list[ca.SX], out: Any) -> ca.Function:
+        """Return one dense output as a function, or a tuple of derivatives by the first arguments.
+
+        The function takes the `trailing` arguments too.
+        """
+        outs = out if isinstance(out, tuple) else (out,)
+        labels = [f"by_{n}" for n in argument_names[: len(outs)]] if isinstance(out, tuple) else [name]
+        dense = [ca.densify(x) for x in outs]
+        given = {**dict(zip(argument_names, arguments, strict=True)), **self.trailing}
+        return ca.Function(name, list(given.values()), dense, list(given), labels, {"cse": True})
 
     def pose(self, frame: str) -> ca.Function:
         """Return X_WF(q), 4 by 4."""
-        f = self.model.frame(frame)
-        columns = [self.kin.to_world(f.body, [float(x) for x in f.rotation[:, k]], 0.0) for k in range(3)]
-        columns.append(self.kin.to_world(f.body, [float(x) for x in f.translation]))
+        body, f = self._frame(frame)
+        columns = [self.kin.to_world(body, [row[k] for row in f.rotation], 0.0) for k in range(3)]
+        columns.append(self.kin.to_world(body, f.translation))
         top = ca.horzcat(*(ca.vertcat(*c) for c in columns))
         X = ca.vertcat(ca.SX(top), ca.SX([[0.0, 0.0, 0.0, 1.0]]))
         return self.named("pose", ["q"], [self.q], X)
 
     def jacobian(self, frame: str, axes: str) -> ca.Function:
         """Return the Jacobian of a frame's velocity, linear then angular."""
-        f = self.model.frame(frame)
-        linear, angular = self.kin.twists[f.body]
-        linear = add(linear, cross3(angular, [float(x) for x in f.translation]))
+        body, f = self._frame(frame)
+        linear, angular = self.kin.twists[body]
+        linear = add(linear, cross3(angular, f.translation))
         if axes == "world":
-            halves = [self.kin.to_world(f.body, x, 0.0) for x in (linear, angular)]
+            halves = [self.kin.to_world(body, x, 0.0) for x in (linear, angular)]
         else:
-            halves = [constant_times(f.rotation.T, x) for x in (linear, angular)]
+            halves = [constant_transposed_times(f.rotation, x) for x in (linear, angular)]
         twist = ca.vertcat(*(ca.SX(x) for half in halves for x in half))
         return self.named("jacobian", ["q"], [self.q], ca.jacobian(twist, self.v))
+
+    def _frame(self, name: str) -> tuple[str, Any]:
+        frame = self.model.frame(name)
+        return frame.body, self.kin.values.frame(frame)

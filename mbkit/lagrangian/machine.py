@@ -1,14 +1,19 @@
-"""Run a CasADi function on NumPy arrays without copies, one state or many."""
+"""Run a CasADi function in CasADi's own machine, one state or many.
+
+Nothing is compiled, so it is at once at hand: right for what is evaluated a few
+times, and where there is no compiler. `Compiled` has the same face.
+"""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, all_finite
 
 __all__ = ["Machine"]
 
@@ -18,10 +23,22 @@ class Machine:
 
     A C-ordered batch ``(N, n)`` is CasADi's column-major ``n`` by ``N``, so arrays
     are handed over as they are.
+
+    Attributes
+    ----------
+    inputs : tuple of int
+        Entries of each argument.
+    shapes : tuple of (int, int)
+        Rows and columns of each result.
+    operations : int
+        Instructions of one evaluation.
     """
 
     def __init__(self, function: ca.Function) -> None:
         self.function = function
+        self.inputs = tuple(function.size1_in(i) for i in range(function.n_in()))
+        self.shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
+        self.operations = int(function.n_instructions())
         self._sizes: dict[int, tuple[Any, Any, list[Any], list[Any]]] = {}
         # CasADi's buffers belong to one call at a time.
         self._lock = threading.Lock()
@@ -47,7 +64,25 @@ class Machine:
             self._sizes[n] = (buffer, run, inputs, outputs)
         return self._sizes[n]
 
-    def __call__(self, *arguments: Array) -> list[Array]:
+    def watched(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
+        """Return the results, and whether all that was read and written is finite."""
+        results = self(*arguments, threads=threads)
+        return results, all(all_finite(x) for x in (*arguments, *results))
+
+    def bound(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> tuple[Callable[[], None], Array]:
+        """Return a call that reads and writes these very arrays, as `Compiled.bound` does."""
+        watch = np.zeros(1)
+
+        def call() -> None:
+            results, finite = self.watched(*inputs)
+            for out, result in zip(outputs, results, strict=True):
+                out[:] = result.reshape(out.shape)
+            if not finite:
+                watch[:] = np.nan
+
+        return call, watch
+
+    def __call__(self, *arguments: Array, threads: int | None = None) -> list[Array]:  # noqa: ARG002  # one is all it has
         """Return each output with shape (rows, columns) or (N, rows, columns)."""
         single = arguments[0].ndim == 1
         n = 1 if single else arguments[0].shape[0]

@@ -1,0 +1,126 @@
+"""Machine code kept on disk between processes.
+
+The folder belongs to the user alone (0700), an entry is written under another name
+and then renamed, so that any number of processes may write at once, and nothing is
+handed out unless its SHA-256, its key and its owner are right. Whatever is wrong with
+an entry, it is as if it were not there.
+
+``MBKIT_CACHE_DIR`` moves the folder; set to the empty string it switches this off.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+import tempfile
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from platformdirs import user_cache_path
+
+__all__ = ["folder", "key_of", "read", "sources", "write"]
+
+_MAGIC: Final = b"mbkit machine code 1\n"
+#: The oldest entries go when the folder holds more than this, bytes.
+_MOST: Final = 512 * 2**20
+
+
+def key_of(*parts: str) -> str:
+    """Return the name of an entry: the SHA-256 of all that its content depends on."""
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+@cache
+def sources() -> str:
+    """Return the SHA-256 of the code that derives and compiles."""
+    here = Path(__file__).parent
+    total = hashlib.sha256()
+    for path in sorted([*here.glob("*.py"), *(here.parent / "model").glob("*.py")]):
+        total.update(path.name.encode() + b"\0" + path.read_bytes())
+    return total.hexdigest()
+
+
+def folder() -> Path | None:
+    """Return the folder, made if need be, or None where no safe one is to be had."""
+    chosen = os.environ.get("MBKIT_CACHE_DIR")
+    if chosen == "":
+        return None
+    path = Path(chosen) if chosen else user_cache_path("mbkit") / "machine-code"
+    try:
+        path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        found = path.stat()
+        if hasattr(os, "getuid"):
+            if found.st_uid != os.getuid():
+                return None
+            if stat.S_IMODE(found.st_mode) != 0o700:
+                path.chmod(0o700)
+    except OSError:
+        return None
+    return path
+
+
+def read(key: str) -> tuple[dict[str, Any], bytes] | None:
+    """Return the description and code of an entry, or None if there is none to be trusted."""
+    at = folder()
+    if at is None:
+        return None
+    path = at / key
+    try:
+        # Not through a link, which may lead out of the folder.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+        with os.fdopen(handle, "rb") as file:
+            if hasattr(os, "getuid") and os.fstat(file.fileno()).st_uid != os.getuid():
+                return None
+            content = file.read()
+        with suppress(OSError):
+            os.utime(path)
+    except OSError:
+        return None
+    start = len(_MAGIC) + 65
+    checksum, rest = content[len(_MAGIC) : start - 1].decode("ascii", "replace"), content[start:]
+    if not content.startswith(_MAGIC) or hashlib.sha256(rest).hexdigest() != checksum:
+        return None
+    text, _, code = rest.partition(b"\n")
+    about: dict[str, Any] = json.loads(text)
+    return (about, code) if about.get("key") == key else None
+
+
+def write(key: str, about: dict[str, Any], code: bytes) -> None:
+    """Keep an entry; where that is not possible, nothing happens."""
+    at = folder()
+    if at is None:
+        return
+    rest = json.dumps({**about, "key": key}).encode() + b"\n" + code
+    content = _MAGIC + hashlib.sha256(rest).hexdigest().encode() + b"\n" + rest
+    try:
+        handle, temporary = tempfile.mkstemp(dir=at, prefix=".new-")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+            os.replace(temporary, at / key)
+        except OSError:
+            with suppress(OSError):
+                os.unlink(temporary)
+            return
+        _forget_oldest(at)
+    except OSError:
+        return
+
+
+def _forget_oldest(at: Path) -> None:
+    entries = []
+    for path in at.iterdir():
+        with suppress(OSError):
+            found = path.stat()
+            entries.append((found.st_mtime, found.st_size, path))
+    size = sum(entry[1] for entry in entries)
+    for _, bytes_, path in sorted(entries):
+        if size <= _MOST:
+            return
+        with suppress(OSError):
+            path.unlink()
+            size -= bytes_

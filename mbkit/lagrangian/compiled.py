@@ -1,0 +1,270 @@
+"""A function of vectors as machine code: one state or a batch, one thread or all."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, Final
+from weakref import WeakValueDictionary
+
+import casadi as ca
+import numpy as np
+
+from mbkit._check import Array
+from mbkit._version import __version__
+from mbkit.lagrangian import cache as disk
+from mbkit.lagrangian import jit
+from mbkit.lagrangian.program import program
+
+__all__ = ["Compiled", "aligned", "compiled", "cores"]
+
+#: Operations on which a second thread is worth its start: about 100 µs.
+_SHARE: Final = 2_000_000
+#: Coordinate-major arrays with more rows than this are read in blocks: so many places
+#: of a large array at once are more than the processor's tables of pages hold.
+_ROWS: Final = 48
+#: Samples in such a block. No power of two: rows would meet in the same cache sets.
+_BLOCK: Final = 1032
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def aligned(size: int) -> Array:
+    """Return an array that starts at a cache line."""
+    room = np.empty(size + 8)
+    return room[-room.ctypes.data // 8 % 8 :][:size]
+
+
+def _readable(x: Array) -> Array:
+    """Return an array as machine code can read it: doubles at whole places."""
+    good = x.dtype == np.float64 and x.dtype.isnative and not any(s % 8 for s in x.strides) and not x.ctypes.data % 8
+    return x if good else np.array(x, dtype=np.float64)
+
+
+class Compiled:
+    """Machine code of a function whose arguments are vectors.
+
+    Attributes
+    ----------
+    inputs : tuple of int
+        Entries of each argument.
+    shapes : tuple of (int, int)
+        Rows and columns of each result.
+    operations : int
+        Scalar operations of one evaluation.
+    """
+
+    def __init__(self, about: dict[str, Any], code: bytes) -> None:
+        self.inputs = tuple(about["inputs"])
+        self.shapes = tuple((r, c) for r, c in about["shapes"])
+        self.operations = int(about["operations"])
+        self._loaded = jit.load(_batch_object(), code)
+        self._share = int(about["work"])
+        tiles = sum(self.inputs) + sum(rows * columns for rows, columns in self.shapes)
+        self._work_size = self._share + tiles * jit.host().width
+        self._local = threading.local()
+
+    def __call__(self, *arguments: Array, threads: int | None = None) -> list[Array]:
+        """Return each result with shape (rows, columns) or (N, rows, columns).
+
+        Arguments are all vectors or all (N, n), with any strides. Results are
+        coordinate-major if all arguments of more than one entry are.
+        """
+        return self.watched(*arguments, threads=threads)[0]
+
+    def watched(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
+        """Return the results, and whether all that was read and written is finite."""
+        single = arguments[0].ndim == 1
+        given = [x[None] for x in arguments] if single else list(arguments)
+        n = given[0].shape[0]
+        for i, (x, size) in enumerate(zip(given, self.inputs, strict=True)):
+            if x.shape != (n, size):
+                raise ValueError(f"argument {i}: expected ({n}, {size}), got {x.shape}")
+        given = [_readable(x) for x in given]
+        major = n > 1 and all(x.strides[0] == 8 for x in given if x.shape[1] > 1)
+        sizes = [rows * columns for rows, columns in self.shapes]
+        flat = [np.empty((size, n)).T if major else np.empty((n, size)) for size in sizes]
+        finite = self.run(given, flat, threads)
+        results = [
+            (x.T.reshape(r, c, n).transpose(2, 0, 1) if major else x.reshape(n, r, c))
+            for x, (r, c) in zip(flat, self.shapes, strict=True)
+        ]
+        return ([x[0] for x in results] if single else results), finite
+
+    def run(self, inputs: Sequence[Array], outputs: Sequence[Array], threads: int | None = None) -> bool:
+        """Fill outputs, without checks.
+
+        Parameters
+        ----------
+        inputs, outputs : sequences of (N, n) float64 arrays
+            With any strides; transposed coordinate-major ones are used in place.
+        threads : int, optional
+
+        Returns
+        -------
+        bool
+            Whether every number read and written is finite.
+        """
+        n = inputs[0].shape[0]
+        if n == 0:
+            return True
+        width = jit.host().width
+        parts = min(threads or cores(), max(1, n * self.operations // _SHARE))
+        if parts == 1:
+            return self._part(inputs, outputs, 0, n)
+        # A few more parts than threads: one that is held up is helped out by the others.
+        size = -(-n // (4 * parts * width)) * width
+        starts = range(0, n, size)
+        return all(list(_pool(parts).map(lambda s: self._part(inputs, outputs, s, min(s + size, n)), starts)))
+
+    def _part(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
+        many = [sum(x.shape[1] for x in xs if x.strides[0] == 8) > _ROWS for xs in (inputs, outputs)]
+        if not any(many) or last - first <= _BLOCK:
+            return self._straight(inputs, outputs, first, last)
+        near = [[np.empty((x.shape[1], _BLOCK)).T for x in xs] for xs in (inputs, outputs)]
+        finite = True
+        for start in range(first, last, _BLOCK):
+            n = min(_BLOCK, last - start)
+            for x, y in zip(inputs, near[0], strict=True):
+                y[:n] = x[start : start + n]
+            finite &= self._straight(near[0], near[1], 0, n)
+            for x, y in zip(outputs, near[1], strict=True):
+                x[start : start + n] = y[:n]
+        return finite
+
+    def _straight(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
+        table = self._table(inputs, outputs)
+        work = self._work()
+        watch = work[: jit.host().width]
+        watch[:] = 0.0
+        self._loaded.run(table.ctypes.data, work.ctypes.data, first, last)
+        return bool(np.dot(watch, watch) == 0.0)
+
+    def _table(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Array:
+        table = [len(inputs), len(outputs), self._share]
+        for x in (*inputs, *outputs):
+            table += [x.ctypes.data, x.shape[1], x.strides[1] >> 3, x.strides[0] >> 3]
+        return np.array(table, dtype=np.int64)
+
+    def bound(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> tuple[Callable[[], None], Array]:
+        """Return a call that reads and writes these very arrays, for many calls of few states.
+
+        Parameters
+        ----------
+        inputs, outputs : sequences of (N, n) float64 arrays
+            As in `run`.
+
+        Returns
+        -------
+        callable
+            Takes nothing and returns nothing; one thread may be in it at a time.
+        array
+            Zero until a number read or written is not finite; may be set to zero again.
+        """
+        table, work = self._table(inputs, outputs), aligned(self._work_size)
+        watch = work[: jit.host().width]
+        watch[:] = 0.0
+        run, last = self._loaded.run, inputs[0].shape[0]
+        at, scratch = table.ctypes.data, work.ctypes.data
+
+        def call(_kept: Any = (self, table, work, inputs, outputs)) -> None:
+            run(at, scratch, 0, last)
+
+        return call, watch
+
+    def _work(self) -> Array:
+        """Return this thread's own work space."""
+        if not hasattr(self._local, "work"):
+            self._local.work = aligned(self._work_size)
+        work: Array = self._local.work
+        return work
+
+
+@cache
+def _batch_object() -> bytes:
+    key = disk.key_of("batch", disk.sources(), *map(str, jit.host()))
+    found = disk.read(key)
+    if found:
+        return found[1]
+    code = jit.batch_object()
+    disk.write(key, {}, code)
+    return code
+
+
+_POOLS: dict[int, ThreadPoolExecutor] = {}
+if hasattr(os, "register_at_fork"):
+    # A child has none of its parent's threads.
+    os.register_at_fork(after_in_child=_POOLS.clear)
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    if threads not in _POOLS:
+        _POOLS[threads] = ThreadPoolExecutor(threads, thread_name_prefix="mbkit")
+    return _POOLS[threads]
+
+
+def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
+    """Return machine code of a function: kept in this process, from disk, or made now.
+
+    Parameters
+    ----------
+    name : sequence of str
+        All that the function depends on but the code of mbkit: the model's digest,
+        the quantity.
+    make : callable
+        Derives the function; called only if it has not been compiled before.
+    """
+    key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), disk.sources(), *map(str, jit.host()))
+    with _HELD.lock:
+        found = _HELD.functions.get(key)
+        if found is None:
+            found = _HELD.functions[key] = _from_disk(key) or _made(key, make)
+    return found
+
+
+def _from_disk(key: str) -> Compiled | None:
+    found = disk.read(key)
+    if found is None:
+        return None
+    try:
+        return Compiled(*found)
+    except (KeyError, TypeError, ValueError):
+        # Whole, and ours by its key, but not of this form: made anew.
+        return None
+
+
+def _made(key: str, make: Callable[[], ca.Function]) -> Compiled:
+    derived = program(make())
+    code, work = jit.program_object(derived)
+    about = {
+        "inputs": derived.inputs,
+        "shapes": derived.shapes,
+        "operations": derived.arithmetic,
+        "work": work,
+    }
+    disk.write(key, about, code)
+    return Compiled(about, code)
+
+
+class _Held:
+    """Functions in use by anyone in this process; a forked child starts with a free lock."""
+
+    def __init__(self) -> None:
+        self.functions: WeakValueDictionary[str, Compiled] = WeakValueDictionary()
+        self.renew()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self.renew)
+
+    def renew(self) -> None:
+        self.lock = threading.RLock()
+
+
+_HELD: Final = _Held()

@@ -1,0 +1,59 @@
+"""How a derived function is run: as machine code, or in CasADi's own machine."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from mbkit.errors import NoCompilerWarning
+from mbkit.lagrangian.machine import Machine
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.compiled import Compiled
+
+__all__ = ["compile_by_default", "executable"]
+
+
+def compile_by_default() -> bool:
+    """Return whether functions are compiled when nobody says: yes, unless ``MBKIT_COMPILE=0``."""
+    return os.environ.get("MBKIT_COMPILE", "1") != "0"
+
+
+def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile: bool) -> Compiled | Machine:  # noqa: A002  # the word that users look for
+    """Return a function ready to run.
+
+    Parameters
+    ----------
+    name : sequence of str
+        All that it depends on but the code of mbkit, for the cache.
+    make : callable
+        Derives it; not called if its machine code is in the cache.
+    compile : bool
+        Whether to compile; where there is no compiler a `NoCompilerWarning` says so
+        once, and CasADi's machine runs it.
+    """
+    if compile and _compiler():
+        # Loads LLVM, which interpreting never needs.
+        from mbkit.lagrangian.compiled import compiled
+
+        return compiled(name, make)
+    return Machine(make())
+
+
+@cache
+def _compiler() -> bool:
+    if importlib.util.find_spec("llvmlite") is not None:
+        return True
+    warnings.warn(
+        "llvmlite is not installed: mbkit's own derivation runs in CasADi's machine, some ten times slower; "
+        "pip install llvmlite",
+        NoCompilerWarning,
+        stacklevel=2,
+    )
+    return False

@@ -1,0 +1,106 @@
+"""Machine code for this processor, by LLVM (llvmlite).
+
+A compiled program is an object file in memory: bytes that can be kept and loaded
+again, by this process or another one on the same kind of processor.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import threading
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+import llvmlite
+from llvmlite import binding as llvm
+
+from mbkit.lagrangian.batch_code import RUN, batch_code
+from mbkit.lagrangian.program import Program
+from mbkit.lagrangian.vector_code import vector_code
+
+__all__ = ["Host", "Loaded", "batch_object", "host", "load", "program_object"]
+
+_SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+
+
+class Host(NamedTuple):
+    """What machine code depends on; `width` is the number of doubles in a register."""
+
+    triple: str
+    cpu: str
+    features: str
+    width: int
+    llvm: str
+
+
+class Loaded:
+    """A function in memory; its code lives as long as this object."""
+
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
+        #: Called with the addresses of table and work space and a range of samples;
+        #: other Python threads run meanwhile.
+        self.run = _SIGNATURE(engine.get_function_address(RUN))
+
+
+class _Lock:
+    """LLVM's own tables are shared by the process; a forked child starts with a free lock."""
+
+    def __init__(self) -> None:
+        self.renew()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self.renew)
+
+    def renew(self) -> None:
+        self.held = threading.RLock()
+
+
+_LOCK: Final = _Lock()
+
+
+@cache
+def host() -> Host:
+    """Return what this machine's code depends on."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    found = llvm.get_host_cpu_features()
+    width = 8 if found.get("avx512f") else 4 if found.get("avx") else 2
+    version = f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
+    return Host(llvm.get_process_triple(), llvm.get_host_cpu_name(), found.flatten(), width, version)
+
+
+def _target() -> Any:
+    h = host()
+    return llvm.Target.from_triple(h.triple).create_target_machine(cpu=h.cpu, features=h.features, opt=2, jit=True)
+
+
+def _object(text: str) -> bytes:
+    with _LOCK.held:
+        module, target = llvm.parse_assembly(text), _target()
+        builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
+        builder.getModulePassManager().run(module, builder)
+        return bytes(target.emit_object(module))
+
+
+def program_object(program: Program) -> tuple[bytes, int]:
+    """Return a program's object file, and how many doubles of work space its body needs."""
+    width = host().width
+    text, vectors = vector_code(program, width)
+    return _object(text), vectors * width
+
+
+def batch_object() -> bytes:
+    """Return the object file of the loop over a batch, which every program shares."""
+    return _object(batch_code(host().width))
+
+
+def load(*objects: bytes) -> Loaded:
+    """Return the function of object files that belong together."""
+    host()
+    with _LOCK.held:
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
+        for code in objects:
+            engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        return Loaded(engine)

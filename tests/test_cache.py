@@ -1,0 +1,170 @@
+"""Machine code on disk: found again, never trusted when it is not what was written."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.lagrangian import cache
+from mbkit.lagrangian import compiled as module
+from tests.random_trees import states
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A cache of this test's own, and a process that holds no functions."""
+    monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(module._HELD, "functions", {})
+    module._batch_object.cache_clear()
+    yield tmp_path / "cache"
+    module._batch_object.cache_clear()
+
+
+MODEL = mb.catalog.double_pendulum()
+
+
+def evaluated(*, derives: bool) -> np.ndarray:
+    """Return inverse dynamics from a new engine, and see whether it derived anything."""
+    module._HELD.functions.clear()
+    module._batch_object.cache_clear()
+    dyn = mb.dynamics(MODEL, "lagrangian", compile=True)
+    q, v, a, _ = states(MODEL, 4)
+    out = dyn.inverse_dynamics(q, v, a)
+    assert ("equations" in dyn.__dict__) == derives
+    return out
+
+
+def test_a_second_process_finds_what_the_first_compiled(folder):
+    first = evaluated(derives=True)
+    np.testing.assert_array_equal(evaluated(derives=False), first)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert all(stat.S_IMODE(p.stat().st_mode) == 0o600 for p in folder.iterdir())
+    assert len(list(folder.iterdir())) == 2  # the function, and the loop that all share
+
+
+def spoil_all(folder, change) -> None:
+    for path in folder.iterdir():
+        path.write_bytes(change(path.read_bytes()))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda _: b"",
+        lambda b: b[:50],
+        lambda b: b[:-1],
+        lambda b: b + b"\0",
+        lambda b: b[:-20] + bytes([b[-20] ^ 1]) + b[-19:],
+        lambda b: b"\xff" * len(b),
+        lambda b: b.replace(b"machine code 1", b"machine code 0"),
+    ],
+    ids=["empty", "cut", "one short", "one more", "one bit", "noise", "other version"],
+)
+def test_a_spoiled_entry_is_made_again(folder, change):
+    first = evaluated(derives=True)
+    spoil_all(folder, change)
+    np.testing.assert_array_equal(evaluated(derives=True), first)
+    np.testing.assert_array_equal(evaluated(derives=False), first)
+
+
+def test_an_entry_under_another_name_is_not_trusted(folder):
+    first = evaluated(derives=True)
+    a, b = sorted(folder.iterdir())
+    content = a.read_bytes(), b.read_bytes()
+    a.write_bytes(content[1])
+    b.write_bytes(content[0])
+    np.testing.assert_array_equal(evaluated(derives=True), first)
+
+
+def test_whole_entries_of_another_form_are_made_again(folder):
+    first = evaluated(derives=True)
+    for path in folder.iterdir():
+        found = cache.read(path.name)
+        assert found is not None
+        if "inputs" in found[0]:
+            cache.write(path.name, {"inputs": "?"}, found[1])
+    np.testing.assert_array_equal(evaluated(derives=True), first)
+
+
+def test_a_link_and_another_users_file_are_not_followed(folder):
+    evaluated(derives=True)
+    for path in list(folder.iterdir()):
+        moved = folder.parent / path.name
+        path.rename(moved)
+        path.symlink_to(moved)
+    evaluated(derives=True)
+    if os.getuid() == 0:
+        for path in folder.iterdir():
+            os.chown(path, 65534, 65534)
+        evaluated(derives=True)
+        os.chown(folder, 65534, 65534)
+        assert cache.folder() is None
+
+
+def test_a_folder_that_others_may_enter_is_closed(folder):
+    folder.mkdir()
+    folder.chmod(0o755)
+    evaluated(derives=True)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_no_cache_where_none_can_be(folder, monkeypatch):
+    for place in ("", str(folder / "file" / "below")):
+        monkeypatch.setenv("MBKIT_CACHE_DIR", place)
+        if place:
+            folder.mkdir()
+            (folder / "file").write_text("in the way")
+        evaluated(derives=True)
+        evaluated(derives=True)
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_changed_number_is_another_entry():
+    evaluated(derives=True)
+    other = mb.dynamics(mb.catalog.double_pendulum(mass1=1.5), "lagrangian", compile=True)
+    other.inverse_dynamics(*states(MODEL, 1)[:3])
+    assert "equations" in other.__dict__
+
+
+def test_the_oldest_entries_go_when_the_folder_is_full(folder, monkeypatch):
+    monkeypatch.setattr(cache, "_MOST", 3000)
+    for k in range(6):
+        cache.write(f"{k:064x}", {"k": k}, b"x" * 900)
+        os.utime(folder / f"{k:064x}", (k, k))
+    assert cache.read(f"{0:064x}") is None
+    assert cache.read(f"{5:064x}") == ({"k": 5, "key": f"{5:064x}"}, b"x" * 900)
+    assert sum(p.stat().st_size for p in folder.iterdir()) <= 3000
+
+
+def test_many_writers_of_one_entry_leave_a_whole_one(folder):
+    def write(k: int) -> None:
+        cache.write("a" * 64, {"k": k}, bytes([k]) * 200_000)
+        found = cache.read("a" * 64)
+        assert found is not None
+        assert found[1] == bytes([found[0]["k"]]) * 200_000
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, range(64)))
+    assert [p.name for p in folder.iterdir()] == ["a" * 64]
+
+
+def test_processes_that_start_at_once_agree(folder):
+    code = (
+        "import json, numpy as np, mbkit as mb\n"
+        "m = mb.catalog.chain(n=3)\n"
+        "d = mb.dynamics(m, 'lagrangian', compile=True)\n"
+        "q = np.linspace(0, 1, 3)\n"
+        "print(json.dumps([x.hex() for x in d.forward_dynamics(q, q, q)]))\n"
+    )
+    running = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    out = {tuple(json.loads(p.communicate(timeout=120)[0])) for p in running}
+    assert len(out) == 1
+    assert not [p for p in folder.iterdir() if p.name.startswith(".new-")]

@@ -1,0 +1,351 @@
+"""Machine code: the same numbers as the expressions, whatever the arrays and threads."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import resource
+import threading
+import warnings
+
+import casadi as ca
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mbkit as mb
+from mbkit.lagrangian import execution, jit, vector_code
+from mbkit.lagrangian.compiled import Compiled, compiled
+from mbkit.lagrangian.machine import Machine
+from mbkit.lagrangian.program import program
+from tests.random_trees import random_tree, states
+
+EPS = np.finfo(float).eps
+
+
+def built(function: ca.Function) -> Compiled:
+    """Return machine code that no cache has seen."""
+    derived = program(function)
+    code, work = jit.program_object(derived)
+    about = {"inputs": derived.inputs, "shapes": derived.shapes, "operations": derived.arithmetic, "work": work}
+    return Compiled(about, code)
+
+
+def sines() -> ca.Function:
+    x = ca.SX.sym("x")
+    return ca.Function("sines", [x], [ca.vertcat(ca.sin(x), ca.cos(x))])
+
+
+def mixed() -> ca.Function:
+    """A function of every operation, with two arguments, a matrix and a vector, and an entry that nothing reads."""
+    x, y = ca.SX.sym("x", 9), ca.SX.sym("y", 3)
+    a = ca.sin(x[0]) * y[0] + ca.cos(x[0]) / (2.0 + x[1] ** 2) - ca.sqrt(1.0 + y[1] * y[1])
+    less = x[2] < y[2]
+    yes = ca.SX.binary(ca.OP_IF_ELSE_ZERO, less, 2 * x[3])
+    b = yes + ca.SX.binary(ca.OP_IF_ELSE_ZERO, 1 - less, -1 / (3.0 + x[4] ** 2))
+    c = ca.horzcat(a, b, x[5] * y[0] + x[6] * y[1], x[7], 0.0, 4.5)
+    return ca.Function("mixed", [x, y], [ca.densify(ca.reshape(c, 2, 3)), ca.vertcat(a * b, a + b, b)])
+
+
+@pytest.fixture(scope="module")
+def code() -> Compiled:
+    return built(mixed())
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [
+        lambda rng: rng.uniform(-np.pi, np.pi, 3000),
+        lambda rng: rng.uniform(-1e8, 1e8, 3000),
+        lambda rng: 10.0 ** rng.uniform(-300, -1, 1000),
+        lambda _: np.arange(1, 2000) * (np.pi / 2),
+        lambda rng: rng.integers(-60_000_000, 60_000_000, 3000) * (np.pi / 2),
+        lambda rng: rng.uniform(-1, 1, 500) * 10.0 ** rng.uniform(8, 300, 500),
+        lambda _: np.array([0.0, -0.0, 1e8, np.nextafter(1e8, 2e8), -1e8]),
+    ],
+    ids=["turn", "many turns", "tiny", "multiples", "far multiples", "beyond", "edges"],
+)
+def test_sine_and_cosine_are_right_to_three_quarters_of_an_ulp(angles):
+    x = angles(np.random.default_rng(0))
+    out = built(sines())(x[:, None])[0][..., 0]
+    with mpmath.workprec(1200):
+        for angle, pair in zip(x, out, strict=True):
+            for got, exact in zip(pair, (mpmath.sin(angle), mpmath.cos(angle)), strict=True):
+                assert abs(mpmath.mpf(float(got)) - exact) <= 0.76 * np.spacing(abs(float(exact)))
+
+
+def test_sine_and_cosine_of_what_is_not_finite_are_not_finite():
+    x = np.array([np.nan, np.inf, -np.inf, 1.0])
+    out, finite = built(sines()).watched(x[:, None])
+    assert not finite
+    assert np.isnan(out[0][:3]).all()
+    assert np.isfinite(out[0][3]).all()
+
+
+def layouts(x: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the same numbers in memory in many ways."""
+    n, k = x.shape
+    wide = np.empty((2 * n, 3 * k))
+    wide[::2, ::3] = x
+    back = x[::-1].copy()[::-1]
+    frozen = x.copy()
+    frozen.setflags(write=False)
+    odd = np.frombuffer(b"x" + x.tobytes(), dtype=np.uint8)[1:].view(np.float64).reshape(x.shape)
+    return {
+        "rows": x,
+        "coordinate-major": np.asfortranarray(x),
+        "every other": wide[::2, ::3],
+        "backwards": back,
+        "read-only": frozen,
+        "not aligned": odd,
+        "big-endian": x.astype(">f8"),
+    }
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 7, 8, 9, 31, 1033])
+def test_every_layout_gives_the_same_bits(code, n):
+    rng = np.random.default_rng(n)
+    x, y = rng.standard_normal((n, 9)), rng.standard_normal((n, 3))
+    expected = code(x, y)
+    for (told, a), b in zip(layouts(x).items(), reversed(layouts(y).values()), strict=True):
+        for got, want in zip(code(a, b), expected, strict=True):
+            assert got.shape == want.shape, told
+            np.testing.assert_array_equal(got, want, err_msg=told)
+    for i in range(min(n, 20)):
+        for got, want in zip(code(x[i], y[i]), expected, strict=True):
+            np.testing.assert_array_equal(got, want[i])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=12, max_size=12))
+def test_every_operation_agrees_with_casadi(code, numbers):
+    given_ = np.array(numbers)
+    for got, want in zip(code(given_[:9], given_[9:]), mixed()(given_[:9], given_[9:]), strict=True):
+        # Contraction rounds once where CasADi rounds twice.
+        scale = 4 * EPS * (1 + np.abs(given_).max() ** 2)
+        np.testing.assert_allclose(got, np.array(want), rtol=0, atol=scale)
+
+
+@pytest.mark.parametrize("width", [2, 4, 8])
+def test_every_width_of_register_gives_the_same_numbers(monkeypatch, width):
+    here = jit.host()
+    if width > here.width:
+        pytest.skip(f"this processor's registers hold {here.width} doubles")
+    expected = built(mixed())
+    monkeypatch.setattr(jit, "host", lambda: here._replace(width=width))
+    from mbkit.lagrangian import compiled as module
+
+    monkeypatch.setattr(module, "_batch_object", jit.batch_object)
+    narrow = built(mixed())
+    rng = np.random.default_rng(1)
+    for n in (1, 5, 64):
+        x, y = rng.standard_normal((n, 9)), rng.standard_normal((n, 3))
+        for a, b in ((x, y), (np.asfortranarray(x), y)):
+            for got, want in zip(narrow(a, b), expected(x, y), strict=True):
+                np.testing.assert_allclose(got, want, rtol=4 * EPS, atol=4 * EPS)
+
+
+def test_a_program_in_pieces_gives_the_same_numbers_as_a_whole(monkeypatch):
+    model = random_tree(3, 6)
+    function = mb.dynamics(model, "lagrangian", compile=False).function("forward_dynamics")
+    q, v, _, tau = states(model, 17)
+    whole = built(function)(q, v, tau)[0]
+    monkeypatch.setattr(vector_code, "_WHOLE", 100)
+    monkeypatch.setattr(vector_code, "_PIECE", 150)
+    pieces = built(function)(q, v, tau)[0]
+    np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e3 * EPS * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("place", [(0, 8), (0, 0), (1, 2)])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_found_even_if_nothing_reads_it(code, place, bad):
+    rng = np.random.default_rng(2)
+    for n in (1, 3, 40):
+        for turn in (np.ascontiguousarray, np.asfortranarray):
+            arrays = [turn(rng.standard_normal((n, k))) for k in (9, 3)]
+            assert code.watched(*arrays)[1]
+            arrays[place[0]][n - 1, place[1]] = bad
+            assert not code.watched(*arrays)[1]
+
+
+def test_threads_give_the_same_bits_as_one(code):
+    rng = np.random.default_rng(3)
+    x, y = rng.standard_normal((300_001, 9)), rng.standard_normal((300_001, 3))
+    one = code(x, y, threads=1)
+    for threads in (2, 3):
+        for got, want in zip(code(x, y, threads=threads), one, strict=True):
+            np.testing.assert_array_equal(got, want)
+    many: list[list[np.ndarray]] = []
+    callers = [threading.Thread(target=lambda: many.append(code(x, y, threads=2))) for _ in range(4)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert len(many) == 4
+    for results in many:
+        np.testing.assert_array_equal(results[0], one[0])
+
+
+def _in_a_child(queue, code, x, y):
+    queue.put(code(x, y, threads=2)[0])
+
+
+def test_a_forked_child_computes_the_same(code):
+    if "fork" not in multiprocessing.get_all_start_methods():
+        pytest.skip("this system does not fork")
+    rng = np.random.default_rng(4)
+    x, y = rng.standard_normal((400_000, 9)), rng.standard_normal((400_000, 3))
+    expected = code(x, y, threads=2)[0]
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    with warnings.catch_warnings():
+        # Python warns of forking beside threads, which is what this is about.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = context.Process(target=_in_a_child, args=(queue, code, x[:5000], y[:5000]))
+        child.start()
+    np.testing.assert_array_equal(queue.get(timeout=60), expected[:5000])
+    child.join(60)
+
+
+def test_memory_stays_flat_over_ten_thousand_batches():
+    model = mb.catalog.double_pendulum()
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    q, v, a, _ = states(model, 64)
+
+    def calls(n: int) -> int:
+        for _ in range(n):
+            dyn.inverse_dynamics(q, v, a)
+            dyn.forward_dynamics(q, v, a)
+        gc.collect()
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    before = calls(500)
+    assert calls(10_000) - before < 2000  # kB; a leak of one result of 1 kB a call would be 20,000
+
+
+@pytest.mark.parametrize("to_code", [True, False])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_engine_agrees_with_its_own_expressions_in_every_shape(seed, to_code):
+    model = random_tree(seed, 8)
+    dyn = mb.dynamics(model, "lagrangian", compile=to_code)
+    plain = mb.dynamics(model, "lagrangian", compile=False)
+    q, v, a, tau = states(model, 13)
+    calls = {
+        "mass_matrix": (q,),
+        "coriolis_matrix": (q, v),
+        "gravity": (q,),
+        "nle": (q, v),
+        "passive": (q, v),
+        "inverse_dynamics": (q, v, a),
+        "forward_dynamics": (q, v, tau),
+        "kinetic_energy": (q, v),
+        "potential_energy": (q,),
+    }
+    for name, arguments in calls.items():
+        expected = getattr(plain, name)(*arguments)
+        # Twice: the first call takes the checked way, later ones the short one.
+        for _ in range(2):
+            for turn in (np.ascontiguousarray, np.asfortranarray):
+                got = getattr(dyn, name)(*map(turn, arguments))
+                assert got.shape == expected.shape
+                np.testing.assert_allclose(
+                    got, expected, rtol=0, atol=1e-12 * max(np.abs(expected).max(), 1), err_msg=name
+                )
+            one = getattr(dyn, name)(*(x[3] for x in arguments))
+            assert np.shape(one) == expected.shape[1:]
+            np.testing.assert_array_equal(one, getattr(dyn, name)(*arguments)[3])
+
+
+def test_the_short_way_says_what_is_wrong_as_the_long_one_does():
+    model = mb.load("ur5")
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    q, v, a, _ = states(model, 5)
+    expected = dyn.inverse_dynamics(q, v, a)
+    np.testing.assert_array_equal(dyn.inverse_dynamics(q[0].tolist(), v[0].tolist(), a[0].tolist()), expected[0])
+    np.testing.assert_array_equal(dyn.inverse_dynamics(q=q, v=v, a=a[:1].repeat(5, 0))[0], expected[0])
+    np.testing.assert_array_equal(dyn.inverse_dynamics(q[0], v, a)[0], expected[0])
+    rounded = [x.astype(np.float32) for x in (q, v, a)]
+    exact = dyn.inverse_dynamics(*(x.astype(np.float64) for x in rounded))
+    np.testing.assert_array_equal(dyn.inverse_dynamics(*rounded), exact)
+    assert dyn.inverse_dynamics(q[:0], v[:0], a[:0]).shape == (0, 6)
+    for bad, told in (
+        ((q[:, :5], v, a), "q: expected shape"),
+        ((q, v[:3], a), "batches of different sizes"),
+        ((q[0, :5], v[0], a[0]), "q: expected shape"),
+        ((q, v, "x"), "a: "),
+    ):
+        with pytest.raises(mb.errors.InputError, match=told):
+            dyn.inverse_dynamics(*bad)
+    for place in (0, 1, 2):
+        given_ = [x.copy() for x in (q, v, a)]
+        given_[place][4, 0] = np.nan
+        with pytest.raises(mb.errors.InputError, match="expected finite"):
+            dyn.inverse_dynamics(*given_)
+        with pytest.raises(mb.errors.InputError, match="expected finite"):
+            dyn.inverse_dynamics(*(x[4] for x in given_))
+    # q of the first joint turns about gravity: nothing reads it.
+    blind = q[0].copy()
+    blind[0] = np.nan
+    with pytest.raises(mb.errors.InputError, match="q: nan at index"):
+        dyn.gravity(blind)
+
+
+def test_quaternions_are_checked_on_the_short_way_too():
+    model = mb.load("solo12", floating_base=True)
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    q, v, a, _ = states(model, 4)
+    dyn.inverse_dynamics(q, v, a)
+    q[2, 3:7] *= 1.1
+    with pytest.raises(mb.errors.InputError, match="quaternion"):
+        dyn.inverse_dynamics(q, v, a)
+    with pytest.raises(mb.errors.InputError, match="quaternion"):
+        dyn.inverse_dynamics(q[2], v[2], a[2])
+
+
+def test_without_a_compiler_the_same_numbers_come_and_one_warning(monkeypatch):
+    model = mb.load("ur5")
+    q, v, a, _ = states(model, 3)
+    expected = mb.dynamics(model, "lagrangian", compile=True).inverse_dynamics(q, v, a)
+    monkeypatch.setattr(execution.importlib.util, "find_spec", lambda _: None)
+    execution._compiler.cache_clear()
+    try:
+        dyn = mb.dynamics(model, "lagrangian", compile=True)
+        with pytest.warns(mb.errors.NoCompilerWarning, match="pip install llvmlite"):
+            got = dyn.inverse_dynamics(q, v, a)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            mb.dynamics(model, "lagrangian", compile=True).nle(q, v)
+    finally:
+        execution._compiler.cache_clear()
+    assert isinstance(dyn.code("inverse_dynamics"), Machine)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=50 * EPS * np.abs(expected).max())
+
+
+def test_options_are_checked_and_kept():
+    model = mb.catalog.pendulum()
+    with pytest.raises(mb.errors.InputError, match="threads: expected a whole number"):
+        mb.dynamics(model, "lagrangian", threads=0)
+    with pytest.raises(mb.errors.InputError, match="compile: expected True"):
+        mb.dynamics(model, "lagrangian", compile=1)
+    with pytest.raises(mb.errors.InputError, match="threads: pinocchio has no such option"):
+        mb.dynamics(model, "pinocchio", threads=2)
+    import pickle
+
+    dyn = pickle.loads(pickle.dumps(mb.dynamics(model, "lagrangian", compile=True, threads=1)))
+    assert dyn.compile is True
+    assert dyn.threads == 1
+
+
+def test_one_function_serves_all_who_ask_in_a_process(tmp_path, monkeypatch):
+    monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path))
+    made = []
+
+    def make() -> ca.Function:
+        made.append(1)
+        return sines()
+
+    first = compiled(("one function",), make)
+    assert compiled(("one function",), make) is first
+    assert len(made) == 1

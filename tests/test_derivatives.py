@@ -1,0 +1,258 @@
+"""Derivatives of inverse and forward dynamics against differences at 113 bits and Pinocchio's."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import mbkit as mb
+from mbkit.errors import InputError, NumericalError
+from mbkit.lagrangian.arithmetic import arithmetic
+from mbkit.lagrangian.extended import Extended
+from mbkit.lagrangian.program import program
+from tests.random_trees import off, random_tree, states
+
+EPS = np.finfo(float).eps
+# A central difference is good to h² and to 2⁻¹¹³ / h: 22 digits.
+H = 1e-12
+# Roundings that a column of derivatives collects, on a scale of the whole matrix.
+K = 50
+TREES = {
+    "shallow": {"seed": 1, "n": 12},
+    "deep": {"seed": 2, "n": 8, "nearest": 1},
+    "mimic": {"seed": 3, "n": 8, "mimic": True, "nearest": 2},
+    "all revolute": {"seed": 4, "n": 8, "kinds": ("revolute",), "nearest": 1},
+    "free and balls": {"seed": 5, "n": 4, "kinds": ("free", "ball"), "nearest": 1},
+    "no passive forces": {"seed": 6, "n": 10, "springs": False, "damping": False, "armature": False},
+    "no gravity": {"seed": 7, "n": 10, "gravity": False},
+}
+
+
+@pytest.fixture(scope="module", params=list(TREES))
+def tree(request):
+    model = random_tree(**TREES[request.param])
+    return model, mb.dynamics(model, "lagrangian"), [x[0] for x in states(model, 1, 5)]
+
+
+class Differences:
+    """Central differences of one of a model's functions, in extended precision."""
+
+    def __init__(self, dyn, name):
+        self.model, self.own = dyn.model, arithmetic()
+        self.run = Extended(program(dyn.function(name)), self.own)
+
+    def moved(self, q, k, t):
+        """Return q ⊕ t e_k, by the exponentials of one direction, coded here alone."""
+        q, own = self.own.array(q), self.own
+        joint = next(
+            j
+            for j in self.model.independent_joints
+            if self.model.layout.v[j.name].start <= k < self.model.layout.v[j.name].stop
+        )
+        at, i = self.model.layout.q[joint.name].start, k - self.model.layout.v[joint.name].start
+        t = own.array(np.array([t]))
+        out = q.copy()
+        turn = {"free": 3, "ball": 0}.get(joint.kind)
+        if turn is None:
+            out[at + i] = out[at + i] + t[0]
+            return out
+        unit = own.array(np.eye(4)[i % 3])
+        quaternion = q[at + turn : at + turn + 4]
+        if i < turn:
+            out[at : at + 3] = q[at : at + 3] + t * times(times(quaternion, unit), conjugate(quaternion))[:3]
+        else:
+            step = own.sin(t / 2) * unit + own.cos(t / 2) * own.array(np.eye(4)[3])
+            out[at + turn : at + turn + 4] = times(quaternion, step)
+        return out
+
+    def along(self, which, *state):
+        """Return the derivative with respect to one argument, rounded to double."""
+        nv, own = self.model.nv, self.own
+        rows = [[own.array(x) for x in state] for _ in range(2 * nv)]
+        for k in range(nv):
+            for row, t in ((rows[k], H), (rows[nv + k], -H)):
+                if which == 0:
+                    row[0] = self.moved(state[0], k, t)
+                else:
+                    row[which] = row[which] + own.array(t * np.eye(nv)[k])
+        out = self.run(*(np.array([row[i] for row in rows]) for i in range(len(state))))[0][..., 0]
+        step = own.array(np.full((1, 1), H))
+        return own.pair((out[:nv] - out[nv:]) / (step + step))[0].T
+
+
+def times(a, b):
+    x, y, z, w = a
+    r, s, t, u = b
+    return np.array(
+        [w * r + x * u + y * t - z * s, w * s - x * t + y * u + z * r, w * t + x * s - y * r + z * u,
+         w * u - x * r - y * s - z * t]
+    )  # fmt: skip
+
+
+def conjugate(a):
+    return np.array([-a[0], -a[1], -a[2], a[3]])
+
+
+def close(x, reference, k=K):
+    error, scale = np.linalg.norm(x - reference), np.linalg.norm(reference)
+    assert error <= k * EPS * scale, f"{error / scale / EPS:.3g} eps"
+
+
+def test_inverse_dynamics_derivatives_are_differences_along_the_manifold(tree):
+    _, dyn, (q, v, a, _) = tree
+    differences = Differences(dyn, "inverse_dynamics")
+    got = dyn.inverse_dynamics_derivatives(q, v, a)
+    for which, x in enumerate((got.q, got.v, got.a)):
+        close(x, differences.along(which, q, v, a))
+
+
+def test_forward_dynamics_derivatives_are_differences_along_the_manifold(tree):
+    _, dyn, (q, v, _, tau) = tree
+    differences = Differences(dyn, "forward_dynamics")
+    got = dyn.forward_dynamics_derivatives(q, v, tau)
+    condition = np.linalg.cond(dyn.mass_matrix(q))
+    for which, x in enumerate((got.q, got.v, got.tau)):
+        close(x, differences.along(which, q, v, tau), k=condition)
+
+
+def test_gravity_and_springs_are_the_slope_of_the_potential(tree):
+    _, dyn, (q, v, _, _) = tree
+    slope = Differences(dyn, "potential_energy").along(0, q)[0]
+    close(dyn.gravity(q) - dyn.passive(q, 0 * v), slope)
+
+
+def test_the_numerical_solution_for_large_systems_gives_the_same(tree, monkeypatch):
+    _, dyn, (q, v, _, tau) = tree
+    condition = np.linalg.cond(dyn.mass_matrix(q))
+    assert dyn._written_out
+    written = dyn.forward_dynamics_derivatives(q, v, tau)
+    monkeypatch.setitem(vars(dyn), "_written_out", False)
+    solved = dyn.forward_dynamics_derivatives(q, v, tau)
+    for x, y in zip(written, solved, strict=True):
+        close(x, y, k=condition)
+
+
+def test_the_tangent_is_that_of_the_models_integrate(tree):
+    model, dyn, (q, v, a, _) = tree
+    h = 1e-3
+    ends = [dyn.inverse_dynamics(model.integrate(q, s * h * np.eye(model.nv)), v, a) for s in (-2, -1, 1, 2)]
+    numeric = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]).T / (12 * h)
+    # The rule is good to h⁴ times a fifth derivative, which turns by a few radians per radian.
+    assert off(numeric.ravel(), dyn.inverse_dynamics_derivatives(q, v, a).q.ravel()) < 1e3 * h**4
+
+
+@pytest.mark.parametrize(("robot", "floating"), [("ur5", False), ("panda", False), ("anymal_b", True)])
+def test_pinocchio_gives_the_same(robot, floating):
+    """Pinocchio's knows neither damping nor mimic joints: both are put around it here."""
+    model = mb.load(robot, floating_base=floating)
+    dyn, theirs = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "pinocchio").pin_model
+    q, v, a, tau = (x[0] for x in states(model, 1))
+    layout = model.layout
+    G, data = layout.G, theirs.createData()
+    full_q, full_v = layout.G_q @ q + layout.offsets, G @ v
+    damping = np.diag(np.concatenate([j.damping for j in model.joints]))
+    by_q, by_v, M = (np.array(x) for x in pin.computeRNEADerivatives(theirs, data, full_q, full_v, G @ a))
+    M = np.triu(M) + np.triu(M, 1).T
+    mine = dyn.inverse_dynamics_derivatives(q, v, a)
+    for x, y in zip(mine, (by_q, by_v + damping, M), strict=True):
+        close(x, G.T @ y @ G)
+    if layout.reduced:
+        return
+    out = pin.computeABADerivatives(theirs, data, q, v, tau - damping @ v)
+    by_q, by_v, inverse = (np.array(x) for x in out)
+    inverse = np.triu(inverse) + np.triu(inverse, 1).T
+    condition = np.linalg.cond(M)
+    for x, y in zip(
+        dyn.forward_dynamics_derivatives(q, v, tau), (by_q, by_v - inverse @ damping, inverse), strict=True
+    ):
+        close(x, y, k=condition)
+
+
+def test_at_rest_only_damping_and_gravity_are_left():
+    model = random_tree(8, 7)
+    dyn = mb.dynamics(model, "lagrangian")
+    q = states(model, 1)[0][0]
+    zero = np.zeros(model.nv)
+    still = mb.dynamics(model.without("damping"), "lagrangian").inverse_dynamics_derivatives(q, zero, zero)
+    assert np.abs(still.v).max() == 0.0
+    damped = dyn.inverse_dynamics_derivatives(q, zero, zero).v
+    assert off(damped, damped.T) < 10 * EPS
+    assert np.linalg.eigvalsh(damped).min() > -10 * EPS * np.abs(damped).max()
+    free = mb.dynamics(model.without("gravity", "springs"), "lagrangian").inverse_dynamics_derivatives(q, zero, zero)
+    assert np.abs(free.q).max() == 0.0
+
+
+def test_a_batch_is_its_states_one_by_one(tree):
+    model, dyn, _ = tree
+    q, v, a, tau = states(model, 3)
+    for method, third in ((dyn.inverse_dynamics_derivatives, a), (dyn.forward_dynamics_derivatives, tau)):
+        together = method(q, v, third)
+        for k in range(3):
+            for x, y in zip(together, method(q[k], v[k], third[k]), strict=True):
+                assert x.shape == (3, model.nv, model.nv)
+                assert off(x[k], y) < 10 * EPS
+        assert [x.shape for x in method(q[:0], v[:0], third[:0])] == [(0, model.nv, model.nv)] * 3
+
+
+def test_fields_and_functions_are_named():
+    dyn = mb.dynamics(mb.load("ur5"), "lagrangian")
+    q, v, a, tau = (x[0] for x in states(dyn.model, 1))
+    for name, third, value in (("inverse_dynamics", "a", a), ("forward_dynamics", "tau", tau)):
+        result = getattr(dyn, f"{name}_derivatives")(q, v, value)
+        assert result._fields == ("q", "v", third)
+        f = dyn.function(f"{name}_derivatives")
+        assert isinstance(f, ca.Function)
+        got = f(q=q, v=v, **{third: value})
+        for field, x in result._asdict().items():
+            assert off(got[f"by_{field}"], x) < 10 * EPS
+
+
+def test_compiled_derivatives_are_those_interpreted():
+    model = random_tree(9, 2, ("revolute", "ball"))
+    q, v, a, tau = states(model, 5)
+    fast, slow = (mb.dynamics(model, "lagrangian", compile=yes) for yes in (True, False))
+    for x, y in zip(
+        fast.inverse_dynamics_derivatives(q, v, a), slow.inverse_dynamics_derivatives(q, v, a), strict=True
+    ):
+        close(x, y)
+    condition = np.linalg.cond(slow.mass_matrix(q)).max()
+    ours, theirs = (d.forward_dynamics_derivatives(q, v, tau) for d in (fast, slow))
+    for x, y in zip(ours, theirs, strict=True):
+        close(x, y, k=condition)
+
+
+def test_parameters_are_arguments_of_derivatives_too():
+    q, v, x = [0.3, -0.5], [1.0, 2.0], [0.1, 0.2]
+    named = mb.dynamics(mb.catalog.double_pendulum(mass1=mb.Parameter("m", 2.0)), "lagrangian").at(m=3.0)
+    plain = mb.dynamics(mb.catalog.double_pendulum(mass1=3.0), "lagrangian")
+    for method in ("inverse_dynamics_derivatives", "forward_dynamics_derivatives"):
+        for ours, theirs in zip(getattr(named, method)(q, v, x), getattr(plain, method)(q, v, x), strict=True):
+            close(ours, theirs)
+
+
+def test_a_model_that_cannot_move_has_empty_derivatives():
+    b = mb.ModelBuilder("block")
+    b.add_body("a", mass=1.0)
+    b.add_joint("j", "fixed", parent="world", child="a")
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    nothing = np.zeros(0)
+    for result in (
+        dyn.inverse_dynamics_derivatives(nothing, nothing, nothing),
+        dyn.forward_dynamics_derivatives(nothing, nothing, nothing),
+    ):
+        assert [x.shape for x in result] == [(0, 0)] * 3
+
+
+def test_bad_input_and_singular_poses_are_named():
+    dyn = mb.dynamics(mb.load("ur5"), "lagrangian")
+    with pytest.raises(InputError, match="expected shape"):
+        dyn.inverse_dynamics_derivatives(np.zeros(6), np.zeros(6), np.zeros(5))
+    b = mb.ModelBuilder("massless")
+    b.add_body("a", mass=1.0, com=(0.0, 0.0, 0.0))
+    b.add_joint("spin", "revolute", parent="world", child="a", axis=(0, 0, 1))
+    with pytest.warns(UserWarning, match="no mass moves"):
+        model = b.build(nonphysical="warn")
+    with pytest.raises(NumericalError, match="forward_dynamics_derivatives"):
+        mb.dynamics(model, "lagrangian").forward_dynamics_derivatives([0.0], [0.0], [0.0])
