@@ -1,6 +1,6 @@
 """The command `mbkit`: checks arguments, calls the library, prints, and says how it ended.
 
-Exit status: 0 the engines agree, 1 they differ, 2 misuse or bad input, 70 a fault of
+Exit status: 0 done, and the engines agree, 1 they differ, 2 misuse or bad input, 70 a fault of
 mbkit's own, 130 interrupted.
 """
 
@@ -65,15 +65,33 @@ def _split(_ctx: click.Context, _parameter: click.Parameter, value: str) -> tupl
     return tuple(name.strip() for name in value.split(",") if name.strip())
 
 
+def _model_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say how a file or robot is read; `_options` gathers them."""
+    for option in (
+        click.option(
+            "--nonphysical", type=click.Choice(["error", "warn"]), help="Refuse impossible bodies, or take them."
+        ),
+        click.option(
+            "--mimic", type=click.Choice(["reduce", "free"]), help="What mimic joints become.  [default: reduce]"
+        ),
+        click.option("--floating-base", is_flag=True, help="Let the base of a file or robot move freely."),
+    ):
+        command = option(command)
+    return command
+
+
+def _options(floating_base: bool, mimic: str | None, nonphysical: str | None) -> dict[str, Any]:
+    asked = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical}
+    return {k: v for k, v in asked.items() if v is not None}
+
+
 @cli.command()
 @click.argument("target", required=False)
 @click.option("--all", "everything", is_flag=True, help="Check every robot of example-robot-data.")
 @click.option("--engines", default="pinocchio,lagrangian,mujoco", show_default=True, callback=_split, metavar="A,B,...")
 @click.option("--samples", default=64, show_default=True, type=click.IntRange(min=1), help="Random states.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
-@click.option("--floating-base", is_flag=True, help="Let the base of a file or robot move freely.")
-@click.option("--mimic", type=click.Choice(["reduce", "free"]), help="What mimic joints become.  [default: reduce]")
-@click.option("--nonphysical", type=click.Choice(["error", "warn"]), help="Refuse impossible bodies, or take them.")
+@_model_options
 @click.option("--no-rollouts", is_flag=True, help="Terms only: no trajectories, run times or omissions.")
 @click.option("--jobs", type=click.IntRange(min=1), help="With --all: processes.  [default: one per processor]")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
@@ -110,8 +128,7 @@ def check(
     if everything:
         _check_all(engines, samples, seed, floating_base, mimic or "reduce", jobs, as_json, out)
     elif target is not None:
-        asked = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical}
-        options = {k: v for k, v in asked.items() if v is not None}
+        options = _options(floating_base, mimic, nonphysical)
         _check_one(target, options, engines, samples, seed, no_rollouts, as_json, out)
     else:
         raise click.UsageError("give a TARGET, such as panda, or --all; mbkit robots lists what there is")
@@ -226,15 +243,75 @@ def robots(as_json: bool) -> None:
     _console().print(tables.robots(records(), catalog.systems()))
 
 
+@cli.command()
+@click.argument("target")
+@click.option(
+    "--quantity",
+    "quantities",
+    multiple=True,
+    metavar="NAME",
+    help="What to compute; may be repeated.  [default: inverse_dynamics, forward_dynamics]",
+)
+@_model_options
+@click.option("--name", help="Prefix of every name in C, and stem of the files.  [default: the target's name]")
+@click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@click.option(
+    "--out", default="mbkit-export", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
+)
+def export(
+    target: str,
+    quantities: tuple[str, ...],
+    floating_base: bool,
+    mimic: str | None,
+    nonphysical: str | None,
+    name: str | None,
+    force: bool,
+    as_json: bool,
+    out: Path,
+) -> None:
+    """Write the equations of motion of TARGET as C99 that needs no library.
+
+    TARGET is what `mbkit check` takes. The header tells how to compile and call it, the
+    units, the conventions and the order of the joints. A file that mbkit wrote before is
+    replaced; an unknown quantity lists those that there are.
+    """
+    from mbkit.lagrangian.export import DEFAULT, c_identifier, export_c
+    from mbkit.load.names import find
+    from mbkit.studies.target import model_of
+
+    model = model_of(target, _options(floating_base, mimic, nonphysical))
+    # Several robots' files hold the same name.
+    stem = name if name is not None else c_identifier(target) if find(target) else None
+    made = export_c(model, quantities or DEFAULT, name=stem)
+    paths = made.write(out, force=force)
+    if as_json:
+        import json
+        from dataclasses import asdict
+
+        told: dict[str, Any] = {"name": made.name, "model": model.name, "digest": made.digest}
+        told |= {"versions": made.versions, "header": str(paths[0]), "source": str(paths[1])}
+        told["functions"] = [asdict(f) | {"inputs": dict(f.inputs), "outputs": dict(f.outputs)} for f in made.functions]
+        click.echo(json.dumps(told, indent=1))
+        return
+    for function in made.functions:
+        click.echo(f"{function.signature}: {function.operations} operations")
+    click.echo(f"header {paths[0]}\nsource {paths[1]}")
+
+
 def _check_engines(names: tuple[str, ...]) -> None:
     # Before anything is read, loaded or computed.
     from mbkit.engines import ENGINES
 
+    comparable = [name for name in ENGINES if name != "oracle"]
     for name in names:
-        if name not in ENGINES:
-            raise UnknownNameError("engine", name, ENGINES)
+        if name == "oracle":
+            raise InputError("--engines: the oracle is what every engine is measured by; leave it out")
+        if name not in comparable:
+            raise UnknownNameError("engine", name, comparable)
     if len(set(names)) < 2:
-        raise InputError(f"--engines: expected at least two of {', '.join(ENGINES)}, got {', '.join(names) or 'none'}")
+        told = ", ".join(comparable)
+        raise InputError(f"--engines: expected at least two of {told}, got {', '.join(names) or 'none'}")
 
 
 # What is printed and written.

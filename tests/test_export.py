@@ -1,0 +1,399 @@
+"""Exported C code: it computes what the engine computes, compiles clean, and takes no file that is not ours."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import mbkit as mb
+from mbkit.cli import cli
+from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
+from mbkit.lagrangian import FUNCTIONS, export_c
+from mbkit.lagrangian.c_code import c_body
+from mbkit.lagrangian.program import program
+from tests.random_trees import off, random_tree, states
+
+CC, CXX = shutil.which("cc"), shutil.which("c++")
+EPS = float(np.finfo(float).eps)
+needs_cc = pytest.mark.skipif(CC is None, reason="no C compiler on PATH")
+STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Werror")
+# The compiler may then not contract a product and a sum, and what is computed is known to the bit.
+C99 = (str(CC), "-std=c99", "-O2", "-ffp-contract=off", *STRICT)
+LIGHT = tuple(name for name in FUNCTIONS if name != "coriolis_matrix" and not name.endswith("derivatives"))
+CASES = {
+    "panda": (lambda: mb.load("panda"), LIGHT),
+    "panda_free": (lambda: mb.load("panda", mimic="free"), ("forward_dynamics",)),
+    "solo12": (
+        lambda: mb.load("solo12", floating_base=True),
+        ("mass_matrix", "inverse_dynamics", "forward_dynamics"),
+    ),
+    "tree": (lambda: random_tree(1, 10), ("nle", "passive", "inverse_dynamics", "energy_rate")),
+    "pair": (lambda: random_tree(3, 2, ("ball", "prismatic")), tuple(FUNCTIONS)),
+}
+
+
+class Compiled:
+    """An exported model, loaded with ctypes."""
+
+    def __init__(self, model, made, folder):
+        self.model, self.functions = model, {f.quantity: f for f in made.functions}
+        _, source = made.write(folder)
+        library = folder / "library.so"
+        subprocess.run([*C99, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"], check=True)
+        self.library = ctypes.CDLL(str(library))
+
+    def __call__(self, quantity, *arguments, out=None):
+        """Return each output, a matrix where it is one."""
+        described = self.functions[quantity]
+        arguments = [np.ascontiguousarray(x) for x in arguments]
+        assert [x.size for x in arguments] == [n for _, n in described.inputs]
+        outputs = [np.full(rows * columns, np.nan) for _, (rows, columns) in described.outputs] if out is None else out
+        pointers = [x.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for x in (*arguments, *outputs)]
+        call = getattr(self.library, described.name)
+        call.restype = None
+        call(*pointers)
+        return [x.reshape(shape, order="F") for x, (_, shape) in zip(outputs, described.outputs, strict=True)]
+
+
+@pytest.fixture(scope="module", params=list(CASES))
+def compiled(request, tmp_path_factory):
+    if CC is None:
+        pytest.skip("no C compiler on PATH")
+    make, quantities = CASES[request.param]
+    model = make()
+    return Compiled(model, export_c(model, quantities, name=request.param), tmp_path_factory.mktemp("c"))
+
+
+def arguments_of(quantity, model, n, seed=0):
+    named = dict(zip(("q", "v", "a", "tau"), states(model, n, seed), strict=True))
+    return [named[name] for name in FUNCTIONS[quantity]]
+
+
+def test_every_quantity_is_casadis_to_the_bit(compiled):
+    dyn = mb.dynamics(compiled.model, "lagrangian")
+    for quantity in compiled.functions:
+        f = dyn.function(quantity)
+        for state in zip(*arguments_of(quantity, compiled.model, 8), strict=True):
+            wanted = f.call([ca.DM(x) for x in state])
+            for got, want in zip(compiled(quantity, *state), wanted, strict=True):
+                np.testing.assert_array_equal(got, want.full(), err_msg=quantity)
+
+
+def test_every_quantity_is_the_engines(compiled):
+    dyn = mb.dynamics(compiled.model, "lagrangian")
+    for quantity, described in compiled.functions.items():
+        arguments = arguments_of(quantity, compiled.model, 8)
+        wanted = getattr(dyn, quantity)(*arguments)
+        # Sums of a few hundred rounded terms; what solves with M loses its condition number.
+        solves = quantity.startswith("forward_dynamics")
+        conditions = np.linalg.cond(dyn.mass_matrix(arguments[0])) if solves else np.ones(8)
+        for k, state in enumerate(zip(*arguments, strict=True)):
+            got = compiled(quantity, *state)
+            want = [x[k] for x in wanted] if len(described.outputs) > 1 else [wanted[k]]
+            for g, w in zip(got, want, strict=True):
+                assert off(g.reshape(np.shape(w)), w) < 256 * EPS * conditions[k], quantity
+
+
+def test_threads_that_call_at_once_agree(compiled):
+    quantity = next(iter(compiled.functions))
+    rows = list(zip(*arguments_of(quantity, compiled.model, 256), strict=True))
+    alone = [compiled(quantity, *row) for row in rows]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda row: compiled(quantity, *row), rows))
+    np.testing.assert_array_equal(together, alone)
+
+
+def test_an_output_may_lie_on_an_input(compiled):
+    for quantity, on in (("forward_dynamics", "tau"), ("inverse_dynamics", "a"), ("nle", "v")):
+        if quantity not in compiled.functions:
+            continue
+        arguments = [x[0].copy() for x in arguments_of(quantity, compiled.model, 1)]
+        (apart,) = compiled(quantity, *arguments)
+        shared = arguments[FUNCTIONS[quantity].index(on)]
+        compiled(quantity, *arguments, out=[shared])
+        np.testing.assert_array_equal(shared, apart[:, 0])
+
+
+@needs_cc
+def test_entries_that_pass_through_survive_an_output_on_their_input(tmp_path):
+    x = ca.SX.sym("x", 3)
+    swap = ca.Function("swap", [x], [ca.vertcat(x[1], x[0], 7, x[2] * x[0])])
+    body = "\n".join(c_body(program(swap), ["x"], ["y"]))
+    source, library = tmp_path / "swap.c", tmp_path / "swap.so"
+    source.write_text(
+        f"void swap(const double *x, double *y);\nvoid swap(const double *x, double *y)\n{{\n{body}\n}}\n"
+    )
+    subprocess.run([*C99, "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    data = (ctypes.c_double * 4)(2, 3, 5, 0)
+    ctypes.CDLL(str(library)).swap(data, data)
+    assert list(data) == [3, 2, 7, 10]
+
+
+@needs_cc
+def test_every_operation_of_a_program_can_be_written(tmp_path):
+    # Derivations of today make fewer of them; numbers of every kind are among them.
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    terms = [x + y, x - y, x * y, x / y, -x, x * x, 2 * x, 1 / x, ca.sqrt(y), ca.sin(x), ca.cos(x), x < y]
+    terms += [ca.if_else(x < y, x, 0), -2.5 - x, x + 1e-300, x * np.inf, x * -np.inf, x + 0.1, ca.SX(np.nan), -0.0]
+    f = ca.Function("f", [x, y], [ca.vertcat(*terms)])
+    body = "\n".join(c_body(program(f), ["x", "y"], ["out"]))
+    head = "#include <math.h>\nvoid f(const double *x, const double *y, double *out);\n"
+    source, library = tmp_path / "f.c", tmp_path / "f.so"
+    source.write_text(f"{head}void f(const double *x, const double *y, double *out)\n{{\n{body}\n}}\n")
+    subprocess.run([*C99, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"], check=True)
+    call = ctypes.CDLL(str(library)).f
+    for a, b in ((-1.5, 2.25), (3.5, 0.7), (1e-320, 1.0)):
+        out = (ctypes.c_double * len(terms))()
+        call((ctypes.c_double * 1)(a), (ctypes.c_double * 1)(b), out)
+        wanted = f(a, b).full()[:, 0]
+        np.testing.assert_array_equal(list(out), wanted)
+        np.testing.assert_array_equal(np.signbit(list(out)), np.signbit(wanted))
+
+
+@needs_cc
+def test_parameters_are_the_last_input(tmp_path):
+    free = mb.catalog.double_pendulum(mass1=mb.Parameter("m1", 2.0), length1=mb.Parameter("l1"))
+    made = export_c(free, ["forward_dynamics", "potential_energy", "kinetic_energy"])
+    compiled = Compiled(free, made, tmp_path)
+    assert [f.inputs[-1] for f in made.functions] == [("parameters", 2)] * 3
+    assert "0  m1  2.0\n" in made.header
+    assert "1  l1  none\n" in made.header
+    assert "{2.0, NAN}" in made.header
+    for values in ({"m1": 3.0, "l1": 0.5}, {"m1": 0.1, "l1": 2.0}):
+        model = mb.catalog.double_pendulum(mass1=values["m1"], length1=values["l1"])
+        dyn = mb.dynamics(model, "lagrangian")
+        for f in made.functions:
+            state = [x[0] for x in arguments_of(f.quantity, model, 1)]
+            (got,) = compiled(f.quantity, *state, np.array(list(values.values())))
+            want = getattr(dyn, f.quantity)(*state)
+            assert off(got.reshape(np.shape(want)), want) < 256 * EPS
+
+
+# The header.
+
+
+@needs_cc
+@pytest.mark.parametrize(("robot", "options"), [("panda", {}), ("solo12", {"floating_base": True})])
+def test_the_headers_own_program_compiles_and_runs(tmp_path, robot, options):
+    model = mb.load(robot, **options)
+    made = export_c(model, ["potential_energy", "gravity"], name=robot)
+    made.write(tmp_path)
+    told = [line.removeprefix(" *") for line in made.header.split(" */")[0].splitlines()]
+    begin = next(k for k, line in enumerate(told) if "#include" in line)
+    end = next(k for k, line in enumerate(told) if k > begin and line.strip() == "}")
+    (tmp_path / "main.c").write_text("\n".join(told[begin : end + 1]) + "\n")
+    command = next(line for line in told if "A program" in line).split("A program")[1].split()
+    assert command[0] == "cc"
+    subprocess.run([command[0], *STRICT, *command[1:]], check=True, cwd=tmp_path)
+    printed = subprocess.run([tmp_path / "main"], check=True, capture_output=True, text=True).stdout
+    energy = mb.dynamics(model, "lagrangian").potential_energy(model.neutral())
+    assert float(printed) == pytest.approx(energy, rel=64 * EPS)
+
+
+@needs_cc
+def test_headers_compile_alone_twice_over_and_in_cpp(tmp_path):
+    export_c(mb.load("panda"), ["gravity"]).write(tmp_path)
+    export_c(mb.catalog.double_pendulum(), ["gravity"]).write(tmp_path)
+    included = '#include "panda.h"\n#include "panda.h"\n#include "double_pendulum.h"\n'
+    used = "double q[PANDA_NQ] = {0.0}, g[PANDA_NV]; panda_gravity(q, g); return 0;"
+    # A file without any declaration of its own is no C99.
+    (tmp_path / "alone.c").write_text(f"{included}int nothing;\n")
+    subprocess.run([*C99, "-fsyntax-only", str(tmp_path / "alone.c")], check=True)
+    if CXX is None:
+        pytest.skip("no C++ compiler on PATH")
+    (tmp_path / "main.cpp").write_text(f"{included}int main() {{ {used} }}\n")
+    subprocess.run([*C99, "-c", str(tmp_path / "panda.c"), "-o", str(tmp_path / "panda.o")], check=True)
+    # Linked, so that the names must be C's.
+    linked = [str(tmp_path / "main.cpp"), str(tmp_path / "panda.o"), "-o", str(tmp_path / "main"), "-lm"]
+    subprocess.run([CXX, "-std=c++11", *STRICT, *linked], check=True)
+    subprocess.run([tmp_path / "main"], check=True)
+    # The source is C++ as well.
+    subprocess.run([CXX, "-std=c++11", *STRICT, "-x", "c++", "-fsyntax-only", str(tmp_path / "panda.c")], check=True)
+
+
+def test_the_header_tells_order_units_and_conventions():
+    made = export_c(mb.load("panda"), ["mass_matrix", "forward_dynamics"])
+    assert "void panda_mass_matrix(const double q[PANDA_NQ], double M[PANDA_NV * PANDA_NV]);" in made.header
+    for told in ("7  panda_finger_joint1  m/s    N\n", "x, y, z, w", "by columns", "0  panda_joint1         rad\n"):
+        assert told in made.header
+    assert "panda_finger_joint2 = 1.0 * panda_finger_joint1 + 0.0" in made.header
+    assert made.digest in made.header
+    free = export_c(mb.load("solo12", floating_base=True), ["gravity"]).header
+    assert "[6] = 1.0" in free
+    rows = [line.split()[1:] for line in free.splitlines() if line.startswith(" *  ") and "root_joint" in line]
+    units = [row[2:] for row in rows]
+    assert units == [["m"]] * 3 + [["1"]] * 4 + [["m/s", "N"]] * 3 + [["rad/s", "N", "m"]] * 3
+
+
+@needs_cc
+def test_names_from_a_file_do_no_harm(tmp_path):
+    b = mb.ModelBuilder("7 */ int x; /* naïve ??/")
+    b.add_body("b", mass=1.0, com=(0, 0, 1), inertia=np.eye(3))
+    evil = "*/ #error /* ??/ \u202e \\"
+    b.add_joint(evil, "revolute", parent="world", child="b", axis=(1, 0, 0))
+    made = export_c(b.build(), ["gravity"])
+    assert made.name == "model_7_int_x_na_ve"
+    assert made.header.isprintable() or "\u202e" not in made.header
+    made.write(tmp_path)
+    subprocess.run([*C99, "-c", str(tmp_path / f"{made.name}.c"), "-o", str(tmp_path / "x.o")], check=True)
+
+
+def test_bytes_are_the_same_in_another_process():
+    script = (
+        "import sys, mbkit as mb\n"
+        "made = mb.lagrangian.export_c(mb.load('solo12', floating_base=True), ['mass_matrix', 'forward_dynamics'])\n"
+        "sys.stdout.buffer.write((made.header + made.source).encode())\n"
+    )
+    runs = []
+    for seed in ("1", "2"):
+        env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "PYTHONHASHSEED": seed}
+        runs.append(subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, check=True).stdout)
+    assert runs[0] == runs[1]
+    assert b"void solo_forward_dynamics" in runs[0]
+
+
+# Names, files and the command.
+
+
+def test_bad_names_are_told():
+    model = mb.catalog.pendulum()
+    with pytest.raises(UnknownNameError, match="did you mean 'mass_matrix'"):
+        export_c(model, ["mass_matrx"])
+    with pytest.raises(InputError, match="at least one of mass_matrix"):
+        export_c(model, [])
+    with pytest.raises(InputError, match="list of names"):
+        export_c(model, "nle")
+    for name in ("", "2link", "a b", "é", "a;b", "../x"):
+        with pytest.raises(InputError, match="name: expected letters"):
+            export_c(model, ["nle"], name=name)
+
+
+def test_what_no_tree_holds_is_refused():
+    b = mb.ModelBuilder("closed")
+    b.add_body("b", mass=1.0, inertia=np.eye(3))
+    b.add_joint("j", "revolute", parent="world", child="b", axis=(1, 0, 0))
+    b.prescribe("j", rate=1.0)
+    with pytest.raises(UnsupportedError, match=r"without\('prescribed'\)"):
+        export_c(b.build())
+
+
+def test_files_of_other_origin_are_kept(tmp_path):
+    made = export_c(mb.catalog.pendulum(), ["nle"])
+    paths = made.write(tmp_path / "new" / "folder")
+    assert [p.name for p in paths] == ["pendulum.h", "pendulum.c"]
+    assert made.write(tmp_path / "new" / "folder") == paths
+    mine = tmp_path / "pendulum.c"
+    mine.write_text("int mine;\n")
+    with pytest.raises(OutputError, match=r"pendulum\.c is there and mbkit did not write it"):
+        made.write(tmp_path)
+    assert mine.read_text() == "int mine;\n"
+    assert not (tmp_path / "pendulum.h").exists()
+    made.write(tmp_path, force=True)
+    assert mine.read_text() == made.source
+
+
+def call(*arguments):
+    return CliRunner().invoke(cli, ["export", *arguments])
+
+
+def test_the_command_writes_and_tells(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = call("double_pendulum")
+    assert result.exit_code == 0, result.output
+    assert "double_pendulum_forward_dynamics(q[2], v[2], tau[2]) -> a[2]: " in result.stdout
+    assert {p.name for p in Path("mbkit-export").iterdir()} == {"double_pendulum.h", "double_pendulum.c"}
+    result = call("panda", "--mimic", "free", "--quantity", "nle", "--quantity", "gravity", "--json", "--name", "arm")
+    told = json.loads(result.stdout)
+    assert told["header"] == os.path.join("mbkit-export", "arm.h")
+    assert [f["name"] for f in told["functions"]] == ["arm_nle", "arm_gravity"]
+    assert told["functions"][0]["inputs"] == {"q": 9, "v": 9}
+    assert told["digest"] == mb.load("panda", mimic="free").digest
+    assert call("solo12", "--floating-base", "--quantity", "gravity").exit_code == 0
+    assert "[6] = 1.0" in Path("mbkit-export/solo12.h").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "Missing argument"),
+        (["pandaa"], "did you mean 'panda'"),
+        (["pendulum", "--quantity", "nlee"], "did you mean 'nle'"),
+        (["pendulum", "--quantity", "xyz"], "coriolis_force"),
+        (["pendulum", "--name", "a b"], "name: expected"),
+        (["pendulum", "--floating-base"], "floating_base"),
+        (["pendulum", "--mimic", "maybe"], "--mimic"),
+        (["pendulum", "--out", "regular"], "regular"),
+        (["pendulum", "--out", "regular/below"], "regular"),
+        (["pendulum", "--out", "taken"], "mbkit did not write it"),
+    ],
+)
+def test_misuse_is_one_message_and_exit_2(tmp_path, monkeypatch, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    Path("regular").write_text("")
+    Path("taken").mkdir()
+    Path("taken/pendulum.h").write_text("/* mine */\n")
+    result = call(*arguments)
+    assert result.exit_code == 2, result.output
+    assert told in result.stderr
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="whoever may write everywhere meets no refusal")
+def test_a_folder_without_permission_is_told(tmp_path):
+    tmp_path.chmod(0o500)
+    assert call("pendulum", "--out", str(tmp_path)).exit_code == 2
+
+
+# The functions themselves, for optimal control.
+
+
+def test_functions_have_the_stated_names_and_dense_shapes():
+    model = random_tree(2, 10)
+    dyn = mb.dynamics(model, "lagrangian")
+    one = {"kinetic_energy": (1, 1), "potential_energy": (1, 1), "energy_rate": (1, 1)}
+    square = ("mass_matrix", "coriolis_matrix")
+    for name, arguments in FUNCTIONS.items():
+        if name.endswith("derivatives"):
+            continue
+        f = dyn.function(name)
+        assert f.name_in() == list(arguments)
+        assert f.name_out() == [name]
+        assert [f.size1_in(k) for k in range(f.n_in())] == [model.nq if n == "q" else model.nv for n in arguments]
+        assert f.size_out(0) == one.get(name, (model.nv, model.nv if name in square else 1))
+        assert f.sparsity_out(0).is_dense()
+    J = dyn.equations.jacobian("tip", "world")
+    assert J.size_out(0) == (6, model.nv)
+    assert J.sparsity_out(0).is_dense()
+
+
+def test_functions_serve_in_an_optimal_control_expression():
+    # Two steps of Euler's method as MX, and the sensitivity of where they end to the torque.
+    model = mb.load("ur5").without("damping")
+    dyn = mb.dynamics(model, "lagrangian")
+    f = dyn.function("forward_dynamics")
+    h, n = 1e-2, model.nv
+    q0, v0, _, tau0 = (x[0] for x in states(model, 1))
+    tau = ca.MX.sym("tau", n)
+    q, v = ca.MX(q0), ca.MX(v0)
+    for _ in range(2):
+        a = f(q=q, v=v, tau=tau)["forward_dynamics"]
+        q, v = q + h * v, v + h * a
+    end = ca.Function("end", [tau], [q, ca.jacobian(q, tau)])
+    got, J = (x.full() for x in end(tau0))
+    step = dyn.forward_dynamics(q0, v0, tau0)
+    assert off(got[:, 0], q0 + h * v0 + h * (v0 + h * step)) < 64 * EPS
+    # q after two steps depends on the torque of the first alone: h² M(q0)⁻¹.
+    inverse = h * h * np.linalg.inv(dyn.mass_matrix(q0))
+    assert np.linalg.norm(J - inverse) < 256 * EPS * np.linalg.cond(dyn.mass_matrix(q0)) * np.linalg.norm(inverse)
