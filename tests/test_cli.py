@@ -206,6 +206,7 @@ BAD = [
     (["check", "faulty:f"], "no bodies"),
     (["check", "panda", "--engines", "pinocchio,bullet"], "unknown engine 'bullet'"),
     (["check", "panda", "--engines", "pinocchio"], "at least two"),
+    (["check", "panda", "--engines", "pinocchio,oracle"], "leave it out"),
     (["check", "panda", "--engines", ","], "at least two"),
     (["check", "panda", "--samples", "0"], "--samples"),
     (["check", "panda", "--seed", "-1"], "--seed"),

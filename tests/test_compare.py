@@ -111,7 +111,7 @@ def test_a_half_wrong_acceleration_fails_however_badly_conditioned():
     assert terms(model).passed
     q, v, a, tau = (np.ones((1, 2)) * x for x in (0.3, 0.2, 1.0, 1.0))
     M = mb.dynamics(model).mass_matrix(q)
-    wrong = acceleration_errors(1.5 * a, a, Scales.of(M, v, tau))
+    wrong = acceleration_errors(0.5 * a, a, Scales.of(M, v, tau))
     assert wrong.relative[0] > 0.01
 
 
@@ -121,6 +121,31 @@ def test_what_no_engine_can_give_is_not_called_agreement():
     assert result.passed
     assert result.not_compared == ("forward dynamics", "power balance")
     assert "not compared: forward dynamics, power balance" in result.verdict
+
+
+def test_every_engine_is_measured_by_the_oracle(monkeypatch):
+    """An error that all engines share is seen."""
+    model = mb.load("ur5")
+    result = terms(model)
+    assert result.reference == "oracle"
+    assert {r.reference for r in result.rows} == {"oracle"}
+    assert all(0 < r.relative < 1e-14 for r in result.rows if r.term == "nle")
+    for engine in (PinocchioDynamics, LagrangianDynamics, MujocoDynamics):
+        planted(monkeypatch, engine, "_nle", lambda x: x * (1 + 1e-11))
+    failed = {(r.term, r.engine) for r in terms(model).rows if not r.passed}
+    assert failed >= {("nle", e) for e in ("pinocchio", "lagrangian", "mujoco")}
+
+
+def test_where_the_oracle_has_no_value_an_engine_stands_in():
+    b = mb.ModelBuilder("tether")
+    b.add_body("a", mass=1.0, inertia=(1, 1, 1))
+    b.add_joint("j", "free", parent="world", child="a")
+    b.add_spring("s", body_a="world", body_b="a", stiffness=3.0, rest_length=0.1)
+    result = terms(b.build())
+    assert any(r.engine == "oracle" and r.term == "passive" for r in result.refusals)
+    rows = [r for r in result.rows if r.term == "passive"]
+    assert {r.reference for r in rows} == {"mujoco"}
+    assert {r.engine: r.passed for r in rows} == {"pinocchio": False, "lagrangian": False, "mujoco": True}
 
 
 def test_a_failing_study_loses_no_terms():
@@ -337,6 +362,7 @@ def test_progress_is_told_and_grows():
     [
         ({"engines": ("pinocchio",)}, InputError, "at least two"),
         ({"engines": "pinocchio"}, InputError, "several names"),
+        ({"engines": ("pinocchio", "oracle")}, InputError, "leave it out"),
         ({"engines": ("pinocchio", "mujocco")}, UnknownNameError, "'mujoco'"),
         ({"samples": 0}, InputError, "samples"),
         ({"tolerance": -1.0}, InputError, "tolerance"),
@@ -379,8 +405,8 @@ def test_no_unit_changes_the_error_of_a_mass_matrix():
     E = 1e-9 * rng.standard_normal(M.shape)
     v = rng.standard_normal((5, 4))
     D = np.diag([1e3, 1e-3, 1.0, 7.0])
-    plain = matrix_errors(M + E, M, Scales.of(M, v, v))
-    scaled = matrix_errors(D @ (M + E) @ D, D @ M @ D, Scales.of(D @ M @ D, v, v))
+    plain = matrix_errors(E, M, Scales.of(M, v, v))
+    scaled = matrix_errors(D @ E @ D, D @ M @ D, Scales.of(D @ M @ D, v, v))
     assert plain.relative == pytest.approx(scaled.relative)
     assert plain.relative == pytest.approx(
         [(abs(e) / np.sqrt(np.outer(np.diag(m), np.diag(m)))).max() for e, m in zip(E, M, strict=True)]
@@ -420,14 +446,14 @@ def test_forward_dynamics_is_allowed_its_condition_and_no_more():
     scales = Scales.of(M, v, 0 * v)
     assert scales.condition == pytest.approx([1999.0])
     a = np.array([[1.0, -1.0]])
-    errors = acceleration_errors(a * (1 + 1e-10), a, scales)
+    errors = acceleration_errors(1e-10 * a, a, scales)
     # This error lies along the light direction: M e is as small as the forward error.
     assert errors.relative == pytest.approx([1e-10 / 1999.0])
     # Along the heavy one it is a force, and no condition excuses that.
-    heavy = acceleration_errors(a + 1e-10, a, scales)
+    heavy = acceleration_errors(np.full_like(a, 1e-10), a, scales)
     assert heavy.relative[0] > 1e-11
     # Forces a thousand times what is left of them round as what they are.
-    cancelled = acceleration_errors(a * (1 + 1e-10), a, Scales.of(M, v, 1e3 * v))
+    cancelled = acceleration_errors(1e-10 * a, a, Scales.of(M, v, 1e3 * v))
     assert cancelled.relative == pytest.approx([1e-13 / 1999.0])
 
 

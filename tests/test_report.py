@@ -31,7 +31,7 @@ def row(
     return Row(
         term=term,
         engine=engine,
-        reference="lagrangian",
+        reference="oracle",
         joint=joint,
         max_abs=error,
         relative=error,
@@ -66,7 +66,7 @@ AGREEING = Comparison(
         "nonphysical": ["link: negative"],
     },
     engines=("pinocchio", "lagrangian", "mujoco"),
-    reference="lagrangian",
+    reference="oracle",
     samples=64,
     seed=7,
     tolerance=TOLERANCE,
@@ -333,7 +333,7 @@ def test_figures_are_the_same_every_time_and_scale():
         assert "viewBox" in one
         assert not re.match(r"<svg[^>]* width=", one)
         assert "var(--series1)" in one
-    assert "mujoco against lagrangian" in figures.digits(AGREEING)
+    assert "mujoco against oracle" in figures.digits(AGREEING)
     assert "var(--bad)" in figures.digits(DIFFERING)
     assert "var(--bad)" not in figures.digits(AGREEING)
 

@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import casadi as ca
 
@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.compiled import Compiled
 
 __all__ = ["compile_by_default", "executable"]
+
+
+#: Operations above which LLVM's time, some 10 s per 100k, is not spent unasked: a
+#: Coriolis matrix of a hundred joints has twice as many, and is interpreted in 0.5 ms.
+_MOST: Final = 150_000
 
 
 def compile_by_default() -> bool:
@@ -36,14 +41,29 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
         Derives it; not called if its machine code is in the cache.
     compile : bool
         Whether to compile; where there is no compiler a `NoCompilerWarning` says so
-        once, and CasADi's machine runs it.
+        once, and CasADi's machine runs it. It also runs what is very large.
     """
-    if compile and _compiler():
-        # Loads LLVM, which interpreting never needs.
-        from mbkit.lagrangian.compiled import compiled
+    if not compile or not _compiler():
+        return Machine(make())
+    # Loads LLVM, which interpreting never needs.
+    from mbkit.lagrangian.compiled import compiled
 
-        return compiled(name, make)
-    return Machine(make())
+    def checked() -> ca.Function:
+        function = make()
+        if function.n_instructions() > _MOST:
+            raise _TooLargeError(function)
+        return function
+
+    try:
+        return compiled(name, checked)
+    except _TooLargeError as error:
+        return Machine(error.function)
+
+
+class _TooLargeError(Exception):
+    def __init__(self, function: ca.Function) -> None:
+        super().__init__()
+        self.function = function
 
 
 @cache

@@ -12,8 +12,7 @@ from typing import Final
 
 import casadi as ca
 import numpy as np
-
-from mbkit._check import Array
+from numpy.typing import NDArray
 
 __all__ = ["Operation", "Program", "program"]
 
@@ -76,7 +75,7 @@ class Program:
     inputs: tuple[int, ...]
     shapes: tuple[tuple[int, int], ...]
     operations: tuple[Operation, ...]
-    outputs: tuple[Array, ...]
+    outputs: tuple[NDArray[np.intp], ...]
 
     @cached_property
     def arithmetic(self) -> int:
@@ -95,7 +94,7 @@ def program(function: ca.Function) -> Program:
     where: dict[int, int] = {}
     operations: list[Operation] = []
     shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
-    outputs = [np.full(rows * columns, -1) for rows, columns in shapes]
+    outputs = [np.full(rows * columns, -1, dtype=np.intp) for rows, columns in shapes]
     if any(function.nnz_out(i) != out.size for i, out in enumerate(outputs)):
         raise ValueError(f"{function.name()}: expected dense outputs; casadi.densify makes them")
     for k in range(function.n_instructions()):

@@ -71,7 +71,7 @@ _SAME: Final = 17.0
 def digits(result: Comparison) -> str:
     """Draw the digits of agreement of each term and engine: worst sample, and median behind it."""
     terms = by_term(result)
-    engines = [e for e in result.engines if e != result.reference] or list(result.engines)
+    engines = result.engines
     with _figure(7.2, 0.9 + 0.36 * len(terms), "digits") as (fig, ax):
         for k, engine in enumerate(engines):
             colour, mark = _SERIES[result.engines.index(engine) % 6], _ENGINE_MARKS[result.engines.index(engine) % 6]

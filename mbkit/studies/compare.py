@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from mbkit._check import count, real
 from mbkit.engines import ENGINES, Dynamics, dynamics
+from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, MbkitError, UnknownNameError
 from mbkit.model import Model
 from mbkit.studies import stamp
@@ -18,10 +19,10 @@ from mbkit.studies.result import Comparison, Refusal, Row
 from mbkit.studies.rollouts import free_of_mimic, rollouts
 from mbkit.studies.states import states
 
-__all__ = ["compare"]
+__all__ = ["COMPARABLE", "compare"]
 
-# The own derivation first: it shares no algorithm with the other two.
-_REFERENCES: Final = ("lagrangian", "pinocchio", "mujoco")
+#: Engines that can be compared: all but the one that they are measured by.
+COMPARABLE: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
 Progress = Callable[[float, str], None]
 
 
@@ -41,7 +42,7 @@ def compare(
     ----------
     model : Model
     engines : sequence of str
-        At least two; the reference is the own derivation where it is among them.
+        At least two. All are measured by the oracle, the own derivation at 34 digits.
     samples : int
         Random states, beside which stand neutral, at-limit and near-singular ones.
     seed : int
@@ -63,13 +64,16 @@ def compare(
     """
     begun = time.perf_counter()
     names = _checked(model, engines, samples, seed, tolerance)
+    if model.parameters:
+        model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
     tell = progress or _silent
-    made, refusals, setup = _made(model, names, tell)
-    present = [n for n in _REFERENCES if n in made]
-    reference = present[0] if present else ""
+    made, refusals, setup = _made(model, names, tell, compile=not terms_only)
+    reference = ""
     rows: list[Row] = []
     if len(made) > 1:
-        study = Judge(model, made, reference, states(model, samples, seed), tolerance)
+        tell(0.05, "34 digits")
+        reference = OracleDynamics.engine
+        study = Judge(model, made, OracleDynamics(model), states(model, samples, seed), tolerance)
         rows, refused = study.rows(lambda f, text: tell(0.05 + f * (0.85 if terms_only else 0.35), text))
         refusals += refused
     result: dict[str, Any] = {}
@@ -104,7 +108,7 @@ def _beyond_terms(
     moving, movers, note = model, made, ""
     if model.layout.reduced:
         moving, note = free_of_mimic(model), "mimic joints free"
-        movers, _, _ = _made(moving, tuple(made), _silent)
+        movers, _, _ = _made(moving, tuple(made), _silent, compile=True)
 
     def study(fraction: float, name: str, call: Callable[[], None]) -> None:
         tell(fraction, name)
@@ -141,11 +145,15 @@ def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tole
     if isinstance(engines, str):
         raise InputError(f"engines: expected several names, got the string {engines!r}; write ({engines!r}, ...)")
     for name in engines:
-        if not isinstance(name, str) or name not in ENGINES:
-            raise UnknownNameError("engine", str(name), ENGINES)
+        if name == OracleDynamics.engine:
+            raise InputError("engines: the oracle is what every engine is measured by; leave it out")
+        if not isinstance(name, str) or name not in COMPARABLE:
+            raise UnknownNameError("engine", str(name), COMPARABLE)
     unique = tuple(dict.fromkeys(engines))
     if len(unique) < 2:
-        raise InputError(f"engines: expected at least two to compare, got {list(engines)}; there are {list(ENGINES)}")
+        raise InputError(
+            f"engines: expected at least two to compare, got {list(engines)}; there are {list(COMPARABLE)}"
+        )
     count("samples", samples, least=1)
     count("seed", seed)
     real("tolerance", tolerance, positive=True)
@@ -153,14 +161,20 @@ def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tole
 
 
 def _made(
-    model: Model, names: Sequence[str], tell: Progress
+    model: Model,
+    names: Sequence[str],
+    tell: Progress,
+    *,
+    compile: bool,  # noqa: A002  # the engine's own word
 ) -> tuple[dict[str, Dynamics], list[Refusal], dict[str, float]]:
     made, refusals, setup = {}, [], {}
     for k, name in enumerate(names):
         tell(0.05 * k / len(names), f"building {name}")
         start = time.perf_counter()
         try:
-            made[name] = dynamics(model, name)
+            # A few dozen states are no reason to compile; run times are.
+            options = {} if compile or name != "lagrangian" else {"compile": False}
+            made[name] = dynamics(model, name, **options)
         except MbkitError as error:
             refusals.append(Refusal(name, "", str(error).removeprefix(f"{name}: ")))
         setup[name] = time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""Every term in every engine, judged against the reference."""
+"""Every term in every engine, judged against the oracle."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError
 from mbkit.model import Model
 from mbkit.studies.measure import Errors, Scales
@@ -29,20 +30,25 @@ Progress = Callable[[float, str], None]
 
 
 class Judge:
-    """Evaluates every term in every engine, and judges it against the reference."""
+    """Evaluates every term in every engine, and judges it against the oracle.
 
-    def __init__(self, model: Model, made: dict[str, Dynamics], reference: str, at: States, tolerance: float) -> None:
-        self.model, self.made, self.reference = model, made, reference
+    A term for which the oracle has no value, as where M is singular, is judged
+    against the first engine that gives one.
+    """
+
+    def __init__(
+        self, model: Model, made: dict[str, Dynamics], oracle: OracleDynamics, at: States, tolerance: float
+    ) -> None:
+        self.model, self.made, self.oracle = model, made, oracle
         self.at, self.tolerance = at, tolerance
         self.refusals: list[Refusal] = []
-        dyn = made[reference]
         acting = np.abs(at.tau)
-        for quantity in (dyn.nle, dyn.passive):
+        for quantity in (oracle.nle, oracle.passive):
             # Where a term has no value, its own row says so.
             with contextlib.suppress(NumericalError):
                 acting = acting + np.abs(quantity(at.q, at.v))
         heavy = float(np.linalg.norm(model.gravity)) * np.sqrt(model.mass)
-        self.scales = Scales.of(dyn.mass_matrix(at.q), at.v, acting, heavy)
+        self.scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
         #: The joint of each velocity.
         self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
 
@@ -57,7 +63,7 @@ class Judge:
         def refuse(engine: str, error: MbkitError) -> None:
             self._refuse(engine, "power balance", error)
 
-        for name, errors in power_rows(self.made, self.at, self.scales, refuse):
+        for name, errors in power_rows(self.made, self.oracle, self.at, self.scales, refuse):
             rows.append(self._row("power balance", name, errors, (np.nan, np.nan), ""))
         return rows, self.refusals
 
@@ -82,16 +88,22 @@ class Judge:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KnownDefectWarning)
             times = interleaved({name: term.single(self.made[name], self.at) for name in values})
-        reference = self.reference if self.reference in values else next(iter(values))
+        reference, high, low = self._reference(term, values)
         rows = [self._broken_row(term.name, name, reference, why) for name, why in broken.items()]
         for name, value in values.items():
-            if name != reference:
-                errors = term.errors(value, values[reference], self.scales)
-                allowed = self._allowed(term, name, errors)
-                rows.append(self._row(term.name, name, errors, times[name], defects[name], allowed, reference))
-        own = Errors(*(np.zeros(len(self.at.q)),) * 2, np.zeros(self.model.nv))
-        rows.append(self._row(term.name, reference, own, times[reference], defects[reference], None, reference))
+            errors = term.errors((value - high) - low, high, self.scales)
+            allowed = self._allowed(term, name, errors)
+            rows.append(self._row(term.name, name, errors, times[name], defects[name], allowed, reference))
         return rows
+
+    def _reference(self, term: Term, values: dict[str, Array]) -> tuple[str, Array, Array]:
+        """Return who has the reference values, and their high and low part."""
+        try:
+            return self.oracle.engine, *term.reference(self.oracle, self.at)
+        except NumericalError as error:
+            self._refuse(self.oracle.engine, term.name, error)
+        name = next(iter(values))
+        return name, values[name], np.zeros_like(values[name])
 
     def _refuse(self, engine: str, term: str, error: MbkitError) -> None:
         self.refusals.append(Refusal(engine, term, str(error).removeprefix(f"{engine}: ")))
@@ -157,7 +169,7 @@ class Judge:
         return Row(
             term=term,
             engine=engine,
-            reference=reference or self.reference,
+            reference=reference or self.oracle.engine,
             joint=joint,
             max_abs=float(errors.absolute.max()),
             relative=relative,

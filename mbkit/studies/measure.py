@@ -1,7 +1,9 @@
 """How errors are measured: per sample, relative to a scale that does not vanish.
 
-For a vector x with error e the error is ‖e‖ / max(‖x‖, ‖M‖ ‖v‖²): a term that
-happens to be small is compared with the forces at play. Where gravity is among
+Errors e are an engine's value minus the oracle's, both high and low part, so that
+they are known to many digits however small they are. For a vector x with error e the
+error is ‖e‖ / max(‖x‖, ‖M‖ ‖v‖²): a term that happens to be small is compared with the
+forces at play. Where gravity is among
 them, so is what it could do: |g| √(m M_jj) is the most that it exerts on joint j
 (Cauchy and Schwarz on Σ m_i g · J_ij), and what rounds with it where a pendulum
 hangs straight down. M's error is the largest |e_ij| / √(M_ii M_jj), which no unit
@@ -88,9 +90,9 @@ def _ratio(e: Array, scale: Array) -> Array:
     return np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
 
 
-def force_errors(x: Array, reference: Array, scales: Scales, *, heavy: bool = False) -> Errors:
-    """Compare vectors of generalized forces; `heavy` where gravity is among them."""
-    e = np.abs(x - reference)
+def force_errors(error: Array, reference: Array, scales: Scales, *, heavy: bool = False) -> Errors:
+    """Measure errors of generalized forces; `heavy` where gravity is among them."""
+    e = np.abs(error)
     floor = np.maximum(scales.inertial, scales.weight) if heavy else scales.inertial
     relative = _ratio(np.linalg.norm(e, axis=1), np.maximum(np.linalg.norm(reference, axis=1), floor))
     # A joint's own scale: its force, or its share of what is at play.
@@ -100,13 +102,13 @@ def force_errors(x: Array, reference: Array, scales: Scales, *, heavy: bool = Fa
     return Errors(e.max(axis=1, initial=0.0), relative, _ratio(e, own).max(axis=0))
 
 
-def acceleration_errors(x: Array, reference: Array, scales: Scales) -> Errors:
-    """Compare accelerations in the norm √M_jj a_j, per cond(M)."""
-    e, root = np.abs(x - reference), np.sqrt(scales.diagonal)
+def acceleration_errors(error: Array, reference: Array, scales: Scales) -> Errors:
+    """Measure errors of accelerations in the norm √M_jj a_j, per cond(M)."""
+    e, root = np.abs(error), np.sqrt(scales.diagonal)
     pushed = np.linalg.norm(scales.acting / np.where(root > 0, root, np.inf), axis=1)
     size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
     own = np.maximum(np.abs(reference), scales.acting / np.where(scales.diagonal > 0, scales.diagonal, np.inf))
-    force = np.einsum("nij,nj->ni", scales.M, x - reference) / np.where(root > 0, root, np.inf)
+    force = np.einsum("nij,nj->ni", scales.M, error) / np.where(root > 0, root, np.inf)
     backward = _ratio(np.linalg.norm(force, axis=1), scales.size * size)
     forward = _ratio(np.linalg.norm(root * e, axis=1), size * scales.condition)
     return Errors(
@@ -116,16 +118,16 @@ def acceleration_errors(x: Array, reference: Array, scales: Scales) -> Errors:
     )
 
 
-def matrix_errors(M: Array, reference: Array, scales: Scales) -> Errors:
-    """Compare mass matrices entry by entry, each by its two diagonal entries."""
-    e = np.abs(M - reference)
+def matrix_errors(error: Array, reference: Array, scales: Scales) -> Errors:  # noqa: ARG001  # as the others
+    """Measure errors of mass matrices entry by entry, each by its two diagonal entries."""
+    e = np.abs(error)
     root = np.sqrt(np.abs(scales.diagonal))
     ratio = _ratio(e, root[:, :, None] * root[:, None, :])
     return Errors(e.max(axis=(1, 2), initial=0.0), ratio.max(axis=(1, 2), initial=0.0), ratio.max(axis=(0, 1)))
 
 
-def energy_errors(x: Array, reference: Array, scales: Scales) -> Errors:
-    """Compare energies, by the largest of all samples."""
-    e = np.abs(x - reference)
+def energy_errors(error: Array, reference: Array, scales: Scales) -> Errors:
+    """Measure errors of energies, by the largest of all samples."""
+    e = np.abs(error)
     scale = np.maximum(np.abs(reference).max(initial=0.0), scales.inertial)
     return Errors(e, _ratio(e, scale), np.empty(0))

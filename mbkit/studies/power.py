@@ -1,6 +1,6 @@
 """Power balance: dE/dt = (τ + τ_damping) · v, with each engine's own acceleration.
 
-The rate of energy is differentiated exactly from T and V by the own derivation;
+The rate of energy is differentiated exactly from T and V by the oracle;
 acceleration and damping are the engine's. So it fails if either the engine's
 dynamics or the energies are wrong, whatever two engines agree on.
 """
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from mbkit.engines import Dynamics
+from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError
 from mbkit.studies.measure import Errors, Scales
 from mbkit.studies.states import States
@@ -20,21 +21,18 @@ __all__ = ["power_rows"]
 
 
 def power_rows(
-    made: Mapping[str, Dynamics], at: States, scales: Scales, refuse: Callable[[str, MbkitError], None]
+    made: Mapping[str, Dynamics],
+    oracle: OracleDynamics,
+    at: States,
+    scales: Scales,
+    refuse: Callable[[str, MbkitError], None],
 ) -> Iterator[tuple[str, Errors]]:
-    """Yield (engine, errors) for every engine, where the own derivation is at hand.
-
-    What cannot be had is told to `refuse`.
-    """
-    own = made.get("lagrangian")
-    energy_rate = getattr(own, "energy_rate", None)
-    if own is None or energy_rate is None:
-        return
+    """Yield (engine, errors) for every engine; what cannot be had is told to `refuse`."""
     for name, dyn in made.items():
         try:
             a = dyn.forward_dynamics(at.q, at.v, at.tau)
             damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
-            inertial, rate = own.inverse_dynamics(at.q, at.v, a), energy_rate(at.q, at.v, a)
+            inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
         except MbkitError as error:
             refuse(name, error)
             continue

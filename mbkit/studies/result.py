@@ -23,7 +23,9 @@ class Row:
 
     Attributes
     ----------
-    term, engine, reference : str
+    term, engine : str
+    reference : str
+        ``"oracle"``, or an engine where the oracle has no value.
     joint : str
         The joint with the largest per-joint error; empty for energies.
     max_abs : float
@@ -194,8 +196,9 @@ class Comparison:
     facts : dict
         nq, nv, mass, digest, needs and notes of the model.
     engines : tuple of str
-        The engines compared, the reference among them.
+        The engines compared.
     reference : str
+        What their terms were measured by: the oracle.
     samples, seed : int
     tolerance : float
     rows : tuple of Row

@@ -11,6 +11,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.oracle import OracleDynamics
 from mbkit.studies.measure import (
     Errors,
     Scales,
@@ -37,7 +38,7 @@ class Term:
     arguments : tuple of str
         Fields of `States`.
     errors : callable
-        (values, reference values, scales) -> Errors.
+        (errors, reference values, scales) -> Errors.
     """
 
     name: str
@@ -48,6 +49,10 @@ class Term:
     def call(self, dyn: Dynamics, states: States) -> Array:
         """Evaluate at all states."""
         return np.asarray(getattr(dyn, self.quantity)(*(getattr(states, a) for a in self.arguments)))
+
+    def reference(self, oracle: OracleDynamics, states: States) -> tuple[Array, Array]:
+        """Return the oracle's values at all states, high and low part."""
+        return oracle.extended(self.quantity, *(getattr(states, a) for a in self.arguments))
 
     def single(self, dyn: Dynamics, states: States) -> Callable[[], Any]:
         """Return a call at one random state, for timing."""
