@@ -85,6 +85,8 @@ def run_dop853(
     runs = []
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for i, start in enumerate(y0):
+            if batch is not None:
+                rates.only(i)
             force = torque.of_member(None if batch is None else i)
             task = _Task(start, rtol, atol, stops, saved, force, torque.held)
             runs.append(_integrate(rates, task, _reporter(bar, i, len(y0), duration)))

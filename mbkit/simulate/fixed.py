@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.model.space import Space
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.space import Space
 from mbkit.simulate.steps import RAN_AWAY, DivergenceError, Field, Step, credible, make_step
 from mbkit.simulate.torque import Torque
 
@@ -33,7 +33,7 @@ def run_fixed(
     """
     space = Space(dyn.model)
     field = Field(dyn, space)
-    run = _Run(make_step(method, field, space), torque, space, q0, v0, grid, kept)
+    run = _Run(make_step(method, field, space), field, torque, space, q0, v0, grid, kept)
     # What overflows is a divergence, and told as one.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(grid.steps):
@@ -47,8 +47,9 @@ class _Run:
     """The states on their way; `members` are those of a batch that are still good."""
 
     def __init__(
-        self, step: Step, torque: Torque, space: Space, q0: Array, v0: Array, grid: Grid, kept: Indices
+        self, step: Step, field: Field, torque: Torque, space: Space, q0: Array, v0: Array, grid: Grid, kept: Indices
     ) -> None:
+        self._field = field
         self._step, self._torque, self._space, self._grid, self._kept = step, torque, space, grid, kept
         lead = q0.shape[:-1]
         check_room(len(kept) * (lead[0] if lead else 1), q0.shape[-1] + v0.shape[-1])
@@ -84,6 +85,7 @@ class _Run:
             self._members, q, w = self._members[good], q[good], w[good]
             if not len(self._members):
                 return False
+            self._field.only(self._members)
         self._q, self._w = q, w
         self._steps += 1 if self._members is None else len(self._members)
         if k + 1 == self._next:
@@ -99,11 +101,13 @@ class _Run:
         for i in range(len(q)):
             one = slice(i, i + 1)
             force = self._torque.during(k, self._members[one])
+            self._field.only(self._members[one])
             try:
                 q[one], w[one] = self._step(t, h, self._q[one], self._w[one], force)
             except DivergenceError:
                 continue
             good[i] = credible(q[i]) and credible(w[i])
+        self._field.only(self._members)
         return q, w, good
 
     def _keep(self, q: Array, v: Array) -> None:

@@ -28,11 +28,15 @@ class Rates:
     """
 
     def __init__(self, dyn: Dynamics) -> None:
-        self._model, self._forward = dyn.model, dyn.forward_dynamics
+        self._dyn, self._model, self._forward = dyn, dyn.model, dyn.forward_dynamics
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         self.evaluations = 0
         self.why = ""
+
+    def only(self, member: int) -> None:
+        """Go on with this member of a batch."""
+        self._forward = self._dyn.of_samples([member]).forward_dynamics
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
@@ -44,7 +48,8 @@ class Rates:
         tau = force if isinstance(force, np.ndarray) else force(t, q, v)
         self.evaluations += 1
         try:
-            a = self._forward(q, v, tau)
+            # One of a batch with parameters of its own is a batch of one.
+            a = self._forward(q, v, tau).reshape(-1)
         except NumericalError as error:
             self.why = str(error)
             return np.full(len(y), np.nan)

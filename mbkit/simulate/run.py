@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,16 @@ def simulate(
     UnsupportedError
         The engine does not have this method, or not for this model.
 
+    Notes
+    -----
+    On the lagrangian engine, ``"rk4"`` and ``"semi_implicit_euler"`` with no torque or
+    an array run as machine code: the whole step is one function, or, where that would be
+    beyond 20,000 operations, parts around the forward dynamics; chunks of a batch are
+    shared among the cores, and no number depends on how. The first run of a model
+    compiles its step, which is kept on disk. A callable torque, an engine made with
+    ``compile=False``, and models so large that their forward dynamics is not written
+    out are stepped stage by stage, by the same formulas.
+
     Examples
     --------
     >>> import mbkit as mb
@@ -108,7 +119,7 @@ def simulate(
     chosen = method_of(method)
     model = dyn.model
     q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
-    batch = batch_of(q0=q, v0=v)
+    batch = _batch(dyn, batch_of(q0=q, v0=v))
     if batch is not None:
         q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
     duration, dt = real("duration", duration, nonnegative=True), real("dt", dt, positive=True)
@@ -122,6 +133,14 @@ def simulate(
             _refuse_tolerances(chosen, rtol, atol)
             outcome = _stepped(dyn, chosen, q, v, duration, dt, **arguments)
     return _wrapped(dyn, chosen, outcome, time.perf_counter() - started)
+
+
+def _batch(dyn: Dynamics, states: int | None) -> int | None:
+    parameters = getattr(dyn, "_parameters", None)
+    samples = len(parameters.array) if parameters is not None and parameters.batched else states
+    if states not in (None, samples):
+        raise InputError(f"q0, v0: a batch of {states}, but the parameters' values are {samples}")
+    return samples
 
 
 def _adaptive(
@@ -176,7 +195,17 @@ def _stepped(
         outcome = run_native(dyn, method, q, v, grid, kept, read)
         bar.update(1.0)
         return outcome
-    return run_fixed(dyn, method.name, q, v, grid, kept, read, bar)
+    return _fixed(dyn, read)(dyn, method.name, q, v, grid, kept, read, bar)
+
+
+def _fixed(dyn: Dynamics, torque: Torque) -> Callable[..., Outcome]:
+    if dyn.engine == "lagrangian":
+        # Other engines need no CasADi.
+        from mbkit.simulate.rollout import can_roll_out, run_rollout
+
+        if can_roll_out(dyn, torque):
+            return run_rollout
+    return run_fixed
 
 
 def _wrapped(dyn: Dynamics, method: Method, outcome: Outcome, seconds: float) -> Trajectory:

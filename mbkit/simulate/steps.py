@@ -1,7 +1,7 @@
-"""One step of each fixed-step method, on the space of `mbkit.simulate.space`.
+"""One step of each fixed-step method, on the space of `mbkit.model.space`.
 
 A free joint's linear velocity is integrated in the axes of the joint's fixed
-frame and its position by addition (see `mbkit.simulate.free_joint`); a rotation
+frame and its position by addition (see `mbkit.model.free_joint`); a rotation
 is moved by the exponential of what its body-axes velocity adds up to, and inside
 a Runge-Kutta step the velocities are pulled back by the inverse of exp's
 differential (Munthe-Kaas 1999, High order Runge-Kutta methods on manifolds).
@@ -19,17 +19,19 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, NumericalError
-from mbkit.simulate.space import Space
+from mbkit.model.space import Space
+from mbkit.simulate.grid import Indices
 from mbkit.simulate.tableau import RK4, Tableau
 from mbkit.simulate.torque import Force
 
-__all__ = ["RAN_AWAY", "DivergenceError", "Field", "Step", "credible", "make_step"]
+__all__ = ["RAN_AWAY", "RUNAWAY", "DivergenceError", "Field", "Step", "credible", "make_step", "reason"]
 
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
 
 RAN_AWAY: Final = "the state grew beyond all bounds"
-_RUNAWAY: Final = 1e100
+#: A state with a number of this size is none any more.
+RUNAWAY: Final = 1e100
 
 
 class DivergenceError(Exception):
@@ -41,7 +43,7 @@ def credible(x: Array) -> NDArray[np.bool_]:
 
     No machine goes there, and energies of what lies below can still be computed.
     """
-    return np.asarray((np.abs(x) < _RUNAWAY).all(axis=-1))
+    return np.asarray((np.abs(x) < RUNAWAY).all(axis=-1))
 
 
 def _finite(q: Array, v: Array) -> bool:
@@ -58,8 +60,12 @@ class Field:
     """
 
     def __init__(self, dyn: Dynamics, space: Space) -> None:
-        self._forward, self._space = dyn.forward_dynamics, space
+        self._dyn, self._forward, self._space = dyn, dyn.forward_dynamics, space
         self.evaluations = 0
+
+    def only(self, members: Indices) -> None:
+        """Go on with these members of the whole batch."""
+        self._forward = self._dyn.of_samples(members).forward_dynamics
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""
@@ -78,13 +84,24 @@ class Field:
             if _finite(q, v):
                 raise
             raise DivergenceError(RAN_AWAY) from None
-        return self._space.acceleration(q, v, a)
+        return np.asarray(self._space.acceleration(q, v, a))
 
 
 def _blamed(told: str, q: Array, v: Array) -> str:
     # An engine overflows before its state does, and blames the model for it.
     largest = max(float(np.abs(x).max()) for x in (q, v))
     return told if largest < 1e50 else RAN_AWAY
+
+
+def reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, force: Array) -> str:
+    """Return why the step from a batch of one state diverges, in the engine's words if it has some."""
+    space = Space(dyn.model)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        try:
+            make_step(method, Field(dyn, space), space)(t, h, q, w, force)
+        except DivergenceError as error:
+            return str(error)
+    return RAN_AWAY
 
 
 def make_step(method: str, field: Field, space: Space) -> Step:

@@ -105,6 +105,15 @@ class Torque:
             return lambda k: self.during(k, None)
         return lambda k: np.asarray(self.during(k, np.array([i])))[0]
 
+    def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
+        """Return an array's rows of steps start to stop for members of a batch: (steps, nv, members or 1)."""
+        if self._rows is None:
+            constant = self._zero if self._zero.ndim == 1 else self._zero[:1].sum(axis=0)
+            return np.broadcast_to(constant[:, None], (stop - start, self._nv, 1))
+        if self._rows.ndim == 2:
+            return self._rows[start:stop, :, None]
+        return np.ascontiguousarray(self._rows[members, start:stop].transpose(1, 2, 0))
+
     def over(self, start: int, stop: int) -> Array | None:
         """Return the rows of steps start to stop, (steps, nv) or (N, steps, nv); None where all are zero."""
         if self._rows is not None:

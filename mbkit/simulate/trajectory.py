@@ -52,8 +52,11 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         for name in ("t", "q", "v"):
-            array = np.array(getattr(self, name), order="C")
-            array.setflags(write=False)
+            array = getattr(self, name)
+            # One that is read-only and its own is as good as a copy.
+            if array.flags.writeable or array.base is not None or not array.flags.c_contiguous:
+                array = np.array(array, order="C")
+                array.setflags(write=False)
             object.__setattr__(self, name, array)
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
@@ -76,6 +79,8 @@ class Trajectory:
         good = np.isfinite(q).all(-1) & np.isfinite(v).all(-1)
         out = np.full(len(q), np.nan)
         if good.any():
+            # A batch may have parameters of its own for each trajectory.
+            dyn = dyn.of_samples(np.repeat(np.arange(len(self.q)), len(self.t))[good]) if self.q.ndim == 3 else dyn
             kinetic = 0.5 * np.einsum("ni,nij,nj->n", v[good], dyn.mass_matrix(q[good]), v[good])
             out[good] = kinetic + dyn.potential_energy(q[good])
         return out.reshape(self.q.shape[:-1])

@@ -10,14 +10,14 @@ With R = R_JB and body-axes velocity (v, w)::
     v_J = R v                 a_J = R (a + w × v)
 
 Quaternion, linear and angular parts are sequences of components, as in
-`mbkit.simulate.rotation`.
+`mbkit.model.rotation`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from mbkit.simulate.rotation import Components, cross, rotate, rotate_back
+from mbkit.model.rotation import Components, cross, rotate, rotate_back
 
 __all__ = ["acceleration_in_parent", "velocity_in_body", "velocity_in_parent"]
 

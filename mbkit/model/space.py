@@ -1,21 +1,14 @@
-"""The space that the fixed-step methods move in: vectors, and rotations by their exponential."""
+"""The space that fixed-step methods move in: vectors, and rotations by their exponential."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from mbkit._check import Array
-from mbkit.model import Model
-from mbkit.simulate import rotation
-from mbkit.simulate.free_joint import acceleration_in_parent, velocity_in_body, velocity_in_parent
+from mbkit.model import rotation
+from mbkit.model.free_joint import acceleration_in_parent, velocity_in_body, velocity_in_parent
+from mbkit.model.model import Model
 
 __all__ = ["Space"]
-
-
-def _components(x: Array, part: slice) -> list[Any]:
-    return x[part].tolist() if x.ndim == 1 else list(x.T[part])
 
 
 class Space:
@@ -23,7 +16,8 @@ class Space:
 
     A configuration is mbkit's q. A velocity `w` is mbkit's v with the linear part
     of each free joint in the axes of the joint's fixed frame. All methods take
-    one state or a batch. On a model without quaternions they cost one addition.
+    one state or a batch; whoever reckons with something else than arrays overrides
+    the methods at the end. On a model without quaternions all cost one addition.
 
     Parameters
     ----------
@@ -56,50 +50,79 @@ class Space:
         else:
             self._sums.append((q, v))
 
-    def move(self, q: Array, u: Array) -> Array:
+    def move(self, q: Any, u: Any) -> Any:
         """Return q moved by u: positions add, rotations turn by exp(u) in body axes."""
         if self.flat:
-            return np.asarray(q + u)
-        out = np.empty(q.shape)
+            return q + u
+        m, out = self.arithmetic(q), self.copied(q)
         for a, b in self._sums:
-            out[..., a] = q[..., a] + u[..., b]
+            self.put(out, a, self.part(q, a) + self.part(u, b))
         for a, b in self._turns:
-            turned = rotation.product(_components(q, a), rotation.exponential(_components(u, b)))
-            out.T[a] = rotation.unit(turned)
+            turned = rotation.product(self.components(q, a), rotation.exponential(m, self.components(u, b)))
+            self.put(out, a, rotation.unit(m, turned))
         return out
 
-    def rate(self, u: Array, w: Array) -> Array:
+    def rate(self, u: Any, w: Any) -> Any:
         """Return u̇ where q moved by u(t) has the velocity w: dexp⁻¹ on rotations."""
         if self.flat:
             return w
-        out = w.copy()
+        m, out = self.arithmetic(w), self.copied(w)
         for _, b in self._turns:
-            out.T[b] = rotation.dexp_inverse(_components(u, b), _components(w, b))
+            self.put(out, b, rotation.dexp_inverse(m, self.components(u, b), self.components(w, b)))
         return out
 
-    def enter(self, q: Array, v: Array) -> Array:
+    def enter(self, q: Any, v: Any) -> Any:
         """Return w of mbkit's v."""
         return self._changed(q, v, velocity_in_parent)
 
-    def leave(self, q: Array, w: Array) -> Array:
+    def leave(self, q: Any, w: Any) -> Any:
         """Return mbkit's v of w."""
         return self._changed(q, w, velocity_in_body)
 
-    def _changed(self, q: Array, v: Array, change: Any) -> Array:
+    def _changed(self, q: Any, v: Any, change: Any) -> Any:
         if not self._free:
             return v
-        out = v.copy()
+        out = self.copied(v)
         for turn, linear, _ in self._free:
-            out.T[linear] = change(_components(q, turn), _components(v, linear))
+            self.put(out, linear, change(self.components(q, turn), self.components(v, linear)))
         return out
 
-    def acceleration(self, q: Array, v: Array, a: Array) -> Array:
+    def acceleration(self, q: Any, v: Any, a: Any) -> Any:
         """Return ẇ of mbkit's v and v̇."""
         if not self._free:
             return a
-        out = a.copy()
+        out = self.copied(a)
         for turn, linear, angular in self._free:
-            out.T[linear] = acceleration_in_parent(
-                _components(q, turn), _components(v, linear), _components(v, angular), _components(a, linear)
+            turned = acceleration_in_parent(
+                self.components(q, turn),
+                self.components(v, linear),
+                self.components(v, angular),
+                self.components(a, linear),
             )
+            self.put(out, linear, turned)
         return out
+
+    @staticmethod
+    def arithmetic(x: Any) -> rotation.Arithmetic:
+        """Return how components of x are reckoned with."""
+        return rotation.FLOATS if x.ndim == 1 else rotation.ARRAYS
+
+    @staticmethod
+    def part(x: Any, part: slice) -> Any:
+        """Return a part of x, its components along the first axis."""
+        return x.T[part]
+
+    @staticmethod
+    def components(x: Any, part: slice) -> list[Any]:
+        """Return the components of a part of x."""
+        return x[part].tolist() if x.ndim == 1 else list(x.T[part])
+
+    @staticmethod
+    def put(x: Any, part: slice, components: Any) -> None:
+        """Write components into a part of x."""
+        x.T[part] = components
+
+    @staticmethod
+    def copied(x: Any) -> Any:
+        """Return a copy to write into."""
+        return x.copy()

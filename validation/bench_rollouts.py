@@ -1,0 +1,123 @@
+"""Batches of rollouts: mbkit's compiled steps beside `mujoco.rollout`, the same RK4 with the same step.
+
+Run ``python -m validation.bench_rollouts``. Both sides use all cores, are timed in turn
+in one process, and integrate the same states of the same description (MuJoCo's model
+is built from it, with contacts, limits and all else off that the smooth dynamics does
+not need); ratios of the minima are what to read. MuJoCo always writes every state and
+is called bare, with threads that are kept; mbkit is timed as a user calls it. The
+budget: 25 times `mujoco.rollout` for the UR5, 15 times for the Panda, and the same
+states within 1e-11 after 200 steps of 1 ms.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+import mbkit as mb
+from mbkit.studies.stamp import processor, versions
+
+ROUNDS, STEPS, DT = 7, 200, 1e-3
+SIZES = (1024, 4096, 16384)
+#: MuJoCo's time per state does not depend on how many there are.
+BARE = 1024
+
+
+def cases():
+    yield "double_pendulum", mb.catalog.double_pendulum()
+    yield "ur5", mb.load("ur5").without("damping")
+    yield "panda, mimic free", mb.load("panda", mimic="free").without("damping")
+    yield "anymal_b, floating", mb.load("anymal_b", floating_base=True).without("damping")
+    yield "talos_reduced", mb.load("talos_reduced").without("damping")
+
+
+def states(model, n):
+    """Return random poses with moderate velocities: faster starts multiply rounding by more than 1e3."""
+    q, v = model.random_state(np.random.default_rng(5), n)
+    return q, 0.1 * v
+
+
+def bare(dyn, q, v, pool):
+    """Return a call of mujoco.rollout and nothing else."""
+    m = dyn.mj_model
+    m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, DT
+    n = len(q)
+    start = np.zeros((n, mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    # The states' values matter here, not which of MuJoCo's coordinates has which.
+    start[:, 1 : 1 + m.nq], start[:, 1 + m.nq : 1 + m.nq + m.nv] = q[:, dyn._made.q_index], v[:, dyn._made.v_index]
+    out = np.empty((n, STEPS, start.shape[1]))
+    sensors = np.empty((n, STEPS, m.nsensordata))
+    data = [mujoco.MjData(m) for _ in range(cores())]
+    return lambda: pool.rollout(m, data, start, nstep=STEPS, state=out, sensordata=sensors)
+
+
+def cores():
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def seconds(f):
+    start = time.perf_counter()
+    f()
+    return time.perf_counter() - start
+
+
+def row(label, model, pool):
+    own, theirs = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "mujoco")
+    q, v = states(model, max(SIZES))
+    duration = STEPS * DT
+    first = seconds(lambda: mb.simulate(own, q[:1], v[:1], duration))
+    ours = mb.simulate(own, q[:64], v[:64], duration)
+    same = mb.simulate(theirs, q[:64], v[:64], duration, "mujoco_rk4")
+    apart = max(float(np.abs(x - y).max()) for x, y in ((ours.q, same.q), (ours.v, same.v)))
+    calls = {"mujoco": bare(theirs, q[:BARE], v[:BARE], pool)}
+    work = {"mujoco": BARE}
+    for n in SIZES:
+        for kept, save in (("end", [duration]), ("all", None)):
+            if kept == "all" and n * STEPS * (model.nq + model.nv) > 1e8:
+                continue
+            name = f"{n} {kept}"
+            work[name] = n
+            calls[name] = lambda n=n, save=save: mb.simulate(own, q[:n], v[:n], duration, save=save)
+    single = "1 all"
+    work[single], calls[single] = 1, lambda: mb.simulate(own, q[0], v[0], duration)
+    for call in calls.values():
+        call()
+    best = {name: min(seconds(call) for _ in range(1)) for name, call in calls.items()}
+    for _ in range(ROUNDS):
+        for name, call in calls.items():
+            best[name] = min(best[name], seconds(call))
+    ns = {name: s / (work[name] * STEPS) * 1e9 for name, s in best.items()}
+    ratios = {name: ns["mujoco"] / x for name, x in ns.items() if name not in ("mujoco", single)}
+    return {
+        "model": label,
+        "nv": model.nv,
+        "max_difference": apart,
+        "first_run_s": first,
+        "ns_per_state_and_step": ns,
+        "times_mujoco": ratios,
+    }
+
+
+def main():
+    rows = []
+    with mujoco.rollout.Rollout(nthread=cores()) as pool:
+        for label, model in cases():
+            rows.append(row(label, model, pool))
+            r = rows[-1]
+            ns = ", ".join(f"{k}: {x:.0f}" for k, x in r["ns_per_state_and_step"].items())
+            ratios = ", ".join(f"{k}: × {x:.1f}" for k, x in r["times_mujoco"].items())
+            print(
+                f"{label}: {r['max_difference']:.1e} apart, first run {r['first_run_s']:.2f} s\n  ns {ns}\n  {ratios}"
+            )
+    about = {"rk4_dt": DT, "steps": STEPS, "cores": cores(), "versions": versions(), "processor": processor()}
+    with open("validation/rollouts.json", "w", encoding="utf-8") as f:
+        json.dump({"rows": rows, **about}, f, indent=1)
+
+
+if __name__ == "__main__":
+    main()
