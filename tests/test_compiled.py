@@ -349,3 +349,20 @@ def test_one_function_serves_all_who_ask_in_a_process(tmp_path, monkeypatch):
     first = compiled(("one function",), make)
     assert compiled(("one function",), make) is first
     assert len(made) == 1
+
+
+@pytest.mark.parametrize("kind", ["prismatic", "continuous"])
+def test_a_spring_in_one_dimension_is_compiled_too(kind):
+    """CasADi turns √(x²) into |x|, whose derivative is a sign."""
+    b = mb.ModelBuilder("line")
+    b.add_body("b", mass=1.0, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("j", kind, parent="world", child="b", axis=(1, 0, 0))
+    b.add_spring("s", body_a="world", body_b="b", stiffness=3.0, rest_length=0.5, damping=0.2, point_b=(0.2, 0, 0))
+    model = b.build()
+    code, plain = (mb.dynamics(model, "lagrangian", compile=c) for c in (True, False))
+    q, v, a, tau = states(model, 9)
+    for name, last in (("inverse_dynamics", a), ("forward_dynamics", tau)):
+        got, want = (getattr(dyn, name)(q, v, last) for dyn in (code, plain))
+        np.testing.assert_allclose(got, want, rtol=0, atol=50 * EPS * max(np.abs(want).max(), 1))
+    exact = mb.dynamics(model, "oracle").inverse_dynamics(q, v, a)
+    np.testing.assert_allclose(code.inverse_dynamics(q, v, a), exact, rtol=0, atol=50 * EPS * np.abs(exact).max())

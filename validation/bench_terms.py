@@ -183,7 +183,7 @@ def states_of(model, n, seed=0):
 def operations(model, quantity):
     """Return what one evaluation computes, counted by kind, or None where it is not written out."""
     dyn = mb.dynamics(model, "lagrangian")
-    if quantity == "forward_dynamics" and not dyn._written_out:
+    if quantity == "forward_dynamics" and not dyn.written_out:
         return None
     counted = Counter(o.name for o in program(dyn.function(quantity)).operations)
     return {name: n for name, n in counted.most_common() if name not in ("input", "const")}

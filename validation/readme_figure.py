@@ -62,7 +62,8 @@ def draw(rows, result, path):
     ticks = [*range(0, len(compared) - 8, 8), len(compared) - 1]
     left.set_xticks(ticks, [str(compared[k]["nv"]) for k in ticks])
     left.set(
-        xlabel="robots of example-robot-data, by degrees of freedom", ylabel="digits that are right, worst term and state"
+        xlabel="robots of example-robot-data, by degrees of freedom",
+        ylabel="digits that are right, worst term and state",
     )
     left.set_ylim(10.5, 17)
     left.legend(frameon=False, loc="upper right", fontsize=8)

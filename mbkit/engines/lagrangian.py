@@ -98,6 +98,11 @@ class LagrangianDynamics(Dynamics):
         return self._with(self._parameters.at(values))
 
     @property
+    def parameter_values(self) -> Array:
+        """Values of the model's parameters, (p,) or one row per sample."""
+        return self._parameters.array if self.model.parameters else np.empty(0)
+
+    @property
     def samples(self) -> int | None:
         """Size of the batch that the parameters' values make, None where every sample has the same."""
         return self._parameters.samples
@@ -170,7 +175,7 @@ class LagrangianDynamics(Dynamics):
         return self._machine("side_by_side", "inverse_dynamics_derivatives")(q, v, a)[0]
 
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
-        if self._written_out:
+        if self.written_out:
             return self._machine("side_by_side", "forward_dynamics_derivatives")(q, v, tau)[0]
         return through_inverse(self._inverse_dynamics_derivatives(q, v, self._forward_dynamics(q, v, tau)))
 
@@ -181,11 +186,12 @@ class LagrangianDynamics(Dynamics):
         return self._vector("inverse_dynamics", q, v, a)
 
     @cached_property
-    def _written_out(self) -> bool:
+    def written_out(self) -> bool:
+        """Whether forward dynamics is one expression; else M is formed and solved numerically."""
         return elimination_size(self.model) <= _WRITTEN_OUT[self.compile]
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        if self._written_out:
+        if self.written_out:
             return self._vector("forward_dynamics", q, v, tau)
         M, f = self._machine("applied_function")(q, v)
         return np.asarray(np.linalg.solve(M, f + tau[..., None])[..., 0])

@@ -67,11 +67,14 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
     run, watch = code.bound([given[:, part] for part in parts], [out])
     views = [given[0, part] for part in parts]
     copy = trim(out.reshape(rows, columns)).copy
-    # The arrays belong to one call at a time.
+    # The arrays belong to one call at a time. Nobody waits for them: a forked child
+    # would for ever, if another thread was in here when it forked.
     lock = threading.Lock()
 
     def call(arguments: tuple[Any, ...]) -> Any:
-        with lock:
+        if not lock.acquire(blocking=False):
+            return None
+        try:
             for view, x in zip(views, arguments, strict=True):
                 if x.dtype is not _FLOAT:
                     return None
@@ -81,6 +84,8 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
                 watch[:] = 0.0
                 return None
             return copy()
+        finally:
+            lock.release()
 
     return call
 

@@ -55,6 +55,14 @@ _ARGUMENTS: Final = {
 }
 
 
+_Key = tuple[tuple[int, ...], bytes]
+
+
+def _key(x: Array) -> _Key:
+    # Of arrays without entries the shape tells how many states there are.
+    return x.shape, x.tobytes()
+
+
 class OracleDynamics(Dynamics):
     """Terms with 34 digits. The methods of `Dynamics` round them once, to double.
 
@@ -101,7 +109,7 @@ class OracleDynamics(Dynamics):
         #: One row, the same for all states; nothing where no number is a symbol.
         self._constants = [values[None]] if values.size else []
         self._programs: dict[tuple[str, ...], Extended] = {}
-        self._held: tuple[bytes, bytes, list[Any]] | None = None
+        self._held: tuple[_Key, _Key, list[Any]] | None = None
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return type(self), (self.model, self._given, self._arithmetic.name)
@@ -214,12 +222,12 @@ class OracleDynamics(Dynamics):
     def _terms(self, q: Array, v: Array | None = None) -> list[Any]:
         """Return M, C v, g and the passive forces; the last answer is kept, M and g for any v."""
         held = self._held
-        if held and held[0] == q.tobytes() and (v is None or held[1] == v.tobytes()):
+        if held and held[0] == _key(q) and (v is None or held[1] == _key(v)):
             return held[2]
         v = np.zeros((len(q), self.model.nv)) if v is None else v
         M, *vectors = self._run(("terms",), self._state(q), v)
         out = [M, *(x[:, :, 0] for x in vectors)]
-        self._held = (q.tobytes(), v.tobytes(), out)
+        self._held = (_key(q), _key(v), out)
         return out
 
     def _mass_matrix(self, q: Array) -> Any:

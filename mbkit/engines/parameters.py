@@ -59,7 +59,11 @@ class ParameterValues:
 
     def of_samples(self, which: ArrayLike) -> ParameterValues:
         """Return the values of these samples, by index; one of them may stand many times."""
-        index = np.asarray(which, dtype=int)
+        index = np.asarray(which)
+        # A mask would be taken for the samples 0 and 1.
+        if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
+            raise InputError(f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask")
+        index = index.astype(int)
         return ParameterValues(self.model, {name: x[index] for name, x in self.batched.items()})
 
     def bound(self, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -29,6 +29,8 @@ _FORMS: Final = {
     "sqrt": "sqrt({0})",
     "sin": "sin({0})",
     "cos": "cos({0})",
+    "fabs": "fabs({0})",
+    "sign": "(double)(({0} > 0.0) - ({0} < 0.0))",
     "lt": "(double)({0} < {1})",
     "if_else_zero": "{0} != 0.0 ? {1} : 0.0",
 }

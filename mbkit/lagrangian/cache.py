@@ -5,7 +5,9 @@ and then renamed, so that any number of processes may write at once, and nothing
 handed out unless its SHA-256, its key and its owner are right. Whatever is wrong with
 an entry, it is as if it were not there.
 
-``MBKIT_CACHE_DIR`` moves the folder; set to the empty string it switches this off.
+``MBKIT_CACHE_DIR`` moves the folder; set to the empty string it switches this off. A
+folder that is open to others and holds anything else is somebody's own: its mode is
+not changed, and nothing is kept there. No file but an entry is ever deleted.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import stat
 import tempfile
 from contextlib import suppress
@@ -27,6 +30,8 @@ __all__ = ["folder", "key_of", "read", "sources", "write"]
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
 _MOST: Final = 512 * 2**20
+#: Names of entries, and of those being written.
+_ENTRY: Final = re.compile(r"[0-9a-f]{64}|\.new-.+")
 
 
 def key_of(*parts: str) -> str:
@@ -57,6 +62,8 @@ def folder() -> Path | None:
             if found.st_uid != os.getuid():
                 return None
             if stat.S_IMODE(found.st_mode) != 0o700:
+                if not all(_ENTRY.fullmatch(name) for name in os.listdir(path)):
+                    return None
                 path.chmod(0o700)
     except OSError:
         return None
@@ -114,6 +121,8 @@ def write(key: str, about: dict[str, Any], code: bytes) -> None:
 def _forget_oldest(at: Path) -> None:
     entries = []
     for path in at.iterdir():
+        if not _ENTRY.fullmatch(path.name):
+            continue
         with suppress(OSError):
             found = path.stat()
             entries.append((found.st_mtime, found.st_size, path))

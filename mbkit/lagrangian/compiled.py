@@ -19,7 +19,7 @@ from mbkit.lagrangian import cache as disk
 from mbkit.lagrangian import jit
 from mbkit.lagrangian.program import program
 
-__all__ = ["Compiled", "aligned", "compiled", "cores"]
+__all__ = ["Compiled", "aligned", "compiled", "cores", "shared_object"]
 
 #: Operations on which a second thread is worth its start: about 100 µs.
 _SHARE: Final = 2_000_000
@@ -60,16 +60,20 @@ class Compiled:
         Rows and columns of each result.
     operations : int
         Scalar operations of one evaluation.
+    work_size : int
+        Doubles of work space that a call needs.
+    loaded : jit.Loaded
+        The code itself.
     """
 
     def __init__(self, about: dict[str, Any], code: bytes) -> None:
         self.inputs = tuple(about["inputs"])
         self.shapes = tuple((r, c) for r, c in about["shapes"])
         self.operations = int(about["operations"])
-        self._loaded = jit.load(_batch_object(), code)
+        self.loaded = jit.load(_batch_object(), code)
         self._share = int(about["work"])
         tiles = sum(self.inputs) + sum(rows * columns for rows, columns in self.shapes)
-        self._work_size = self._share + tiles * jit.host().width
+        self.work_size = self._share + tiles * jit.host().width
         self._local = threading.local()
 
     def __call__(self, *arguments: Array, threads: int | None = None) -> list[Array]:
@@ -141,14 +145,15 @@ class Compiled:
         return finite
 
     def _straight(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
-        table = self._table(inputs, outputs)
+        table = self.table(inputs, outputs)
         work = self._work()
         watch = work[: jit.host().width]
         watch[:] = 0.0
-        self._loaded.run(table.ctypes.data, work.ctypes.data, first, last)
+        self.loaded.run(table.ctypes.data, work.ctypes.data, first, last)
         return bool(np.dot(watch, watch) == 0.0)
 
-    def _table(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Array:
+    def table(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Array:
+        """Return what the code is told of these arrays, which must outlive its use."""
         table = [len(inputs), len(outputs), self._share]
         for x in (*inputs, *outputs):
             table += [x.ctypes.data, x.shape[1], x.strides[1] >> 3, x.strides[0] >> 3]
@@ -169,10 +174,10 @@ class Compiled:
         array
             Zero until a number read or written is not finite; may be set to zero again.
         """
-        table, work = self._table(inputs, outputs), aligned(self._work_size)
+        table, work = self.table(inputs, outputs), aligned(self.work_size)
         watch = work[: jit.host().width]
         watch[:] = 0.0
-        run, last = self._loaded.run, inputs[0].shape[0]
+        run, last = self.loaded.run, inputs[0].shape[0]
         at, scratch = table.ctypes.data, work.ctypes.data
 
         def call(_kept: Any = (self, table, work, inputs, outputs)) -> None:
@@ -183,18 +188,23 @@ class Compiled:
     def _work(self) -> Array:
         """Return this thread's own work space."""
         if not hasattr(self._local, "work"):
-            self._local.work = aligned(self._work_size)
+            self._local.work = aligned(self.work_size)
         work: Array = self._local.work
         return work
 
 
 @cache
 def _batch_object() -> bytes:
-    key = disk.key_of("batch", disk.sources(), *map(str, jit.host()))
+    return shared_object("batch", jit.batch_object)
+
+
+def shared_object(name: str, make: Callable[[], bytes]) -> bytes:
+    """Return an object file that depends on no model, from disk or made now."""
+    key = disk.key_of(name, disk.sources(), *map(str, jit.host()))
     found = disk.read(key)
     if found:
         return found[1]
-    code = jit.batch_object()
+    code = make()
     disk.write(key, {}, code)
     return code
 

@@ -103,6 +103,8 @@ def _functions(own: Arithmetic) -> dict[str, Callable[..., Any]]:
         "sqrt": own.sqrt,
         "sin": own.sin,
         "cos": own.cos,
+        "fabs": lambda x: np.where(x < zero, -x, x),
+        "sign": lambda x: np.where(x > zero, one, np.where(x < zero, -one, x)),
         "lt": lambda a, b: np.where(a < b, one, zero),
         "if_else_zero": lambda a, b: np.where(a != zero, b, zero),
     }

@@ -19,7 +19,7 @@ from mbkit.lagrangian.batch_code import RUN, batch_code
 from mbkit.lagrangian.program import Program
 from mbkit.lagrangian.vector_code import vector_code
 
-__all__ = ["Host", "Loaded", "batch_object", "host", "load", "program_object"]
+__all__ = ["Host", "Loaded", "batch_object", "host", "load", "object_code", "program_object"]
 
 _SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
@@ -75,7 +75,8 @@ def _target() -> Any:
     return llvm.Target.from_triple(h.triple).create_target_machine(cpu=h.cpu, features=h.features, opt=2, jit=True)
 
 
-def _object(text: str) -> bytes:
+def object_code(text: str) -> bytes:
+    """Return the object file of LLVM's textual code."""
     with _LOCK.held:
         module, target = llvm.parse_assembly(text), _target()
         builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
@@ -87,12 +88,12 @@ def program_object(program: Program) -> tuple[bytes, int]:
     """Return a program's object file, and how many doubles of work space its body needs."""
     width = host().width
     text, vectors = vector_code(program, width)
-    return _object(text), vectors * width
+    return object_code(text), vectors * width
 
 
 def batch_object() -> bytes:
     """Return the object file of the loop over a batch, which every program shares."""
-    return _object(batch_code(host().width))
+    return object_code(batch_code(host().width))
 
 
 def load(*objects: bytes) -> Loaded:

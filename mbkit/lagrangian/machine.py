@@ -6,9 +6,11 @@ times, and where there is no compiler. `Compiled` has the same face.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Final
+from weakref import WeakSet
 
 import casadi as ca
 import numpy as np
@@ -39,6 +41,11 @@ class Machine:
         self.inputs = tuple(function.size1_in(i) for i in range(function.n_in()))
         self.shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
         self.operations = int(function.n_instructions())
+        self.renew()
+        _MACHINES.add(self)
+
+    def renew(self) -> None:
+        """Start with new buffers, as a forked child must: a thread of its parent may have been in a call."""
         self._sizes: dict[int, tuple[Any, Any, list[Any], list[Any]]] = {}
         # CasADi's buffers belong to one call at a time.
         self._lock = threading.Lock()
@@ -99,3 +106,15 @@ class Machine:
             run()
             results = [np.array(np.swapaxes(x, 1, 2), order="C") for x in outputs]
         return [x[0] for x in results] if single else results
+
+
+_MACHINES: Final[WeakSet[Machine]] = WeakSet()
+
+
+def _renew_all() -> None:
+    for machine in _MACHINES:
+        machine.renew()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_all)

@@ -30,10 +30,12 @@ _NAMES: Final = {
     ca.OP_SQRT: "sqrt",
     ca.OP_SIN: "sin",
     ca.OP_COS: "cos",
+    ca.OP_FABS: "fabs",
+    ca.OP_SIGN: "sign",
     ca.OP_LT: "lt",
     ca.OP_IF_ELSE_ZERO: "if_else_zero",
 }
-_UNARY: Final = frozenset({"neg", "sq", "twice", "inv", "sqrt", "sin", "cos"})
+_UNARY: Final = frozenset({"neg", "sq", "twice", "inv", "sqrt", "sin", "cos", "fabs", "sign"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Operation:
     ----------
     name : str
         "input", "const", or an arithmetic one: add, sub, mul, div, neg, sq, twice,
-        inv, sqrt, sin, cos, lt (1 where a < b, else 0), if_else_zero (b where a is
+        inv, sqrt, sin, cos, fabs, sign (0 of 0), lt (1 where a < b, else 0), if_else_zero (b where a is
         not 0, else 0).
     arguments : tuple of int
         Indices of earlier operations; of an input, (which argument, which entry).

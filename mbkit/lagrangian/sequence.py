@@ -12,7 +12,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.lagrangian import jit
 from mbkit.lagrangian.batch_code import RUN
-from mbkit.lagrangian.compiled import Compiled, aligned
+from mbkit.lagrangian.compiled import Compiled, aligned, shared_object
 
 __all__ = ["Call", "CallSequence"]
 
@@ -66,10 +66,10 @@ class CallSequence:
 
     def __init__(self, calls: Sequence[Call], times: int = 1) -> None:
         self._calls = tuple(calls)
-        self._work = aligned(max((call.code._work_size for call in calls), default=0))
+        self._work = aligned(max((call.code.work_size for call in calls), default=0))
         # The sum in which a compiled function tells that something is not finite.
         self._work[:] = 0.0
-        self._tables = [call.code._table(call.inputs, call.outputs) for call in calls]
+        self._tables = [call.code.table(call.inputs, call.outputs) for call in calls]
         entries = [
             (_address(call.code), table.ctypes.data, self._work.ctypes.data, len(call.inputs[0]))
             for call, table in zip(calls, self._tables, strict=True)
@@ -83,9 +83,9 @@ class CallSequence:
 
 
 def _address(code: Compiled) -> int:
-    return ctypes.cast(code._loaded.run, ctypes.c_void_p).value or 0
+    return ctypes.cast(code.loaded.run, ctypes.c_void_p).value or 0
 
 
 @cache
 def _runner() -> jit.Loaded:
-    return jit.load(jit._object(_CODE))
+    return jit.load(shared_object("sequence", lambda: jit.object_code(_CODE)))

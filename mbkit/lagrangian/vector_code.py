@@ -227,6 +227,12 @@ class _Piece:
             return t.neg(a[0])
         if o.name == "sqrt":
             return t.call("sqrt", a[0])
+        if o.name == "fabs":
+            return t.call("fabs", a[0])
+        if o.name == "sign":
+            above, below = (t.put(f"fcmp {how} {V} {a[0]}, {number(0.0)}") for how in ("ogt", "olt"))
+            negative = t.put(f"select {B} {below}, {V} {number(-1.0)}, {V} {a[0]}")
+            return t.put(f"select {B} {above}, {V} {number(1.0)}, {V} {negative}")
         if o.name == "lt":
             less = t.put(f"fcmp olt {V} {a[0]}, {a[1]}")
             return t.put(f"select {B} {less}, {V} {number(1.0)}, {V} {number(0.0)}")

@@ -41,7 +41,7 @@ _PLANS: Final[WeakKeyDictionary[Equations, dict[str, Plan]]] = WeakKeyDictionary
 
 def can_roll_out(dyn: Dynamics, torque: Torque) -> bool:
     """Return whether whole steps can be compiled: own derivation, written out, no callable."""
-    if not isinstance(dyn, LagrangianDynamics) or torque.callable or not dyn.model.nv or not dyn._written_out:
+    if not isinstance(dyn, LagrangianDynamics) or torque.callable or not dyn.model.nv or not dyn.written_out:
         return False
     return not isinstance(dyn.code("forward_dynamics"), Machine)
 
@@ -94,7 +94,7 @@ class _Run:
     ) -> None:
         self._dyn, self._method, self._grid, self._kept, self._torque = dyn, method, grid, kept, torque
         self._plan, self._space = _plan(dyn, method), Space(dyn.model)
-        self._parameters = dyn._parameters.array if dyn.model.parameters else np.empty(0)
+        self._parameters = dyn.parameter_values
         self._q0, self._w0 = q0, self._space.enter(q0, v0)
         n = len(q0)
         # Written by the threads, so that each of them pays for its own pages.

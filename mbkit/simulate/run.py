@@ -136,8 +136,7 @@ def simulate(
 
 
 def _batch(dyn: Dynamics, states: int | None) -> int | None:
-    parameters = getattr(dyn, "_parameters", None)
-    samples = len(parameters.array) if parameters is not None and parameters.batched else states
+    samples = states if dyn.samples is None else dyn.samples
     if states not in (None, samples):
         raise InputError(f"q0, v0: a batch of {states}, but the parameters' values are {samples}")
     return samples
