@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
+import os
 import resource
+import stat
 import threading
 import warnings
+from pathlib import Path
 
 import casadi as ca
 import mpmath
@@ -16,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
-from mbkit.lagrangian import execution, jit, vector_code
+from mbkit.lagrangian import cache, execution, jit, vector_code
 from mbkit.lagrangian.compiled import Compiled, compiled
 from mbkit.lagrangian.machine import Machine
 from mbkit.lagrangian.program import program
@@ -366,3 +369,99 @@ def test_a_spring_in_one_dimension_is_compiled_too(kind):
         np.testing.assert_allclose(got, want, rtol=0, atol=50 * EPS * max(np.abs(want).max(), 1))
     exact = mb.dynamics(model, "oracle").inverse_dynamics(q, v, a)
     np.testing.assert_allclose(code.inverse_dynamics(q, v, a), exact, rtol=0, atol=50 * EPS * np.abs(exact).max())
+
+
+def test_a_far_angle_leaves_its_neighbours_as_they_are():
+    x = np.random.default_rng(5).uniform(-np.pi, np.pi, (4000, 1))
+    code = built(sines())
+    alone = code(x)[0]
+    far = x.copy()
+    far[::3] = 1e9
+    # The C library rounds some of the others differently.
+    near = np.arange(len(x)) % 3 != 0
+    np.testing.assert_array_equal(code(far)[0][near], alone[near])
+
+
+@pytest.mark.parametrize("to_code", [True, False])
+def test_a_child_forked_during_another_threads_call_computes(to_code):
+    if "fork" not in multiprocessing.get_all_start_methods():
+        pytest.skip("this system does not fork")
+    model = mb.load("panda")
+    dyn = mb.dynamics(model, "lagrangian", compile=to_code)
+    q, v, _, _ = states(model, 1)
+    expected = dyn.nle(q[0], v[0])
+    done = threading.Event()
+
+    def calls() -> None:
+        while not done.is_set():
+            dyn.nle(q[0], v[0])
+
+    other = threading.Thread(target=calls)
+    other.start()
+    context = multiprocessing.get_context("fork")
+    try:
+        for _ in range(30):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)
+                child = context.Process(target=lambda: np.testing.assert_array_equal(dyn.nle(q[0], v[0]), expected))
+                child.start()
+            child.join(30)
+            if child.exitcode is None:
+                child.kill()
+            assert child.exitcode == 0
+    finally:
+        done.set()
+        other.join()
+
+
+def test_a_folder_of_other_files_is_neither_closed_nor_cleared(tmp_path, monkeypatch):
+    monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(cache, "_MOST", 1000)
+    mine = tmp_path / "thesis.dat"
+    mine.write_bytes(b"x" * 3000)
+    os.utime(mine, (1, 1))
+    tmp_path.chmod(0o755)
+    cache.write("a" * 64, {}, b"code")
+    assert stat.S_IMODE(tmp_path.stat().st_mode) == 0o755
+    assert list(tmp_path.iterdir()) == [mine]
+    tmp_path.chmod(0o700)
+    cache.write("a" * 64, {}, b"code")
+    cache.write("b" * 64, {}, b"x" * 2000)
+    assert mine.exists()
+    assert cache.read("a" * 64) is None
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch):
+    def homeless(_: str) -> Path:
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.delenv("MBKIT_CACHE_DIR")
+    monkeypatch.setattr(cache, "user_cache_path", homeless)
+    assert cache.folder() is None
+    assert cache.read("a" * 64) is None
+
+
+def test_what_never_moves_is_evaluated_and_not_exported():
+    b = mb.ModelBuilder("statue")
+    b.add_body("stone", mass=2.0, com=(0, 0, 1.0), inertia=(1, 1, 1))
+    b.add_joint("foot", "fixed", parent="world", child="stone")
+    model = b.build()
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    for shape in ((0,), (3, 0)):
+        q = np.zeros(shape)
+        assert dyn.nle(q, q).shape == shape
+        assert dyn.forward_dynamics(q, q, q).shape == shape
+        np.testing.assert_allclose(dyn.potential_energy(q), 2 * 9.81, rtol=4 * EPS)
+    with pytest.raises(mb.errors.UnsupportedError, match="no joint of it moves"):
+        mb.lagrangian.export_c(model)
+
+
+def test_more_arrays_than_the_loop_has_room_for_are_refused():
+    for n in (16, 17):
+        x = [ca.SX.sym(f"x{k}") for k in range(n)]
+        function = ca.Function("sum", x, [sum(x)])
+        if n > 16:
+            with pytest.raises(ValueError, match="at most 16 arguments"):
+                built(function)
+        else:
+            assert built(function)(*[np.ones((20, 1))] * n)[0][19, 0, 0] == n

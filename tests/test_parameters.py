@@ -591,3 +591,11 @@ def test_equal_numbers_share_a_symbol():
 def test_unknown_kinds_of_constants_are_refused():
     with pytest.raises(InputError, match="constants: expected 'literal' or 'symbols'"):
         Equations(mb.catalog.pendulum(), "floats")
+
+
+@pytest.mark.parametrize("which", [[False, True], 1, [0.5], [[0]], "a"])
+def test_samples_are_chosen_by_whole_numbers_alone(which):
+    dyn = mb.dynamics(mb.catalog.pendulum(mass=mb.Parameter("m")), "lagrangian").at(m=[1.0, 2.0])
+    assert dyn.of_samples([]).mass_matrix([0.0]).shape == (0, 1, 1)
+    with pytest.raises(InputError, match="expected a list of indices"):
+        dyn.of_samples(which)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any, Final
 
@@ -122,11 +122,14 @@ class LagrangianDynamics(Dynamics):
         return _remade, (self.model, self._parameters.batched, self.compile, self.threads)
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
-        if quantity in self._short:
-            own = tuple(arguments.values())
-            out = self._short[quantity](*own, *self._parameters.behind(own[0]))
+        short = self._short.get(quantity)
+        if short is not None:
+            own: Iterable[Any] = arguments.values()
+            if self.model.parameters:
+                own = (*own, *self._parameters.behind(arguments["q"]))
+            out: Array | None = short(*own)
             if out is not None:
-                return np.asarray(out)
+                return out
         return super()._evaluate(quantity, method, **self._parameters.spread(arguments))
 
     def _vector(self, name: str, *arguments: Array) -> Array:

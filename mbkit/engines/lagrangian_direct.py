@@ -7,7 +7,6 @@ is wrong.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
@@ -63,17 +62,22 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
     ends = np.cumsum([0, *code.inputs]).tolist()
     parts = [slice(a, b) for a, b in pairwise(ends)]
     rows, columns = code.shapes[0]
-    given, out = np.zeros((1, ends[-1])), np.zeros((1, rows * columns))
-    run, watch = code.bound([given[:, part] for part in parts], [out])
-    views = [given[0, part] for part in parts]
-    copy = trim(out.reshape(rows, columns)).copy
-    # The arrays belong to one call at a time. Nobody waits for them: a forked child
-    # would for ever, if another thread was in here when it forked.
-    lock = threading.Lock()
+
+    def place() -> tuple[Any, ...]:
+        given, out = np.zeros((1, ends[-1])), np.zeros((1, rows * columns))
+        run, watch = code.bound([given[:, part] for part in parts], [out])
+        return [given[0, part] for part in parts], run, watch, trim(out.reshape(rows, columns)).copy
+
+    # A place belongs to one call at a time. Nobody waits for one: a forked child would
+    # for ever, if another thread held it when it forked.
+    free = [place()]
 
     def call(arguments: tuple[Any, ...]) -> Any:
-        if not lock.acquire(blocking=False):
-            return None
+        try:
+            held = free.pop()
+        except IndexError:
+            held = place()
+        views, run, watch, copy = held
         try:
             for view, x in zip(views, arguments, strict=True):
                 if x.dtype is not _FLOAT:
@@ -85,7 +89,7 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
                 return None
             return copy()
         finally:
-            lock.release()
+            free.append(held)
 
     return call
 

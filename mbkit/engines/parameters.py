@@ -62,7 +62,9 @@ class ParameterValues:
         index = np.asarray(which)
         # A mask would be taken for the samples 0 and 1.
         if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
-            raise InputError(f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask")
+            raise InputError(
+                f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask"
+            )
         index = index.astype(int)
         return ParameterValues(self.model, {name: x[index] for name, x in self.batched.items()})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -149,7 +150,9 @@ def header(prefix: str, model: Model, functions: Sequence[CFunction], written_by
     followers = [(j.name, j.mimic) for j in model.joints if j.mimic]
     if followers:
         told += ["", "Joints that follow another and have no coordinate of their own"]
-        told += [f"    {_safe(name)} = {m.ratio!r} * {_safe(m.joint)} + {m.offset!r}" for name, m in followers]
+        told += [
+            f"    {_safe(name)} = {_told(m.ratio)} * {_safe(m.joint)} + {_told(m.offset)}" for name, m in followers
+        ]
     sizes = {"NQ": model.nq, "NV": model.nv} | ({"NP": len(model.parameters)} if model.parameters else {})
     blocks = [
         _comment(told),
@@ -214,6 +217,10 @@ def _example(prefix: str, model: Model, function: CFunction) -> list[str]:
 
 def _initial(model: Model) -> str:
     return ", ".join(f"[{k}] = 1.0" for k, x in enumerate(model.neutral().tolist()) if x) or "0.0"
+
+
+def _told(x: float) -> str:
+    return "(what the parameters make)" if math.isnan(x) else repr(x)
 
 
 def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:

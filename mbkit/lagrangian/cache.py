@@ -19,13 +19,12 @@ import re
 import stat
 import tempfile
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from platformdirs import user_cache_path
 
-__all__ = ["folder", "key_of", "read", "sources", "write"]
+__all__ = ["folder", "key_of", "read", "write"]
 
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
@@ -39,23 +38,13 @@ def key_of(*parts: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-@cache
-def sources() -> str:
-    """Return the SHA-256 of the code that derives and compiles."""
-    here = Path(__file__).parent
-    total = hashlib.sha256()
-    for path in sorted([*here.glob("*.py"), *(here.parent / "model").glob("*.py")]):
-        total.update(path.name.encode() + b"\0" + path.read_bytes())
-    return total.hexdigest()
-
-
 def folder() -> Path | None:
     """Return the folder, made if need be, or None where no safe one is to be had."""
     chosen = os.environ.get("MBKIT_CACHE_DIR")
     if chosen == "":
         return None
-    path = Path(chosen) if chosen else user_cache_path("mbkit") / "machine-code"
     try:
+        path = Path(chosen) if chosen else user_cache_path("mbkit") / "machine-code"
         path.mkdir(parents=True, exist_ok=True, mode=0o700)
         found = path.stat()
         if hasattr(os, "getuid"):
@@ -65,7 +54,8 @@ def folder() -> Path | None:
                 if not all(_ENTRY.fullmatch(name) for name in os.listdir(path)):
                     return None
                 path.chmod(0o700)
-    except OSError:
+    except (OSError, RuntimeError):
+        # platformdirs raises a RuntimeError where the user has no home.
         return None
     return path
 

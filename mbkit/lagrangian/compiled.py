@@ -18,6 +18,7 @@ from mbkit._version import __version__
 from mbkit.lagrangian import cache as disk
 from mbkit.lagrangian import jit
 from mbkit.lagrangian.program import program
+from mbkit.lagrangian.sources import SOURCES
 
 __all__ = ["Compiled", "aligned", "compiled", "cores", "shared_object"]
 
@@ -200,7 +201,7 @@ def _batch_object() -> bytes:
 
 def shared_object(name: str, make: Callable[[], bytes]) -> bytes:
     """Return an object file that depends on no model, from disk or made now."""
-    key = disk.key_of(name, disk.sources(), *map(str, jit.host()))
+    key = disk.key_of(name, SOURCES, *map(str, jit.host()))
     found = disk.read(key)
     if found:
         return found[1]
@@ -232,7 +233,7 @@ def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
     make : callable
         Derives the function; called only if it has not been compiled before.
     """
-    key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), disk.sources(), *map(str, jit.host()))
+    key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, jit.host()))
     with _HELD.lock:
         found = _HELD.functions.get(key)
         if found is None:

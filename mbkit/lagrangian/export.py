@@ -119,7 +119,7 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     InputError
         No quantity, or a `name` that is no identifier in C.
     UnsupportedError
-        The model has loops or motions prescribed in time.
+        The model has loops or motions prescribed in time, or no joint that moves.
 
     Examples
     --------
@@ -132,6 +132,8 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     for needed, told in (("loops", model.needs.loops), ("prescribed", model.needs.time)):
         if told:
             raise UnsupportedError(f"{model.name} cannot be exported yet; model.without({needed!r}) can")
+    if not model.nv:
+        raise UnsupportedError(f"{model.name} cannot be exported: no joint of it moves, and C has no empty arrays")
     prefix = c_identifier(model.name) if name is None else name
     if not _IDENTIFIER.fullmatch(prefix):
         raise InputError(f"name: expected letters, digits and _, a letter first, got {name!r}")

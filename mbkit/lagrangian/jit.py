@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import llvmlite
 from llvmlite import binding as llvm
 
-from mbkit.lagrangian.batch_code import RUN, batch_code
+from mbkit.lagrangian.batch_code import MOST_ARRAYS, RUN, batch_code
 from mbkit.lagrangian.program import Program
 from mbkit.lagrangian.vector_code import vector_code
 
@@ -86,6 +86,8 @@ def object_code(text: str) -> bytes:
 
 def program_object(program: Program) -> tuple[bytes, int]:
     """Return a program's object file, and how many doubles of work space its body needs."""
+    if max(len(program.inputs), len(program.outputs)) > MOST_ARRAYS:
+        raise ValueError(f"expected at most {MOST_ARRAYS} arguments and as many results")
     width = host().width
     text, vectors = vector_code(program, width)
     return object_code(text), vectors * width
@@ -100,7 +102,8 @@ def load(*objects: bytes) -> Loaded:
     """Return the function of object files that belong together."""
     host()
     with _LOCK.held:
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
+        # llvmlite's memory manager keeps all sections within reach of one another.
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target(), use_lmm=True)
         for code in objects:
             engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()

@@ -7,6 +7,9 @@ twice the working precision. On [-π/4, π/4] the minimax polynomials of Ng's
 account. Measured against 70 digits: at most 0.76 ulp below `LIMIT`, next to multiples
 of π/2 too; beyond it a lane takes the C library's value. Its neighbours keep theirs:
 no state's bits depend on what stands beside it.
+
+The function's name is not the C library's ``sincos``, which LLVM may call for a sine
+and a cosine of one angle, and which it would take ours for.
 """
 
 from __future__ import annotations
@@ -41,7 +44,7 @@ _COS: Final = (
 
 
 def sincos(width: int) -> str:
-    """Return LLVM code of ``@sincos``: a vector of angles -> {sines, cosines}."""
+    """Return LLVM code of ``@mbkit_sincos``: a vector of angles -> {sines, cosines}."""
     t = Text(width)
     V, Q, B = t.vector, f"<{width} x i64>", f"<{width} x i1>"
     half_pi = [number(x) for x in _HALF_PI]
@@ -107,11 +110,11 @@ def sincos(width: int) -> str:
     slow_out = s.put(f"insertvalue {pair} {slow_out}, {V} {cosines}, 1")
     slow = "\n".join(s.lines)
     return f"""
-declare double @sin(double)
-declare double @cos(double)
+declare double @sin(double) nounwind willreturn memory(none)
+declare double @cos(double) nounwind willreturn memory(none)
 declare i1 @llvm.vector.reduce.or.v{width}i1({B})
 
-define internal {pair} @sincos({V} %x) noinline nounwind {{
+define internal {pair} @mbkit_sincos({V} %x) noinline nounwind willreturn memory(none) {{
   %size = call {V} @llvm.fabs.v{width}f64({V} %x)
   %far = fcmp ugt {V} %size, {number(LIMIT)}
   %any = call i1 @llvm.vector.reduce.or.v{width}i1({B} %far)

@@ -215,7 +215,7 @@ class _Piece:
         if o.name in ("sin", "cos"):
             x = o.arguments[0]
             if x not in self._pairs:
-                self._pairs[x] = t.put(f"call {{ {V}, {V} }} @sincos({V} {a[0]})")
+                self._pairs[x] = t.put(f"call {{ {V}, {V} }} @mbkit_sincos({V} {a[0]})")
             return t.put(f"extractvalue {{ {V}, {V} }} {self._pairs[x]}, {int(o.name == 'cos')}")
         if o.name == "sq":
             return t.op("fmul", a[0], a[0], "contract ")

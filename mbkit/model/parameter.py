@@ -76,8 +76,10 @@ class Expression:
         return self
 
     def __pow__(self, exponent: float) -> Expression:
-        if not _is_number(exponent) or not (float(exponent).is_integer() or exponent == 0.5):
-            raise InputError(f"power of {self}: expected a whole number or 0.5 as exponent, got {exponent!r}")
+        if not _is_number(exponent) or not (float(exponent).is_integer() or exponent == 0.5) or abs(exponent) > 100:
+            raise InputError(
+                f"power of {self}: expected a whole number from -100 to 100 or 0.5 as exponent, got {exponent!r}"
+            )
         return _Power(self, float(exponent))
 
 
