@@ -8,7 +8,7 @@ Entry j of argument i is the vector at ``in[i] + j * in_strides[i]``; entries of
 output count along the rows. Products and sums may be contracted to one rounding,
 which the derivation's expressions leave open; nothing else is reordered.
 
-The first vector of the work space gathers 0 times every number read and written: it
+The first vector of the work space gathers 0 times the numbers given and returned: it
 stays zero in a lane until one of them is not finite, whether a graph reads it or not.
 """
 
@@ -31,6 +31,7 @@ _WHOLE: Final = 20000
 _PIECE: Final = 3000
 _STORE: Final = 4  # weight of a store, in operations
 _ARGUMENTS: Final = "ptr noalias %in, ptr noalias %is, ptr noalias %out, ptr noalias %os, ptr noalias %work"
+_HIDING: Final = frozenset({"div", "inv", "lt", "if_else_zero", "sign"})
 _BINARY: Final = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 
 
@@ -94,6 +95,17 @@ def _is_zero(program: Program, k: int) -> bool:
     return program.operations[k].name == "const" and program.operations[k].value == 0.0
 
 
+def _seen(program: Program) -> set[tuple[int, ...]]:
+    """Return the entries of the arguments whose NaN or infinity shows in some result by itself.
+
+    All that is read does where nothing is divided or decided by it: sums, products,
+    sines and roots of what is not finite are not finite.
+    """
+    if any(o.name in _HIDING for o in program.operations):
+        return set()
+    return {o.arguments for o in program.operations if o.name == "input"}
+
+
 def _slots(program: Program, pieces: list[list[int]]) -> dict[int, int]:
     """Return the place in the work space of each value that another piece reads."""
     at = {k: n for n, piece in enumerate(pieces) for k in piece}
@@ -139,8 +151,11 @@ class _Piece:
         """Write every operation of this piece, each result to where it is wanted."""
         operations = self._program.operations
         if first:
+            seen = _seen(self._program)
             for i, size in enumerate(self._program.inputs):
                 for j in range(size):
+                    if (i, j) in seen:
+                        continue
                     place = self._place("in", "is", i, j)
                     self._watched.append(self._text.put(f"load {self._text.vector}, ptr {place}, align 8"))
         # A call spills what is live: sines of inputs come first, when little is.
