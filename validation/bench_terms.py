@@ -31,7 +31,6 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from importlib import metadata
 from pathlib import Path
 
 import mujoco
@@ -342,7 +341,7 @@ def main():
         "samples": given.samples,
         "rounds": given.rounds,
         "threads": cores(),
-        "versions": versions() | {"llvmlite": metadata.version("llvmlite")},
+        "versions": versions(),
         "processor": processor(),
         "robots": robots(given.samples, given.rounds, given.robots.split(",")),
         "growth": growth(given.samples, given.rounds, given.most),

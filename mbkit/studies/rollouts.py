@@ -94,6 +94,8 @@ def rollouts(model: Model, made: Mapping[str, Dynamics], seed: int, note: str) -
         condition = _condition(engines["mujoco"], engines[ours_on[0]], native, theirs)
         last = _safe(condition)
         for name in ours_on:
+            # One step first: compiling it is not run time.
+            quiet_simulate(engines[name], q0, v0, STEP, method, STEP)
             ours = quiet_simulate(engines[name], q0, v0, STEP * last, method, STEP)
             rows.append(_row(model, method, name, native, ours, theirs, condition, last, note))
     if model.needs.damping:
