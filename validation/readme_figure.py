@@ -83,7 +83,7 @@ def draw(rows, result, path):
     right.text(
         0.02, low * 1.3, "reference known to here", color="grey", fontsize=8, transform=right.get_yaxis_transform()
     )
-    right.set_ylim(low / 4, 1e3)
+    right.set_ylim(low / 4, 1e6)
     right.set(xlabel=f"run time of 0.5 s of {result.model}, ms", ylabel="largest error of q, rad")
     right.legend(frameon=False, fontsize=7, loc="upper right", bbox_to_anchor=(1.02, 1.02))
     fig.tight_layout()
