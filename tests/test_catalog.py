@@ -34,6 +34,11 @@ CASES: dict[str, tuple[Callable[[], Model], closed_forms.System]] = {
         lambda: catalog.cart_pole(cart_mass=2.1, pole_mass=0.3, length=0.6, gravity=3.7),
         closed_forms.cart_pole(2.1, 0.3, 0.6, 3.7),
     ),
+    "spherical_pendulum": (catalog.spherical_pendulum, closed_forms.spherical_pendulum()),
+    "spherical_pendulum, other numbers": (
+        lambda: catalog.spherical_pendulum(length=0.7, mass=1.3, gravity=3.7),
+        closed_forms.spherical_pendulum(0.7, 1.3, 3.7),
+    ),
     "chain": (catalog.chain, closed_forms.chain()),
     "chain of one": (lambda: catalog.chain(n=1), closed_forms.chain(1)),
     "chain, other numbers": (
@@ -116,6 +121,8 @@ def test_engines_agree_with_closed_forms(case: str, name: str) -> None:
         ("pendulum", [0.0], (0.0, 0.0, -1.0)),
         ("double_pendulum", [np.pi / 2, -np.pi / 2], (1.0, 0.0, -1.0)),
         ("cart_pole", [0.3, np.pi / 2], (1.3, 0.0, 0.0)),
+        ("spherical_pendulum", [np.pi / 2, 0.0], (1.0, 0.0, 0.0)),
+        ("spherical_pendulum", [1.0, np.pi / 2], (0.0, 1.0, 0.0)),
         ("chain", [np.pi / 2, 0.0, 0.0, 0.0, np.pi / 2], (4.0, 0.0, 1.0)),
     ],
 )
@@ -167,6 +174,9 @@ BAD = [
     ("double_pendulum", "length1", np.inf),
     ("cart_pole", "cart_mass", 0.0),
     ("cart_pole", "length", -1.0),
+    ("spherical_pendulum", "length", 0.0),
+    ("spherical_pendulum", "mass", -1.0),
+    ("spherical_pendulum", "gravity", np.nan),
     ("chain", "n", 0),
     ("chain", "n", 2.5),
     ("chain", "n", True),
@@ -189,7 +199,8 @@ def test_bad_parameters_are_named(name: str, parameter: str, value: Any) -> None
 
 
 def test_registry() -> None:
-    assert set(catalog.systems()) == {"pendulum", "double_pendulum", "cart_pole", "chain", "heavy_top", "free_body"}
+    names = "pendulum double_pendulum cart_pole spherical_pendulum chain heavy_top free_body"
+    assert set(catalog.systems()) == set(names.split())
     assert catalog.get("cart_pole") is catalog.cart_pole
     assert set(catalog.systems()) <= set(dir(catalog))
     with pytest.raises(UnknownNameError, match="unknown system 'cartpole'; did you mean 'cart_pole'"):

@@ -7,7 +7,8 @@ and velocities of the masses, so that T = ½ vᵀ M v is a check and no definiti
 Conventions: angles from the downward vertical, growing towards +x; quaternions
 x, y, z, w; velocities of rotations in body axes; SI units.
 
-Also here: solutions in Jacobi's elliptic functions, and `published`, the figures of
+Also here: solutions in Jacobi's elliptic functions in double, for many times at once
+(``elliptic`` has them with 30 digits, and more of them), and `published`, the figures of
 ``published.json``.
 """
 
@@ -126,6 +127,32 @@ def cart_pole(cart_mass: float = 1.0, pole_mass: float = 1.0, length: float = 1.
         gravity=lambda q: np.array([0.0, m * g * ell * np.sin(q[1])]),
         kinetic_energy=kinetic_energy,
         potential_energy=lambda q: float(-m * g * ell * np.cos(q[1])),
+    )
+
+
+def spherical_pendulum(length: float = 1.0, mass: float = 1.0, g: float = 9.81) -> System:
+    """Return the spherical pendulum, its mass at length (sin α cos β, sin β, -cos α cos β).
+
+    Landau, Lifshitz 1976, §14, with the sphere's axis laid along y: β is the latitude.
+    """
+    inertia = mass * length**2
+
+    def velocity_force(q: Array, v: Array) -> Array:
+        h = inertia * np.sin(q[1]) * np.cos(q[1])
+        return np.array([-2 * h * v[0] * v[1], h * v[0] ** 2])
+
+    def kinetic_energy(q: Array, v: Array) -> float:
+        (a, b), (va, vb) = q, v
+        x = np.cos(a) * np.cos(b) * va - np.sin(a) * np.sin(b) * vb
+        z = np.sin(a) * np.cos(b) * va + np.cos(a) * np.sin(b) * vb
+        return float(inertia * (x**2 + (np.cos(b) * vb) ** 2 + z**2) / 2)
+
+    return System(
+        mass_matrix=lambda q: inertia * np.diag([np.cos(q[1]) ** 2, 1.0]),
+        velocity_force=velocity_force,
+        gravity=lambda q: mass * g * length * np.array([np.sin(q[0]) * np.cos(q[1]), np.cos(q[0]) * np.sin(q[1])]),
+        kinetic_energy=kinetic_energy,
+        potential_energy=lambda q: float(-mass * g * length * np.cos(q[0]) * np.cos(q[1])),
     )
 
 

@@ -16,13 +16,24 @@ from mbkit.catalog.double_pendulum import double_pendulum
 from mbkit.catalog.free_body import free_body
 from mbkit.catalog.heavy_top import heavy_top
 from mbkit.catalog.pendulum import pendulum
+from mbkit.catalog.spherical_pendulum import spherical_pendulum
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 
-__all__ = ["cart_pole", "chain", "double_pendulum", "free_body", "get", "heavy_top", "pendulum", "systems"]
+__all__ = [
+    "cart_pole",
+    "chain",
+    "double_pendulum",
+    "free_body",
+    "get",
+    "heavy_top",
+    "pendulum",
+    "spherical_pendulum",
+    "systems",
+]
 
 _SYSTEMS: dict[str, Callable[..., Model]] = {
-    f.__name__: f for f in (pendulum, double_pendulum, cart_pole, chain, heavy_top, free_body)
+    f.__name__: f for f in (pendulum, double_pendulum, cart_pole, spherical_pendulum, chain, heavy_top, free_body)
 }
 
 
@@ -33,7 +44,7 @@ def systems() -> dict[str, Callable[..., Model]]:
     --------
     >>> import mbkit as mb
     >>> list(mb.catalog.systems())
-    ['pendulum', 'double_pendulum', 'cart_pole', 'chain', 'heavy_top', 'free_body']
+    ['pendulum', 'double_pendulum', 'cart_pole', 'spherical_pendulum', 'chain', 'heavy_top', 'free_body']
     """
     return dict(_SYSTEMS)
 
