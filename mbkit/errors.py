@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 __all__ = [
     "InputError",
@@ -20,6 +21,7 @@ __all__ = [
     "NonPhysicalWarning",
     "NumericalError",
     "OutputError",
+    "TorqueError",
     "UnknownNameError",
     "UnsupportedError",
     "nearest",
@@ -32,6 +34,21 @@ class MbkitError(Exception):
 
 class InputError(MbkitError, ValueError):
     """An argument has the wrong shape, type or value."""
+
+
+class TorqueError(InputError):
+    """A user's torque function raised, or returned what is no torque.
+
+    Attributes
+    ----------
+    trajectory : mbkit.simulate.Trajectory or None
+        The run up to then; None where there is none.
+    """
+
+    trajectory: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self.args, {"trajectory": self.trajectory}
 
 
 class UnknownNameError(MbkitError, LookupError):

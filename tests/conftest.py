@@ -12,3 +12,5 @@ os.environ.setdefault("MBKIT_COMPILE", "0")
 os.environ["MBKIT_CACHE_DIR"] = str(
     Path(tempfile.gettempdir()) / f"mbkit-tests-{os.environ.get('PYTEST_XDIST_TESTRUNUID', os.getpid())}"
 )
+# heyoka keeps compiled code of its own.
+os.environ["HEYOKA_CACHE_DIR"] = os.environ["MBKIT_CACHE_DIR"] + "-heyoka"

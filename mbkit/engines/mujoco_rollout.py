@@ -18,11 +18,17 @@ from mbkit.model import Model
 
 __all__ = ["INTEGRATORS", "Rollout"]
 
+# All but RK4 are of first order. "euler" takes damping as it is, because the description
+# is built with MuJoCo's implicit damping off; the three implicit ones take it at the
+# step's end, "discrete" springs too: stable at any stiffness, by damping what the step
+# cannot resolve. "implicit" has the derivatives of all velocity terms, and damps whatever
+# turns; "implicitfast" and "discrete" have them for free bodies only.
 INTEGRATORS: Final = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _FORCE: Final = mujoco.mjtState.mjSTATE_QFRC_APPLIED

@@ -1,12 +1,26 @@
 """Motion in time: one trajectory or a batch, by any engine's forward dynamics."""
 
 from mbkit._callable import make_callable
+from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.methods import METHODS, Method
 from mbkit.simulate.run import simulate
 from mbkit.simulate.stats import Stats
 from mbkit.simulate.tableau import RK4, Tableau
 from mbkit.simulate.trajectory import Trajectory
 
-__all__ = ["METHODS", "RK4", "Method", "Stats", "Tableau", "Trajectory", "simulate"]
+__all__ = [
+    "METHODS",
+    "RK4",
+    "Event",
+    "Hit",
+    "Method",
+    "Stats",
+    "Tableau",
+    "Trajectory",
+    "at_energy",
+    "at_limits",
+    "at_section",
+    "simulate",
+]
 
 make_callable(__name__, simulate)

@@ -1,29 +1,66 @@
-"""SciPy's DOP853 on q and v: an independent road to a reference.
+"""SciPy's adaptive methods on q and v: an independent road to a reference, and the stiff ones.
 
-Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, ch. II.5.
+DOP853 (Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, ch.
+II.5), Radau IIA of order 5 (Hairer, Wanner 1996, volume II, ch. IV.8), BDF (Shampine,
+Reichelt 1997) and ODEPACK's LSODA (Petzold 1983). The implicit ones get the exact
+Jacobian.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.errors import InputError
+from mbkit.errors import MbkitError, TorqueError
 from mbkit.model import Model
-from mbkit.simulate.grid import check_room
+from mbkit.simulate.events import Event, State, Watch
+from mbkit.simulate.members import Member, check_save, gathered, reporter
+from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.rates import Rates, unit_quaternions
-from mbkit.simulate.stats import Ended
 from mbkit.simulate.steps import RAN_AWAY, credible
 from mbkit.simulate.torque import Force, Torque
 
-__all__ = ["run_dop853"]
+__all__ = ["run_scipy"]
+
+_EPS: Final = float(np.finfo(float).eps)
+
+
+class _Scheme(NamedTuple):
+    """A solver of SciPy; `dense` where its interpolant is as accurate as its steps."""
+
+    solver: str
+    implicit: bool
+    dense: bool
+
+
+# Of DOP853 the interpolant has order 7 beside the steps' 8, of Radau 3 beside 5: their
+# steps end where a state is wanted. Multistep methods are interpolants themselves, and
+# would be slowed by ending often.
+_SCHEMES: Final = {
+    "dop853": _Scheme("DOP853", implicit=False, dense=False),
+    "radau": _Scheme("Radau", implicit=True, dense=False),
+    "bdf": _Scheme("BDF", implicit=True, dense=True),
+    "lsoda": _Scheme("LSODA", implicit=True, dense=True),
+}
+# Forward dynamics per step that DOP853 tries.
+_STAGES: Final = 12
+
+
+class _Jacobian(Protocol):
+    evaluations: int
+
+    def only(self, member: int) -> None: ...
+
+    def __call__(self, t: float, y: Array, force: Force) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -31,146 +68,278 @@ class _Task:
     """One state to integrate; `stops` are the times that steps must end on."""
 
     y0: Array
-    rtol: float
-    atol: float
     stops: tuple[float, ...]
-    saved: frozenset[float] | None
+    saved: tuple[float, ...] | None
     force: Callable[[int], Force]
     held: bool
+    watch: Watch | None
 
 
-@dataclass
-class _Run:
-    """What came of it."""
-
-    t: list[float] = field(default_factory=list)
-    y: list[Array] = field(default_factory=list)
-    steps: int = 0
-    reached: float = 0.0
-    ended: Ended = "finished"
-    message: str = ""
-
-    def stop(self, ended: Ended, message: str) -> _Run:
-        self.ended, self.message = ended, f"{message} after t = {self.reached:.6g} s"
-        return self
-
-
-def run_dop853(
+def run_scipy(
     dyn: Dynamics,
+    method: str,
     q0: Array,
     v0: Array,
     duration: float,
-    rtol: float,
-    atol: float,
+    tolerances: Tolerances,
     torque: Torque,
     save: Array | None,
+    events: tuple[Event, ...],
     bar: Progress,
 ) -> Outcome:
     """Integrate one state, or each of a batch by itself.
 
-    Steps end exactly on the saved times, because DOP853's interpolant is of lower
-    order than its steps. Without `save`, the solver's own steps are kept.
+    Saved states are as accurate as the steps: steps of DOP853 and Radau end on the
+    saved times, BDF and LSODA interpolate. Without `save`, the solver's own steps are
+    kept. Torques held as an array start every method anew at each interval.
     """
     batch = None if q0.ndim == 1 else len(q0)
-    if batch is not None and save is None:
-        raise InputError(
-            "save: expected a grid of times for a batch with an adaptive method; without it each state has its own"
-        )
     y0 = np.concatenate([q0, v0], axis=-1).reshape(-1, q0.shape[-1] + v0.shape[-1])
-    if save is not None:
-        check_room(len(save) * len(y0), y0.shape[1])
-    stops = (duration,) if save is None else tuple(sorted({*save.tolist(), duration} - {0.0}))
-    saved = None if save is None else frozenset(save.tolist())
-    rates = Rates(dyn)
-    runs = []
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+    check_save(save, batch, y0.shape[1])
+    scheme = _SCHEMES[method]
+    ends = (duration,) if save is None or (scheme.dense and not torque.held) else (*save.tolist(), duration)
+    stops = tuple(sorted({*ends} - {0.0}))
+    solve = _Solve(dyn, scheme, tolerances)
+    members = []
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"), _quiet():
         for i, start in enumerate(y0):
-            if batch is not None:
-                rates.only(i)
-            force = torque.of_member(None if batch is None else i)
-            task = _Task(start, rtol, atol, stops, saved, force, torque.held)
-            runs.append(_integrate(rates, task, _reporter(bar, i, len(y0), duration)))
-    return _gathered(dyn.model, runs, rates.evaluations, batch)
-
-
-def _reporter(bar: Progress, i: int, count: int, duration: float) -> Callable[[float], None]:
-    def done(t: float) -> None:
-        bar.update((i + t / duration) / count)
-
-    return done
-
-
-def _integrate(rates: Rates, task: _Task, done: Callable[[float], None]) -> _Run:
-    run = _Run()
-    solver: Any = None
-    if task.saved is None or 0.0 in task.saved:
-        run.t.append(0.0)
-        run.y.append(task.y0)
-    for k, stop in enumerate(task.stops):
-        if stop <= run.reached:
-            continue  # a run of no duration
-        if solver is None or task.held:
-            # A held force jumps here, and with it the rate that the solver remembers.
-            solver = _solver(rates, task, k, solver, stop)
-        if solver is None:
-            return run.stop("diverged", f"diverged: {rates.why or RAN_AWAY}")
-        solver.t_bound, solver.status = stop, "running"
-        while solver.status == "running":
-            rates.why = ""
-            solver.step()
-            if solver.status == "failed" and rates.why:
-                return run.stop("diverged", f"diverged: {rates.why}")
-            # 1/eps steps would never end, though near t = 0 they are above rounding.
-            if solver.status == "failed" or solver.h_abs < task.stops[-1] * np.finfo(float).eps:
-                told = f"step below rounding at rtol = {task.rtol:g}: stiff, singular or diverging"
-                return run.stop("step_too_small", told)
-            if not credible(solver.y):
-                return run.stop("diverged", f"diverged: {RAN_AWAY}")
-            run.steps += 1
-            run.reached = float(solver.t)
-            if task.saved is None or (solver.status == "finished" and stop in task.saved):
-                run.t.append(run.reached)
-                run.y.append(solver.y.copy())
-            done(run.reached)
-    return run
-
-
-def _solver(rates: Rates, task: _Task, k: int, last: Any, stop: float) -> Any:
-    from scipy.integrate import DOP853
-
-    t, y = (0.0, task.y0) if last is None else (last.t, last.y)
-    first = None if last is None else min(last.h_abs, stop - t)
-    force = task.force(k)
-
-    def rate(t: float, y: Array) -> Array:
-        return rates(t, y, force)
-
-    # SciPy would start from a rate that is none.
-    if not np.isfinite(rate(t, y)).all():
-        return None
-    return DOP853(rate, t, y, stop, rtol=task.rtol, atol=task.atol, first_step=first)
-
-
-def _gathered(model: Model, runs: list[_Run], evaluations: int, batch: int | None) -> Outcome:
-    longest = max((run.t for run in runs), key=len, default=[])
-    y = np.full((len(runs), len(longest), model.nq + model.nv), np.nan)
-    for i, run in enumerate(runs):
-        for j, state in enumerate(run.y):
-            y[i, j, : model.nq] = unit_quaternions(model, state[: model.nq])[0]
-            y[i, j, model.nq :] = state[model.nq :]
-    early = [run for run in runs if run.message]
-    message = early[0].message if early else ""
-    if early and batch is not None:
-        message += f"; {len(early)} of {batch} trajectories ended early, see reached"
-    reached = np.array([run.reached for run in runs])
-    y, reached = (y[0], reached[0]) if batch is None else (y, reached)
-    return Outcome(
-        t=np.array(longest),
-        q=y[..., : model.nq],
-        v=y[..., model.nq :],
-        steps=sum(run.steps for run in runs),
-        evaluations=evaluations,
-        ended=early[0].ended if early else "finished",
-        reached=np.asarray(reached),
-        message=message,
+            which = None if batch is None else i
+            if which is not None:
+                solve.only(which)
+            watch = Watch(events, which) if events else None
+            saved = None if save is None else tuple(save.tolist())
+            task = _Task(start, stops, saved, torque.of_member(which), torque.held, watch)
+            members.append(solve.member(task, reporter(bar, i, len(y0), duration)))
+            if members[-1].error is not None:
+                break
+    return gathered(
+        dyn.model, members, batch, save, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations
     )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    # LSODA warns of what is told as the end of the run.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="lsoda: ", category=UserWarning)
+        yield
+
+
+class _Solve:
+    """Integrates one trajectory after the other."""
+
+    def __init__(self, dyn: Dynamics, scheme: _Scheme, tolerances: Tolerances) -> None:
+        self.rates = Rates(dyn)
+        self._model: Model = dyn.model
+        self._scheme, self._tolerances = scheme, tolerances
+        self._jacobian: _Jacobian | None = None
+        if scheme.implicit:
+            from mbkit.simulate.linearization import Linearization
+
+            self._jacobian = Linearization(dyn)
+
+    @property
+    def jacobian_evaluations(self) -> int:
+        return 0 if self._jacobian is None else self._jacobian.evaluations
+
+    def only(self, member: int) -> None:
+        """Go on with this member of a batch."""
+        self.rates.only(member)
+        if self._jacobian is not None:
+            self._jacobian.only(member)
+
+    def member(self, task: _Task, done: Callable[[float], None]) -> Member:
+        """Return what comes of one trajectory."""
+        member = Member()
+        try:
+            self._integrate(member, task, done)
+        except TorqueError as error:
+            member.fail(error)
+        return member
+
+    def _integrate(self, member: Member, task: _Task, done: Callable[[float], None]) -> None:
+        if task.saved is None or (task.saved and task.saved[0] == 0.0):
+            member.keep(0.0, task.y0)
+        if task.watch is not None:
+            task.watch.start(0.0, *self._state(task.y0))
+        solver: Any = None
+        for k, stop in enumerate(task.stops):
+            force = task.force(k)
+            if solver is None or task.held:
+                # A held force jumps here, and with it all that the solver remembers.
+                solver = self._anew(task, solver, force, stop)
+            if solver is None:
+                member.stop("diverged", f"diverged: {self.rates.why or RAN_AWAY}")
+                return
+            solver.t_bound, solver.status = stop, "running"
+            while solver.status == "running":
+                start = solver.t, solver.y.copy()
+                solver = self._step(member, solver, force, stop, task.stops[-1])
+                if solver is None or self._stopped(member, task, solver, start, force):
+                    return
+                member.steps += 1
+                member.reached = float(solver.t)
+                self._keep(member, task, solver)
+                done(member.reached)
+
+    def _anew(self, task: _Task, last: Any, force: Force, stop: float) -> Any:
+        t, y = (0.0, task.y0) if last is None else (float(last.t), last.y)
+        # A multistep method starts again with order 1, for which its last step is too long.
+        first = None if last is None or self._scheme.dense else min(last.h_abs, stop - t)
+        return self._solver(t, y, force, stop, first)
+
+    def _solver(self, t: float, y: Array, force: Force, stop: float, first: float | None) -> Any:
+        from scipy import integrate
+
+        # SciPy would start from a rate that is none.
+        if not np.isfinite(self.rates(t, y, force)).all():
+            return None
+        more: dict[str, Any] = {}
+        jacobian = self._jacobian
+        if jacobian is not None:
+            more["jac"] = lambda t, y: jacobian(t, y, force)
+        return getattr(integrate, self._scheme.solver)(
+            lambda t, y: self.rates(t, y, force),
+            t,
+            y,
+            stop,
+            rtol=self._tolerances.rtol,
+            atol=self._tolerances.atol,
+            first_step=first,
+            **more,
+        )
+
+    def _step(self, member: Member, solver: Any, force: Force, stop: float, duration: float) -> Any:
+        """Take a step and return the solver, or end the member and return None."""
+        t, y = float(solver.t), solver.y.copy()
+        self.rates.why = ""
+        before = self.rates.evaluations
+        wanted = self._shorten(solver, stop)
+        if not _stepped(solver):
+            member.stop("diverged", f"diverged: {self.rates.why or RAN_AWAY}")
+            return None
+        self._lengthen(solver, wanted)
+        if not self._scheme.implicit:
+            tried = (self.rates.evaluations - before) // _STAGES
+            member.rejected += max(0, tried - (solver.status != "failed"))
+        while self._scheme.solver == "LSODA" and solver.status != "failed" and not credible(solver.y):
+            # It takes a step into what is no state; the others try a shorter one by themselves.
+            first = (solver.t - t) / 4
+            again = self._solver(t, y, force, stop, first) if first > duration * _EPS else None
+            if again is None:
+                break
+            member.rejected += 1
+            solver = again
+            _stepped(solver)
+        if solver.status == "failed" and self.rates.why:
+            member.stop("diverged", f"diverged: {self.rates.why}")
+            return None
+        if solver.status == "failed" or _below_rounding(solver, duration):
+            rtol = self._tolerances.rtol
+            told = f"step below rounding at rtol = {rtol:g}: stiff, singular or diverging"
+            member.stop("step_too_small", told)
+            return None
+        # Radau and DOP853 go on from the rate at the end of a step.
+        if not credible(solver.y) or not np.isfinite(getattr(solver, "f", 0.0)).all():
+            member.stop("diverged", f"diverged: {self.rates.why or RAN_AWAY}")
+            return None
+        return solver
+
+    def _shorten(self, solver: Any, stop: float) -> float:
+        """Let a one-step method's next step end at the stop; return the length that it had chosen."""
+        if self._scheme.dense:
+            return 0.0
+        room, wanted = stop - float(solver.t), float(solver.h_abs)
+        # A little longer is better than a rest below rounding; the error is judged either way.
+        if room < 1.01 * wanted:
+            self._resize(solver, room)
+        return wanted
+
+    def _lengthen(self, solver: Any, wanted: float) -> None:
+        # One short step on the way is no reason to grow from its length again.
+        if not self._scheme.dense and solver.status == "finished" and solver.step_size < wanted:
+            self._resize(solver, max(wanted, solver.h_abs))
+
+    def _resize(self, solver: Any, length: float) -> None:
+        if length != solver.h_abs:
+            solver.h_abs = length
+            # Radau keeps a factorization for the length that it knew.
+            solver.LU_real = solver.LU_complex = None
+
+    def _stopped(self, member: Member, task: _Task, solver: Any, start: tuple[float, Array], force: Force) -> bool:
+        if task.watch is None:
+            return False
+        t = float(solver.t)
+        hits, last = task.watch.look(t, self._within(solver, start, force))
+        member.events += hits
+        if last is None:
+            return False
+        member.steps += 1
+        self._keep(member, task, solver, last.t)
+        member.stop_at(last)
+        return True
+
+    def _within(self, solver: Any, start: tuple[float, Array], force: Force) -> State:
+        """Return the states of the last step by time."""
+        interpolant: Any = None
+
+        def state(t: float) -> tuple[Array, Array]:
+            nonlocal interpolant
+            if t == solver.t:
+                return self._state(solver.y)
+            if t == start[0]:
+                return self._state(start[1])
+            if not self._scheme.dense:
+                return self._state(self._shorter(start, t, force))
+            interpolant = interpolant or solver.dense_output()
+            return self._state(interpolant(t))
+
+        return state
+
+    def _shorter(self, start: tuple[float, Array], t: float, force: Force) -> Array:
+        """Return the state at a time within a step, by a step that ends there."""
+        solver = self._solver(*start, force, t, t - start[0])
+        while solver.status == "running" and _stepped(solver):
+            pass
+        return np.asarray(solver.y)
+
+    def _keep(self, member: Member, task: _Task, solver: Any, end: float | None = None) -> None:
+        """Keep what is wanted of the last step, up to its end or an earlier one."""
+        t = float(solver.t)
+        end = t if end is None else end
+        if task.saved is None:
+            if end == t:
+                member.keep(t, solver.y)
+            return
+        interpolant: Any = None
+        while len(member.t) < len(task.saved) and task.saved[len(member.t)] <= end:
+            wanted = task.saved[len(member.t)]
+            if wanted == t:
+                member.keep(t, solver.y)
+            else:
+                interpolant = interpolant or solver.dense_output()
+                member.keep(wanted, interpolant(wanted))
+
+    def _state(self, y: Array) -> tuple[Array, Array]:
+        nq = self._model.nq
+        return unit_quaternions(self._model, y[:nq])[0], y[nq:]
+
+
+def _stepped(solver: Any) -> bool:
+    """Take a step; return whether its numbers were any."""
+    try:
+        solver.step()
+    except MbkitError:
+        raise  # a torque function's, which is a ValueError too
+    except ValueError:
+        # SciPy's linear solver, of a matrix that overflowed.
+        return False
+    return True
+
+
+def _below_rounding(solver: Any, duration: float) -> bool:
+    # 1/eps steps would never end, though near t = 0 they are above rounding. LSODA does
+    # not tell the next step.
+    if not hasattr(solver, "h_abs"):
+        return bool(solver.status == "running" and solver.step_size < duration * _EPS)
+    return bool(solver.h_abs < duration * _EPS)

@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.errors import TorqueError
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.progress import Progress
+from mbkit.simulate.stats import Ended
 from mbkit.simulate.steps import RAN_AWAY, DivergenceError, Field, Step, credible, make_step
 from mbkit.simulate.torque import Torque
 
@@ -29,7 +31,8 @@ def run_fixed(
 ) -> Outcome:
     """Step one state or a batch over the grid.
 
-    A trajectory that diverges stops there; the others of its batch go on.
+    A trajectory that diverges stops there; the others of its batch go on. A torque
+    function that fails stops all of them, with what they have.
     """
     space = Space(dyn.model)
     field = Field(dyn, space)
@@ -37,7 +40,11 @@ def run_fixed(
     # What overflows is a divergence, and told as one.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for k in range(grid.steps):
-            if not run.advance(k):
+            try:
+                if not run.advance(k):
+                    break
+            except TorqueError as error:
+                run.failed(k, error)
                 break
             bar.update((k + 1) / grid.steps)
     return run.outcome(field.evaluations)
@@ -59,6 +66,7 @@ class _Run:
         self._members: Indices | None = np.arange(lead[0]) if lead else None
         self._reached = np.full(lead, grid.duration)
         self._message = ""
+        self._error: TorqueError | None = None
         self._steps = 0
         self._q, self._w = q0.copy(), space.enter(q0, v0)
         if self._next == 0:
@@ -92,6 +100,11 @@ class _Run:
             self._keep(q, self._space.leave(q, w))
         return True
 
+    def failed(self, k: int, error: TorqueError) -> None:
+        """End the run before step k, because the torque function did."""
+        self._error = error
+        self._reached[... if self._members is None else self._members] = self._grid.time(k)
+
     def _one_by_one(self, t: float, h: float, k: int) -> tuple[Array, Array, NDArray[np.bool_]]:
         # One divergence must not stop the others of a batch: each steps by itself.
         q, w = np.full(self._q.shape, np.nan), np.full(self._w.shape, np.nan)
@@ -122,13 +135,17 @@ class _Run:
         if message and self._members is not None:
             batch = len(self._reached)
             message += f"; {batch - len(self._members)} of {batch} trajectories diverged, see reached"
+        ended: Ended = "diverged" if message else "finished"
+        if self._error is not None:
+            ended, message = "torque_failed", str(self._error)
         return Outcome(
             t=np.array([self._grid.time(int(k)) for k in self._kept[: self._row]]),
             q=self._q_kept[..., : self._row, :],
             v=self._v_kept[..., : self._row, :],
             steps=self._steps,
             evaluations=evaluations,
-            ended="diverged" if message else "finished",
+            ended=ended,
             reached=self._reached,
             message=message,
+            error=self._error,
         )

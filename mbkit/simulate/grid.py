@@ -50,6 +50,13 @@ class Grid:
         """Time of the k-th state, s; k dt, so that rounding does not pile up."""
         return self.duration if k == self.steps else k * self.dt
 
+    @property
+    def times(self) -> Array:
+        """All of them, (steps + 1,), s."""
+        out = np.arange(self.steps + 1, dtype=np.float64) * np.float64(self.dt)
+        out[-1] = self.duration
+        return out
+
     def step(self, k: int) -> float:
         """Length of the k-th step, s."""
         return self.last if k == self.steps - 1 else self.dt
@@ -92,9 +99,13 @@ class Grid:
 
 def save_times(save: ArrayLike, duration: float) -> Array:
     """Return a grid of times, checked: increasing, within the run."""
-    if np.ndim(save) != 1 or not np.size(save):
-        raise InputError(f"save: expected increasing times of shape (K,), got shape {np.shape(save)}")
-    times = finite_array("save", save, np.shape(save))
+    try:
+        shape = np.shape(save)
+    except ValueError:
+        raise InputError("save: expected increasing times of shape (K,), got rows of different lengths") from None
+    if len(shape) != 1 or not shape[0]:
+        raise InputError(f"save: expected increasing times of shape (K,), got shape {shape}")
+    times = finite_array("save", save, shape)
     if np.any(np.diff(times) <= 0):
         raise InputError("save: expected increasing times")
     if times[0] < 0 or times[-1] > duration * (1 + 1e-12):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mbkit._check import Array
+from mbkit.errors import TorqueError
+from mbkit.simulate.events import Hit
 from mbkit.simulate.stats import Ended
 
 __all__ = ["Outcome"]
@@ -12,7 +14,10 @@ __all__ = ["Outcome"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Kept states and the figures of a run; `reached` has shape () or (N,)."""
+    """Kept states and the figures of a run; `reached` has shape () or (N,).
+
+    A torque function's `error` is handed on with what was computed before it.
+    """
 
     t: Array
     q: Array
@@ -22,3 +27,7 @@ class Outcome:
     ended: Ended
     reached: Array
     message: str
+    rejected: int = 0
+    jacobians: int = 0
+    events: tuple[Hit, ...] = ()
+    error: TorqueError | None = None

@@ -19,11 +19,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.lagrangian import Equations
 from mbkit.lagrangian.compiled import cores
-from mbkit.lagrangian.machine import Machine
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.marching import BLOCK, Chunk, Plan
@@ -33,17 +31,10 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.steps import RUNAWAY, credible, reason
 from mbkit.simulate.torque import Torque
 
-__all__ = ["can_roll_out", "run_rollout"]
+__all__ = ["run_rollout"]
 
 # Equations are shared by dynamics of one model at different values of its parameters.
 _PLANS: Final[WeakKeyDictionary[Equations, dict[str, Plan]]] = WeakKeyDictionary()
-
-
-def can_roll_out(dyn: Dynamics, torque: Torque) -> bool:
-    """Return whether whole steps can be compiled: own derivation, written out, no callable."""
-    if not isinstance(dyn, LagrangianDynamics) or torque.callable or not dyn.model.nv or not dyn.written_out:
-        return False
-    return not isinstance(dyn.code("forward_dynamics"), Machine)
 
 
 def run_rollout(

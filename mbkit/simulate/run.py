@@ -4,30 +4,31 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
-from mbkit.errors import InputError, MbkitWarning
-from mbkit.simulate.adaptive import run_dop853
-from mbkit.simulate.fixed import run_fixed
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError
+from mbkit.simulate.applied import Applied, TorqueFunction
+from mbkit.simulate.events import Event, as_events
 from mbkit.simulate.grid import Grid, save_times
-from mbkit.simulate.methods import Method, method_of
+from mbkit.simulate.methods import METHODS, Method, Tolerances, method_of
 from mbkit.simulate.native import run_native
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.progress import Progress, ProgressFunction
+from mbkit.simulate.runners import adaptive_runner, fixed_runner
 from mbkit.simulate.stats import Stats
-from mbkit.simulate.torque import Torque, TorqueFunction
+from mbkit.simulate.torque import Torque
 from mbkit.simulate.trajectory import Trajectory
 
 __all__ = ["simulate"]
 
-# SciPy's solvers raise a smaller rtol to this by themselves.
-_TIGHTEST = 100 * float(np.finfo(float).eps)
+# The oracle computes with 113 bits.
+_LEAST_EXTENDED: Final = 1e-32
 
 
 def simulate(
@@ -42,6 +43,7 @@ def simulate(
     torque: ArrayLike | TorqueFunction | None = None,
     save: ArrayLike | int | None = None,
     progress: bool | ProgressFunction | None = None,
+    events: Event | Sequence[Event] | None = None,
 ) -> Trajectory:
     """Integrate v̇ = forward_dynamics(q, v, τ), q̇ = D(q) v from one state or a batch.
 
@@ -56,15 +58,21 @@ def simulate(
         s. The run ends exactly there: where it is no multiple of `dt`, the last
         step is shorter.
     method : str
-        ``"rk4"`` or ``"semi_implicit_euler"``, with MuJoCo 4's formulas on any
-        engine; ``"dop853"``, SciPy's; ``"mujoco_euler"``, ``"mujoco_rk4"``,
-        ``"mujoco_implicit"``, ``"mujoco_implicitfast"``, MuJoCo's own on its
-        engine. `mbkit.simulate.METHODS` describes them.
+        With a step: ``"rk4"`` and ``"semi_implicit_euler"``, MuJoCo 4's formulas on
+        any engine; ``"gauss4"`` and ``"gauss6"``, implicit, on any engine;
+        ``"implicit_midpoint"``, symplectic, on the own derivation; ``"mujoco_euler"``,
+        ``"mujoco_rk4"``, ``"mujoco_implicit"``, ``"mujoco_implicitfast"`` and
+        ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance:
+        ``"rk853"``, fastest on the own derivation, and ``"dop853"``, ``"radau"``,
+        ``"bdf"``, ``"lsoda"``, SciPy's, on any engine (the last three are for stiff
+        scenes); ``"taylor"``, heyoka's, and ``"cvodes"``, SUNDIALS', on the own
+        derivation; ``"taylor"`` on the oracle computes with 34 digits.
+        `mbkit.simulate.METHODS` describes them.
     dt : float
         Step of the methods that have one, s.
     rtol, atol : float, optional
-        Tolerances of an adaptive method, from 2.3e-14 upwards; 1e-10, and `atol`
-        as `rtol`, when not given.
+        Tolerances of an adaptive method, from ``METHODS[method].least`` upwards;
+        1e-10, and `atol` as `rtol`, when not given.
     torque : array_like or callable, optional
         Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv),
         held over each step (for an adaptive method, each interval of `save`, which
@@ -77,6 +85,10 @@ def simulate(
     progress : bool or callable, optional
         True shows a bar when the run takes more than 2 s; a callable gets the
         fraction done.
+    events : Event or sequence of Event, optional
+        What ends the run or is noted on the way, for methods that have events:
+        `mbkit.simulate.at_limits`, `at_energy`, `at_section`, or an `Event` of any
+        function of (t, q, v). What happened is in ``Trajectory.events``.
 
     Returns
     -------
@@ -89,6 +101,9 @@ def simulate(
     ------
     InputError
         A wrong shape, state, time, tolerance or torque.
+    TorqueError
+        The torque function raised, or returned something else than (nv,) finite
+        numbers; its `trajectory` is the run up to then.
     UnknownNameError
         No method of this name.
     UnsupportedError
@@ -123,16 +138,35 @@ def simulate(
     if batch is not None:
         q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
     duration, dt = real("duration", duration, nonnegative=True), real("dt", dt, positive=True)
+    _require_engine(dyn, chosen)
+    wanted = as_events(events)
+    if wanted and not chosen.events:
+        _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
+    if callable(torque) and not chosen.callables:
+        _refuse("torque functions", chosen, ["rk4", "rk853", "dop853"])
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
     arguments: dict[str, Any] = {"batch": batch, "torque": torque, "save": save, "bar": bar}
     started = time.perf_counter()
     with bar:
         if chosen.kind == "adaptive":
-            outcome = _adaptive(dyn, q, v, duration, rtol, atol, **arguments)
+            applied, outcome = _adaptive(dyn, chosen, q, v, duration, rtol, atol, events=wanted, **arguments)
         else:
             _refuse_tolerances(chosen, rtol, atol)
-            outcome = _stepped(dyn, chosen, q, v, duration, dt, **arguments)
-    return _wrapped(dyn, chosen, outcome, time.perf_counter() - started)
+            applied, outcome = _stepped(dyn, chosen, q, v, duration, dt, **arguments)
+    return _wrapped(dyn, chosen, applied, outcome, time.perf_counter() - started)
+
+
+def _require_engine(dyn: Dynamics, method: Method) -> None:
+    if method.engines and dyn.engine not in method.engines:
+        has = " or ".join(f"mbkit.dynamics(model, {name!r})" for name in method.engines)
+        raise UnsupportedError(
+            f"{method.name}: not on the {dyn.engine} engine; use {has}, or a method that any engine has: "
+            + ", ".join(m.name for m in METHODS.values() if not m.engines)
+        )
+
+
+def _refuse(what: str, method: Method, others: Sequence[str]) -> None:
+    raise UnsupportedError(f"{method.name}: {what} are not there with this method; use {', '.join(others)}")
 
 
 def _batch(dyn: Dynamics, states: int | None) -> int | None:
@@ -144,6 +178,7 @@ def _batch(dyn: Dynamics, states: int | None) -> int | None:
 
 def _adaptive(
     dyn: Dynamics,
+    method: Method,
     q: Array,
     v: Array,
     duration: float,
@@ -154,23 +189,27 @@ def _adaptive(
     torque: ArrayLike | TorqueFunction | None,
     save: ArrayLike | int | None,
     bar: Progress,
-) -> Outcome:
+    events: tuple[Event, ...],
+) -> tuple[Applied | None, Outcome]:
     rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
-    if rtol < _TIGHTEST:
-        raise InputError(f"rtol: expected at least {_TIGHTEST:.3g}, got {rtol:g}; double precision holds no more")
+    least = _LEAST_EXTENDED if dyn.engine == "oracle" and method.name == "taylor" else method.least
+    if rtol < least:
+        raise InputError(f"rtol: expected at least {least:.3g} for {method.name} on {dyn.engine}, got {rtol:g}")
     atol = rtol if atol is None else real("atol", atol, positive=True)
     if isinstance(save, (int, np.integer)):
         raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
     times = None if save is None else save_times(save, duration)
     whole = times is not None and times[0] == 0 and times[-1] == duration
     read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
-    return run_dop853(dyn, q, v, duration, rtol, atol, read, times, bar)
+    tolerances = Tolerances(rtol, atol)
+    outcome = adaptive_runner(method)(dyn, method.name, q, v, duration, tolerances, read, times, events, bar)
+    return read.applied(times), outcome
 
 
 def _refuse_tolerances(method: Method, rtol: float | None, atol: float | None) -> None:
     for name, value in (("rtol", rtol), ("atol", atol)):
         if value is not None:
-            raise InputError(f"{name}: {method.name} has a fixed step and no tolerance; give dt, or method='dop853'")
+            raise InputError(f"{name}: {method.name} has a fixed step and no tolerance; give dt, or method='rk853'")
 
 
 def _stepped(
@@ -185,7 +224,7 @@ def _stepped(
     torque: ArrayLike | TorqueFunction | None,
     save: ArrayLike | int | None,
     bar: Progress,
-) -> Outcome:
+) -> tuple[Applied | None, Outcome]:
     model = dyn.model
     grid = Grid.of(duration, dt)
     kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
@@ -193,21 +232,12 @@ def _stepped(
     if method.kind == "native":
         outcome = run_native(dyn, method, q, v, grid, kept, read)
         bar.update(1.0)
-        return outcome
-    return _fixed(dyn, read)(dyn, method.name, q, v, grid, kept, read, bar)
+    else:
+        outcome = fixed_runner(method, dyn, read)(dyn, method.name, q, v, grid, kept, read, bar)
+    return read.applied(grid.times), outcome
 
 
-def _fixed(dyn: Dynamics, torque: Torque) -> Callable[..., Outcome]:
-    if dyn.engine == "lagrangian":
-        # Other engines need no CasADi.
-        from mbkit.simulate.rollout import can_roll_out, run_rollout
-
-        if can_roll_out(dyn, torque):
-            return run_rollout
-    return run_fixed
-
-
-def _wrapped(dyn: Dynamics, method: Method, outcome: Outcome, seconds: float) -> Trajectory:
+def _wrapped(dyn: Dynamics, method: Method, applied: Applied | None, outcome: Outcome, seconds: float) -> Trajectory:
     reached = outcome.reached
     stats = Stats(
         steps=outcome.steps,
@@ -216,7 +246,14 @@ def _wrapped(dyn: Dynamics, method: Method, outcome: Outcome, seconds: float) ->
         ended=outcome.ended,
         reached=float(reached) if reached.ndim == 0 else tuple(reached.tolist()),
         message=outcome.message,
+        rejected=outcome.rejected,
+        jacobians=outcome.jacobians,
     )
-    if outcome.message:
+    states = outcome.t, outcome.q, outcome.v
+    run = Trajectory(*states, dyn.model, method.name, dyn.engine, stats, dyn, outcome.events, applied)
+    if outcome.error is not None:
+        outcome.error.trajectory = run
+        raise outcome.error
+    if outcome.message and outcome.ended != "event":
         warnings.warn(f"{dyn.model.name}: {method.name} {outcome.message}", MbkitWarning, stacklevel=3)
-    return Trajectory(outcome.t, outcome.q, outcome.v, dyn.model, method.name, dyn.engine, stats, dyn)
+    return run

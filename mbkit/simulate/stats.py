@@ -7,7 +7,7 @@ from typing import Literal
 
 __all__ = ["Ended", "Stats"]
 
-Ended = Literal["finished", "diverged", "step_too_small"]
+Ended = Literal["finished", "event", "diverged", "step_too_small", "torque_failed"]
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,19 @@ class Stats:
         Evaluations of the forward dynamics, summed over a batch.
     seconds : float
         Time on the wall.
-    ended : {"finished", "diverged", "step_too_small"}
-        ``"diverged"`` when a state or acceleration of any trajectory stopped being
-        finite, or a state passed 1e100; ``"step_too_small"`` when an adaptive method could not go on.
+    ended : {"finished", "event", "diverged", "step_too_small", "torque_failed"}
+        ``"event"`` when one asked for the end; ``"diverged"`` when a state or
+        acceleration of any trajectory stopped being finite, or a state passed 1e100;
+        ``"step_too_small"`` when an adaptive method could not go on;
+        ``"torque_failed"`` when the torque function did.
     reached : float or tuple of float
         Time of the last good state, s; one per trajectory of a batch.
     message : str
         Why a run ended early; empty for one that finished.
+    rejected : int
+        Steps that an adaptive method tried in vain, where it tells.
+    jacobians : int
+        Evaluations of the Jacobian of the forward dynamics.
     """
 
     steps: int
@@ -37,11 +43,13 @@ class Stats:
     ended: Ended
     reached: float | tuple[float, ...]
     message: str = ""
+    rejected: int = 0
+    jacobians: int = 0
 
     @property
     def finished(self) -> bool:
-        """Whether every trajectory reached the end."""
-        return self.ended == "finished"
+        """Whether every trajectory reached the end, or the event that was to stop it."""
+        return self.ended in ("finished", "event")
 
     def __str__(self) -> str:
         end = self.message or "finished"

@@ -72,7 +72,7 @@ class Field:
         v = self._space.leave(q, w)
         if not isinstance(force, np.ndarray):
             # A user's function never sees a state that is none.
-            if not _finite(q, v):
+            if not (credible(q).all() and credible(v).all()):
                 raise DivergenceError(RAN_AWAY)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
@@ -108,6 +108,11 @@ def make_step(method: str, field: Field, space: Space) -> Step:
     """Return the step of a fixed-step method."""
     if method in _TABLEAUS:
         return _runge_kutta(_TABLEAUS[method], field, space)
+    if method.startswith("gauss"):
+        # It takes this module's own names.
+        from mbkit.simulate.gauss import gauss_step
+
+        return gauss_step(method, field, space)
     return _semi_implicit_euler(field, space)
 
 

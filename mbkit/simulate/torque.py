@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,10 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, finite_array
 from mbkit.errors import InputError
 from mbkit.model import Model
+from mbkit.simulate.applied import Asked, Held, TorqueFunction
 from mbkit.simulate.grid import Indices
 
-__all__ = ["Force", "Torque", "TorqueFunction"]
-
-#: torque(t, q, v) -> (nv,), of one state
-TorqueFunction = Callable[[float, Array, Array], ArrayLike]
+__all__ = ["Force", "Torque"]
 
 #: What acts during one step: an array, or a function of (t, q, v) of one state or a batch.
 Force = Array | Callable[[float, Array, Array], Array]
@@ -40,7 +39,8 @@ class Torque:
     Raises
     ------
     InputError
-        Wrong shape or not finite, here for an array, during the run for a callable.
+        Wrong shape or not finite, here for an array; a callable's is a `TorqueError`
+        during the run, as is whatever else it raises.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Torque:
     def during(self, k: int, members: Indices | None) -> Force:
         """Return what acts during step k on a single state, or on these members of a batch."""
         if self._function is not None:
-            return self._of_single if members is None else self._of_batch
+            return self._asked(members)
         if self._rows is None:
             return self._zero if members is None else self._zero[members]
         if self._rows.ndim == 3:
@@ -101,8 +101,11 @@ class Torque:
 
     def of_member(self, i: int | None) -> Callable[[int], Force]:
         """Return a function of the step that gives what acts on one state (of a batch)."""
-        if i is None or self._function is not None:
+        if i is None:
             return lambda k: self.during(k, None)
+        if self._function is not None:
+            asked = Asked(self._function, self._nv)
+            return lambda _: partial(asked.one, member=i)
         return lambda k: np.asarray(self.during(k, np.array([i])))[0]
 
     def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
@@ -124,16 +127,29 @@ class Torque:
         one = self._zero if self._zero.ndim == 1 else self._zero[0]
         return np.broadcast_to(one, (stop - start, self._nv)).copy()
 
-    def _of_single(self, t: float, q: Array, v: Array) -> Array:
-        assert self._function is not None
-        given: Any = self._function(t, q.copy(), v.copy())
-        try:
-            return finite_array("torque", given, (self._nv,))
-        except InputError as error:
-            raise InputError(f"{error}; it is what the callable returned at t = {t:.9g} s") from None
+    def applied(self, bounds: Array | None) -> Held | Asked | None:
+        """Return what acted, for a finished run to read; None where nothing did.
 
-    def _of_batch(self, t: float, q: Array, v: Array) -> Array:
-        return np.array([self._of_single(t, *state) for state in zip(q, v, strict=True)]).reshape(-1, self._nv)
+        Parameters
+        ----------
+        bounds : (rows + 1,) array or None
+            Times between which the rows of an array were held, s.
+        """
+        if self._function is not None:
+            return Asked(self._function, self._nv)
+        if self._rows is not None:
+            assert bounds is not None  # rows are read only where there are intervals
+            return Held(self._rows, bounds[:-1])
+        if not self._zero.any():
+            return None
+        return Held(self._zero if self._zero.ndim == 1 else self._zero[0], None)
+
+    def _asked(self, members: Indices | None) -> Force:
+        assert self._function is not None
+        asked = Asked(self._function, self._nv)
+        if members is None:
+            return asked.one
+        return lambda t, q, v: asked.many(t, q, v, members)
 
 
 def _shape(value: Any) -> tuple[int, ...]:

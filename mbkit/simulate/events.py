@@ -1,0 +1,214 @@
+"""Events: zero crossings of a function of the state, that end a run or are noted.
+
+A crossing is looked for between the ends of each accepted step, so that one which
+comes and goes within a step is not seen; a smaller tolerance makes smaller steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from mbkit._check import Array, real
+from mbkit.engines import Dynamics
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.model import Model
+
+__all__ = ["Event", "Hit", "State", "Watch", "as_events", "at_energy", "at_limits", "at_section"]
+
+#: state(t) -> (q, v) within a step
+State = Callable[[float], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Event:
+    """A zero crossing of a function.
+
+    Attributes
+    ----------
+    function : callable
+        function(t, q, v) -> float, of one state; q has unit quaternions.
+    name : str
+    direction : {-1, 0, 1}
+        Whether only a falling or a rising crossing counts, or both.
+    terminal : bool
+        Whether the run ends there.
+    """
+
+    function: Callable[[float, Array, Array], float]
+    name: str = "event"
+    direction: int = 0
+    terminal: bool = True
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise InputError(f"events: expected a function of (t, q, v), got {type(self.function).__name__}")
+        if not isinstance(self.name, str):
+            raise InputError(f"events: expected a name, got {self.name!r}")
+        if self.direction not in (-1, 0, 1):
+            raise InputError(f"events: direction of {self.name!r}: expected -1, 0 or 1, got {self.direction!r}")
+
+    def __call__(self, t: float, q: Array, v: Array) -> float:
+        """Return the function's value, checked."""
+        try:
+            value = float(self.function(t, q.copy(), v.copy()))
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"events: {self.name!r} at t = {t:.9g} s: expected a number from the function; {error}"
+            ) from error
+        if not np.isfinite(value):
+            raise InputError(f"events: {self.name!r} returned {value} at t = {t:.9g} s; expected a finite number")
+        return value
+
+
+@dataclass(frozen=True, eq=False)
+class Hit:
+    """An event that happened.
+
+    Attributes
+    ----------
+    name : str
+    t : float
+        s.
+    q, v : (nq,) and (nv,) arrays
+    member : int or None
+        Which trajectory of a batch.
+    """
+
+    name: str
+    t: float
+    q: Array
+    v: Array
+    member: int | None = None
+
+
+class Watch:
+    """Looks for events along one trajectory.
+
+    Parameters
+    ----------
+    events : sequence of Event
+    member : int, optional
+        Of a batch.
+    """
+
+    def __init__(self, events: Sequence[Event], member: int | None = None) -> None:
+        self._events, self._member = tuple(events), member
+        self._t, self._values = 0.0, [0.0] * len(self._events)
+
+    def start(self, t: float, q: Array, v: Array) -> None:
+        """Begin at a state; a function that is zero there crosses only when it is zero again."""
+        self._t, self._values = t, [event(t, q, v) for event in self._events]
+
+    def look(self, t1: float, state: State) -> tuple[list[Hit], Hit | None]:
+        """Return the crossings since the last look, in time's order, and the first that ends the run.
+
+        Nothing after the latter is returned.
+        """
+        q1, v1 = state(t1)
+        values = [event(t1, q1, v1) for event in self._events]
+        found: list[tuple[float, int]] = []
+        for k, (event, before, after) in enumerate(zip(self._events, self._values, values, strict=True)):
+            if _crosses(before, after, event.direction):
+                found.append((self._root(event, state, t1, before, after), k))
+        hits: list[Hit] = []
+        for t, k in sorted(found):
+            q, v = state(t)
+            hits.append(Hit(self._events[k].name, t, q, v, self._member))
+            if self._events[k].terminal:
+                return hits, hits[-1]
+        self._t, self._values = t1, values
+        return hits, None
+
+    def _root(self, event: Event, state: State, t1: float, before: float, after: float) -> float:
+        if after == 0.0:
+            return t1
+        from scipy.optimize import brentq
+
+        # At the ends it is what it was found to be, whatever an interpolant rounds there to.
+        known = {self._t: before, t1: after}
+        eps = float(np.finfo(float).eps)
+        root = brentq(
+            lambda t: known[t] if t in known else event(t, *state(t)), self._t, t1, xtol=4 * eps * t1, rtol=4 * eps
+        )
+        return float(root)
+
+
+def _crosses(before: float, after: float, direction: int) -> bool:
+    rises, falls = before < 0 <= after, before > 0 >= after
+    return (rises and direction >= 0) or (falls and direction <= 0)
+
+
+def as_events(events: object) -> tuple[Event, ...]:
+    """Return what a caller gave as events: one, several, or functions."""
+    if events is None:
+        return ()
+    if isinstance(events, Event) or callable(events):
+        events = (events,)
+    if not isinstance(events, Sequence) or isinstance(events, (str, bytes)):
+        raise InputError(f"events: expected an Event, a function of (t, q, v) or several, got {type(events).__name__}")
+    named = [e if isinstance(e, Event) else Event(e, getattr(e, "__name__", "event")) for e in events]
+    return tuple(named)
+
+
+def at_limits(model: Model) -> tuple[Event, ...]:
+    """Return events that end a run where a coordinate passes a limit of its joint.
+
+    Raises
+    ------
+    InputError
+        No joint of the model has a limit.
+    """
+    out = []
+    for i, (name, low, high) in enumerate(zip(model.coordinate_names, model.lower, model.upper, strict=True)):
+        for limit, side in ((low, -1), (high, 1)):
+            if np.isfinite(limit):
+                out.append(_passes(i, float(limit), side, f"{name} {'above' if side > 0 else 'below'} {limit:g}"))
+    if not out:
+        raise InputError(f"at_limits: {model.name} has no joint limits, so no run would end there")
+    return tuple(out)
+
+
+def at_energy(dyn: Dynamics, joules: float, *, direction: int = 0) -> Event:
+    """Return an event that ends a run where kinetic plus potential energy passes a value."""
+    level = real("joules", joules)
+    return Event(partial(_above, dyn, level), f"energy {level:g} J", direction)
+
+
+def at_section(
+    model: Model, coordinate: str, value: float = 0.0, *, direction: int = 0, terminal: bool = False
+) -> Event:
+    """Return an event where a coordinate passes a value: a Poincaré section.
+
+    Parameters
+    ----------
+    model : Model
+    coordinate : str
+        One of ``model.coordinate_names``.
+    value : float
+        m or rad.
+    direction : {-1, 0, 1}
+    terminal : bool
+        Whether the run ends there, or goes on and notes it.
+    """
+    if coordinate not in model.coordinate_names:
+        raise UnknownNameError("coordinate", str(coordinate), model.coordinate_names)
+    i, value = model.coordinate_names.index(coordinate), real("value", value)
+    return _passes(i, value, direction, f"{coordinate} = {value:g}", terminal)
+
+
+def _passes(i: int, value: float, direction: int, name: str, terminal: bool = True) -> Event:
+    return Event(partial(_beyond, i, value), name, direction, terminal)
+
+
+# Functions of the module, so that events can be sent to other processes.
+def _beyond(i: int, value: float, _t: float, q: Array, _v: Array) -> float:
+    return float(q[i] - value)
+
+
+def _above(dyn: Dynamics, level: float, _t: float, q: Array, v: Array) -> float:
+    kinetic = 0.5 * v @ dyn.mass_matrix(q) @ v
+    return float(kinetic + dyn.potential_energy(q) - level)

@@ -1,0 +1,59 @@
+"""Which integrator runs a method, each imported when it is first needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from mbkit.engines import Dynamics
+from mbkit.simulate.methods import Method
+from mbkit.simulate.outcome import Outcome
+from mbkit.simulate.torque import Torque
+
+__all__ = ["adaptive_runner", "fixed_runner"]
+
+
+def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[..., Outcome]:
+    """Return run(dyn, method, q0, v0, grid, kept, torque, bar)."""
+    if method.name == "implicit_midpoint":
+        from mbkit.simulate.midpoint import run_midpoint
+
+        return run_midpoint
+    if method.name in ("rk4", "semi_implicit_euler") and not torque.callable and _compiles(dyn):
+        from mbkit.simulate.rollout import run_rollout
+
+        return run_rollout
+    from mbkit.simulate.fixed import run_fixed
+
+    return run_fixed
+
+
+def adaptive_runner(method: Method) -> Callable[..., Outcome]:
+    """Return run(dyn, method, q0, v0, duration, tolerances, torque, save, events, bar)."""
+    if method.name == "rk853":
+        from mbkit.simulate.embedded import run_embedded
+
+        return run_embedded
+    if method.name == "taylor":
+        from mbkit.simulate.taylor import run_taylor
+
+        return run_taylor
+    if method.name == "cvodes":
+        from mbkit.simulate.cvodes import run_cvodes
+
+        return run_cvodes
+    from mbkit.simulate.adaptive import run_scipy
+
+    return run_scipy
+
+
+def _compiles(dyn: Dynamics) -> bool:
+    """Return whether whole steps can be compiled: own derivation, written out, and a compiler."""
+    if dyn.engine != "lagrangian":
+        return False
+    # Other engines need no CasADi.
+    from mbkit.engines.lagrangian import LagrangianDynamics
+    from mbkit.lagrangian.machine import Machine
+
+    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out:
+        return False
+    return not isinstance(dyn.code("forward_dynamics"), Machine)

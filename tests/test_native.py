@@ -1,0 +1,140 @@
+"""MuJoCo's own five integrators: their order, what each does to damping, springs and rotations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mbkit import catalog
+from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.mujoco_rollout import INTEGRATORS
+from mbkit.errors import MbkitWarning
+from mbkit.model import Model, ModelBuilder
+from mbkit.simulate import METHODS, simulate
+
+NATIVE = tuple(m.name for m in METHODS.values() if m.kind == "native")
+IMPLICIT = ("mujoco_implicit", "mujoco_implicitfast", "mujoco_discrete")
+
+
+def damped() -> Model:
+    b = ModelBuilder("damped")
+    b.add_body("a", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+    b.add_body("b", mass=0.5, com=(0, 0, -0.3), inertia=(0.03, 0.03, 0.01))
+    b.add_joint("j1", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.7, stiffness=3.0, rest=0.2)
+    b.add_joint("j2", "revolute", parent="a", child="b", axis=(1, 0, 0), translation=(0, 0, -1), damping=0.1)
+    return b.build()
+
+
+def slider(**joint: float) -> Dynamics:
+    b = ModelBuilder("slider")
+    b.add_body("mass", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), **joint)
+    return dynamics(b.build(), "mujoco")
+
+
+def cases() -> dict[str, tuple[Model, np.ndarray, np.ndarray, float]]:
+    rng = np.random.default_rng(2)
+    top, box = catalog.heavy_top(), catalog.free_body()
+    return {
+        "double pendulum": (catalog.double_pendulum(), np.array([0.6, 0.3]), np.array([0.5, -0.5]), 1.0),
+        "damped, on a spring": (damped(), np.array([1.0, -0.5]), np.array([2.0, 1.0]), 1.0),
+        "heavy top": (top, top.random_state(rng)[0], np.array([1.0, 20.0, -4.0]), 0.5),
+        "free body": (box, box.random_state(rng)[0], np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1]), 1.0),
+    }
+
+
+def test_there_are_all_of_mujocos() -> None:
+    import mujoco
+
+    assert len(INTEGRATORS) == len(mujoco.mjtIntegrator.__members__) == len(NATIVE) == 5
+    assert [f"mujoco_{name}" for name in INTEGRATORS] == list(NATIVE)
+
+
+@pytest.mark.parametrize("case", cases())
+@pytest.mark.parametrize("method", NATIVE)
+def test_observed_order(case: str, method: str) -> None:
+    model, q, v, duration = cases()[case]
+    dyn = dynamics(model, "mujoco")
+    truth = simulate(dynamics(model), q, v, duration, "dop853", rtol=3e-14, save=[0.0, duration])
+    counts = (60, 90, 140, 200) if METHODS[method].order == 4 else (300, 450, 700, 1000)
+    errors = []
+    for n in counts:
+        run = simulate(dyn, q, v, duration, method, dt=duration / n)
+        apart = [model.difference(truth.q[-1], run.q[-1]), run.v[-1] - truth.v[-1]]
+        errors.append(float(np.linalg.norm(np.concatenate(apart))))
+    order = np.polyfit(np.log(1 / np.array(counts)), np.log(errors), 1)[0]
+    assert order == pytest.approx(METHODS[method].order, abs=0.2)
+
+
+def gain(method: str, model: Model, v: np.ndarray) -> float:
+    """Return the relative growth of kinetic energy of what is left to itself for 0.5 s."""
+    energy = simulate(dynamics(model, "mujoco"), model.neutral(), v, 0.5, method, dt=1e-3).energy()
+    return float(energy[-1] / energy[0] - 1)
+
+
+def test_implicit_methods_damp_a_tumbling_body_and_explicit_ones_drive_it() -> None:
+    box, spin = catalog.free_body(), np.array([0.0, 0.0, 0.0, 2.0, 10.0, 2.0])
+    assert gain("mujoco_euler", box, spin) > 1e-4
+    for method in IMPLICIT:
+        assert gain(method, box, spin) < -1e-4
+    assert abs(gain("mujoco_rk4", box, spin)) < 1e-8
+
+
+def test_only_the_fully_implicit_method_damps_a_body_on_a_ball_joint() -> None:
+    top, spin = catalog.heavy_top(gravity=0.0), np.array([1.0, 20.0, -4.0])
+    gains = {method: gain(method, top, spin) for method in NATIVE}
+    assert gains["mujoco_implicit"] < -1e-2
+    for method in ("mujoco_euler", "mujoco_implicitfast", "mujoco_discrete"):
+        assert gains[method] > 1e-2
+    assert gains["mujoco_implicitfast"] == pytest.approx(gains["mujoco_euler"], rel=1e-9)
+
+
+def test_dampers_are_implicit_in_three_and_springs_in_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    h, damping, stiffness = 1e-3, 1e6, 1e9
+    for method in NATIVE:
+        if method in IMPLICIT:
+            run = simulate(slider(damping=damping), [1.0], [1.0], 0.01, method, dt=h)
+            factor = 1 / (1 + h * damping)
+            assert run.v[:, 0] == pytest.approx(factor ** np.arange(11), rel=1e-9)
+        else:
+            with pytest.warns(MbkitWarning, match="diverged"):
+                simulate(slider(damping=damping), [1.0], [1.0], 0.1, method, dt=h)
+        if method == "mujoco_discrete":
+            run = simulate(slider(stiffness=stiffness), [1.0], [0.0], 0.1, method, dt=h)
+            # v⁺ = v - h K (q + h v⁺), q⁺ = q + h v⁺: implicit Euler.
+            step = np.linalg.inv([[1.0, -h], [h * stiffness, 1.0]])
+            exact = [np.linalg.matrix_power(step, k) @ [1.0, 0.0] for k in range(6)]
+            assert np.column_stack([run.q, run.v])[:6] == pytest.approx(np.array(exact), rel=1e-9, abs=1e-12)
+            assert abs(run.q[-1, 0]) < 1e-100
+        else:
+            with pytest.warns(MbkitWarning, match="diverged"):
+                simulate(slider(stiffness=stiffness), [1.0], [0.0], 0.1, method, dt=h)
+    # MuJoCo writes MUJOCO_LOG.TXT where it stands, if it is let.
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("method", NATIVE)
+def test_batches_are_their_states_one_by_one_and_may_be_empty(method: str) -> None:
+    model = catalog.double_pendulum()
+    dyn = dynamics(model, "mujoco")
+    q, v = model.random_state(np.random.default_rng(0), 3)
+    tau = np.random.default_rng(1).standard_normal((3, 6, 2))
+    run = simulate(dyn, q, v, 0.055, method, dt=0.01, torque=tau)
+    assert run.t[-1] == 0.055
+    for i in range(3):
+        alone = simulate(dyn, q[i], v[i], 0.055, method, dt=0.01, torque=tau[i])
+        assert np.array_equal(run.q[i], alone.q)
+    assert run.stats.evaluations == run.stats.steps * METHODS[method].stages
+    empty = simulate(dyn, np.empty((0, 2)), [0.0, 0.0], 0.05, method)
+    assert empty.q.shape == (0, 51, 2)
+    assert empty.stats.steps == 0
+
+
+@pytest.mark.parametrize("method", NATIVE)
+def test_the_same_inputs_give_the_same_bits(method: str) -> None:
+    model, q, v, _ = cases()["free body"]
+    runs = [simulate(dynamics(model, "mujoco"), q, v, 0.05, method).q for _ in range(2)]
+    assert np.array_equal(*runs)

@@ -1,0 +1,452 @@
+# Torques have the signature they are called with.
+# ruff: noqa: ARG001, ARG002, ARG005
+"""Radau, BDF, LSODA and CVODES: the exact Jacobian, stiff scenes, and runs that go wrong."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit import catalog
+from mbkit.engines import Dynamics, dynamics
+from mbkit.errors import InputError, MbkitWarning, NumericalError, TorqueError, UnsupportedError
+from mbkit.model import Model, ModelBuilder
+from mbkit.simulate import simulate
+from mbkit.simulate.linearization import Linearization
+from mbkit.simulate.rates import Rates
+from tests.random_trees import ALL, random_tree
+from validation import closed_forms
+
+IMPLICIT = ("radau", "bdf", "lsoda")
+SCIPY = ("dop853", *IMPLICIT)
+STIFF = (*IMPLICIT, "cvodes")
+# A tolerance that gives 1e-6 on a scene of a few swings; multistep methods exceed theirs the most.
+ENOUGH = {"dop853": 1e-9, "radau": 1e-8, "bdf": 1e-11, "lsoda": 1e-10, "cvodes": 1e-11}
+
+
+def elastic_pendulum(stiffness: float, damping: float) -> Model:
+    """A bob on a rod that stretches along itself."""
+    b = ModelBuilder("elastic pendulum")
+    b.add_body("rod", mass=0.1, com=(0, 0, -0.5), inertia=(0.01, 0.01, 0.001))
+    b.add_joint("swing", "revolute", parent="world", child="rod", axis=(0, -1, 0))
+    b.add_body("bob", mass=1.0, com=(0, 0, -1.0))
+    b.add_joint(
+        "stretch", "prismatic", parent="rod", child="bob", axis=(0, 0, -1), stiffness=stiffness, damping=damping
+    )
+    return b.build()
+
+
+def bent_pendulum(stiffness: float, damping: float) -> Model:
+    """Two links that a joint spring all but holds straight."""
+    b = ModelBuilder("bent pendulum")
+    for name, parent, place in (("a", "world", 0.0), ("b", "a", -1.0)):
+        b.add_body(name, mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+        spring = {"stiffness": stiffness, "damping": damping} if name == "b" else {}
+        at = (0.0, 0.0, place)
+        b.add_joint(f"to {name}", "revolute", parent=parent, child=name, axis=(0, -1, 0), translation=at, **spring)
+    return b.build()
+
+
+def apart(model: Model, run: Any, other: Any) -> float:
+    return float(max(np.abs(model.difference(run.q[-1], other.q[-1])).max(), np.abs(run.v[-1] - other.v[-1]).max()))
+
+
+# The Jacobian
+
+
+def differences(rates: Rates, y: np.ndarray, force: Any, h: float = 1e-3) -> np.ndarray:
+    """Central differences of sixth order of the rates, in every raw component."""
+    columns = []
+    for e in np.eye(len(y)):
+        at = {s: rates(0.3, y + s * h * e, force) for s in (-3, -2, -1, 1, 2, 3)}
+        columns.append((45 * (at[1] - at[-1]) - 9 * (at[2] - at[-2]) + at[3] - at[-3]) / (60 * h))
+    return np.array(columns).T
+
+
+def state(model: Model, seed: int) -> np.ndarray:
+    """A state whose quaternions have any length."""
+    rng = np.random.default_rng(seed)
+    q, v = model.random_state(rng)
+    for start, _ in model.quaternions:
+        q[start : start + 4] *= rng.uniform(0.5, 2.0)
+    return np.concatenate([q, v])
+
+
+def close(J: np.ndarray, numeric: np.ndarray, good: float) -> None:
+    assert np.linalg.norm(J - numeric) <= good * np.linalg.norm(numeric)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_jacobian_is_that_of_the_rates(seed: int, engine: str) -> None:
+    kinds = tuple(k for k in ALL if k != "helical") if engine == "mujoco" else ALL
+    model = random_tree(seed, 11, kinds)
+    dyn = dynamics(model, engine)
+    y, tau = state(model, seed), np.random.default_rng(seed).standard_normal(model.nv)
+    exact = Linearization(dyn)
+    # The differences are good to h⁶ of a seventh derivative beside 2e-16 / h of the rates.
+    close(exact(0.3, y, tau), differences(Rates(dyn), y, tau), 1e-10)
+    assert exact.evaluations == 1
+
+    def spring(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return tau * np.sin(t + q.sum()) - 0.3 * v
+
+    # Of a torque function, forward differences: half of the digits.
+    close(exact(0.3, y, spring), differences(Rates(dyn), y, spring), 1e-7)
+
+
+def test_the_jacobian_has_the_parameters_values() -> None:
+    model = catalog.double_pendulum(mass1=mb.Parameter("m", 2.0))
+    dyn = dynamics(model, "lagrangian")
+    y, tau = np.array([0.3, -0.5, 1.0, 2.0]), np.zeros(2)
+    plain = Linearization(dynamics(catalog.double_pendulum(mass1=3.0), "lagrangian"))(0.0, y, tau)
+    assert Linearization(dyn.at(m=3.0))(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
+    assert Linearization(dynamics(model).at(m=3.0))(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
+    many = Linearization(dyn.at(m=[1.0, 3.0]))
+    many.only(1)
+    assert many(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
+
+
+def test_another_engine_is_derived_once() -> None:
+    dyn = dynamics(catalog.pendulum())
+    assert Linearization(dyn)._twin is Linearization(dyn)._twin
+    own = dynamics(catalog.pendulum(), "lagrangian")
+    assert Linearization(own)._twin is own
+
+
+def test_where_there_is_no_jacobian_the_last_one_stays() -> None:
+    model = catalog.pendulum()
+    exact = Linearization(dynamics(model, "lagrangian"))
+    assert not exact(0.0, np.array([np.nan, 0.0]), np.zeros(1)).any()
+    known = exact(0.0, np.array([0.3, 0.0]), np.zeros(1))
+    assert np.array_equal(exact(0.0, np.array([0.3, np.inf]), np.zeros(1)), known)
+
+
+# Accuracy
+
+
+@pytest.mark.parametrize("method", STIFF)
+def test_tolerance_rules_the_error(method: str) -> None:
+    dyn = dynamics(catalog.pendulum(), "lagrangian")
+    t = np.linspace(0, 3, 7)
+    exact, speed = closed_forms.pendulum_solution(t, 2.0)
+    errors, cost = [], []
+    for rtol in (1e-4, 1e-6, 1e-8, 1e-10):
+        run = simulate(dyn, [2.0], [0.0], 3.0, method, rtol=rtol, save=t)
+        assert np.array_equal(run.t, t)
+        errors.append(max(np.abs(run.q[:, 0] - exact).max(), np.abs(run.v[:, 0] - speed).max()))
+        cost.append(run.stats.evaluations)
+    assert all(error < 2e4 * rtol for error, rtol in zip(errors, (1e-4, 1e-6, 1e-8, 1e-10), strict=True))
+    assert errors == sorted(errors, reverse=True)
+    assert cost == sorted(cost)
+
+
+@pytest.mark.parametrize("method", STIFF)
+def test_every_joint_kind_moves_as_with_dop853(method: str) -> None:
+    model = random_tree(3, 10)
+    q, v = model.random_state(np.random.default_rng(0))
+    dyn, save = dynamics(model, "lagrangian"), [0.0, 0.04, 0.08]
+    truth = simulate(dyn, q, v, 0.08, "dop853", rtol=1e-12, save=save)
+    run = simulate(dyn, q, v, 0.08, method, rtol=ENOUGH[method], save=save)
+    assert apart(model, run, truth) < 1e-6
+    model.check_q(run.q)
+    # LSODA stays with Adams where nothing is stiff.
+    assert run.stats.jacobians > 0 or method == "lsoda"
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
+@pytest.mark.parametrize("method", IMPLICIT)
+def test_scipys_run_on_every_engine(engine: str, method: str) -> None:
+    model = catalog.heavy_top()
+    q, v = model.neutral(), np.array([1.0, 20.0, -4.0])
+    truth = simulate(dynamics(model, "lagrangian"), q, v, 0.1, "dop853", rtol=1e-12)
+    run = simulate(dynamics(model, engine), q, v, 0.1, method, rtol=ENOUGH[method])
+    assert apart(model, run, truth) < 1e-5
+    assert len(run.t) == run.stats.steps + 1
+
+
+@pytest.mark.parametrize("method", SCIPY)
+def test_a_dense_grid_costs_little_and_loses_nothing(method: str) -> None:
+    """Saved times between the steps: interpolated, or ended on without starting over."""
+    dyn = dynamics(catalog.pendulum())
+    few = simulate(dyn, [2.0], [0.0], 2.0, method, rtol=1e-10, save=[0, 2.0])
+    times = np.sort(np.append(np.linspace(0, 2, 41), np.linspace(0, 2, 41)[1:-1] + 1e-9))
+    many = simulate(dyn, [2.0], [0.0], 2.0, method, rtol=1e-10, save=times)
+    assert many.stats.finished
+    exact, _ = closed_forms.pendulum_solution(times, 2.0)
+    assert many.q[:, 0] == pytest.approx(exact, abs=2e-7)
+    if method in ("bdf", "lsoda"):
+        assert many.stats.evaluations == few.stats.evaluations
+    else:
+        assert many.stats.steps <= few.stats.steps + 2 * len(times)
+
+
+# Stiffness, counted in evaluations
+
+
+@pytest.mark.parametrize("scene", [elastic_pendulum, bent_pendulum])
+@pytest.mark.parametrize(("stiffness", "damping"), [(1e6, 1e4), (1e9, 1e6)])
+def test_stiff_scenes_are_reached_with_few_evaluations(scene: Any, stiffness: float, damping: float) -> None:
+    model = scene(stiffness, damping)
+    dyn = dynamics(model, "lagrangian")
+    start = [1.0, 0.0], [0.0, 0.0], 1.0
+    truth = simulate(dyn, *start, "radau", rtol=1e-11, save=[0, 1.0])
+    # The reference is held by a method of another family.
+    assert apart(model, simulate(dyn, *start, "lsoda", rtol=1e-12, save=[0, 1.0]), truth) < 1e-9
+    for method, rtol in (("radau", 1e-7), ("bdf", 1e-8), ("lsoda", 1e-9), ("cvodes", 1e-8)):
+        run = simulate(dyn, *start, method, rtol=rtol, save=[0, 1.0])
+        assert apart(model, run, truth) < 1e-6, method
+        assert run.stats.evaluations < 1000, method
+        assert 0 < run.stats.jacobians < 100, method
+
+
+def test_an_explicit_method_needs_far_more() -> None:
+    model = elastic_pendulum(1e6, 1e4)
+    dyn = dynamics(model, "lagrangian")
+    explicit, implicit = (
+        simulate(dyn, [1.0, 0.0], [0.0, 0.0], 1.0, method, rtol=1e-7, save=[0, 1.0]) for method in ("dop853", "radau")
+    )
+    assert apart(model, explicit, implicit) < 1e-6
+    # The fast decay, at the rate c/m = 1e4 and more per second, bounds its step, whatever the tolerance.
+    assert explicit.stats.evaluations > 20 * implicit.stats.evaluations
+    assert explicit.stats.rejected > 0
+
+
+def test_a_stiff_linear_oscillator_follows_its_closed_form() -> None:
+    k, c, m = 1e9, 1e6, 1.0
+    b = ModelBuilder("slider")
+    b.add_body("mass", mass=m)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=k, damping=c)
+    dyn = dynamics(b.build(), "lagrangian")
+    root = np.sqrt(c * c / 4 - k * m)
+    slow, fast = -k / (c / 2 + root), -(c / 2 + root)
+    t = np.linspace(0, 5e-3, 11)
+    exact = (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow)
+    for method in STIFF:
+        run = simulate(dyn, [1.0], [0.0], 5e-3, method, rtol=ENOUGH[method], save=t)
+        assert run.q[:, 0] == pytest.approx(exact, abs=1e-6), method
+        assert run.stats.evaluations < 5000, method
+
+
+# Torques, batches, parameters
+
+
+@pytest.mark.parametrize("method", STIFF)
+def test_held_torques_start_the_method_anew(method: str) -> None:
+    model = catalog.double_pendulum()
+    dyn = dynamics(model, "lagrangian")
+    grid = np.linspace(0, 0.3, 4)
+    tau = 5 * np.random.default_rng(0).standard_normal((3, 2))
+    truth = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.3, "dop853", rtol=1e-13, torque=tau, save=grid)
+    run = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.3, method, rtol=ENOUGH[method], torque=tau, save=grid)
+    assert run.q == pytest.approx(truth.q, abs=1e-7)
+    q = np.array([[0.5, 0.2], [0.1, 0.0]])
+    both = simulate(dyn, q, [0.0, 0.0], 0.3, method, rtol=ENOUGH[method], torque=np.stack([tau, -tau]), save=grid)
+    assert np.array_equal(both.q[0], run.q)
+    alone = simulate(dyn, q[1], [0.0, 0.0], 0.3, method, rtol=ENOUGH[method], torque=-tau, save=grid)
+    assert np.array_equal(both.q[1], alone.q)
+    assert both.stats.evaluations == run.stats.evaluations + alone.stats.evaluations
+    assert both.stats.jacobians == run.stats.jacobians + alone.stats.jacobians
+    constant = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.3, method, rtol=ENOUGH[method], torque=[1.0, -2.0], save=grid)
+    same = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.3, "dop853", rtol=1e-13, torque=[1.0, -2.0], save=grid)
+    assert constant.q == pytest.approx(same.q, abs=1e-7)
+
+
+@pytest.mark.parametrize("method", STIFF)
+def test_parameters_of_each_of_a_batch(method: str) -> None:
+    dyn = dynamics(catalog.pendulum(length=mb.Parameter("l", 1.0)), "lagrangian")
+    times, lengths = [0.0, 1.0], [0.5, 2.0]
+    run = simulate(dyn.at(l=lengths), [1.0], [0.0], 1.0, method, rtol=ENOUGH[method], save=times)
+    for length, q in zip(lengths, run.q, strict=True):
+        exact, _ = closed_forms.pendulum_solution(np.array(times), 1.0, length)
+        assert q[:, 0] == pytest.approx(exact, abs=1e-7)
+    one = simulate(dyn.at(l=2.0), [1.0], [0.0], 1.0, method, rtol=ENOUGH[method], save=times)
+    assert one.q == pytest.approx(run.q[1], abs=1e-12)
+
+
+@pytest.mark.parametrize("method", STIFF)
+def test_the_same_inputs_give_the_same_bits_and_a_batch_may_be_empty(method: str) -> None:
+    model = catalog.heavy_top()
+    dyn, save = dynamics(model, "lagrangian"), np.linspace(0, 0.2, 21)
+    v = np.array([1.0, 20.0, -4.0])
+    runs = [simulate(dyn, model.neutral(), v, 0.2, method, rtol=1e-8, save=save).q for _ in range(2)]
+    assert np.array_equal(*runs)
+    assert simulate(dyn, np.empty((0, 4)), v, 0.2, method, save=save).q.shape == (0, 0, 4)
+    still = simulate(dyn, model.neutral(), v, 0.0, method, save=[0.0])
+    assert still.q.shape == (1, 4)
+    assert still.stats.steps == 0
+
+
+# Runs that go wrong
+
+
+class _Wall(Dynamics):
+    """A pendulum whose engine fails past 1 rad."""
+
+    engine = "wall"
+
+    def _forward_dynamics(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        if np.any(q > 1.0):
+            raise NumericalError("wall: no acceleration past 1 rad")
+        return tau - 9.81 * np.sin(q)
+
+    def _other(self, *_: Any) -> np.ndarray:
+        raise NotImplementedError
+
+    _mass_matrix = _potential_energy = _kinetic_energy = _gravity = _nle = _passive = _inverse_dynamics = _other
+    _pose = _jacobian = _other
+
+
+@pytest.mark.parametrize("method", SCIPY)
+def test_an_engine_that_fails_ends_the_run_close_to_there(method: str, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.warns(MbkitWarning, match=r"diverged: wall: no acceleration past 1 rad after t = 0\.05") as heard:
+        run = simulate(_Wall(catalog.pendulum()), [0.9], [2.0], 1.0, method, rtol=1e-8)
+    assert len(heard) == 1
+    assert run.stats.ended == "diverged"
+    assert 0.999 < run.q[-1, 0] <= 1.0
+    assert run.t[-1] == run.stats.reached
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("method", STIFF)
+def test_a_state_that_overflows_keeps_what_there_was(method: str, capfd: pytest.CaptureFixture[str]) -> None:
+    box = catalog.free_body()
+    dyn = dynamics(box, "lagrangian")
+    with pytest.warns(MbkitWarning, match=r"after t = 0 s") as heard:
+        run = simulate(dyn, box.neutral(), [0, 0, 0, 0, 0, 1e155], 1.0, method, save=[0, 0.5, 1.0])
+    assert len(heard) == 1
+    assert run.stats.ended in ("diverged", "step_too_small")
+    assert np.array_equal(run.q, [box.neutral()])
+    assert capfd.readouterr() == ("", "")
+
+
+def pushed(t: float) -> float:
+    """A force that is without bound at 0.7 s."""
+    return 1.0 / (0.7 - t) ** 2
+
+
+@pytest.mark.parametrize("method", SCIPY)
+def test_a_step_below_rounding_is_told(method: str) -> None:
+    dyn = dynamics(catalog.pendulum())
+    save = np.linspace(0, 1, 11)
+    with pytest.warns(MbkitWarning, match=r"after t = 0\.[67]"):
+        run = simulate(dyn, [0.1], [0.0], 1.0, method, rtol=1e-8, torque=lambda t, q, v: [pushed(t)], save=save)
+    assert run.stats.ended in ("step_too_small", "diverged")
+    assert run.stats.reached == pytest.approx(0.7, abs=1e-3)
+    assert np.array_equal(run.t, save[:7])
+
+
+@pytest.mark.parametrize("method", SCIPY)
+@pytest.mark.parametrize("states", [[0.1], [[0.1], [0.2], [0.3]]])
+def test_a_torque_that_fails_leaves_the_run_up_to_then(method: str, states: Any) -> None:
+    dyn = dynamics(catalog.pendulum())
+    save = np.linspace(0, 1, 11)
+
+    def failing(t: float, q: np.ndarray, v: np.ndarray) -> Any:
+        if t > 0.55:
+            raise ZeroDivisionError("mine")
+        return [0.0]
+
+    with pytest.raises(TorqueError) as caught:
+        simulate(dyn, states, [0.0], 1.0, method, torque=failing, save=save)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    partial = caught.value.trajectory
+    assert partial.stats.ended == "torque_failed"
+    first = partial.q if np.ndim(states) == 1 else partial.q[0]
+    good = simulate(dyn, [0.1], [0.0], 1.0, method, save=save)
+    assert 5 <= len(first) <= 6
+    assert first == pytest.approx(good.q[: len(first)], abs=1e-8)
+    if np.ndim(states) == 2:
+        # Those that were not begun are void.
+        assert np.isnan(partial.q[1:]).all()
+
+
+@pytest.mark.parametrize("method", IMPLICIT)
+def test_an_interruption_gets_through(method: str) -> None:
+    def interrupted(t: float, q: np.ndarray, v: np.ndarray) -> Any:
+        if t > 0.5:
+            raise KeyboardInterrupt
+        return [0.0]
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(dynamics(catalog.pendulum()), [0.1], [0.0], 1.0, method, torque=interrupted)
+
+
+# CVODES
+
+
+def test_cvodes_tells_how_far_it_is_and_starts_over_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mbkit.simulate import progress
+
+    monkeypatch.setattr(progress, "_PERIOD", 0.0)
+    dyn = dynamics(catalog.pendulum(), "lagrangian")
+    told: list[float] = []
+    fine = simulate(dyn, [2.0], [0.0], 20.0, "cvodes", rtol=1e-12, save=np.linspace(0, 20, 501), progress=told.append)
+    assert len(told) > 3
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    coarse = simulate(dyn, [2.0], [0.0], 20.0, "cvodes", rtol=1e-12, save=[0, 20.0])
+    assert fine.stats.steps < 1.2 * coarse.stats.steps
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no interval timer on this system")
+def test_cvodes_can_be_interrupted_while_casadi_runs() -> None:
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.3)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(
+                dynamics(catalog.double_pendulum(), "lagrangian"), [2.0, 1.0], [0.0, 0.0], 1e5, "cvodes", save=[1e5]
+            )
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def cart_without_mass() -> Model:
+    """Where the pole hangs down nothing resists the cart: the mass matrix is singular there."""
+    b = ModelBuilder("cart without mass")
+    b.add_body("cart")
+    b.add_body("pole", mass=1.0, com=(0, 0, -1.0))
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b.add_joint("theta", "revolute", parent="cart", child="pole", axis=(0, -1, 0))
+    return b.build()
+
+
+def test_cvodes_keeps_all_that_was_reached(capfd: pytest.CaptureFixture[str]) -> None:
+    dyn = dynamics(cart_without_mass(), "lagrangian")
+    save = np.linspace(0, 2, 201)
+    # The bob falls freely, so θ = 0 is reached after √(2 (1 - cos 1) / g).
+    down = np.sqrt(2 * (1 - np.cos(1.0)) / 9.81)
+    with pytest.warns(MbkitWarning, match=r"cvodes step below rounding .* after t = 0\.3 s") as heard:
+        run = simulate(dyn, [0.0, 1.0], [0.0, 0.0], 2.0, "cvodes", save=save)
+    assert len(heard) == 1
+    assert run.stats.ended == "step_too_small"
+    assert run.stats.reached == run.t[-1] == save[save < down][-1]
+    assert np.array_equal(run.t, save[save < down])
+    assert -np.cos(run.q[:, 1]) == pytest.approx(-np.cos(1.0) - 0.5 * 9.81 * run.t**2, abs=1e-6)
+    with pytest.warns(MbkitWarning, match="1 of 2 trajectories ended early"):
+        both = simulate(dyn, [[0.0, 1.0], [0.0, 3.0]], [0.0, 0.0], 0.4, "cvodes", save=save[:41])
+    assert np.isfinite(both.q[1]).all()
+    assert np.array_equal(np.isfinite(both.q[0, :, 0]), both.t < down)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_cvodes_cannot_do_is_said() -> None:
+    model = catalog.pendulum()
+    dyn = dynamics(model, "lagrangian")
+    with pytest.raises(UnsupportedError, match=r"cvodes: .*mbkit.dynamics\(model, 'lagrangian'\)"):
+        simulate(dynamics(model), [0.1], [0.0], 1.0, "cvodes", save=[0, 1.0])
+    with pytest.raises(InputError, match="save: cvodes does not tell its own steps"):
+        simulate(dyn, [0.1], [0.0], 1.0, "cvodes")
+    with pytest.raises(UnsupportedError, match="cvodes: torque functions"):
+        simulate(dyn, [0.1], [0.0], 1.0, "cvodes", save=[0, 1.0], torque=lambda t, q, v: -v)
+    with pytest.raises(InputError, match="rtol: expected at least"):
+        simulate(dyn, [0.1], [0.0], 1.0, "cvodes", save=[0, 1.0], rtol=1e-16)
