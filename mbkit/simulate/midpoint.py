@@ -1,0 +1,255 @@
+"""Runs of the implicit midpoint rule in (q, p), on `mbkit.lagrangian.midpoint`'s parts.
+
+The state from step to step is (q, π), and velocities are made of it only where they are
+kept. With no torque or an array, blocks of steps run as machine code, chunks of a batch
+on all cores; the chunks are the same whatever the number of cores. A function as torque
+is evaluated at the midpoint and taken along in the iteration, which then converges
+linearly, at the rate of the step times the torque's derivative.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import TorqueError, UnsupportedError
+from mbkit.lagrangian.machine import Machine
+from mbkit.lagrangian.midpoint import GUESS, Midpoint
+from mbkit.model.space import Space
+from mbkit.simulate.grid import Grid, Indices, check_room
+from mbkit.simulate.midpoint_solver import MidpointSolver, called
+from mbkit.simulate.outcome import Outcome
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.steps import RAN_AWAY, RUNAWAY
+from mbkit.simulate.torque import Torque
+
+if TYPE_CHECKING:
+    from mbkit.simulate.midpoint_chunk import MidpointChunk
+
+__all__ = ["run_midpoint"]
+
+_UNSOLVED: Final = "Newton's iteration does not solve the step's equations"
+# Numbers that are turned from momenta into velocities at a time.
+_SLICE: Final = 2**16
+
+
+def run_midpoint(
+    dyn: Dynamics,
+    method: str,
+    q0: Array,
+    v0: Array,
+    grid: Grid,
+    kept: Indices,
+    torque: Torque,
+    bar: Progress,
+) -> Outcome:
+    """Step one state or a batch over the grid; a trajectory that diverges stops there, and the others go on."""
+    if not isinstance(dyn, LagrangianDynamics):
+        raise UnsupportedError(
+            f"{method}: {dyn.engine} gives neither momenta nor ∂T/∂q, which the midpoint rule in (q, p) is made of; "
+            "mbkit.dynamics(model, 'lagrangian') has them; 'gauss4' and 'gauss6' run on any engine"
+        )
+    single = q0.ndim == 1
+    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
+    check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])
+    run = _Run(dyn, q0, v0, grid, kept, torque)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        if _machine_code(dyn, torque):
+            run.in_chunks(bar)
+        else:
+            run.step_by_step(bar, single=single)
+        return run.outcome(single)
+
+
+def _machine_code(dyn: LagrangianDynamics, torque: Torque) -> bool:
+    if torque.callable or not dyn.model.nv or not dyn.compile or not dyn.written_out:
+        return False
+    midpoint = Midpoint(dyn.equations)
+    return not any(isinstance(dyn.code(p.name, make=p.make), Machine) for p in (midpoint.newton, midpoint.end))
+
+
+class _Run:
+    """Kept states of all trajectories: momenta at first, velocities in the end."""
+
+    def __init__(
+        self, dyn: LagrangianDynamics, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque
+    ) -> None:
+        self._dyn, self._grid, self._kept, self._torque = dyn, grid, kept, torque
+        self._midpoint = Midpoint(dyn.equations)
+        self._q0, self._v0, self._w0 = q0, v0, Space(dyn.model).enter(q0, v0)
+        n, rows = len(q0), len(kept)
+        (self._pi0,) = called(self._dyn, self._midpoint.momentum, slice(None), q0, v0)
+        self._q, self._v = np.full((n, rows, q0.shape[1]), np.nan), np.full((n, rows, v0.shape[1]), np.nan)
+        self._steps = np.zeros(n, dtype=np.intp)
+        self._last = np.zeros(n)
+        # Threads append to it.
+        self._iterations: list[int] = []
+        self._error: TorqueError | None = None
+
+    def _rows(self, first: int, last: int) -> slice:
+        """Return the rows of what is kept of the states from the first to the last."""
+        return slice(*np.searchsorted(self._kept, (first, last + 1), side="left"))
+
+    # In machine code
+
+    def in_chunks(self, bar: Progress) -> None:
+        """Run every trajectory, some side by side, and such chunks at once on several cores."""
+        # These load LLVM, which interpreting never needs.
+        from mbkit.lagrangian.compiled import cores
+        from mbkit.simulate.midpoint_chunk import WIDEST, MidpointChunk
+
+        n, workers = len(self._q0), self._dyn.threads or cores()
+        parts = -(-n // WIDEST)
+        ends = [n * i // max(parts, 1) for i in range(parts + 1)]
+        chunks = [slice(a, b) for a, b in pairwise(ends)]
+        done, stop = [0] * parts, threading.Event()
+        total = max(parts * self._grid.steps, 1)
+
+        def work(i: int, tell: Callable[[], None]) -> None:
+            def progress(k: int) -> bool:
+                done[i] = k
+                tell()
+                return stop.is_set()
+
+            members = chunks[i]
+            chunk = MidpointChunk(self._dyn, members.stop - members.start, self._grid.steps, torques=self._torque.held)
+            self._march(chunk, members, progress)
+
+        if parts < 2 or workers < 2:
+            for i in range(parts):
+                work(i, lambda: bar.update(sum(done) / total))
+            return
+        with ThreadPoolExecutor(min(workers, parts)) as pool:
+            waiting: set[Future[None]] = {pool.submit(work, i, lambda: None) for i in range(parts)}
+            try:
+                while waiting:
+                    finished, waiting = wait(waiting, timeout=0.1, return_when=FIRST_EXCEPTION)
+                    for future in finished:
+                        future.result()
+                    bar.update(sum(done) / total)
+            finally:
+                stop.set()
+
+    def _march(self, chunk: MidpointChunk, members: slice, progress: Callable[[int], bool]) -> None:
+        grid, held = self._grid, self._torque.held
+        values = self._dyn.parameter_values
+        own = values[members] if values.ndim == 2 else values
+        chunk.begin(self._q0[members], self._pi0[members], self._w0[members], own)
+        alive, k, torques = np.full(members.stop - members.start, True), 0, np.empty(0)
+        while k < grid.steps and alive.any():
+            # The last step may have a length of its own.
+            whole = grid.steps - 1 if grid.last != grid.dt and k < grid.steps - 1 else grid.steps
+            n = min(chunk.block, whole - k)
+            if held or not torques.size:
+                torques = self._torque.columns(members, k, k + n)
+            good = chunk.advance(n, grid.step(k), torques)
+            if (rows := self._rows(k + 1, k + n)).start < rows.stop:
+                at = self._kept[rows] - k
+                self._q[members, rows], self._v[members, rows] = chunk.states("q", at), chunk.states("pi", at)
+            self._steps[members][alive] = k + good[alive]
+            for m in np.flatnonzero(alive & (good < n)):
+                last = [chunk.states(name, good[m : m + 1])[m] for name in ("q", "pi")]
+                self._last[members.start + m] = max(np.abs(x).max() for x in last)
+            alive &= good == n
+            chunk.again()
+            k += n
+            if progress(k):
+                break
+        self._iterations.append(chunk.iterations)
+
+    # In Python
+
+    def step_by_step(self, bar: Progress, *, single: bool) -> None:
+        """Run all trajectories side by side, with a look at every step."""
+        grid = self._grid
+        members: Indices = np.arange(len(self._q0))
+        solver = MidpointSolver(self._dyn, self._torque, single=single)
+        q, pi, ws, guess = self._q0, self._pi0, [self._w0] * len(GUESS), self._w0
+        try:
+            for k in range(grid.steps):
+                w, tau, good = solver.velocity(members, k, grid.time(k), grid.step(k), q, pi, guess)
+                ws = [w, *ws[:-1]]
+                q1, pi1, guess = solver.end(members, grid.step(k), q, pi, ws, tau)
+                good &= (np.abs(q1) < RUNAWAY).all(axis=1) & (np.abs(pi1) < RUNAWAY).all(axis=1)
+                if not good.all():
+                    self._last[members[~good]] = np.maximum(np.abs(q).max(axis=1), np.abs(pi).max(axis=1))[~good]
+                    members, q1, pi1, guess = members[good], q1[good], pi1[good], guess[good]
+                    ws = [w[good] for w in ws]
+                    if not len(members):
+                        break
+                q, pi = q1, pi1
+                self._steps[members] = k + 1
+                if (rows := self._rows(k + 1, k + 1)).start < rows.stop:
+                    self._q[members, rows.start], self._v[members, rows.start] = q, pi
+                bar.update((k + 1) / grid.steps)
+        except TorqueError as error:
+            self._error = error
+        self._iterations.append(solver.iterations)
+
+    # In the end
+
+    def outcome(self, single: bool) -> Outcome:
+        """Return what was kept, with velocities."""
+        grid, kept, steps = self._grid, self._kept, self._steps
+        for i in np.flatnonzero(steps < grid.steps):
+            self._q[i, kept > steps[i]], self._v[i, kept > steps[i]] = np.nan, np.nan
+        self._to_velocities()
+        if kept[0] == 0:
+            self._q[:, 0], self._v[:, 0] = self._q0, self._v0
+        rows = int(np.count_nonzero(kept <= steps.max())) if len(steps) else len(kept)
+        q, v = self._q[:, :rows], self._v[:, :rows]
+        times = np.array([grid.time(int(k)) for k in steps])
+        message = self._message(single)
+        return Outcome(
+            t=np.array([grid.time(int(k)) for k in kept[:rows]]),
+            q=q[0] if single else q,
+            v=v[0] if single else v,
+            steps=int(steps.sum()),
+            # Each iteration is one, and so is the end of each step.
+            evaluations=sum(self._iterations) + int(steps.sum()),
+            ended="torque_failed" if self._error else "diverged" if message else "finished",
+            reached=np.asarray(times[0] if single else times),
+            message=message,
+            jacobians=sum(self._iterations),
+            error=self._error,
+        )
+
+    def _to_velocities(self) -> None:
+        n, rows, nv = self._v.shape
+        size = max(_SLICE // max(n * (nv or 1), 1), 1)
+        for start in range(0, rows, size):
+            q, v = (x[:, start : start + size] for x in (self._q, self._v))
+            good = np.isfinite(v).all(axis=2)
+            who, at = np.nonzero(good)
+            if len(who):
+                v[who, at] = self._velocities(who, q[who, at], v[who, at])
+
+    def _velocities(self, members: Indices, q: Array, pi: Array) -> Array:
+        if self._dyn.written_out:
+            return called(self._dyn, self._midpoint.velocity, members, q, pi)[0]
+        M, p = called(self._dyn, self._midpoint.velocity_system, members, q, pi)
+        return np.asarray(np.linalg.solve(M, p[..., None])[..., 0])
+
+    def _message(self, single: bool) -> str:
+        grid, steps = self._grid, self._steps
+        if self._error is not None:
+            return str(self._error)
+        short = np.flatnonzero(steps < grid.steps)
+        if not len(short):
+            return ""
+        i = int(short[np.argmin(steps[short])])
+        t = grid.time(int(steps[i]))
+        # What overflows in the middle of a step leaves no number for the iteration either.
+        why = RAN_AWAY if self._last[i] > RUNAWAY**0.5 else _UNSOLVED
+        message = f"diverged after t = {t:.6g} s (step {steps[i] + 1}): {why}; dt = {grid.dt:g} s may be too long"
+        if not single:
+            message += f"; {len(short)} of {len(steps)} trajectories diverged, see reached"
+        return message

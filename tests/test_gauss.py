@@ -1,0 +1,257 @@
+# Torques have the signature they are called with.
+# ruff: noqa: ARG001, ARG005
+"""Gauss-Legendre collocation: its tableaus, its order on any engine, and runs that go wrong."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit import catalog
+from mbkit.errors import InputError, MbkitWarning, TorqueError
+from mbkit.model import Model, ModelBuilder
+from mbkit.model.space import Space
+from mbkit.simulate import METHODS, simulate
+from mbkit.simulate.gauss import gauss_legendre
+from mbkit.simulate.steps import Field, make_step
+from mbkit.simulate.tableau import ImplicitTableau, Tableau
+from tests.random_trees import random_tree
+
+EPS = np.finfo(float).eps
+GAUSS = ("gauss4", "gauss6")
+PUBLISHED = json.loads((Path(__file__).parents[1] / "validation" / "published.json").read_text(encoding="utf-8"))
+
+
+# Tableaus
+
+
+@pytest.mark.parametrize("stages", [2, 3])
+def test_tableaus_are_gauss_and_legendres(stages: int) -> None:
+    tableau = gauss_legendre(stages)
+    nodes, weights = np.polynomial.legendre.leggauss(stages)
+    assert tableau.c == pytest.approx((1 + nodes) / 2, abs=4 * EPS)
+    assert tableau.b == pytest.approx(weights / 2, abs=4 * EPS)
+    # Symplectic: b_i a_ij + b_j a_ji = b_i b_j. Symmetric: A and its mirror image sum to b.
+    b, A = tableau.b, tableau.A
+    assert b[:, None] * A + (b[:, None] * A).T == pytest.approx(np.outer(b, b), abs=4 * EPS)
+    assert A + A[::-1, ::-1] == pytest.approx(np.tile(b, (stages, 1)), abs=4 * EPS)
+    with pytest.raises(InputError, match=f"order {2 * stages + 1} condition"):
+        ImplicitTableau("too high", A, b, 2 * stages + 1)
+    with pytest.raises(InputError, match="not explicit"):
+        Tableau("explicit", A, b, 2 * stages)
+    again = pickle.loads(pickle.dumps(tableau))
+    assert type(again) is ImplicitTableau
+    assert np.array_equal(again.A, A)
+
+
+# Order
+
+
+def cases() -> dict[str, tuple[Model, np.ndarray, np.ndarray, float]]:
+    rng = np.random.default_rng(5)
+    tree = random_tree(11, n=4, kinds=("free", "ball", "revolute", "prismatic"))
+    top, box = catalog.heavy_top(), catalog.free_body()
+    return {
+        "double pendulum": (catalog.double_pendulum(), np.array([0.6, 0.3]), np.array([0.5, -0.5]), 1.0),
+        "heavy top": (top, top.random_state(rng)[0], np.array([1.0, 20.0, -4.0]), 0.5),
+        "Dzhanibekov box": (box, box.random_state(rng)[0], np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1]), 1.0),
+        # With springs, damping and armature; the torque pushes it too.
+        "random tree": (tree, *tree.random_state(rng), 0.5),
+    }
+
+
+def torque_on(model: Model) -> np.ndarray:
+    return np.linspace(-1.0, 1.0, model.nv) if model.name.startswith("tree") else np.zeros(model.nv)
+
+
+def observed_order(
+    case: str, method: str, engine: str, torque: object, counts: tuple[int, ...]
+) -> tuple[float, list[float]]:
+    model, q, v, duration = cases()[case]
+    truth = simulate(mb.dynamics(model), q, v, duration, "dop853", rtol=3e-14, save=[0.0, duration], torque=torque)  # type: ignore[arg-type]
+    dyn, steps, errors = mb.dynamics(model, engine), [], []
+    for n in counts:
+        run = simulate(dyn, q, v, duration, method, dt=duration / n, torque=torque)  # type: ignore[arg-type]
+        steps.append(duration / n)
+        apart = [model.difference(truth.q[-1], run.q[-1]), run.v[-1] - truth.v[-1]]
+        errors.append(float(np.linalg.norm(np.concatenate(apart))))
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0]), errors
+
+
+# Long enough steps that rounding is far, short enough that the first term of the error rules.
+COUNTS = {"gauss4": (30, 45, 65, 90), "gauss6": (14, 18, 24, 32)}
+# The top turns fast; the tree has a joint that swings and damps within a few hundredths of a second.
+QUICKER = {
+    ("heavy top", "gauss4"): 2,
+    ("heavy top", "gauss6"): 2,
+    ("random tree", "gauss4"): 3,
+    ("random tree", "gauss6"): 4,
+}
+
+
+@pytest.mark.parametrize("case", cases())
+@pytest.mark.parametrize("method", GAUSS)
+def test_observed_order(case: str, method: str) -> None:
+    counts = tuple(QUICKER.get((case, method), 1) * n for n in COUNTS[method])
+    order, _ = observed_order(case, method, "pinocchio", torque_on(cases()[case][0]), counts)
+    assert order == pytest.approx(METHODS[method].order, abs=0.2)
+
+
+@pytest.mark.parametrize("method", GAUSS)
+def test_observed_order_with_a_torque_function(method: str) -> None:
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.array([np.sin(5 * t), 0.0]) - 2.0 * v - 3.0 * q
+
+    order, _ = observed_order("double pendulum", method, "lagrangian", torque, COUNTS[method])
+    assert order == pytest.approx(METHODS[method].order, abs=0.2)
+
+
+@pytest.mark.parametrize("case", cases())
+def test_every_engine_gives_the_same(case: str) -> None:
+    model, q, v, duration = cases()[case]
+    runs = [
+        simulate(mb.dynamics(model, engine), q, v, duration, "gauss6", dt=duration / 20, torque=torque_on(model))
+        for engine in ("pinocchio", "lagrangian", "mujoco")
+    ]
+    for run in runs[1:]:
+        # Engines differ by rounding in each of 20 steps' some dozen evaluations.
+        assert np.abs(run.q - runs[0].q).max() <= 1e-12
+        assert np.abs(run.v - runs[0].v).max() <= 1e-11 * max(np.abs(v).max(), 1.0)
+
+
+def test_the_published_heavy_top() -> None:
+    told = PUBLISHED["heavy_top"]
+    top = catalog.heavy_top()
+    run = simulate(mb.dynamics(top), top.neutral(), told["w0_body"], 0.2, "gauss6", dt=5e-4, save=[0.2])
+    w, x, y, z = told["published_quaternion_wxyz_t0p2_rk4"]
+    got = run.q[-1] * np.sign(run.q[-1] @ [x, y, z, w])
+    # Printed with five digits, from a run that the source made with RK4.
+    assert got == pytest.approx([x, y, z, w], abs=1e-4)
+
+
+# Stages solved to rounding
+
+
+@pytest.mark.parametrize("case", cases())
+@pytest.mark.parametrize("method", GAUSS)
+def test_stages_are_solved_to_rounding(case: str, method: str) -> None:
+    """A step from a good guess and one from none agree, so the iteration's way leaves no trace."""
+    model, q, v, duration = cases()[case]
+    space, h, force = Space(model), duration / 40, torque_on(model)
+    dyn = mb.dynamics(model)
+    warm = make_step(method, Field(dyn, space), space)
+    state = q, space.enter(q, v)
+    for k in range(4):
+        cold = make_step(method, Field(dyn, space), space)
+        fresh = cold(k * h, h, *state, force)
+        state = warm(k * h, h, *state, force)
+        assert np.abs(fresh[0] - state[0]).max() <= 64 * EPS * max(np.abs(state[0]).max(), 1.0)
+        assert np.abs(fresh[1] - state[1]).max() <= 256 * EPS * max(np.abs(state[1]).max(), 1.0)
+
+
+@pytest.mark.parametrize("method", GAUSS)
+def test_a_stiff_damper_is_no_reason_for_short_steps(method: str) -> None:
+    """On v' = -c v the step is the Padé approximation of exp, whatever h c is."""
+    b = ModelBuilder("damped")
+    b.add_body("mass", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), damping=1e4)
+    run = simulate(mb.dynamics(b.build()), [0.0], [1.0], 0.1, method, dt=0.01)
+    z = -100.0
+    pade = {
+        "gauss4": (1 + z / 2 + z**2 / 12) / (1 - z / 2 + z**2 / 12),
+        "gauss6": (1 + z / 2 + z**2 / 10 + z**3 / 120) / (1 - z / 2 + z**2 / 10 - z**3 / 120),
+    }
+    # The stages' equations have the condition number |z|.
+    assert run.v[:, 0] == pytest.approx(pade[method] ** np.arange(11), abs=11 * 16 * abs(z) * EPS)
+
+
+@pytest.mark.parametrize("method", GAUSS)
+def test_time_can_be_turned_back_without_quaternions(method: str) -> None:
+    model, q, v, duration = cases()["double pendulum"]
+    dyn = mb.dynamics(model)
+    there = simulate(dyn, q, v, duration, method, dt=0.02)
+    back = simulate(dyn, there.q[-1], -there.v[-1], duration, method, dt=0.02)
+    assert back.q[-1] == pytest.approx(q, abs=1e-13)
+    assert back.v[-1] == pytest.approx(-v, abs=1e-12)
+
+
+def test_energy_does_not_drift_without_quaternions() -> None:
+    model, q, v, _ = cases()["double pendulum"]
+    run = simulate(mb.dynamics(model), q, v, 200.0, "gauss4", dt=0.05)
+    energy = run.energy()
+    error = np.abs(energy - energy[0])[1:].reshape(4, -1).max(axis=1)
+    assert error[-1] <= 1.2 * error[0]
+
+
+# Batches
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
+def test_a_batch_is_its_members(engine: str) -> None:
+    model, _, _, _ = cases()["random tree"]
+    dyn = mb.dynamics(model, engine)
+    qs, vs = model.random_state(np.random.default_rng(0), 5)
+    rows = np.random.default_rng(1).standard_normal((5, 20, model.nv))
+    batch = simulate(dyn, qs, vs, 0.2, "gauss6", dt=0.01, torque=rows)
+    for i in range(5):
+        one = simulate(dyn, qs[i], vs[i], 0.2, "gauss6", dt=0.01, torque=rows[i])
+        assert np.abs(one.q - batch.q[i]).max() <= 1e-12 * max(np.abs(one.q).max(), 1.0)
+    asked = simulate(dyn, qs, vs, 0.2, "gauss6", dt=0.01, torque=lambda t, q, v: np.ones(model.nv))
+    given = simulate(dyn, qs, vs, 0.2, "gauss6", dt=0.01, torque=np.ones(model.nv))
+    assert np.abs(asked.q - given.q).max() <= 1e-12 * np.abs(given.q).max()
+
+
+def test_the_last_step_may_be_shorter() -> None:
+    model, q, v, _ = cases()["double pendulum"]
+    dyn = mb.dynamics(model)
+    run = simulate(dyn, q, v, 0.107, "gauss6", dt=0.02)
+    truth = simulate(dyn, q, v, 0.107, "dop853", rtol=3e-14, save=[0.107])
+    assert run.t[-1] == 0.107
+    assert run.q[-1] == pytest.approx(truth.q[-1], abs=1e-11)
+
+
+# What goes wrong
+
+
+@pytest.mark.parametrize("method", GAUSS)
+def test_a_step_that_is_too_long_is_told_and_what_was_good_is_kept(method: str) -> None:
+    dyn = mb.dynamics(catalog.double_pendulum())
+    with pytest.warns(MbkitWarning, match=r"diverged after t = .* s \(step .*may be too long"):
+        run = simulate(dyn, [2.0, 1.0], [8.0, -9.0], 300.0, method, dt=1.5)
+    assert run.stats.ended == "diverged"
+    assert np.isfinite(run.q).all()
+    assert run.t[-1] == run.stats.reached < 300.0
+    q, v = np.array([[2.0, 1.0], [0.01, 0.0]]), np.array([[8.0, -9.0], [0.0, 0.0]])
+    with pytest.warns(MbkitWarning, match="1 of 2 trajectories diverged"):
+        batch = simulate(dyn, q, v, 60.0, method, dt=1.5)
+    assert np.isnan(batch.q[0, -1]).all()
+    assert np.isfinite(batch.q[1]).all()
+
+
+def test_a_torque_function_that_fails_leaves_what_was_computed() -> None:
+    model, q, v, _ = cases()["double pendulum"]
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.full(2, np.nan if t > 0.5 else 0.0)
+
+    with pytest.raises(TorqueError, match="torque") as caught:
+        simulate(mb.dynamics(model), q, v, 1.0, "gauss4", dt=0.01, torque=torque)
+    assert caught.value.trajectory.t[-1] == pytest.approx(0.5)
+
+
+def test_a_torque_function_that_jumps_within_a_step_is_told() -> None:
+    dyn = mb.dynamics(catalog.pendulum(gravity=0.0))
+    with pytest.warns(MbkitWarning, match="the iteration does not solve"):
+        run = simulate(dyn, [0.0], [1e-3], 1.0, "gauss4", dt=0.1, torque=lambda t, q, v: -9 * np.sign(v))
+    assert run.stats.ended == "diverged"
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, float("inf")])
+def test_steps_that_are_none_are_refused(dt: float) -> None:
+    with pytest.raises(InputError, match="dt"):
+        simulate(mb.dynamics(catalog.pendulum()), [0.1], [0.0], 1.0, "gauss4", dt=dt)
