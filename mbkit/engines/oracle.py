@@ -114,6 +114,11 @@ class OracleDynamics(Dynamics):
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return type(self), (self.model, self._given, self._arithmetic.name)
 
+    @property
+    def constant_values(self) -> tuple[Array, Array]:
+        """What stands for `equations.constants`, as (high, low) whose sum has 32 digits, each (k,)."""
+        return self._arithmetic.pair(self._constants[0][0]) if self._constants else (np.empty(0), np.empty(0))
+
     def extended(self, quantity: str, *arguments: Any) -> tuple[Array, Array]:
         """Return a quantity as (high, low): its value rounded to double, and the rest.
 

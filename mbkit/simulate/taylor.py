@@ -1,0 +1,308 @@
+"""heyoka's adaptive Taylor method: in double on the own derivation, with 34 digits on the oracle.
+
+A step's series is also its interpolant, as accurate as the step: saved states and
+events are read off it, and the steps are as long as the series allows. Only torques
+held as an array end them, since they jump.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.lagrangian.taylor import Precision, TaylorSystem, precision, taylor_system
+from mbkit.model import Model
+from mbkit.simulate.events import Event, State, Watch
+from mbkit.simulate.members import Member, check_save, gathered, reporter
+from mbkit.simulate.methods import Tolerances
+from mbkit.simulate.outcome import Outcome
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.rates import unit_quaternions
+from mbkit.simulate.stats import Ended
+from mbkit.simulate.steps import RAN_AWAY, credible
+from mbkit.simulate.torque import Torque
+
+__all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
+
+# Of a rate, relative to the largest or 1: what no truncation of a series makes.
+_JUMP: Final = 1e-6
+_BITS: Final = {"lagrangian": 53, "oracle": 113}
+
+
+def run_taylor(
+    dyn: Dynamics,
+    method: str,
+    q0: Array,
+    v0: Array,
+    duration: float,
+    tolerances: Tolerances,
+    torque: Torque,
+    save: Array | None,
+    events: tuple[Event, ...],
+    bar: Progress,
+) -> Outcome:
+    """Integrate one state, or each of a batch by itself.
+
+    The tolerance bounds each step's error: absolute while all numbers of the state are
+    below 1, relative to the largest otherwise, with the smaller of rtol and atol.
+    Without `save`, the method's own steps are kept. An evaluation is that of a whole
+    series, one a step.
+
+    Raises
+    ------
+    UnsupportedError
+        heyoka is not installed; another engine; a torque that is a function, of which
+        there is no series; or a model too large to be written out.
+    """
+    if torque.callable:
+        raise UnsupportedError(
+            f"{method}: a torque function has no Taylor series; use method='rk853' or 'dop853', "
+            "or an array held over each interval of save"
+        )
+    if not isinstance(dyn, (LagrangianDynamics, OracleDynamics)):
+        raise UnsupportedError(f"{method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')")
+    batch = None if q0.ndim == 1 else len(q0)
+    y0 = np.concatenate([q0, v0], axis=-1).reshape(-1, q0.shape[-1] + v0.shape[-1])
+    check_save(save, batch, y0.shape[1])
+    kind = precision(_BITS[dyn.engine])
+    system, tolerance = taylor_system(dyn.equations), max(min(tolerances), kind.eps)
+    ends = [duration] if save is None or not torque.held else [*save.tolist(), duration]
+    stops = sorted({*ends} - {0.0})
+    members = []
+    with system.integrator(kind, tolerance) as integrator:
+        for i, start in enumerate(y0):
+            which = None if batch is None else i
+            own: Any = dyn if which is None else dyn.of_samples([which])
+            steps = TaylorSteps(system, integrator, kind, _behind(own, kind))
+            watch = Watch(events, which) if events else None
+            one = _Run(own, steps, save, watch, reporter(bar, i, len(y0), duration))
+            members.append(one.all(start, stops, torque.of_member(which)))
+    evaluations = sum(member.steps for member in members)
+    return gathered(dyn.model, members, batch, save, evaluations=evaluations)
+
+
+def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:
+    """Return the numbers that the equations take behind tau."""
+    if isinstance(dyn, OracleDynamics):
+        return kind.array(*dyn.constant_values)
+    return dyn.parameter_values.reshape(-1)
+
+
+class StoppedError(Exception):
+    """A state that has no next one; never leaves mbkit.
+
+    Attributes
+    ----------
+    ended : str
+        As in `Stats`.
+    """
+
+    def __init__(self, ended: Ended, message: str) -> None:
+        super().__init__(message)
+        self.ended = ended
+
+
+class TaylorSteps:
+    """Steps of one trajectory after the other, with a borrowed integrator.
+
+    Parameters
+    ----------
+    system : TaylorSystem
+    integrator : heyoka.taylor_adaptive
+        Of this system, for one's own use.
+    kind : Precision
+    behind : (k,) array
+        The values of the equations' trailing argument.
+
+    Attributes
+    ----------
+    t0, t : float
+        Start and end of the last step, s.
+    y0, y : (nq + nv,) arrays
+        The states there, of the format's own type.
+    """
+
+    def __init__(self, system: TaylorSystem, integrator: Any, kind: Precision, behind: Any) -> None:
+        import heyoka
+
+        self._system, self._integrator, self._kind, self._behind = system, integrator, kind, behind
+        self._success, self._limit = heyoka.taylor_outcome.success, heyoka.taylor_outcome.time_limit
+        self.t0 = self.t = 0.0
+        self.y0 = self.y = np.empty(0)
+
+    def __call__(self, y0: Any, stops: Sequence[float], force: Callable[[int], Any]) -> Iterator[float]:
+        """Take steps from t = 0 that end at the stops, and yield the time after each.
+
+        Parameters
+        ----------
+        y0 : (nq + nv,) array
+        stops : sequence of float
+            Increasing, above 0; the last is the end.
+        force : callable
+            force(k) is what acts before the k-th stop, (nv,).
+
+        Raises
+        ------
+        StoppedError
+            No such step exists; t and y are the last good ones.
+        """
+        integrator, kind = self._integrator, self._kind
+        state = integrator.state
+        integrator.time = kind.dtype(0.0)
+        state[:] = y0
+        self.t0 = self.t = 0.0
+        self.y0 = self.y = state.copy()
+        # 1/eps steps would never end, though near t = 0 they are above rounding.
+        least = stops[-1] * kind.eps if stops else 0.0
+        last = kind.dtype(0.0)
+        for k, stop in enumerate(stops):
+            self._system.fill(integrator, force(k), self._behind)
+            end = kind.dtype(stop)
+            while self.t < stop:
+                before = integrator.time
+                outcome, h = integrator.step(max_delta_t=end - before, write_tc=True)
+                # A step like the last one needs no second look.
+                if h > 1.5 * last and h > 2 * (holds := self._holds()):
+                    integrator.time, state[:] = before, self.y
+                    outcome, h = integrator.step(max_delta_t=kind.dtype(holds), write_tc=True)
+                    outcome = self._success if outcome == self._limit else outcome
+                last = h
+                if outcome == self._limit:
+                    integrator.time = end
+                elif outcome != self._success:
+                    raise StoppedError("diverged", RAN_AWAY)
+                elif h < least:
+                    raise StoppedError("step_too_small", "step below rounding: singular or diverging")
+                if not credible(_rounded(state)):
+                    raise StoppedError("diverged", RAN_AWAY)
+                if self._system.kinked and self._jumped(float(h), force(k)):
+                    raise StoppedError(
+                        "step_too_small", "a force jumps, which a series cannot follow and method='rk853' can,"
+                    )
+                self.t0, self.y0 = self.t, self.y
+                self.t, self.y = float(integrator.time), state.copy()
+                yield self.t
+
+    def _holds(self) -> float:
+        """Return how long a step the series just made allows, by its last six orders.
+
+        heyoka judges by the last two. Where a symmetry makes both of them vanish, as for a
+        pendulum let go at the horizontal, whose series has every fourth term only, its
+        step is far too long.
+        """
+        series = np.abs(_rounded(self._integrator.tc))
+        order = series.shape[1] - 1
+        orders = np.arange(max(1, order - 5), order + 1)
+        sizes = np.maximum(series[:, orders].max(axis=0), np.finfo(float).tiny)
+        radius = (max(1.0, series[:, 0].max()) / sizes) ** (1 / orders)
+        return float(radius.min() * np.exp(-2 - 0.7 / (order - 1)))
+
+    def _jumped(self, h: float, force: Array) -> bool:
+        """Return whether the rates at the end of a step of length h are others than the series says."""
+        nq, state = self._system.rates.size1_in(0), _rounded(self._integrator.state)
+        behind = [_rounded(self._behind)] if self._system.rates.n_in() > 3 else []
+        found = self._system.rates(state[:nq], state[nq:], force, *behind)
+        rate = np.concatenate([np.asarray(x).ravel() for x in found])
+        series = _rounded(self._integrator.tc)
+        powers = np.arange(1, series.shape[1])
+        slope = series[:, 1:] @ (powers * h ** (powers - 1))
+        # Far above what truncation does, far below what a force does that turns round.
+        allowed = max(_JUMP, 1e3 * float(self._integrator.tol)) * max(1.0, float(np.abs(rate).max()))
+        return not bool(np.abs(rate - slope).max() <= allowed)
+
+    def at(self, t: float) -> Any:
+        """Return the state at a time within the last step, of the format's own type."""
+        if t == self.t:
+            return self.y
+        if t == self.t0:
+            return self.y0
+        return self._integrator.update_d_output(self._kind.dtype(t)).copy()
+
+
+class _Run:
+    """One trajectory."""
+
+    def __init__(
+        self,
+        dyn: LagrangianDynamics | OracleDynamics,
+        steps: TaylorSteps,
+        save: Array | None,
+        watch: Watch | None,
+        done: Callable[[float], None],
+    ) -> None:
+        self._dyn, self._steps, self._watch, self._done = dyn, steps, watch, done
+        self._save = None if save is None else save.tolist()
+        self._member = Member()
+
+    def all(self, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> Member:
+        """Return what comes of it."""
+        member, steps = self._member, self._steps
+        if self._save is None or self._save[:1] == [0.0]:
+            member.keep(0.0, y0)
+        if self._watch is not None:
+            self._watch.start(0.0, *_state(self._dyn.model, y0))
+        try:
+            for t in steps(y0, stops, force):
+                member.steps += 1
+                if self._watch is not None and self._ends(t, self._watch):
+                    return member
+                member.reached = t
+                self._keep(t)
+                self._done(t)
+        except StoppedError as error:
+            interval = int(np.searchsorted(stops, steps.t, side="right"))
+            why = self._reason(force(min(interval, len(stops) - 1))) if error.ended == "diverged" else ""
+            member.stop(error.ended, f"diverged: {why}" if why else str(error))
+        return member
+
+    def _ends(self, t: float, watch: Watch) -> bool:
+        """Look for events of the last step, and end where one says so."""
+        hits, last = watch.look(t, self._within())
+        self._member.events += hits
+        if last is None:
+            return False
+        self._keep(last.t)
+        self._member.stop_at(last)
+        return True
+
+    def _within(self) -> State:
+        return lambda t: _state(self._dyn.model, _rounded(self._steps.at(t)))
+
+    def _keep(self, end: float) -> None:
+        """Keep what is wanted of the last step, up to a time."""
+        if self._save is None:
+            if end == self._steps.t:
+                self._member.keep(end, _rounded(self._steps.y))
+            return
+        for t in self._save[len(self._member.t) :]:
+            if t > end:
+                break
+            self._member.keep(t, _rounded(self._steps.at(t)))
+
+    def _reason(self, force: Array) -> str:
+        """Return why there is no step from the last good state, in the engine's words if it has some."""
+        y = _rounded(self._steps.y)
+        # An engine overflows before its state does, and blames the model for it.
+        if np.abs(y).max() < 1e50:
+            try:
+                q, v = _state(self._dyn.model, y)
+                # One of a batch with parameters of its own is a batch of one.
+                self._dyn.forward_dynamics(q, v, force)
+            except NumericalError as error:
+                return str(error)
+        return RAN_AWAY
+
+
+def _rounded(y: Any) -> Array:
+    return np.asarray(y, dtype=np.float64)
+
+
+def _state(model: Model, y: Array) -> tuple[Array, Array]:
+    return unit_quaternions(model, y[: model.nq])[0], y[model.nq :]
