@@ -7,20 +7,28 @@ import html
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mbkit import _check
 from mbkit._check import Array
 from mbkit.engines import ENGINES, Dynamics, dynamics
-from mbkit.errors import OutputError
+from mbkit.errors import InputError, OutputError, UnsupportedError
 from mbkit.model import Model
+from mbkit.simulate.applied import Applied, Asked, Held, Sampled
+from mbkit.simulate.balance import kinetic_energy, potential_energy, work
+from mbkit.simulate.events import Hit
+from mbkit.simulate.momenta import canonical_momentum, member_of, momentum
 from mbkit.simulate.stats import Stats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["Trajectory"]
+
+_FEW: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +47,13 @@ class Trajectory:
     method, engine : str
     stats : Stats
         What it cost, and how it ended.
+    events : tuple of Hit
+        What happened on the way, of the events that were asked for.
+
+    Notes
+    -----
+    What is derived from the states is computed when it is asked for, by the run's own
+    engine or, where there is an argument for it, by another one.
     """
 
     t: Array
@@ -49,6 +64,8 @@ class Trajectory:
     engine: str
     stats: Stats
     _dyn: Dynamics | None = field(default=None, repr=False)
+    events: tuple[Hit, ...] = ()
+    _applied: Applied | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("t", "q", "v"):
@@ -62,28 +79,167 @@ class Trajectory:
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         # An engine that can be made again by name is not sent along: deriving it
         # anew for every trajectory of a process pool would cost more than the run.
-        dyn = None if self.engine in ENGINES else self._dyn
-        return type(self), (self.t, self.q, self.v, self.model, self.method, self.engine, self.stats, dyn)
+        known = self.engine in ENGINES and (self._dyn is None or self._dyn.samples is None)
+        applied = self._applied
+        if isinstance(applied, Asked):
+            # Functions seldom travel; what this one says does.
+            applied = applied.sampled(self.t, self.q, self.v, strict=False)
+        dyn = None if known else self._dyn
+        return type(self), (
+            *(self.t, self.q, self.v, self.model, self.method, self.engine, self.stats),
+            *(dyn, self.events, applied),
+        )
 
-    def energy(self) -> Array:
-        """Return kinetic plus potential energy in J, shape (K,) or (N, K), by the run's own engine.
+    # Energies, work and momenta
 
-        The kinetic part is ½ vᵀ M v, which no known defect touches.
+    def energy(self, engine: str | Dynamics | None = None) -> Array:
+        """Return kinetic plus potential energy in J, shape (K,) or (N, K).
+
+        Parameters
+        ----------
+        engine : str or Dynamics, optional
+            Who computes it; the run's own engine when not given.
         """
-        dyn = self._dyn
-        if dyn is None:
-            dyn = dynamics(self.model, self.engine)
-            object.__setattr__(self, "_dyn", dyn)
-        n = int(np.prod(self.q.shape[:-1]))
-        q, v = self.q.reshape(n, self.model.nq), self.v.reshape(n, self.model.nv)
-        good = np.isfinite(q).all(-1) & np.isfinite(v).all(-1)
-        out = np.full(len(q), np.nan)
-        if good.any():
-            # A batch may have parameters of its own for each trajectory.
-            dyn = dyn.of_samples(np.repeat(np.arange(len(self.q)), len(self.t))[good]) if self.q.ndim == 3 else dyn
-            kinetic = 0.5 * np.einsum("ni,nij,nj->n", v[good], dyn.mass_matrix(q[good]), v[good])
-            out[good] = kinetic + dyn.potential_energy(q[good])
-        return out.reshape(self.q.shape[:-1])
+        dyn = self._by(engine)
+        return kinetic_energy(dyn, self.q, self.v) + potential_energy(dyn, self.q)
+
+    def kinetic_energy(self, engine: str | Dynamics | None = None) -> Array:
+        """Return ½ vᵀ M v in J, which no known defect of an engine touches; shape (K,) or (N, K)."""
+        return kinetic_energy(self._by(engine), self.q, self.v)
+
+    def potential_energy(self, engine: str | Dynamics | None = None) -> Array:
+        """Return the energy of gravity and springs in J, shape (K,) or (N, K)."""
+        return potential_energy(self._by(engine), self.q)
+
+    def tau(self) -> Array:
+        """Return the generalized force that acted at each state, of the shape of v.
+
+        Of an array, the row that acts from there on (at the end, the last one); of a
+        function, what it returns at the saved states, for which it is asked once more,
+        unless the trajectory has been pickled, which asks it then. Where the function
+        ended the run, the last state has NaN.
+
+        Raises
+        ------
+        TorqueError
+            The function fails at a state that it has passed before.
+        """
+        acted = self._acted()
+        if acted is None:
+            return np.zeros(self.v.shape)
+        if isinstance(acted, Sampled):
+            return acted.values.copy()
+        rows = np.broadcast_to(acted.at(self.t), self.v.shape)
+        return np.where(np.isfinite(self.v).all(-1, keepdims=True), rows, np.nan)
+
+    def work(self, engine: str | Dynamics | None = None) -> Array:
+        """Return ∫ (τ + τ_damping)·v dt since the first state in J, shape (K,) or (N, K).
+
+        The work of a constant or held torque is τ·Δq, exact for the saved positions,
+        where v = q̇. On quasi-velocities, of dampers, and of a torque function, it is a
+        quadrature of fourth order in the distance of the saved states, where what is
+        integrated is smooth: a function that jumps makes it first order.
+
+        Parameters
+        ----------
+        engine : str or Dynamics, optional
+            Who computes damping and accelerations.
+
+        Raises
+        ------
+        UnsupportedError
+            The rows of a held torque change between two saved states.
+        """
+        return work(self._by(engine), self.t, self.q, self.v, self._acted())
+
+    def power_balance(self, engine: str | Dynamics | None = None) -> Array:
+        """Return E(t) - E(0) - work(t) in J: zero for a run without error, shape (K,) or (N, K).
+
+        It holds the error of the run and that of `work`; the second is that of a
+        quadrature on the saved states, so save every step where they are to be told
+        apart. With no torque or one that is constant or held, on coordinates with
+        v = q̇ and no dampers, only the run's own error is left.
+        """
+        energy = self.energy(engine)
+        return np.asarray(energy - energy[..., :1] - self.work(engine))
+
+    def momentum(self, engine: str | Dynamics | None = None) -> Array:
+        """Return the bodies' momentum, shape (K, 6) or (N, K, 6), in world axes.
+
+        Linear, kg m/s, then angular about the world's origin, kg m²/s: summed over the
+        bodies with the engine's poses and Jacobians. Armature, which belongs to no
+        body, has no part in it.
+        """
+        return momentum(self._by(engine), self.q, self.v)
+
+    def canonical_momentum(self, engine: str | Dynamics | None = None) -> Array:
+        """Return p = M v, shape (K, nv) or (N, K, nv)."""
+        return canonical_momentum(self._by(engine), self.q, self.v)
+
+    def _by(self, engine: str | Dynamics | None) -> Dynamics:
+        if engine is None or engine == self.engine:
+            if self._dyn is None:
+                object.__setattr__(self, "_dyn", dynamics(self.model, self.engine))
+            assert self._dyn is not None
+            return self._dyn
+        if isinstance(engine, Dynamics):
+            if engine.model.coordinate_names != self.model.coordinate_names:
+                raise InputError(f"engine: expected a Dynamics of {self.model.name}, got one of {engine.model.name}")
+            return engine
+        if self._dyn is not None and self._dyn.samples is not None:
+            raise UnsupportedError(
+                f"{engine}: the trajectories have parameters of their own, which only the {self.engine} engine holds"
+            )
+        return dynamics(self.model, engine)
+
+    def _acted(self) -> Held | Sampled | None:
+        if isinstance(self._applied, Asked):
+            strict = self.stats.ended != "torque_failed"
+            answers = self._applied.sampled(self.t, self.q, self.v, strict=strict)
+            object.__setattr__(self, "_applied", answers)
+        acted = self._applied
+        assert not isinstance(acted, Asked)
+        return acted
+
+    # Pictures and files
+
+    def plot(self) -> Figure:
+        """Draw coordinates, velocities, energies and the power balance over time with Matplotlib.
+
+        Lengths, angles and quaternions have a panel each. Of a batch, the first ten
+        trajectories are drawn. Events and the end of a run that diverged are marked.
+        """
+        from mbkit.simulate.plots import plot
+
+        return plot(self)
+
+    def picture(self, count: int = 8, view: str | ArrayLike | None = None, member: int = 0) -> Figure:
+        """Draw the motion as a strip of stick figures at equal times, with Matplotlib.
+
+        Links run from joint to joint, at the ends to the centre of mass or the last
+        frame; the path of one point is drawn along: the end of the longest branch,
+        or the base of a floating robot.
+
+        Parameters
+        ----------
+        count : int
+            How many figures.
+        view : str or (2, 3) array_like, optional
+            The plane: two world axes to the right and upwards, such as ``"xz"``, or two
+            directions. By default upwards is against gravity, and to the right is where
+            the motion is widest.
+        member : int
+            Which trajectory of a batch.
+        """
+        from mbkit.simulate.picture import picture
+
+        member = _check.count("member", member)
+        members = len(self.q) if self.q.ndim == 3 else 1
+        if member >= members:
+            raise InputError(f"member: expected less than {members}, the number of trajectories, got {member}")
+        # What is drawn is the description alone: no engine is made for it.
+        model = self.model if self._dyn is None else member_of(self._dyn, member).model
+        return picture(self, model, count, view, member)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
         """Write t, q and v with all their digits, one line per state.
@@ -109,28 +265,6 @@ class Trajectory:
         except OSError as error:
             raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
 
-    def plot(self) -> Figure:
-        """Draw q and v over time with Matplotlib; of a batch, the first ten trajectories."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(8, 6), layout="constrained")
-        axes = figure.subplots(2, 1, sharex=True)
-        names = (self.model.coordinate_names, self.model.velocity_names)
-        for axis, values, labels, title in zip(
-            axes, (self.q, self.v), names, ("q (m, rad)", "v (m/s, rad/s)"), strict=True
-        ):
-            for i, run in enumerate(values[:10] if values.ndim == 3 else [values]):
-                axis.set_prop_cycle(None)
-                lines = axis.plot(self.t, run, linewidth=1)
-                if not i and len(labels) <= 12:
-                    for line, label in zip(lines, labels, strict=True):
-                        line.set_label(label)
-                    axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
-            axis.set_ylabel(title)
-        axes[0].set_title(f"{self.model.name}: {self.method} on {self.engine}")
-        axes[1].set_xlabel("t (s)")
-        return figure
-
     def _facts(self) -> list[tuple[str, str]]:
         count = f"{len(self.q)} trajectories of " if self.q.ndim == 3 else ""
         span = f", {self.t[0]:g} to {self.t[-1]:g} s" if len(self.t) else ""
@@ -140,6 +274,7 @@ class Trajectory:
             ("method", self.method),
             ("states", f"{count}{len(self.t)}{span}"),
             ("run", str(self.stats)),
+            *([("events", _told(self.events))] if self.events else []),
         ]
 
     def __repr__(self) -> str:
@@ -148,3 +283,15 @@ class Trajectory:
     def _repr_html_(self) -> str:
         cells = "".join(f"<tr><th>{k}</th><td>{html.escape(x)}</td></tr>" for k, x in self._facts())
         return f"<table>{cells}</table>"
+
+
+def _told(events: tuple[Hit, ...]) -> str:
+    """Return the events' names and times, the first few of each name."""
+    times: dict[str, list[float]] = {}
+    for hit in events:
+        times.setdefault(hit.name, []).append(hit.t)
+    return "; ".join(
+        f"{name} at {', '.join(f'{t:.6g}' for t in found[:_FEW])}"
+        + (" s" if len(found) <= _FEW else f" s ({len(found)})")
+        for name, found in times.items()
+    )

@@ -1,0 +1,268 @@
+# Torques have the signature they are called with.
+# ruff: noqa: ARG001, ARG005
+"""Every method meets bad input, torque functions that fail, interruption and divergence; none loses what it has."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mbkit import catalog
+from mbkit.engines import Dynamics, dynamics
+from mbkit.errors import InputError, MbkitWarning, TorqueError
+from mbkit.model import ModelBuilder
+from mbkit.simulate import METHODS, simulate
+from mbkit.simulate.grid import Grid
+
+ADAPTIVE = [m.name for m in METHODS.values() if m.kind == "adaptive"]
+ASKING = [m.name for m in METHODS.values() if m.callables]
+END = 0.1
+
+
+def dynamics_for(method: str, model: Any = None) -> Dynamics:
+    return dynamics(catalog.pendulum() if model is None else model, *METHODS[method].engines[:1])
+
+
+def saved(method: str, duration: float = END) -> dict[str, Any]:
+    """Equal times, which every adaptive method and every step of 1 ms can keep."""
+    return {"save": np.linspace(0, duration, 101)} if method in ADAPTIVE else {}
+
+
+# Times
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("duration", "dt"), [(0.0, 1e-3), (0.0105, 1e-3), (0.1, 0.3), (0.1, 1e300), (1e-9, 1e-3)])
+def test_every_method_ends_exactly_at_the_end(method: str, duration: float, dt: float) -> None:
+    save = [0.0, duration] if duration else [0.0]
+    for states in ([0.1], [[0.1], [0.2]]):
+        run = simulate(dynamics_for(method), states, [0.3], duration, method, dt=dt, save=save)
+        assert run.t.tolist() == save
+        assert run.stats.finished
+        assert np.isfinite(run.q).all()
+        assert np.all(run.stats.reached == np.full(np.shape(states)[:-1], duration))
+        if duration > 1e-3:
+            assert np.abs(run.q[..., -1, :] - run.q[..., 0, :]).max() > 1e-4
+
+
+def test_grids_name_their_own_times() -> None:
+    for duration, dt in ((0.0, 1e-3), (1.0, 0.1), (1.0, 0.3), (0.7, 1 / 3), (5.0, 7.0)):
+        grid = Grid.of(duration, dt)
+        assert grid.times.tolist() == [grid.time(k) for k in range(grid.steps + 1)]
+        assert grid.times[-1] == duration
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"duration": -1.0}, "duration: expected a number of at least 0"),
+        ({"duration": np.nan}, "duration: expected a finite number"),
+        ({"duration": "long"}, "duration: expected a number"),
+        ({"duration": None}, "duration: expected a number"),
+        ({"dt": 0.0}, "dt: expected a number above 0"),
+        ({"dt": -1e-3}, "dt: expected a number above 0"),
+        ({"dt": np.nan}, "dt: expected a finite number"),
+        ({"dt": np.inf}, "dt: expected a finite number"),
+        ({"dt": [1e-3, 1e-3]}, "dt: expected a number"),
+        ({"save": [0.0, 2 * END]}, "save: expected times between 0 and 0.1"),
+        ({"save": [-END, END]}, "save: expected times between 0 and 0.1"),
+        ({"save": [0.0, END, END]}, "save: expected increasing times"),
+        ({"save": [0.0, np.nan]}, "save: nan at index"),
+        ({"save": [[0.0], [0.0, END]]}, "save: .*rows of different lengths"),
+        ({"save": "all"}, "save: expected increasing times"),
+        ({"save": 0.05}, "save: expected increasing times"),
+        ({"q0": [1j]}, "q0: expected real numbers, got dtype complex128"),
+        ({"q0": ["one"]}, "q0: expected real numbers"),
+        ({"q0": None}, "q0: expected real numbers"),
+        ({"q0": [[[0.1]]]}, r"q0: expected shape \(1,\) or \(N, 1\)"),
+        ({"q0": []}, r"q0: expected shape \(1,\)"),
+        ({"v0": [np.nan]}, "v0: nan at index"),
+        ({"torque": [np.nan]}, "torque: nan at index"),
+        ({"torque": [np.inf]}, "torque: inf at index"),
+        ({"torque": [1j]}, "torque: expected real numbers, got dtype complex128"),
+        ({"torque": ["one"]}, "torque: expected real numbers"),
+        ({"torque": "one"}, r"torque: expected shape \(1,\)"),
+        ({"torque": 1.0}, r"torque: expected shape \(1,\).*got \(\)"),
+        (
+            {"torque": np.zeros((7, 1))},
+            r"torque: expected shape .*got \(7, 1\); pendulum has nv = 1 and the run has 100 steps",
+        ),
+        ({"torque": np.zeros((2, 100, 1))}, r"torque: expected shape .*got \(2, 100, 1\)"),
+        ({"torque": np.where(np.arange(100) == 40, np.nan, 0.0)[:, None]}, r"torque: nan at index \(40, 0\)"),
+        ({"progress": "yes"}, "progress: expected None, True or a callable"),
+    ],
+)
+def test_bad_input_is_named_by_every_method(method: str, change: dict[str, Any], message: str) -> None:
+    arguments = {"q0": [0.1], "v0": [0.0], "duration": END, "method": method, **saved(method), **change}
+    with pytest.raises(InputError, match=message):
+        simulate(dynamics_for(method), **arguments)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_quaternions_that_are_none_are_refused(method: str) -> None:
+    dyn = dynamics_for(method, catalog.heavy_top())
+    for q in ([0, 0, 0, 2.0], [0, 0, 0, 0.0], [0.5, 0.5, 0.5, 0.6]):
+        with pytest.raises(InputError, match="q0: the quaternion of joint 'spin'"):
+            simulate(dyn, q, [0.0, 0, 0], END, method, **saved(method))
+
+
+# Torque functions
+
+
+def after(t0: float, wrong: Any) -> Any:
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> Any:
+        if t <= t0:
+            return [0.1 * np.cos(9 * t)]
+        return wrong()
+
+    return torque
+
+
+def raises() -> None:
+    raise ZeroDivisionError("mine")
+
+
+class _Hostile:
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise RuntimeError("no array")
+
+
+@pytest.mark.parametrize("method", ASKING)
+@pytest.mark.parametrize("states", [[0.1], [[0.1], [0.2], [0.3]]])
+@pytest.mark.parametrize("t0", [-1.0, 0.0305])
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: [0.0, 0.0], r"torque: expected shape \(1,\), got \(2,\); it is what the callable returned at t = "),
+        (lambda: 0.0, r"torque: expected shape \(1,\), got \(\); .*callable returned at t = "),
+        (lambda: [np.nan], r"torque: nan at index .*callable returned at t = "),
+        (lambda: [1j], r"torque: expected real numbers, got dtype complex128; .*callable returned at t = "),
+        (lambda: "push", r"torque: expected real numbers, .*callable returned at t = "),
+        (lambda: None, r"torque: expected real numbers, .*callable returned at t = "),
+        (lambda: _Hostile(), r"torque: expected an array of numbers, got _Hostile; .*callable returned at t = "),
+        (raises, r"torque: the callable raised ZeroDivisionError at t = .*: mine"),
+    ],
+)
+def test_a_torque_that_fails_leaves_the_run_up_to_then(
+    method: str, states: Any, t0: float, wrong: Any, message: str
+) -> None:
+    dyn = dynamics_for(method)
+    with pytest.raises(TorqueError, match=message) as caught:
+        simulate(dyn, states, [0.2], END, method, torque=after(t0, wrong), **saved(method))
+    error = caught.value
+    assert isinstance(error, InputError)
+    if wrong is raises:
+        assert isinstance(error.__cause__, ZeroDivisionError)
+    run = error.trajectory
+    assert run.stats.ended == "torque_failed"
+    assert run.stats.message == str(error)
+    assert not run.stats.finished
+    if np.ndim(states) == 2:
+        assert "for trajectory 0" in str(error)
+    if t0 < 0:
+        assert np.all(np.asarray(run.stats.reached) == 0.0)
+        return
+    # The step on which it failed is not kept; those before it are, as they would be without it.
+    whole = simulate(dyn, states, [0.2], END, method, torque=after(END, wrong), **saved(method))
+    first = run.q[0] if np.ndim(states) == 2 else run.q
+    expected = whole.q[0] if np.ndim(states) == 2 else whole.q
+    good = int(np.isfinite(first).all(-1).sum())
+    assert good >= 1
+    assert run.t[good - 1] <= 0.031
+    if METHODS[method].kind == "fixed":
+        assert good >= 31
+        assert np.array_equal(first[:good], expected[:good])
+    assert pickle.loads(pickle.dumps(error)).trajectory.stats == run.stats
+
+
+@pytest.mark.parametrize("method", ASKING)
+def test_interruption_gets_through(method: str) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    for states in ([0.1], [[0.1], [0.2]]):
+        with pytest.raises(KeyboardInterrupt):
+            simulate(dynamics_for(method), states, [0.2], END, method, torque=after(0.03, interrupt), **saved(method))
+
+
+@pytest.mark.parametrize("method", ASKING)
+def test_what_a_torque_does_to_its_arguments_does_not_matter(method: str) -> None:
+    kept = np.zeros(1)
+
+    def plain(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.array([np.sin(t) - 0.3 * v[0]])
+
+    def careless(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        kept[:] = np.sin(t) - 0.3 * v[0]  # and what it returns is written again the next time
+        q[:], v[:] = np.nan, 1e300
+        return kept
+
+    for states in ([0.1], [[0.1], [0.2]]):
+        runs = [
+            simulate(dynamics_for(method), states, [0.2], END, method, torque=f, **saved(method))
+            for f in (plain, careless)
+        ]
+        assert np.array_equal(runs[0].q, runs[1].q)
+        assert np.array_equal(runs[0].v, runs[1].v)
+
+
+# Same input, same bits
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_same_input_same_bits(method: str) -> None:
+    model = catalog.heavy_top() if method != "mujoco_discrete" else catalog.pendulum()
+    q, v = model.random_state(np.random.default_rng(0), 3)
+    first, second = (simulate(dynamics_for(method, model), q, v, END, method, **saved(method)) for _ in range(2))
+    assert np.array_equal(first.q, second.q)
+    assert np.array_equal(first.v, second.v)
+    assert first.stats.steps == second.stats.steps
+
+
+# Divergence
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_away_keeps_what_it_has_and_says_when(
+    method: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log where it stands
+    if not METHODS[method].callables:
+        pytest.skip("no torque function, so nothing to run away with")
+    b = ModelBuilder("pushed_away")
+    b.add_body("mass", mass=1.0)
+    # A damper that pushes: exp(1e4 t) passes all bounds after 23 ms, and each method's own growth before the end.
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0))
+    model = b.build()
+    with pytest.warns(MbkitWarning, match="pushed_away: .* after t = ") as told:
+        run = simulate(
+            *(dynamics_for(method, model), [0.0], [1.0], 0.3, method),
+            torque=lambda t, q, v: 1e4 * v,
+            rtol=1e-6 if method in ADAPTIVE else None,
+            **saved(method, 0.3),
+        )
+    assert len(told) == 1
+    assert run.stats.ended in ("diverged", "step_too_small")
+    assert run.stats.message
+    assert isinstance(run.stats.reached, float)
+    assert run.t[-1] <= run.stats.reached < 0.3
+    assert np.isfinite(run.q).all()
+    assert np.isfinite(run.v).all()
+
+
+@pytest.mark.parametrize("method", [m for m in ASKING if not METHODS[m].engines])
+def test_a_run_away_is_not_blamed_on_the_torque(method: str) -> None:
+    """τ = 3 v |v| grows without bounds in finite time; squared, a stage's velocity overflows."""
+    dyn = dynamics(catalog.double_pendulum())
+    with pytest.warns(MbkitWarning, match=r"after t = 0\.[23]"):
+        run = simulate(
+            *(dyn, [1.0, 0.5], [0.0, 0.0], 2.0, method),
+            dt=1e-2,
+            rtol=1e-6 if method in ADAPTIVE else None,
+            torque=lambda t, q, v: 3 * v * abs(v),
+        )
+    assert run.stats.ended in ("diverged", "step_too_small")

@@ -1,0 +1,452 @@
+# Torques have the signature they are called with.
+# ruff: noqa: ARG001, ARG005
+"""What a run returns: energies, work, momenta, pictures; and that it travels."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit import catalog
+from mbkit.engines import dynamics
+from mbkit.errors import InputError, MbkitWarning, TorqueError, UnsupportedError
+from mbkit.model import Model, ModelBuilder
+from mbkit.simulate import Trajectory, at_section, simulate
+from mbkit.simulate.balance import _by_cubics
+from mbkit.simulate.skeleton import skeleton
+from tests.random_trees import off, random_tree, rotation, states
+
+EPS = np.finfo(float).eps
+
+
+def free_tree(seed: int, n: int = 5) -> Model:
+    """A floating tree that nothing outside acts on; springs and dampers inside it may."""
+    rng = np.random.default_rng(seed)
+    b = ModelBuilder(f"floating{seed}", gravity=np.zeros(3))
+    kinds = ["free", *rng.permutation(["revolute", "ball", "prismatic", "planar", "helical", "free", "fixed"])[: n - 1]]
+    for i, kind in enumerate(kinds):
+        d = rng.uniform(0.1, 1, 3)
+        R = rotation(rng)
+        inertia = R @ np.diag([d[0] + d[1], d[1] + d[2], d[2] + d[0]]) @ R.T
+        b.add_body(f"b{i}", mass=rng.uniform(0.5, 2), com=0.3 * rng.standard_normal(3), inertia=inertia)
+        joint: dict[str, Any] = {"translation": 0.5 * rng.standard_normal(3), "rotation": rotation(rng)}
+        if kind in ("revolute", "prismatic", "helical"):
+            joint |= {"axis": rng.standard_normal(3), "damping": 0.3 if i else 0.0}
+        if kind == "helical":
+            joint["pitch"] = 0.2
+        parent = "world" if i == 0 else f"b{rng.integers(i)}"
+        b.add_joint(f"j{i}", str(kind), parent=parent, child=f"b{i}", **joint)
+    return b.build()
+
+
+def slope(steps: list[float], errors: list[float]) -> float:
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+
+
+def swing(**options: Any) -> Trajectory:
+    return simulate(dynamics(catalog.double_pendulum()), [0.6, -0.3], [0.2, 0.5], 0.3, **{"dt": 0.01, **options})
+
+
+# Energies
+
+
+def test_energy_is_kinetic_and_potential_by_any_engine() -> None:
+    model = random_tree(3, 6, kinds=("revolute", "ball", "free", "prismatic", "planar"), springs=True)
+    q, v, *_ = states(model, 2)
+    runs = simulate(dynamics(model, "lagrangian"), q, v, 0.01)
+    assert np.array_equal(runs.energy(), runs.kinetic_energy() + runs.potential_energy())
+    assert runs.energy().shape == runs.kinetic_energy().shape == (2, 11)
+    for engine in ("pinocchio", "mujoco", dynamics(model, "pinocchio")):
+        assert off(runs.energy(engine), runs.energy()) < 1e-12
+        assert off(runs.momentum(engine), runs.momentum()) < 1e-12
+        assert off(runs.canonical_momentum(engine), runs.canonical_momentum()) < 1e-12
+        assert off(runs.work(engine), runs.work()) < 1e-12
+    with pytest.raises(InputError, match="engine: expected a Dynamics of tree3, got one of pendulum"):
+        runs.energy(dynamics(catalog.pendulum()))
+
+
+# Torque and work
+
+
+def test_tau_is_what_acted() -> None:
+    assert not swing().tau().any()
+    assert np.array_equal(swing(torque=[1.0, 2.0]).tau(), np.tile([1.0, 2.0], (31, 1)))
+    rows = np.arange(60.0).reshape(30, 2)
+    assert np.array_equal(swing(torque=rows).tau(), rows[[*range(30), 29]])
+    assert np.array_equal(swing(torque=rows, save=7).tau(), rows[[0, 7, 14, 21, 28, 29]])
+    run = swing(torque=lambda t, q, v: [t, q[0] * v[1]])
+    assert np.array_equal(run.tau(), np.column_stack([run.t, run.q[:, 0] * run.v[:, 1]]))
+    both = simulate(
+        dynamics(run.model), [[0.1, 0.2]] * 2, [0.0, 0.0], 0.02, dt=0.01, torque=np.arange(8.0).reshape(2, 2, 2)
+    )
+    assert np.array_equal(both.tau(), np.arange(8.0).reshape(2, 2, 2)[:, [0, 1, 1]])
+    saved = swing(torque=np.array([[1.0, 0.0], [0.0, 1.0]]), method="dop853", save=[0.0, 0.1, 0.3])
+    assert np.array_equal(saved.tau(), [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+
+
+def test_a_function_is_asked_once_and_its_answers_travel() -> None:
+    asked = []
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        asked.append(t)
+        q[:] = 0.0
+        return np.array([0.1, -0.2]) * v
+
+    run = swing(torque=torque)
+    during = len(asked)
+    again = pickle.loads(pickle.dumps(run))
+    assert np.array_equal(again.tau(), run.tau())
+    assert np.array_equal(again.power_balance(), run.power_balance())
+    run.tau()
+    run.work()
+    assert len(asked) == during + 2 * 31, "once for the pickle, once for the run"
+    assert np.array_equal(run.tau(), [[0.1, -0.2]] * run.v)
+    run.tau()[:] = 0.0
+    assert run.tau().any()
+
+
+def test_a_held_torque_does_tau_times_distance() -> None:
+    rows = np.random.default_rng(0).standard_normal((30, 2))
+    run = swing(torque=rows, dt=0.01)
+    exact = np.cumsum(np.sum(rows * np.diff(run.q, axis=0), axis=1))
+    assert np.abs(run.work()[1:] - exact).max() < 30 * EPS
+    assert run.work()[0] == 0.0
+    # Where nothing but the run errs, its fourth order shows, whatever the torque's jumps.
+    steps = [0.01 / k for k in (1, 2, 4)]
+    runs = [swing(torque=np.repeat(rows, k, axis=0), dt=0.01 / k) for k in (1, 2, 4)]
+    errors = [np.abs(run.power_balance()).max() for run in runs]
+    assert slope(steps, errors) == pytest.approx(4, abs=0.3)
+    one = swing(torque=rows[:1], dt=0.3)
+    assert one.work()[-1] == pytest.approx(rows[0] @ (one.q[1] - one.q[0]), abs=1e-15)
+    with pytest.raises(UnsupportedError, match=r"changes between the saved states at 0 and 0.05 s.*save=None"):
+        swing(torque=rows, save=5).work()
+    # One that does not change between them may be saved more rarely.
+    same = np.repeat(rows[:6], 5, axis=0)
+    assert swing(torque=same, save=5).work()[-1] == pytest.approx(swing(torque=same).work()[-1], abs=1e-14)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_power_balance_shrinks_with_the_distance_of_the_states(held: bool) -> None:
+    """Quaternions, dampers of both sorts, springs, and a force; the runs are exact to 1e-12."""
+    model = random_tree(5, 6, kinds=("free", "revolute", "ball", "prismatic", "planar", "universal"))
+    q, v, *_ = (x[0] for x in states(model, 1))
+    dyn, rows = dynamics(model), np.random.default_rng(1).standard_normal((4, model.nv))
+    assert {j.kind for j in model.joints} >= {"free", "ball"}
+    assert any(s.damping for s in model.springs)
+    counts, errors = [16, 32, 64], []
+    for n in counts:
+        torque: Any = np.repeat(rows, n // 4, axis=0) if held else lambda t, q, v: np.cos(3 * t) * rows[0] - 0.2 * v
+        run = simulate(dyn, q, 0.3 * v, 0.2, "dop853", rtol=1e-12, torque=torque, save=np.linspace(0, 0.2, n + 1))
+        errors.append(np.abs(run.power_balance()).max())
+        assert np.abs(run.work()).max() > 1e3 * errors[-1]
+    assert slope([1 / n for n in counts], errors) == pytest.approx(4, abs=0.4)
+
+
+def test_the_quadrature_is_exact_for_cubics() -> None:
+    rng = np.random.default_rng(0)
+    for n in (0, 1, 2, 3, 4, 9):
+        t = np.sort(rng.uniform(0, 2, n))
+        degree = min(max(n - 1, 0), 3)
+        c = rng.standard_normal(degree + 1)
+        whole = np.polynomial.Polynomial(c).integ()
+        got = _by_cubics(t, np.stack([np.polynomial.Polynomial(c)(t)] * 2))
+        assert got.shape == (2, max(n - 1, 0))
+        # Close states are as many digits worse as their cubic's weights are larger than one.
+        assert got[0] == pytest.approx(np.diff(whole(t)), abs=1e-12)
+
+
+# Momenta
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_momentum_of_what_floats_is_kept(seed: int) -> None:
+    model = free_tree(seed)
+    dyn = dynamics(model)
+    q, v, *_ = states(model, 2, seed)
+    push = np.zeros(model.nv)
+    push[6:] = 1.0  # inner forces change no momentum
+    run = simulate(dyn, q, 0.5 * v, 0.2, dt=1e-3, torque=push)
+    P = run.momentum()
+    assert P.shape == (2, 201, 6)
+    # Inner motion is rough, and the error of RK4 at this step is what is left of it.
+    assert np.abs(P - P[:, :1]).max() < 1e-7 * np.abs(P).max()
+    assert np.abs(run.canonical_momentum() - run.canonical_momentum()[:, :1]).max() > 1e-3
+    exact = simulate(dyn, q[0], 0.5 * v[0], 0.2, "dop853", rtol=1e-12, torque=push)
+    assert np.abs(exact.momentum() - exact.momentum()[0]).max() < 1e-10 * np.abs(P).max()
+    alone = simulate(dyn, q[1], 0.5 * v[1], 0.2, dt=1e-3, torque=push)
+    assert P[1] == pytest.approx(alone.momentum(), abs=1e-12)
+
+
+def test_momentum_of_one_body_is_m_v_and_i_w() -> None:
+    b = ModelBuilder("body", gravity=(0, 0, 0))
+    inertia, com = np.diag([0.3, 0.4, 0.5]), np.array([0.1, -0.2, 0.3])
+    b.add_body("box", mass=2.0, com=com, inertia=inertia)
+    b.add_joint("float", "free", parent="world", child="box")
+    # A frame that hides the body's own.
+    b.add_body("dot", mass=0.0)
+    b.add_joint("on", "fixed", parent="box", child="dot", translation=(1, 0, 0))
+    model = b.build()
+    rng = np.random.default_rng(0)
+    q, v = model.random_state(rng)
+    run = simulate(dynamics(model, "lagrangian"), q, v, 0.0)
+    x, y, z, w = q[3:]
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    p = 2.0 * R @ (v[:3] + np.cross(v[3:], com))
+    L = np.cross(q[:3] + R @ com, p) + R @ inertia @ v[3:]
+    assert run.momentum()[0] == pytest.approx(np.concatenate([p, L]), abs=1e-14)
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
+def test_frames_with_a_bodys_name_do_not_mislead(engine: str) -> None:
+    def model(name: str) -> Model:
+        b = ModelBuilder("arm")
+        b.add_body("link", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.2, 0.15))
+        b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, 1, 0))
+        b.add_frame(name, body="link", translation=(0.3, 0.2, 0.1), rpy=(0.4, 0.5, 0.6))
+        return b.build()
+
+    runs = [simulate(dynamics(model(name), engine), [0.4], [2.0], 0.0) for name in ("link", "other")]
+    assert runs[0].momentum() == pytest.approx(runs[1].momentum(), abs=1e-15)
+
+
+def test_a_heavy_top_keeps_its_vertical_angular_momentum_and_a_cart_pole_its_p() -> None:
+    top = catalog.heavy_top()
+    run = simulate(dynamics(top), top.neutral(), [0.0, 150.0, -4.61538], 0.2, "dop853", rtol=1e-12)
+    L = run.momentum()[:, 3:]
+    assert np.abs(L[:, 2] - L[0, 2]).max() < 1e-9 * np.abs(L).max()
+    assert np.abs(L[:, 0] - L[0, 0]).max() > 1e-2 * np.abs(L).max()
+    cart = simulate(dynamics(catalog.cart_pole()), [0.0, 1.0], [0.5, 0.0], 1.0, "dop853", rtol=1e-12)
+    p = cart.canonical_momentum()
+    assert np.ptp(p[:, 0]) < 1e-10
+    assert p[:, 0] == pytest.approx(cart.momentum()[:, 0], abs=1e-13)
+    assert np.ptp(p[:, 1]) > 1.0
+
+
+def test_trajectories_with_parameters_of_their_own() -> None:
+    model = catalog.double_pendulum(mass1=mb.Parameter("m1", 1.0), length2=mb.Parameter("l2", 1.0))
+    dyn = dynamics(model, "lagrangian")
+    m1, l2 = np.array([1.0, 3.0]), np.array([0.5, 2.0])
+    runs = simulate(dyn.at(m1=m1, l2=l2), [0.5, 0.2], [0.1, 0.3], 0.05, torque=[0.1, 0.2])
+    again = pickle.loads(pickle.dumps(runs))
+    for i in range(2):
+        alone = simulate(
+            dynamics(model.with_parameters(m1=m1[i], l2=l2[i])), [0.5, 0.2], [0.1, 0.3], 0.05, torque=[0.1, 0.2]
+        )
+        for name in ("energy", "momentum", "canonical_momentum", "work"):
+            expected = getattr(alone, name)()
+            assert getattr(runs, name)()[i] == pytest.approx(expected, abs=1e-11), name
+            assert np.array_equal(getattr(again, name)(), getattr(runs, name)()), name
+    with pytest.raises(UnsupportedError, match="parameters of their own"):
+        runs.energy("pinocchio")
+    heights = [np.ptp(runs.picture(count=1, member=i).axes[0].dataLim.intervaly) for i in range(2)]
+    assert heights[1] > 1.5 * heights[0]
+
+
+# What went wrong
+
+
+def test_what_diverged_is_nan_and_the_rest_is_not() -> None:
+    b = ModelBuilder("stiff")
+    b.add_body("mass", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=1e9, damping=0.1)
+    with pytest.warns(MbkitWarning, match="1 of 2 trajectories diverged"):
+        run = simulate(dynamics(b.build()), [[0.0], [1.0]], [0.0], 0.2, torque=np.ones((200, 1)) * 0.0)
+    assert isinstance(run.stats.reached, tuple)
+    for values in (run.energy(), run.work(), run.power_balance(), run.momentum()[..., 0], run.tau()[..., 0]):
+        assert np.isfinite(values[0]).all()
+        assert np.array_equal(np.isfinite(values[1]), run.t <= run.stats.reached[1])
+    run.plot()
+    for member in (0, 1):
+        run.picture(member=member)
+
+
+def test_a_failed_torque_leaves_nan_where_it_failed() -> None:
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        if t > 0.1:
+            raise ZeroDivisionError("mine")
+        return np.array([0.1, 0.2])
+
+    with pytest.raises(TorqueError) as caught:
+        swing(torque=torque)
+    for error in (caught.value, pickle.loads(pickle.dumps(caught.value))):
+        run = error.trajectory
+        assert run.stats.ended == "torque_failed"
+        assert run.stats.reached == run.t[-1] == pytest.approx(0.1)
+        assert np.isfinite(run.tau()[:-1]).all()
+        assert np.isfinite(run.power_balance()[:-2]).all()
+        assert "ZeroDivisionError" in repr(run)
+        run.plot()
+        run.picture()
+
+
+def test_a_function_that_fails_afterwards_says_so() -> None:
+    calls = []
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        calls.append(t)
+        if len(calls) > 130:
+            raise RuntimeError("used up")
+        return np.zeros(2)
+
+    run = swing(torque=torque)
+    with pytest.raises(TorqueError, match="used up"):
+        run.work()
+    assert np.isnan(pickle.loads(pickle.dumps(run)).tau()).any()
+
+
+def test_runs_of_one_state_and_of_none() -> None:
+    dyn = dynamics(catalog.double_pendulum())
+    run = simulate(dyn, [0.1, 0.2], [0.0, 0.0], 0.0, torque=lambda t, q, v: [1.0, 1.0])
+    assert run.work().tolist() == run.power_balance().tolist() == [0.0]
+    assert len(times(run.picture())) == 1
+    run.plot()
+    none = simulate(dyn, np.empty((0, 2)), np.empty((0, 2)), 0.02)
+    assert none.energy().shape == none.work().shape == (0, len(none.t))
+    assert none.momentum().shape == (0, len(none.t), 6)
+    assert none.tau().shape == none.v.shape
+    none.plot()
+    with pytest.raises(InputError, match="member: expected less than 0"):
+        none.picture()
+
+
+# Pictures
+
+
+def times(figure: Any) -> list[str]:
+    return [t.get_text() for t in figure.axes[0].texts if t.get_text().startswith("t = ")]
+
+
+def test_plot_has_a_panel_for_each_unit(tmp_path: Path) -> None:
+    b = ModelBuilder("mixed $kinds_")
+    for i, kind in enumerate(("free", "revolute", "prismatic")):
+        b.add_body(f"b{i}", mass=1.0, inertia=(0.1, 0.1, 0.1))
+        axis = {} if kind == "free" else {"axis": (0, 1, 0)}
+        b.add_joint(f"$j_{i}", kind, parent="world" if i == 0 else f"b{i - 1}", child=f"b{i}", **axis)
+    model = b.build()
+    q, v = model.random_state(np.random.default_rng(0))
+    run = simulate(dynamics(model), q, v, 0.05, "dop853", events=at_section(model, "$j_1", q[7] + 0.01 * np.sign(v[6])))
+    assert len(run.events) == 1
+    figure = run.plot()
+    labels = [axis.get_ylabel() for axis in figure.axes]
+    assert labels[::2] == ["lengths (m)", "angles (rad)", "quaternions (1)", "energy (J)"]
+    assert [re.search(r"\(([^()]*)\)$", x)[1] for x in labels[1::2]] == ["m/s", "rad/s", "rad/s", "J"]  # type: ignore[index]
+    # A line for each coordinate, and one for the event.
+    assert [len(axis.lines) for axis in figure.axes] == [4 + 1, 4 + 1, 1 + 1, 1 + 1, 4 + 1, 3 + 1, 3 + 1, 1 + 1]
+    assert "$j_1" in figure.axes[0].texts[0].get_text()
+    assert "$j_1" in run._repr_html_()
+    figure.savefig(tmp_path / "run.png")
+
+
+def test_plot_marks_a_divergence_and_shows_what_was_before_it() -> None:
+    b = ModelBuilder("stiff")
+    b.add_body("mass", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=1e7)
+    with pytest.warns(MbkitWarning):
+        run = simulate(dynamics(b.build()), [1.0], [0.0], 1.0)
+    figure = run.plot()
+    assert figure.axes[0].texts[0].get_text().strip() == "diverged"
+    assert max(map(abs, figure.axes[0].get_ylim())) < 1e-3 * np.abs(run.q).max()
+    assert "diverged" in [run.picture().axes[0].get_title("right")]
+
+
+def test_plot_says_what_it_cannot_draw() -> None:
+    run = swing(torque=np.random.default_rng(0).standard_normal((30, 2)), save=5)
+    assert "save=None" in run.plot().axes[-1].texts[0].get_text().replace("\n", " ")
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8, 13])
+def test_a_picture_has_as_many_figures_as_asked(count: int) -> None:
+    assert len(times(swing().picture(count))) == count
+    assert len(times(swing(method="dop853", rtol=1e-3).picture(count))) == count, "also between the states"
+
+
+def test_pictures_of_everything(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    models = [
+        catalog.pendulum(),
+        catalog.cart_pole(),
+        catalog.chain(n=4),
+        catalog.heavy_top(),
+        catalog.free_body(),
+        random_tree(0, 10),
+        random_tree(1, 10, gravity=False, mimic=True),
+        free_tree(2),
+        mb.load("panda", mimic="free"),
+        mb.load("anymal_b", floating_base=True),
+    ]
+    for model in models:
+        q, v = model.random_state(rng)
+        figure = simulate(dynamics(model), q, v, 0.02, dt=0.005).picture(3)
+        assert figure.axes[0].get_aspect() == 1
+        figure.savefig(tmp_path / "strip.png", dpi=40)
+
+
+def test_the_plane_is_the_motions_or_the_one_asked_for() -> None:
+    def told(run: Trajectory, **options: Any) -> str:
+        return str(run.picture(2, **options).axes[0].texts[-1].get_text())
+
+    assert "x to the right, z upwards" in told(swing())
+    assert "y to the right, z upwards" in told(swing(), view="yz")
+    assert "(0.71, 0.71, 0) to the right" in told(swing(), view=[[1, 1, 0], [0, 0, 1]])
+    # On a table, seen from above.
+    b = ModelBuilder("table")
+    for i in range(2):
+        b.add_body(f"b{i}", mass=1.0, com=(0.5, 0, 0), inertia=(0.1, 0.1, 0.1))
+        place = (1.0, 0, 0) if i else (0, 0, 0)
+        b.add_joint(
+            f"j{i}", "revolute", parent=f"b{i - 1}" if i else "world", child=f"b{i}", axis=(0, 0, 1), translation=place
+        )
+    run = simulate(dynamics(b.build()), [0.0, 0.5], [1.0, 2.0], 1.0, dt=0.01)
+    assert "x to the right, y upwards" in told(run)
+    for view, message in (
+        ("xx", "view: expected two of x, y and z"),
+        ("up", "view: expected two"),
+        ([[1, 0, 0], [2, 0, 0]], "not along one line"),
+        ([[0, 0, 0], [2, 0, 0]], "not along one line"),
+        ([1, 0, 0], r"view: expected shape \(2, 3\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            run.picture(view=view)
+    for options, message in (
+        ({"count": 0}, "count: expected a whole number of at least 1"),
+        ({"count": 2.5}, "count: expected a whole number"),
+        ({"member": 1}, "member: expected less than 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            run.picture(**options)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_skeletons_stand_where_engines_put_them(seed: int) -> None:
+    model = random_tree(seed, 10, mimic=True)
+    q, *_ = states(model, 4, seed)
+    drawn, dyn = skeleton(model, q), dynamics(model, "lagrangian")
+    for points, bodies in (
+        (drawn.joints, [j.child for j in model.tree if not j.type.lengths and j.kind != "fixed"]),
+        (drawn.slides[:, 1], [j.child for j in model.tree if j.kind in ("prismatic", "planar")]),
+    ):
+        places = [dyn.pose(q, body)[:, :3, 3] for body in bodies]
+        assert places
+        for place in places:
+            pool = np.concatenate([points, drawn.carts])
+            assert np.abs(pool - place).max(axis=(1, 2)).min() < 1e-13
+
+
+def test_dir_holds_what_a_reader_looks_for() -> None:
+    assert {name for name in dir(swing()) if not name.startswith("_")} == {
+        *("t", "q", "v", "model", "method", "engine", "stats", "events"),
+        *("energy", "kinetic_energy", "potential_energy", "tau", "work", "power_balance"),
+        *("momentum", "canonical_momentum", "plot", "picture", "to_csv"),
+    }
