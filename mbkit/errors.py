@@ -11,6 +11,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 __all__ = [
+    "EventError",
+    "FunctionError",
     "InputError",
     "KnownDefectWarning",
     "LoadError",
@@ -36,8 +38,8 @@ class InputError(MbkitError, ValueError):
     """An argument has the wrong shape, type or value."""
 
 
-class TorqueError(InputError):
-    """A user's torque function raised, or returned what is no torque.
+class FunctionError(InputError):
+    """A function that the user gave raised, or returned what cannot be used.
 
     Attributes
     ----------
@@ -49,6 +51,22 @@ class TorqueError(InputError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), self.args, {"trajectory": self.trajectory}
+
+
+class TorqueError(FunctionError):
+    """A torque function raised, or returned what is no torque."""
+
+
+class EventError(FunctionError):
+    """An event's function raised, or returned what is no number.
+
+    Attributes
+    ----------
+    member : int or None
+        Which trajectory of a batch.
+    """
+
+    member: int | None = None
 
 
 class UnknownNameError(MbkitError, LookupError):

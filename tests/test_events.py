@@ -12,7 +12,7 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import dynamics
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import EventError, InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import METHODS, Event, at_energy, at_limits, at_section, simulate
 from validation import closed_forms
@@ -229,3 +229,21 @@ def test_bad_events_are_named() -> None:
         engine = next(iter(METHODS[method].engines), "pinocchio")
         with pytest.raises(UnsupportedError, match=rf"{method}: .*dop853"):
             simulate(mb.dynamics(model, engine), [1.0], [0.0], 1.0, method, events=lambda t, q, v: q[0])
+
+
+@pytest.mark.parametrize("method", ["rk853", "dop853", "lsoda", "taylor"])
+def test_an_event_that_fails_leaves_the_run_up_to_then(method: str) -> None:
+    dyn = dynamics(catalog.pendulum(), "lagrangian")
+
+    def fails(t: float, _q: Any, _v: Any) -> float:
+        if t > 0.5:
+            raise ZeroDivisionError("too late")
+        return 1.0
+
+    for function, told in ((fails, "ZeroDivisionError: too late"), (lambda t, q, v: np.nan if t > 0.5 else 1.0, "nan")):
+        with pytest.raises(EventError, match=told) as caught:
+            simulate(dyn, [1.0], [0.0], 2.0, method, rtol=1e-8, events=function)
+        run = caught.value.trajectory
+        assert 0 < run.t[-1] <= 0.5 + 0.5
+        assert run.stats.ended == "function_failed"
+        assert np.isfinite(run.q).all()

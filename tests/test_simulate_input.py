@@ -158,7 +158,7 @@ def test_a_torque_that_fails_leaves_the_run_up_to_then(
     if wrong is raises:
         assert isinstance(error.__cause__, ZeroDivisionError)
     run = error.trajectory
-    assert run.stats.ended == "torque_failed"
+    assert run.stats.ended == "function_failed"
     assert run.stats.message == str(error)
     assert not run.stats.finished
     if np.ndim(states) == 2:

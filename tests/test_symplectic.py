@@ -354,7 +354,7 @@ def test_a_torque_function_that_fails_leaves_what_was_computed() -> None:
     kept = caught.value.trajectory
     assert kept.t[-1] == pytest.approx(0.5)
     assert np.isfinite(kept.q).all()
-    assert kept.stats.ended == "torque_failed"
+    assert kept.stats.ended == "function_failed"
     with pytest.raises(TorqueError, match=r"\(2,\)"):
         simulate(engine(model), q, v, 1.0, METHOD, dt=0.01, torque=lambda t, q, v: [0.0])
 

@@ -42,7 +42,7 @@ def states(model, n):
     return q, 0.1 * v
 
 
-def bare(dyn, q, v, pool):
+def bare(dyn, q, v, pool, steps=STEPS):
     """Return a call of mujoco.rollout and nothing else."""
     m = dyn.mj_model
     m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, DT
@@ -50,10 +50,10 @@ def bare(dyn, q, v, pool):
     start = np.zeros((n, mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     # The states' values matter here, not which of MuJoCo's coordinates has which.
     start[:, 1 : 1 + m.nq], start[:, 1 + m.nq : 1 + m.nq + m.nv] = q[:, dyn._made.q_index], v[:, dyn._made.v_index]
-    out = np.empty((n, STEPS, start.shape[1]))
-    sensors = np.empty((n, STEPS, m.nsensordata))
+    out = np.empty((n, steps, start.shape[1]))
+    sensors = np.empty((n, steps, m.nsensordata))
     data = [mujoco.MjData(m) for _ in range(cores())]
-    return lambda: pool.rollout(m, data, start, nstep=STEPS, state=out, sensordata=sensors)
+    return lambda: pool.rollout(m, data, start, nstep=steps, state=out, sensordata=sensors)
 
 
 def cores():
@@ -103,6 +103,31 @@ def row(label, model, pool):
     }
 
 
+def one_call(pool):
+    """Return the rate of 4096 rollouts of 1 s in one call, beside `mujoco.rollout` on a sixteenth of them."""
+    model = mb.load("panda", mimic="free").without("damping")
+    own, theirs = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "mujoco")
+    n, steps = 4096, 1000
+    q, v = states(model, n)
+    few = n // 16
+    calls = {
+        "mujoco": (few, bare(theirs, q[:few], v[:few], pool, steps)),
+        "end saved": (n, lambda: mb.simulate(own, q, v, 1.0, dt=DT, save=[1.0])),
+        "every 10 ms saved": (n, lambda: mb.simulate(own, q, v, 1.0, dt=DT, save=10)),
+    }
+    times = {name: [] for name in calls}
+    for _, call in calls.values():
+        call()
+    for _ in range(5):
+        for name, (_, call) in calls.items():
+            times[name].append(seconds(call))
+    out = {name: {"rollouts": count, "seconds": float(np.median(times[name]))} for name, (count, _) in calls.items()}
+    for told in out.values():
+        told["rollouts_per_second"] = told["rollouts"] / told["seconds"]
+    run = mb.simulate(own, q, v, 1.0, dt=DT, save=[1.0])
+    return {"model": "panda, mimic free", "horizon_s": 1.0, "finished": run.stats.finished, "calls": out}
+
+
 def main():
     rows = []
     with mujoco.rollout.Rollout(nthread=cores()) as pool:
@@ -114,9 +139,12 @@ def main():
             print(
                 f"{label}: {r['max_difference']:.1e} apart, first run {r['first_run_s']:.2f} s\n  ns {ns}\n  {ratios}"
             )
+        whole = one_call(pool)
+        for name, told in whole["calls"].items():
+            print(f"{whole['model']}, 1 s: {name}: {told['rollouts_per_second']:.0f} rollouts per second")
     about = {"rk4_dt": DT, "steps": STEPS, "cores": cores(), "versions": versions(), "processor": processor()}
     with open("validation/rollouts.json", "w", encoding="utf-8") as f:
-        json.dump({"rows": rows, **about}, f, indent=1)
+        json.dump({"rows": rows, "one_call": whole, **about}, f, indent=1)
 
 
 if __name__ == "__main__":

@@ -18,19 +18,23 @@ import os
 import re
 import stat
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final
 
 from platformdirs import user_cache_path
 
-__all__ = ["folder", "key_of", "read", "write"]
+__all__ = ["anew", "folder", "forgotten", "key_of", "read", "write"]
 
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
 _MOST: Final = 512 * 2**20
 #: Names of entries, and of those being written.
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}|\.new-.+")
+#: Entries made within a block of `anew`; None outside of one.
+_ANEW: Final[ContextVar[set[str] | None]] = ContextVar("_ANEW", default=None)
 
 
 def key_of(*parts: str) -> str:
@@ -60,10 +64,29 @@ def folder() -> Path | None:
     return path
 
 
+@contextmanager
+def anew() -> Iterator[None]:
+    """Make each entry once more within the block, in this thread, as if none had been kept.
+
+    So that what a first run takes can be measured at any time. What is made is kept as ever.
+    """
+    token = _ANEW.set(set())
+    try:
+        yield
+    finally:
+        _ANEW.reset(token)
+
+
+def forgotten(key: str) -> bool:
+    """Return whether an entry is to be made although it may be kept, here or in memory: see `anew`."""
+    made = _ANEW.get()
+    return made is not None and key not in made
+
+
 def read(key: str) -> tuple[dict[str, Any], bytes] | None:
     """Return the description and code of an entry, or None if there is none to be trusted."""
     at = folder()
-    if at is None:
+    if at is None or forgotten(key):
         return None
     path = at / key
     try:
@@ -88,6 +111,9 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
 
 def write(key: str, about: dict[str, Any], code: bytes) -> None:
     """Keep an entry; where that is not possible, nothing happens."""
+    made = _ANEW.get()
+    if made is not None:
+        made.add(key)
     at = folder()
     if at is None:
         return

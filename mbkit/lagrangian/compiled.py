@@ -249,7 +249,7 @@ def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
     """
     key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, jit.host()))
     with _HELD.lock:
-        found = _HELD.functions.get(key)
+        found = None if disk.forgotten(key) else _HELD.functions.get(key)
         if found is None:
             found = _HELD.functions[key] = _from_disk(key) or _made(key, make)
     return found

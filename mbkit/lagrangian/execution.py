@@ -17,7 +17,7 @@ from mbkit.lagrangian.machine import Machine
 if TYPE_CHECKING:
     from mbkit.lagrangian.compiled import Compiled
 
-__all__ = ["compile_by_default", "executable"]
+__all__ = ["compile_by_default", "executable", "has_compiler"]
 
 
 #: Operations above which LLVM's time, some 10 s per 100k, is not spent unasked: a
@@ -64,6 +64,11 @@ class _TooLargeError(Exception):
     def __init__(self, function: ca.Function) -> None:
         super().__init__()
         self.function = function
+
+
+def has_compiler() -> bool:
+    """Return whether functions can be compiled; where not, a `NoCompilerWarning` says so once."""
+    return _compiler()
 
 
 @cache

@@ -19,7 +19,7 @@ from mbkit.lagrangian.equations import Equations
 from mbkit.model.rotation import Arithmetic
 from mbkit.model.space import Space
 
-__all__ = ["STEPS", "Part", "SymbolicSpace", "march", "march_in_stages", "step"]
+__all__ = ["STEPS", "Part", "SymbolicSpace", "choose", "function_of", "march", "march_in_stages", "step"]
 
 Rate = Callable[[Any, Any], Any]
 
@@ -27,13 +27,14 @@ _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
 
 
-def _choose(condition: ca.SX, yes: Any, no: Any) -> Any:
+def choose(condition: ca.SX, yes: Any, no: Any) -> Any:
+    """Return `yes` where the condition is 1, `no` where it is 0, whatever the other one is."""
     # casadi.if_else would negate the condition by an operation of its own.
     chosen = ca.SX.binary(ca.OP_IF_ELSE_ZERO, condition, ca.SX(yes))
     return chosen + ca.SX.binary(ca.OP_IF_ELSE_ZERO, 1 - condition, ca.SX(no))
 
 
-_SYMBOLS: Final = Arithmetic(ca.sqrt, ca.sin, ca.cos, _choose)
+_SYMBOLS: Final = Arithmetic(ca.sqrt, ca.sin, ca.cos, choose)
 
 
 class SymbolicSpace(Space):
@@ -128,7 +129,7 @@ def step(equations: Equations, method: str) -> ca.Function:
     given = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.trailing)}
     rate = _rate(equations, space, s)
     q1, w1 = _formula(method)(space, rate, s["q"], space.enter(s["q"], s["v"]), s["dt"])
-    return _function(f"{method}_step", given, {"q1": q1, "v1": space.leave(q1, w1)})
+    return function_of(f"{method}_step", given, {"q1": q1, "v1": space.leave(q1, w1)})
 
 
 def march(equations: Equations, method: str) -> tuple[Part, ...]:
@@ -144,7 +145,7 @@ def march(equations: Equations, method: str) -> tuple[Part, ...]:
         s, space = _symbols(equations), SymbolicSpace(equations.model)
         rate = _rate(equations, space, s)
         q1, w1 = _formula(method)(space, rate, s["q"], s["w"], s["dt"])
-        return _function(name, {n: s[n] for n in (*_MARCH, *behind)}, _watched(s, q1, w1))
+        return function_of(name, {n: s[n] for n in (*_MARCH, *behind)}, _watched(s, q1, w1))
 
     _formula(method)
     return (Part(name, (*_MARCH, *behind), _MARCHED, make),)
@@ -162,7 +163,7 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
 
     def cut(name: str, made: dict[str, Any]) -> None:
         held = dict(given)
-        parts.append(Part(name, tuple(held), tuple(made), lambda: _function(name, held, made)))
+        parts.append(Part(name, tuple(held), tuple(made), lambda: function_of(name, held, made)))
 
     def rate(q: Any, w: Any) -> Any:
         i = sum(part.name == "forward_dynamics" for part in parts)
@@ -209,6 +210,7 @@ def _watched(s: dict[str, Any], q1: Any, w1: Any) -> dict[str, Any]:
     return dict(zip(_MARCHED, (q1, w1, s["squares"] + (ca.sumsqr(q1) + ca.sumsqr(w1))), strict=True))
 
 
-def _function(name: str, given: dict[str, Any], made: dict[str, Any]) -> ca.Function:
+def function_of(name: str, given: dict[str, Any], made: dict[str, Any]) -> ca.Function:
+    """Return the function of named symbols whose named results are dense."""
     outs = [ca.densify(x) for x in made.values()]
     return ca.Function(name, list(given.values()), outs, list(given), list(made), {"cse": True})

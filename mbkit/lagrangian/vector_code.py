@@ -22,7 +22,7 @@ from mbkit.lagrangian.llvm_text import Text, declarations, number
 from mbkit.lagrangian.program import Program
 from mbkit.lagrangian.sincos import sincos
 
-__all__ = ["BODY", "vector_code"]
+__all__ = ["BODY", "Piece", "pieces_of", "slots_of", "vector_code"]
 
 BODY: Final = "mbkit_body"
 #: LLVM's time to compile one block grows faster than its length, most of all with
@@ -37,9 +37,9 @@ _BINARY: Final = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 
 def vector_code(program: Program, width: int) -> tuple[str, int]:
     """Return LLVM code of a program, and how many vectors of work space it needs."""
-    pieces = _pieces(program)
-    written = [_Piece(program, piece, width) for piece in pieces]
-    slots = _slots(program, pieces)
+    pieces = pieces_of(program)
+    written = [Piece(program, piece, width) for piece in pieces]
+    slots = slots_of(program, pieces)
     for k, piece in enumerate(written):
         piece.write(slots, first=k == 0)
     functions = [p.function(f"{BODY}_{k}") for k, p in enumerate(written)]
@@ -51,7 +51,7 @@ def vector_code(program: Program, width: int) -> tuple[str, int]:
     return text, max(slots.values(), default=0) + 1
 
 
-def _pieces(program: Program) -> list[list[int]]:
+def pieces_of(program: Program) -> list[list[int]]:
     """Split the operations, in their order, into what is compiled as one function."""
     stored: dict[int, int] = {}
     for out in program.outputs:
@@ -106,7 +106,7 @@ def _seen(program: Program) -> set[tuple[int, ...]]:
     return {o.arguments for o in program.operations if o.name == "input"}
 
 
-def _slots(program: Program, pieces: list[list[int]]) -> dict[int, int]:
+def slots_of(program: Program, pieces: list[list[int]]) -> dict[int, int]:
     """Return the place in the work space of each value that another piece reads."""
     at = {k: n for n, piece in enumerate(pieces) for k in piece}
     last: dict[int, int] = {}
@@ -131,7 +131,7 @@ def _slots(program: Program, pieces: list[list[int]]) -> dict[int, int]:
     return slots
 
 
-class _Piece:
+class Piece:
     """One function over a run of operations."""
 
     def __init__(self, program: Program, piece: list[int], width: int) -> None:

@@ -71,6 +71,15 @@ class Space:
             self.put(out, b, rotation.dexp_inverse(m, self.components(u, b), self.components(w, b)))
         return out
 
+    def sizes(self, q: Any, u: Any) -> Any:
+        """Return how large q is along each component of a u: |q| where positions add, 1 for a rotation."""
+        if self.flat:
+            return abs(q)
+        out = 0 * u + 1
+        for a, b in self._sums:
+            self.put(out, b, abs(self.part(q, a)))
+        return out
+
     def enter(self, q: Any, v: Any) -> Any:
         """Return w of mbkit's v."""
         return self._changed(q, v, velocity_in_parent)

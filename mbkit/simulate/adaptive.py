@@ -18,7 +18,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.errors import MbkitError, TorqueError
+from mbkit.errors import FunctionError, MbkitError
 from mbkit.model import Model
 from mbkit.simulate.events import Event, State, Watch
 from mbkit.simulate.members import Member, check_save, gathered, reporter
@@ -153,7 +153,7 @@ class _Solve:
         member = Member()
         try:
             self._integrate(member, task, done)
-        except TorqueError as error:
+        except FunctionError as error:
             member.fail(error)
         return member
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mbkit._check import Array, real
 from mbkit.engines import Dynamics
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import EventError, InputError, UnknownNameError
 from mbkit.model import Model
 
 __all__ = ["Event", "Hit", "State", "Watch", "as_events", "at_energy", "at_limits", "at_section"]
@@ -53,14 +53,16 @@ class Event:
 
     def __call__(self, t: float, q: Array, v: Array) -> float:
         """Return the function's value, checked."""
+        when = f"at t = {t:.9g} s"
         try:
             value = float(self.function(t, q.copy(), v.copy()))
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"events: {self.name!r} at t = {t:.9g} s: expected a number from the function; {error}"
+        except Exception as error:
+            raise EventError(
+                f"events: {self.name!r} {when}: expected a number from the function; "
+                f"it raised {type(error).__name__}: {error}"
             ) from error
         if not np.isfinite(value):
-            raise InputError(f"events: {self.name!r} returned {value} at t = {t:.9g} s; expected a finite number")
+            raise EventError(f"events: {self.name!r} returned {value} {when}; expected a finite number")
         return value
 
 
@@ -101,15 +103,15 @@ class Watch:
 
     def start(self, t: float, q: Array, v: Array) -> None:
         """Begin at a state; a function that is zero there crosses only when it is zero again."""
-        self._t, self._values = t, [event(t, q, v) for event in self._events]
+        self._t, self._values = t, [self._value(event, t, (q, v)) for event in self._events]
 
     def look(self, t1: float, state: State) -> tuple[list[Hit], Hit | None]:
         """Return the crossings since the last look, in time's order, and the first that ends the run.
 
         Nothing after the latter is returned.
         """
-        q1, v1 = state(t1)
-        values = [event(t1, q1, v1) for event in self._events]
+        there = state(t1)
+        values = [self._value(event, t1, there) for event in self._events]
         found: list[tuple[float, int]] = []
         for k, (event, before, after) in enumerate(zip(self._events, self._values, values, strict=True)):
             if _crosses(before, after, event.direction):
@@ -123,6 +125,13 @@ class Watch:
         self._t, self._values = t1, values
         return hits, None
 
+    def _value(self, event: Event, t: float, state: tuple[Array, Array]) -> float:
+        try:
+            return event(t, *state)
+        except EventError as error:
+            error.member = self._member
+            raise
+
     def _root(self, event: Event, state: State, t1: float, before: float, after: float) -> float:
         if after == 0.0:
             return t1
@@ -132,7 +141,11 @@ class Watch:
         known = {self._t: before, t1: after}
         eps = float(np.finfo(float).eps)
         root = brentq(
-            lambda t: known[t] if t in known else event(t, *state(t)), self._t, t1, xtol=4 * eps * t1, rtol=4 * eps
+            lambda t: known[t] if t in known else self._value(event, t, state(t)),
+            self._t,
+            t1,
+            xtol=4 * eps * t1,
+            rtol=4 * eps,
         )
         return float(root)
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.errors import TorqueError
+from mbkit.errors import FunctionError
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.outcome import Outcome
@@ -43,7 +43,7 @@ def run_fixed(
             try:
                 if not run.advance(k):
                     break
-            except TorqueError as error:
+            except FunctionError as error:
                 run.failed(k, error)
                 break
             bar.update((k + 1) / grid.steps)
@@ -66,7 +66,7 @@ class _Run:
         self._members: Indices | None = np.arange(lead[0]) if lead else None
         self._reached = np.full(lead, grid.duration)
         self._message = ""
-        self._error: TorqueError | None = None
+        self._error: FunctionError | None = None
         self._steps = 0
         self._q, self._w = q0.copy(), space.enter(q0, v0)
         if self._next == 0:
@@ -100,7 +100,7 @@ class _Run:
             self._keep(q, self._space.leave(q, w))
         return True
 
-    def failed(self, k: int, error: TorqueError) -> None:
+    def failed(self, k: int, error: FunctionError) -> None:
         """End the run before step k, because the torque function did."""
         self._error = error
         self._reached[... if self._members is None else self._members] = self._grid.time(k)
@@ -137,7 +137,7 @@ class _Run:
             message += f"; {batch - len(self._members)} of {batch} trajectories diverged, see reached"
         ended: Ended = "diverged" if message else "finished"
         if self._error is not None:
-            ended, message = "torque_failed", str(self._error)
+            ended, message = "function_failed", str(self._error)
         return Outcome(
             t=np.array([self._grid.time(int(k)) for k in self._kept[: self._row]]),
             q=self._q_kept[..., : self._row, :],

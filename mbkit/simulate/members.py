@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.errors import InputError, TorqueError
+from mbkit.errors import FunctionError, InputError
 from mbkit.model import Model
 from mbkit.simulate.events import Hit
 from mbkit.simulate.grid import check_room
@@ -36,7 +36,7 @@ class Member:
         As in `Stats`.
     message : str
     events : list of Hit
-    error : TorqueError or None
+    error : FunctionError or None
     """
 
     t: list[float] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Member:
     ended: Ended = "finished"
     message: str = ""
     events: list[Hit] = field(default_factory=list)
-    error: TorqueError | None = None
+    error: FunctionError | None = None
 
     def keep(self, t: float, y: Array) -> None:
         """Keep a state."""
@@ -65,9 +65,9 @@ class Member:
         if hit.member is None and not (self.t and self.t[-1] == hit.t):
             self.keep(hit.t, np.concatenate([hit.q, hit.v]))
 
-    def fail(self, error: TorqueError) -> None:
-        """End where the torque function failed."""
-        self.ended, self.message, self.error = "torque_failed", str(error), error
+    def fail(self, error: FunctionError) -> None:
+        """End where a torque or event function failed."""
+        self.ended, self.message, self.error = "function_failed", str(error), error
 
 
 def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
@@ -140,7 +140,7 @@ def gathered(
 def _told(members: Sequence[Member], batch: int | None) -> tuple[Ended, str]:
     # What went wrong is told before what was wished for.
     early = [member for member in members if member.ended != "finished"]
-    early.sort(key=lambda member: ("torque_failed", "diverged", "step_too_small", "event").index(member.ended))
+    early.sort(key=lambda member: ("function_failed", "diverged", "step_too_small", "event").index(member.ended))
     if not early:
         return "finished", ""
     first = early[0]

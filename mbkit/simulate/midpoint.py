@@ -20,7 +20,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import TorqueError, UnsupportedError
+from mbkit.errors import FunctionError, UnsupportedError
 from mbkit.lagrangian.machine import Machine
 from mbkit.lagrangian.midpoint import GUESS, Midpoint
 from mbkit.model.space import Space
@@ -92,7 +92,7 @@ class _Run:
         self._last = np.zeros(n)
         # Threads append to it.
         self._iterations: list[int] = []
-        self._error: TorqueError | None = None
+        self._error: FunctionError | None = None
 
     def _rows(self, first: int, last: int) -> slice:
         """Return the rows of what is kept of the states from the first to the last."""
@@ -190,7 +190,7 @@ class _Run:
                 if (rows := self._rows(k + 1, k + 1)).start < rows.stop:
                     self._q[members, rows.start], self._v[members, rows.start] = q, pi
                 bar.update((k + 1) / grid.steps)
-        except TorqueError as error:
+        except FunctionError as error:
             self._error = error
         self._iterations.append(solver.iterations)
 
@@ -215,7 +215,7 @@ class _Run:
             steps=int(steps.sum()),
             # Each iteration is one, and so is the end of each step.
             evaluations=sum(self._iterations) + int(steps.sum()),
-            ended="torque_failed" if self._error else "diverged" if message else "finished",
+            ended="function_failed" if self._error else "diverged" if message else "finished",
             reached=np.asarray(times[0] if single else times),
             message=message,
             jacobians=sum(self._iterations),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mbkit._check import Array
-from mbkit.errors import TorqueError
+from mbkit.errors import FunctionError
 from mbkit.simulate.events import Hit
 from mbkit.simulate.stats import Ended
 
@@ -16,7 +16,7 @@ __all__ = ["Outcome"]
 class Outcome:
     """Kept states and the figures of a run; `reached` has shape () or (N,).
 
-    A torque function's `error` is handed on with what was computed before it.
+    The `error` of a torque or event function is handed on with what was computed before it.
     """
 
     t: Array
@@ -30,4 +30,4 @@ class Outcome:
     rejected: int = 0
     jacobians: int = 0
     events: tuple[Hit, ...] = ()
-    error: TorqueError | None = None
+    error: FunctionError | None = None

@@ -7,7 +7,7 @@ from typing import Literal
 
 __all__ = ["Ended", "Stats"]
 
-Ended = Literal["finished", "event", "diverged", "step_too_small", "torque_failed"]
+Ended = Literal["finished", "event", "diverged", "step_too_small", "function_failed"]
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Stats:
         Evaluations of the forward dynamics, summed over a batch.
     seconds : float
         Time on the wall.
-    ended : {"finished", "event", "diverged", "step_too_small", "torque_failed"}
+    ended : {"finished", "event", "diverged", "step_too_small", "function_failed"}
         ``"event"`` when one asked for the end; ``"diverged"`` when a state or
         acceleration of any trajectory stopped being finite, or a state passed 1e100;
         ``"step_too_small"`` when an adaptive method could not go on;
-        ``"torque_failed"`` when the torque function did.
+        ``"function_failed"`` when a torque or event function did.
     reached : float or tuple of float
         Time of the last good state, s; one per trajectory of a batch.
     message : str

@@ -16,7 +16,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.lagrangian.taylor import Precision, TaylorSystem, precision, taylor_system
 from mbkit.model import Model
 from mbkit.simulate.events import Event, State, Watch
@@ -246,9 +246,9 @@ class _Run:
         member, steps = self._member, self._steps
         if self._save is None or self._save[:1] == [0.0]:
             member.keep(0.0, y0)
-        if self._watch is not None:
-            self._watch.start(0.0, *_state(self._dyn.model, y0))
         try:
+            if self._watch is not None:
+                self._watch.start(0.0, *_state(self._dyn.model, y0))
             for t in steps(y0, stops, force):
                 member.steps += 1
                 if self._watch is not None and self._ends(t, self._watch):
@@ -260,6 +260,8 @@ class _Run:
             interval = int(np.searchsorted(stops, steps.t, side="right"))
             why = self._reason(force(min(interval, len(stops) - 1))) if error.ended == "diverged" else ""
             member.stop(error.ended, f"diverged: {why}" if why else str(error))
+        except FunctionError as error:
+            member.fail(error)
         return member
 
     def _ends(self, t: float, watch: Watch) -> bool:

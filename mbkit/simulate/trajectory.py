@@ -194,7 +194,7 @@ class Trajectory:
 
     def _acted(self) -> Held | Sampled | None:
         if isinstance(self._applied, Asked):
-            strict = self.stats.ended != "torque_failed"
+            strict = self.stats.ended != "function_failed"
             answers = self._applied.sampled(self.t, self.q, self.v, strict=strict)
             object.__setattr__(self, "_applied", answers)
         acted = self._applied

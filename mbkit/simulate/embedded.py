@@ -1,0 +1,253 @@
+"""The adaptive run of an embedded Runge-Kutta pair on the manifold: rk853.
+
+Own steps do not depend on what is saved or looked for. A state within a step is made
+by a shorter step from the same start, of the same order as all others, so that there is
+no interpolant whose error would have to be told apart; compiled, several of these
+stand side by side in a vector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.errors import FunctionError
+from mbkit.model.space import Space
+from mbkit.simulate.embedded_stages import StageTrials
+from mbkit.simulate.embedded_trials import Stretch, Trials
+from mbkit.simulate.events import Event, Hit, State, Watch
+from mbkit.simulate.grid import Indices
+from mbkit.simulate.members import Member, check_save, gathered
+from mbkit.simulate.methods import Tolerances
+from mbkit.simulate.outcome import Outcome
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.steps import RAN_AWAY, credible
+from mbkit.simulate.torque import Torque
+
+__all__ = ["run_embedded"]
+
+_BEYOND: Final = f"diverged: {RAN_AWAY}"
+
+
+def run_embedded(
+    dyn: Dynamics,
+    method: str,  # noqa: ARG001  # there is one such method
+    q0: Array,
+    v0: Array,
+    duration: float,
+    tolerances: Tolerances,
+    torque: Torque,
+    save: Array | None,
+    events: tuple[Event, ...],
+    bar: Progress,
+) -> Outcome:
+    """Integrate one state, or a batch of them, each with steps of its own.
+
+    Where the own derivation is compiled and the torque is no function, the steps run
+    as machine code; elsewhere stage by stage, by the same formulas. Torques held as an
+    array start a new step at each interval.
+    """
+    batch = None if q0.ndim == 1 else len(q0)
+    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
+    check_save(save, batch, q0.shape[1] + v0.shape[1])
+    space = Space(dyn.model)
+    trials = _trials(dyn, space, tolerances, torque, duration, batch)
+    tracks = [_Track(space, q0.shape[1], trials, i, batch, save, events, tolerances) for i in range(len(q0))]
+    held = save.tolist() if save is not None and torque.held else []
+    stops = sorted({*held, duration} - {0.0})
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for first in range(0, len(q0), trials.width):
+            part = slice(first, first + trials.width)
+            group = tracks[part]
+            try:
+                for track, q, v in zip(group, q0[part], v0[part], strict=True):
+                    track.begin(q, v)
+                trials.start(range(first, first + len(group)), q0[part], space.enter(q0[part], v0[part]))
+                for now in _march(trials, group, stops):
+                    bar.update((first + len(group) * now / duration) / len(q0))
+            except FunctionError as error:
+                # Where the torque is a function, trajectories run one by one.
+                which = getattr(error, "member", None)
+                group[0 if which is None else which - first].member.fail(error)
+                break
+    return _outcome(dyn, tracks, batch, save, trials.evaluations)
+
+
+def _trials(
+    dyn: Dynamics, space: Space, tolerances: Tolerances, torque: Torque, duration: float, batch: int | None
+) -> Trials:
+    if dyn.engine == "lagrangian" and not torque.callable and dyn.model.nv:
+        # Other engines need no CasADi.
+        from mbkit.engines.lagrangian import LagrangianDynamics
+        from mbkit.lagrangian.execution import has_compiler
+
+        if isinstance(dyn, LagrangianDynamics) and dyn.compile and dyn.written_out and has_compiler():
+            # Loads LLVM, which interpreting never needs.
+            from mbkit.simulate.embedded_lanes import LaneTrials
+
+            return LaneTrials(dyn, space, tolerances, torque, duration, batch)
+    return StageTrials(dyn, space, tolerances, torque, duration, batch)
+
+
+def _march(trials: Trials, group: Sequence[_Track], stops: Sequence[float]) -> Iterator[float]:
+    """Take trajectories to the end; yields the mean time that they have reached."""
+    for k, stop in enumerate(stops):
+        trials.hold(k, stop)
+        while made := trials.advance():
+            for place, stretch in made:
+                track = group[place]
+                if not track.take(place, stretch) or track.stuck(place):
+                    trials.drop(place)
+            yield sum(track.member.reached for track in group) / len(group)
+
+
+class _Track:
+    """One trajectory: what is kept of it, and how it ends."""
+
+    def __init__(
+        self,
+        space: Space,
+        nq: int,
+        trials: Trials,
+        index: int,
+        batch: int | None,
+        save: Array | None,
+        events: tuple[Event, ...],
+        tolerances: Tolerances,
+    ) -> None:
+        which = None if batch is None else index
+        self.member, self._nq = Member(), nq
+        self._space, self._trials, self._save, self._tolerances = space, trials, save, tolerances
+        self._watch = Watch(events, which) if events else None
+        self._kept: list[tuple[Array, Array, Array]] = []
+
+    def begin(self, q: Array, v: Array) -> None:
+        """Start at a state."""
+        if self._save is None or (len(self._save) and self._save[0] == 0.0):
+            self._kept.append((np.zeros(1), q[None], v[None]))
+        if self._watch is not None:
+            self._watch.start(0.0, q, v)
+
+    def states(self) -> tuple[Array, Array, Array]:
+        """Return t, q and v of all that was kept."""
+        space = self._space
+        if not self._kept:
+            return np.empty(0), np.empty((0, self._nq)), np.empty((0, space.nv))
+        t, q, v = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
+        return t, q, v
+
+    def take(self, place: int, made: Stretch) -> bool:
+        """Take in some steps; return whether to go on."""
+        member = self.member
+        steps = len(made.t) - 1
+        member.rejected += made.tried - steps
+        # A state that is none stays so: the last one tells.
+        lost = not (credible(made.q[-1]) and credible(made.w[-1]))
+        if lost:
+            good = credible(made.q[1:]) & credible(made.w[1:])
+            steps = int(np.argmin(good))
+        hit = self._look(place, made, steps)
+        if hit is not None:
+            steps = int(np.searchsorted(made.t, hit.t))
+        until = float(made.t[steps]) if hit is None else hit.t
+        if not self._keep(place, made, steps, until):
+            # Never seen: a shorter step than one that was good met what is no number.
+            steps, hit, lost = 0, None, True
+            until = float(made.t[0])
+        member.steps += steps
+        member.reached = until
+        if hit is not None:
+            self._stop_at(hit)
+        elif lost:
+            member.stop("diverged", _BEYOND)
+        return hit is None and not lost
+
+    def stuck(self, place: int) -> bool:
+        """Return whether no step can be made any more, and end there."""
+        stuck = self._trials.stuck(place)
+        if stuck:
+            self.member.stop("diverged", f"diverged: {self._trials.why(place)}")
+        elif stuck is False:
+            rtol = self._tolerances.rtol
+            told = f"step below rounding at rtol = {rtol:g}: stiff, singular or diverging"
+            self.member.stop("step_too_small", told)
+        return stuck is not None
+
+    def _look(self, place: int, made: Stretch, steps: int) -> Hit | None:
+        if self._watch is None:
+            return None
+        for k in range(steps):
+            hits, last = self._watch.look(float(made.t[k + 1]), self._within(place, made, k))
+            self.member.events += hits
+            if last is not None:
+                return last
+        return None
+
+    def _within(self, place: int, made: Stretch, k: int) -> State:
+        """Return the states of step k by time, each made by a step that ends there."""
+
+        def state(t: float) -> tuple[Array, Array]:
+            if t in (made.t[k], made.t[k + 1]):
+                at = k + int(t == made.t[k + 1])
+                return made.q[at], self._space.leave(made.q[at], made.w[at])
+            q, w = self._trials.within(place, _rows(made, np.array([k])), np.array([t]))
+            return q[0], self._space.leave(q[0], w[0])
+
+        return state
+
+    def _keep(self, place: int, made: Stretch, steps: int, until: float) -> bool:
+        """Keep what is wanted after the start, up to a time in or at the end of the last step.
+
+        Returns whether all that was wanted is a state; if not, nothing is kept.
+        """
+        if self._save is None:
+            ends = slice(1, steps + 1 - int(until != made.t[steps]))
+            return self._add(made.t[ends], made.q[ends], made.w[ends])
+        first, last = np.searchsorted(self._save, (made.t[0], until), side="right")
+        times = self._save[first:last]
+        after = np.searchsorted(made.t, times)
+        q, w = made.q[after], made.w[after]
+        between = np.flatnonzero(made.t[after] != times)
+        if len(between):
+            q[between], w[between] = self._trials.within(place, _rows(made, after[between] - 1), times[between])
+        return self._add(times, q, w)
+
+    def _add(self, t: Array, q: Array, w: Array) -> bool:
+        good = bool(credible(q).all() and credible(w).all())
+        if good and len(t):
+            self._kept.append((t, q, self._space.leave(q, w)))
+        return good
+
+    def _stop_at(self, hit: Hit) -> None:
+        self.member.stop_at(hit)
+        # Of one of a batch the state is with the event, off the common times.
+        if hit.member is None and not (self._kept and self._kept[-1][0][-1] == hit.t):
+            self._kept.append((np.array([hit.t]), hit.q[None], hit.v[None]))
+
+
+def _rows(made: Stretch, which: Indices) -> Stretch:
+    return Stretch(made.t[which], made.q[which], made.w[which], 0)
+
+
+def _outcome(
+    dyn: Dynamics, tracks: Sequence[_Track], batch: int | None, save: Array | None, evaluations: int
+) -> Outcome:
+    for track in tracks:
+        # The states are put in below, whole arrays of them.
+        track.member.t, track.member.y = [], []
+    told = gathered(dyn.model, [track.member for track in tracks], batch, save, evaluations=evaluations)
+    kept = [track.states() for track in tracks]
+    if batch is None:
+        t, q, v = kept[0]
+        return replace(told, t=t, q=q, v=v)
+    count = max((len(t) for t, _, _ in kept), default=0)
+    q, v = (np.full((batch, count, n), np.nan) for n in (dyn.model.nq, dyn.model.nv))
+    for i, (t, *state) in enumerate(kept):
+        q[i, : len(t)], v[i, : len(t)] = state
+    assert save is not None
+    return replace(told, t=save[:count], q=q, v=v)
