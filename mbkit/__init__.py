@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import simulate as simulate
     from mbkit.studies.compare import compare as compare
+    from mbkit.studies.work_precision import work_precision as work_precision
 
 
 _HOME = {
@@ -46,6 +47,7 @@ _HOME = {
     "load": "mbkit.load",
     "robots": "mbkit.load",
     "simulate": "mbkit.simulate",
+    "work_precision": "mbkit.studies",
 }
 _MODULES = ("catalog", "errors", "lagrangian")
 

@@ -174,7 +174,8 @@ def test_a_stiff_scene_ends_and_is_not_judged_by_what_it_cannot_show():
     unjudged = [r for r in result.rollouts if not r.judged]
     assert all("not judged" in r.note for r in unjudged)
     assert unjudged or any(r.term == "rollouts" for r in result.refusals)
-    assert any("given up after" in r.reason for r in result.refusals)
+    assert result.precision is None
+    assert any("no reference holds for even" in r.reason for r in result.refusals)
 
 
 def planted(monkeypatch, engine, method, change):
@@ -270,7 +271,7 @@ def test_mujocos_implicit_damping_is_shown_for_what_it_is():
     assert result.passed
 
 
-def test_a_whole_comparison_has_rollouts_costs_and_omissions():
+def test_a_whole_comparison_has_rollouts_run_times_and_omissions():
     result = mb.compare(mb.load("panda"), samples=4)
     assert result.passed, result.verdict
     assert all("mimic joints free" in r.note for r in result.rollouts if "explicit" not in r.method)
@@ -286,13 +287,13 @@ def test_a_whole_comparison_has_rollouts_costs_and_omissions():
         "Coriolis matrix",
     }
     assert all(o.unchanged for o in result.omissions)
-    # Fourth order, seen on the cost points themselves.
-    rk4 = [p for p in result.costs if p.engine == "mujoco" and p.method == "mujoco_rk4"]
-    steps = np.log([float(p.setting.split()[1]) for p in rk4])
-    errors = np.log([p.error for p in rk4])
-    keep = errors > np.log(100 * max(result.reference_floor, 1e-14))
-    assert np.polyfit(steps[keep][:3], errors[keep][:3], 1)[0] == pytest.approx(4, abs=0.4)
-    assert result.reference_floor < 1e-10
+    study = result.precision
+    assert study.complete
+    assert study.floor < 1e-12
+    assert {(c.engine, c.method) for c in study.curves} >= {("pinocchio", "rk4"), ("mujoco", "mujoco_rk4")}
+    rk4 = next(c for c in study.curves if c.method == "mujoco_rk4")
+    assert rk4.order == pytest.approx(4, abs=0.2)
+    assert json.loads(result.to_json())["precision"]["front"]
 
 
 def test_what_was_left_out_would_show_if_it_mattered():

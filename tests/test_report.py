@@ -6,19 +6,23 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from rich.console import Console
 
 from mbkit.errors import OutputError
-from mbkit.report import figures, tables
+from mbkit.report import figures, precision, precision_tables, tables
 from mbkit.report.folder import check_writable, file_stem, write
 from mbkit.report.numbers import count_text, error_text, inline, plain, time_text
-from mbkit.report.page import check_page, sweep_page
+from mbkit.report.page import bench_page, check_page, sweep_page
 from mbkit.report.progress import Bar
-from mbkit.report.reading import failures, headline, notices, omission_state, reached
+from mbkit.report.reading import failures, headline, notices, omission_state
+from mbkit.report.terms_figure import term_costs
 from mbkit.studies.all_robots import RobotOutcome, Sweep
-from mbkit.studies.result import Comparison, CostPoint, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.precision_figure import figure
+from mbkit.studies.precision_result import Curve, PrecisionPoint, WorkPrecision
+from mbkit.studies.result import Comparison, Omission, Refusal, RolloutRow, Row
 
 NAN = math.nan
 HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'
@@ -53,6 +57,37 @@ def rollout(error: float, tolerance: float, *, passed: bool = True, note: str = 
     return RolloutRow("rk4", "pinocchio", "mujoco_rk4", 1e-3, 1.0, error, 5.0, tolerance, 1000, 0.1, 0.2, passed, note)
 
 
+def point(value: float, error: float, seconds: float, *, energy: float = 1e-9, note: str = "") -> PrecisionPoint:
+    return PrecisionPoint("dt", value, error, energy, seconds, 1e-4, 100, 400, 5, note)
+
+
+def curve(engine: str, method: str, seconds: float, order: float, expected: float = 4.0, first: float = 0.5) -> Curve:
+    points = tuple(point(0.1 / 2**k, 1e-3 / 16**k, seconds * 2**k, energy=1e-4 / 16**k) for k in range(5))
+    return Curve(engine, method, points, order, 4, expected, first)
+
+
+STUDY = WorkPrecision(
+    model="arm",
+    facts={"nq": 1, "nv": 1, "mass": 2.0, "digest": "ab" * 32, "needs": {"gravity": True}, "notes": ["a note"]},
+    duration=0.5,
+    asked=1.0,
+    reference="two engines at 1e-13",
+    floor=1e-13,
+    q0=(0.25,),
+    v0=(0.75,),
+    curves=(
+        curve("pinocchio", "rk4", 0.03, 4.02),
+        curve("lagrangian", "rk4", 0.01, 3.55),
+        curve("mujoco", "mujoco_rk4", 0.02, 4.0, first=NAN),
+        curve("mujoco", "rk4", 0.05, NAN, NAN),
+    ),
+    refusals=(Refusal("pinocchio", "taylor", "needs the own derivation"),),
+    complete=True,
+    versions={"pin": "4.1.0"},
+    processor="a processor",
+    seconds=9.0,
+    settings={"seed": 7, "steps": None, "saved": [0.0, 0.5], "timing": "interleaved"},
+)
 AGREEING = Comparison(
     model="arm",
     facts={
@@ -78,12 +113,7 @@ AGREEING = Comparison(
         row("g", "lagrangian", 0.0),
     ),
     rollouts=(rollout(1e-13, 1e-12), rollout(0.5, math.inf, note="for information")),
-    costs=(
-        CostPoint("pinocchio", "rk4", "dt 0.01", 1e-4, 0.01, 1e-4, 100),
-        CostPoint("pinocchio", "rk4", "dt 0.001", 1e-8, 0.1, 1e-4, 1000),
-        CostPoint("mujoco", "mujoco_rk4", "dt 0.01", 1e-5, 0.02, 1e-4, 0),
-    ),
-    reference_floor=1e-13,
+    precision=STUDY,
     omissions=(
         Omission("contacts", False, "collision detection", 1200.0, NAN, 0.0, True, "± 3 ns"),
         Omission("gravity", True, "needed, so it is on", NAN, NAN, NAN, True),
@@ -105,6 +135,22 @@ DIFFERING = replace(
     rollouts=(rollout(1e-6, 1e-12, passed=False),),
     omissions=(Omission("limits", False, "limits", 1.0, NAN, 0.1, False),),
 )
+NASTY_STUDY = replace(
+    STUDY,
+    model=HOSTILE,
+    facts=STUDY.facts | {"notes": [HOSTILE], "digest": HOSTILE},
+    reference=HOSTILE,
+    floor=NAN,
+    curves=(
+        Curve("pinocchio", HOSTILE, (point(0.1, 0.0, 0.1, note=HOSTILE), point(NAN, 1e-3, 0.2)), NAN, 0, 4.0, NAN),
+        Curve("lagrangian", "rk4", (point(0.1, NAN, 0.1, note=HOSTILE), point(0.05, math.inf, NAN)), NAN, 0, 4.0, 0.1),
+        Curve(HOSTILE, "rk4", (point(0.1, 1e-3, 0.1, energy=NAN), point(0.1, 1e9, 0.1)), NAN, 0, 4.0, 0.1),
+        Curve("mujoco", "empty", (), NAN, 0, NAN, NAN),
+    ),
+    refusals=(Refusal(HOSTILE, HOSTILE, HOSTILE),),
+    settings={HOSTILE: HOSTILE, "saved": [HOSTILE]},
+    processor=HOSTILE,
+)
 NASTY = replace(
     DIFFERING,
     model=HOSTILE,
@@ -115,12 +161,7 @@ NASTY = replace(
         row("M", "lagrangian", 0.0, joint=HOSTILE),
     ),
     rollouts=(rollout(NAN, 1e-12, passed=False, note=HOSTILE), rollout(NAN, math.inf, note=HOSTILE)),
-    costs=(
-        CostPoint("pinocchio", HOSTILE, HOSTILE, 0.0, 0.1, NAN, 1),
-        CostPoint("lagrangian", "rk4", "dt", NAN, NAN, NAN, 1),
-        CostPoint("mujoco", "rk4", "dt", 1e-3, 0.1, NAN, 1),
-    ),
-    reference_floor=NAN,
+    precision=NASTY_STUDY,
     omissions=(Omission(HOSTILE, True, HOSTILE, NAN, NAN, math.inf, False, HOSTILE),),
     refusals=(Refusal("drake", HOSTILE, HOSTILE),),
     processor=HOSTILE,
@@ -218,13 +259,6 @@ def test_an_omission_by_choice_is_not_called_unchanged():
     assert [omission_state(o) for o in AGREEING.omissions] == ["same", "on", "chosen"]
 
 
-def test_fastest_run_that_reaches_an_error():
-    points = [p for p in AGREEING.costs if p.engine == "pinocchio"]
-    assert reached(points, 1e-3) is points[0]
-    assert reached(points, 1e-6) is points[1]
-    assert reached(points, 1e-9) is None
-
-
 @pytest.mark.parametrize("width", [80, 100, 140])
 def test_the_verdict_comes_first_and_nothing_is_wider_than_the_terminal(width):
     for result in (AGREEING, DIFFERING):
@@ -260,13 +294,15 @@ def test_many_failures_do_not_bury_the_table():
 
 
 def test_hostile_names_are_only_text():
-    for text in (printed(tables.comparison(NASTY)), check_page(NASTY, asked=HOSTILE), sweep_page(ALL)):
+    pages = check_page(NASTY, asked=HOSTILE), bench_page(NASTY_STUDY, asked=HOSTILE, data=HOSTILE, table=HOSTILE)
+    told = printed(tables.comparison(NASTY)), printed(precision_tables.bench(NASTY_STUDY, HOSTILE))
+    for text in (*told, *pages, sweep_page(ALL)):
         assert "\x1b" not in text
         assert "\u202e" not in text
-    page = Tags(check_page(NASTY, asked=HOSTILE))
-    assert not {tag for tag, _ in page.tags} & {"script", "iframe", "object", "img", "link"}
-    assert '<script>alert("x")</script>[red]x[/red]' in page.text
-    assert "[red]x[/red]" in printed(tables.comparison(NASTY))
+    for page in map(Tags, pages):
+        assert not {tag for tag, _ in page.tags} & {"script", "iframe", "object", "img", "link"}
+        assert '<script>alert("x")</script>[red]x[/red]' in page.text
+    assert all("[red]x[/red]" in text for text in told)
 
 
 def test_nan_and_infinity_are_shown_and_fail():
@@ -277,7 +313,14 @@ def test_nan_and_infinity_are_shown_and_fail():
     assert "NaN" in printed(tables.comparison(NASTY))
 
 
-@pytest.mark.parametrize("page", [check_page(AGREEING, data="arm.json"), sweep_page(ALL, data="all.json")])
+PAGES = [
+    check_page(AGREEING, data="arm.json"),
+    sweep_page(ALL, data="all.json"),
+    bench_page(STUDY, data="arm-bench.json", table="arm-bench.csv"),
+]
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_a_page_needs_nothing_from_elsewhere(page):
     tags = Tags(page).tags
     for tag, attributes in tags:
@@ -313,7 +356,9 @@ def test_a_page_holds_what_an_expert_asks_for():
         "not installed",
         "‖e‖ / max(‖x‖, ‖M‖‖v‖²)",
         "cond(M)",
-        "reference known to 1.0e-13",
+        "known to 1.0e-13",
+        "time of one call, ns",
+        "Who reaches an error first",
         "digits of agreement",
     ):
         assert wanted in text, wanted
@@ -327,7 +372,7 @@ def test_a_comparison_of_nothing_still_has_a_page_and_a_table():
 
 
 def test_figures_are_the_same_every_time_and_scale():
-    for draw in (figures.digits, lambda r: figures.error_against_time(r, 0.5)):
+    for draw in (figures.digits, term_costs, lambda r: precision.error_against_time(r.precision)):
         one, two = draw(AGREEING), draw(AGREEING)
         assert one == two
         assert "viewBox" in one
@@ -336,6 +381,145 @@ def test_figures_are_the_same_every_time_and_scale():
     assert "mujoco against oracle" in figures.digits(AGREEING)
     assert "var(--bad)" in figures.digits(DIFFERING)
     assert "var(--bad)" not in figures.digits(AGREEING)
+
+
+@pytest.mark.parametrize("result", [STUDY, NASTY_STUDY, replace(STUDY, curves=STUDY.curves[:1], floor=0.0)])
+def test_the_figure_is_valid_svg_with_every_panel_named(result):
+    drawn = precision.error_against_time(result)
+    root = ElementTree.fromstring(drawn)
+    assert root.tag.endswith("svg")
+    # What names parts inside is local, so nothing is loaded.
+    assert all(str(v).startswith("#") for e in root.iter() for k, v in e.attrib.items() if k.endswith("href"))
+    assert "NaN" not in drawn
+
+
+def test_the_figure_names_the_front_and_puts_same_formulas_together():
+    drawn = precision.error_against_time(STUDY)
+    for told in ("best of lagrangian", "reference known to 1e-13", "run time of 0.5 s", "energy drift", "dashed"):
+        assert told in drawn, told
+    # MuJoCo's own RK4 stands in the panel of rk4, and has none of its own.
+    assert "mujoco_rk4" not in drawn
+    # Only the page chooses colours: the series of the three engines are all there.
+    assert all(f"var(--series{k})" in drawn for k in (1, 2, 3))
+
+
+def test_without_energies_there_is_no_panel_of_energies():
+    damped = tuple(
+        replace(c, points=tuple(replace(p, energy=NAN, note="has dampers") for p in c.points)) for c in STUDY.curves
+    )
+    assert "energy drift" not in precision.error_against_time(replace(STUDY, curves=damped))
+
+
+def test_a_colour_and_marker_belong_to_an_engine_whichever_others_there_are():
+    alone = figure(replace(STUDY, curves=STUDY.curves[2:]))
+    among = figure(STUDY)
+    for fig in (alone, among):
+        handle = next(h for h in fig.legends[0].legend_handles if "mujoco" in str(h.get_label()))
+        assert (handle.get_color(), handle.get_marker()) == ("#00805e", "D")
+
+
+def test_a_picture_is_png_and_the_same_every_time():
+    made = precision.picture(STUDY)
+    assert made.startswith(b"\x89PNG")
+    assert made == precision.picture(STUDY)
+
+
+def test_levels_end_where_no_run_or_the_reference_ends():
+    found = precision.levels(STUDY)
+    assert [f"{x.error:.0e}" for x in found] == ["1e-02", "1e-04", "1e-06"]
+    assert {x.curve.engine for x in found} == {"lagrangian"}
+    assert found[0].next is not None
+    assert found[0].next[0].method == "mujoco_rk4"
+    assert found[0].factor == pytest.approx(2)
+    # An error that the reference itself may have is not told of.
+    assert len(precision.levels(replace(STUDY, floor=1e-5))) == 2
+    only = precision.levels(replace(STUDY, curves=STUDY.curves[:1]))
+    assert only[0].next is None
+    assert math.isnan(only[0].factor)
+
+
+def test_a_run_that_is_no_answer_is_on_no_front():
+    wild = Curve("pinocchio", "semi_implicit_euler", (point(0.5, 8.0, 1e-4),), NAN, 0, 1.0, 0.1)
+    result = replace(STUDY, curves=(wild, *STUDY.curves))
+    assert result.front[0][0] is wild
+    assert precision.front_names(result) == ["lagrangian rk4"]
+    assert not precision.curve_lines(result)[0].on_front
+
+
+def test_the_headline_tells_where_the_lead_changes():
+    late = Curve("mujoco", "rk853", (point(0.1, 1e-9, 0.012),), NAN, 0, NAN, 0.1)
+    told = precision.headline(replace(STUDY, curves=(*STUDY.curves, late)))
+    assert (
+        told == "fastest of 5 curves: lagrangian rk4 for an error of 1e-02, mujoco rk853 for an error of 1e-04 to 1e-08"
+    )
+
+
+def test_an_order_that_is_off_is_flagged_and_one_that_was_not_seen_is_not():
+    assert [line.off for line in precision.curve_lines(STUDY)] == [False, True, False, False]
+    page = bench_page(STUDY)
+    assert "! 3.55" in page
+    assert "! 4.02" not in page
+    text = printed(precision_tables.bench(STUDY))
+    assert "! 3.55" in text
+    assert "not the method's own" in text
+
+
+def test_the_least_error_is_the_fastest_of_those_that_the_reference_can_tell():
+    line = precision.curve_lines(replace(STUDY, floor=1e-5))[0]
+    assert line.best is STUDY.curves[0].points[2]
+
+
+def test_a_bench_page_holds_what_an_expert_asks_for():
+    page = " ".join(Tags(bench_page(STUDY, asked="my:arm", data="arm-bench.json", table="arm-bench.csv")).text.split())
+    for wanted in (
+        "fastest of 4 curves: lagrangian rk4 for an error of 1e-02 to 1e-06",
+        "cut from 1 s where the reference stops holding",
+        "two engines at 1e-13; known to 1.0e-13",
+        "first run,with compiling",
+        "510 ms",
+        "needs the own derivation",
+        "a note",
+        "my:arm",
+        "ab" * 32,
+        "q0 = [0.25]",
+        "v0 = [0.75]",
+        "interleaved",
+        "pin 4.1.0",
+        "a processor",
+        "arm-bench.csv",
+        "arm-bench.json",
+    ):
+        assert wanted in page, wanted
+
+
+def test_an_interrupted_study_says_so():
+    stopped = replace(STUDY, complete=False, curves=STUDY.curves[:1])
+    for text in (bench_page(stopped), printed(precision_tables.bench(stopped))):
+        assert "interrupted; what was finished: fastest of 1 curve: pinocchio rk4" in " ".join(text.split())
+
+
+def test_a_study_of_nothing_still_has_a_page_and_a_table():
+    nothing = replace(STUDY, curves=())
+    for text in (Tags(bench_page(nothing)).text, printed(precision_tables.bench(nothing))):
+        assert "no run has an error of at most 0.01 rad or m" in text
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_the_table_of_a_study_fits_the_terminal(width):
+    long = replace(STUDY, curves=(*STUDY.curves, curve("lagrangian", "semi_implicit_euler", 0.01, 1.0)))
+    text = printed(precision_tables.bench(long), width)
+    assert max(map(len, text.splitlines())) <= width
+    for wanted in ("semi_implicit_euler", "1e-06", "510 ms", "mujoco × 2", "known to 1.0e-13", "cut from 1 s"):
+        assert wanted in text, wanted
+
+
+def test_terms_that_were_not_timed_are_not_drawn():
+    untimed = replace(AGREEING, rows=tuple(replace(r, ns=NAN) for r in AGREEING.rows))
+    assert term_costs(untimed) == ""
+    assert "nle" not in term_costs(AGREEING)
+    ElementTree.fromstring(term_costs(NASTY))
+    assert "var(--bad)" in term_costs(DIFFERING)
+    assert "var(--bad)" not in term_costs(AGREEING)
 
 
 def test_a_sweep_counts_and_passes_only_when_all_agree_or_are_refused():

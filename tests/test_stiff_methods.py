@@ -355,7 +355,7 @@ def test_a_torque_that_fails_leaves_the_run_up_to_then(method: str, states: Any)
         simulate(dyn, states, [0.0], 1.0, method, torque=failing, save=save)
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
     partial = caught.value.trajectory
-    assert partial.stats.ended == "torque_failed"
+    assert partial.stats.ended == "function_failed"
     first = partial.q if np.ndim(states) == 1 else partial.q[0]
     good = simulate(dyn, [0.1], [0.0], 1.0, method, save=save)
     assert 5 <= len(first) <= 6

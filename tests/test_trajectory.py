@@ -282,7 +282,7 @@ def test_a_failed_torque_leaves_nan_where_it_failed() -> None:
         swing(torque=torque)
     for error in (caught.value, pickle.loads(pickle.dumps(caught.value))):
         run = error.trajectory
-        assert run.stats.ended == "torque_failed"
+        assert run.stats.ended == "function_failed"
         assert run.stats.reached == run.t[-1] == pytest.approx(0.1)
         assert np.isfinite(run.tau()[:-1]).all()
         assert np.isfinite(run.power_balance()[:-2]).all()

@@ -26,6 +26,7 @@ MARKS = {
     "rk4": "o",
     "mujoco_rk4": "o",
     "dop853": "D",
+    "rk853": "^",
     "mujoco_euler": "s",
     "mujoco_implicitfast": "^",
     "semi_implicit_euler": "s",
@@ -67,19 +68,20 @@ def draw(rows, result, path):
     )
     left.set_ylim(10.5, 17)
     left.legend(frameon=False, loc="upper right", fontsize=8)
-    for engine, method in dict.fromkeys((p.engine, p.method) for p in result.costs):
-        points = [p for p in result.costs if (p.engine, p.method) == (engine, method)]
+    study = result.precision
+    for curve in study.curves:
+        engine, method, points = curve.engine, curve.method, curve.points
         right.loglog(
             [p.seconds * 1e3 for p in points],
             [p.error for p in points],
-            MARKS[method] + ("-" if "rk4" in method or method == "dop853" else ":"),
+            MARKS[method] + ("-" if "rk4" in method or method.endswith("853") else ":"),
             ms=4,
             lw=1.2,
             color=COLOURS[engine],
             label=f"{method}, {engine}" if not method.startswith(engine) else method,
         )
-    right.axhline(result.reference_floor, color="grey", lw=0.8, ls="--")
-    low = result.reference_floor
+    low = study.floor
+    right.axhline(low, color="grey", lw=0.8, ls="--")
     right.text(
         0.02, low * 1.3, "reference known to here", color="grey", fontsize=8, transform=right.get_yaxis_transform()
     )

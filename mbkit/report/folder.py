@@ -31,15 +31,15 @@ def check_writable(folder: Path) -> None:
         raise OutputError(f"cannot write to {folder}: no permission in {place}; choose another with --out")
 
 
-def write(folder: Path, name: str, text: str) -> Path:
-    """Write a file as a whole or not at all, and return its path."""
+def write(folder: Path, name: str, content: str | bytes) -> Path:
+    """Write a file as a whole or not at all, and return its path; text is UTF-8."""
     path = folder / name
     temporary = None
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
             temporary = file.name
-            file.write(text.encode("utf-8", "backslashreplace"))
+            file.write(content if isinstance(content, bytes) else content.encode("utf-8", "backslashreplace"))
         # A temporary file is for its owner only; a report is for whoever may read the folder.
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)

@@ -6,17 +6,18 @@ from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from mbkit.report import figures
+from mbkit.report import figures, precision
 from mbkit.report.numbers import count_text, error_text, plain, time_text
-from mbkit.report.reading import allowances, by_term, curves, failures, headline, judged, notices, omission_state, told
+from mbkit.report.reading import allowances, by_term, failures, headline, judged, notices, omission_state, told
+from mbkit.report.terms_figure import term_costs
 from mbkit.studies.all_robots import Sweep
-from mbkit.studies.costs import DURATION
+from mbkit.studies.precision_result import WorkPrecision
 from mbkit.studies.result import Comparison
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["check_page", "sweep_page"]
+__all__ = ["bench_page", "check_page", "sweep_page"]
 
 
 def check_page(result: Comparison, *, asked: str = "", data: str = "", when: datetime | None = None) -> str:
@@ -47,11 +48,52 @@ def check_page(result: Comparison, *, asked: str = "", data: str = "", when: dat
         notices=notices(result.refusals),
         judged=judged(result),
         told=told(result),
-        curves=curves(result),
         digits_figure=Markup(figures.digits(result)) if result.rows else None,
-        costs_figure=Markup(figures.error_against_time(result, DURATION)) if curves(result) else None,
-        horizon=DURATION,
+        terms_figure=Markup(term_costs(result)),
+        study=_study(result.precision) if result.precision is not None else None,
     )
+
+
+def bench_page(
+    result: WorkPrecision, *, asked: str = "", data: str = "", table: str = "", when: datetime | None = None
+) -> str:
+    """Return the page of one work-precision study.
+
+    Parameters
+    ----------
+    result : WorkPrecision
+    asked : str
+        What the model was asked for as, where that is another name.
+    data, table : str
+        Names of the JSON and CSV files beside the page.
+    when : datetime, optional
+        Stamped on the page; by default now.
+    """
+    return _render(
+        "bench.html",
+        when,
+        data,
+        result,
+        asked=asked if asked != result.model else "",
+        headline=precision.headline(result),
+        table=table,
+        study=_study(result),
+    )
+
+
+def _study(result: WorkPrecision) -> dict[str, Any]:
+    """Return what the section of error against run time is made of."""
+    from markupsafe import Markup
+
+    return {
+        "result": result,
+        "figure": Markup(precision.error_against_time(result)) if result.front else None,
+        "front": precision.front_names(result),
+        "levels": precision.levels(result),
+        "lines": precision.curve_lines(result),
+        "order_tolerance": precision.ORDER_TOLERANCE,
+        "notices": notices(result.refusals),
+    }
 
 
 def sweep_page(result: Sweep, *, data: str = "", when: datetime | None = None) -> str:
@@ -80,7 +122,9 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters.update(error=error_text, time=time_text, count=count_text, unchanged=omission_state)
+    made.filters.update(
+        error=error_text, time=time_text, count=count_text, unchanged=omission_state, setting=precision.setting_text
+    )
     return made
 
 

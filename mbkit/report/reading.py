@@ -7,20 +7,18 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from mbkit.studies.result import Comparison, CostPoint, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.result import Comparison, Omission, Refusal, RolloutRow, Row
 
 __all__ = [
     "Failure",
     "Notice",
     "allowances",
     "by_term",
-    "curves",
     "failures",
     "headline",
     "judged",
     "notices",
     "omission_state",
-    "reached",
     "told",
 ]
 
@@ -117,17 +115,3 @@ def notices(refusals: Iterable[Refusal]) -> list[Notice]:
     for r in refusals:
         found.setdefault((r.engine, r.reason), []).extend([r.term] if r.term else [])
     return [Notice(engine, tuple(dict.fromkeys(terms)), reason) for (engine, reason), terms in found.items()]
-
-
-def curves(result: Comparison) -> dict[tuple[str, str], list[CostPoint]]:
-    """Return (engine, method) -> points by run time, of those that have a place on log axes."""
-    out: dict[tuple[str, str], list[CostPoint]] = {}
-    for point in result.costs:
-        if 0 < point.seconds < math.inf and 0 <= point.error < math.inf:
-            out.setdefault((point.engine, point.method), []).append(point)
-    return {key: sorted(points, key=lambda p: p.seconds) for key, points in out.items()}
-
-
-def reached(points: Iterable[CostPoint], error: float) -> CostPoint | None:
-    """Return the fastest run with at most this error."""
-    return min((p for p in points if p.error <= error), key=lambda p: p.seconds, default=None)

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any, Final
 
-from rich import box
 from rich.console import Group, RenderableType
 from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
+from mbkit.report import precision_tables
+from mbkit.report.layout import bullet, columns, right, titled
 from mbkit.report.numbers import count_text, error_text, inline, time_text
 from mbkit.report.reading import (
     allowances,
     by_term,
-    curves,
     failures,
     headline,
     judged,
     notices,
     omission_state,
-    reached,
     told,
 )
 from mbkit.studies.all_robots import Sweep
@@ -36,7 +33,6 @@ _MARK: Final = {True: ("✓", "green"), False: ("✗", DIFFER)}
 _ALLOWED: Final = ("!", "bold yellow")
 _STATUS: Final = {"agree": ("✓", "green"), "refused": ("–", "yellow"), "differ": ("✗", DIFFER), "failed": ("✗", DIFFER)}
 _MOST_FAILURES: Final = 12
-_ERRORS: Final = (1e-3, 1e-6, 1e-9)
 
 
 def comparison(result: Comparison, asked: str = "") -> RenderableType:
@@ -48,8 +44,8 @@ def comparison(result: Comparison, asked: str = "") -> RenderableType:
         parts += _terms(result)
     if result.rollouts:
         parts += _rollouts(result)
-    if result.costs:
-        parts += _costs(result)
+    if result.precision is not None:
+        parts += precision_tables.study(result.precision)
     if result.omissions:
         parts += _omissions(result)
     parts += _notes(result)
@@ -79,45 +75,20 @@ def _facts(result: Comparison) -> Text:
 def _failed(result: Comparison) -> list[RenderableType]:
     found = failures(result)
     lines: list[RenderableType] = [
-        _bullet(f"{inline(f.what)}: ", inline(f.reason, 400), "✗", DIFFER) for f in found[:_MOST_FAILURES]
+        bullet(f"{inline(f.what)}: ", inline(f.reason, 400), "✗", DIFFER) for f in found[:_MOST_FAILURES]
     ]
     if len(found) > _MOST_FAILURES:
-        lines.append(_bullet("", f"and {len(found) - _MOST_FAILURES} more, in the page and the JSON", " ", DIFFER))
+        lines.append(bullet("", f"and {len(found) - _MOST_FAILURES} more, in the page and the JSON", " ", DIFFER))
     return lines
-
-
-def _bullet(head: str, text: str, mark: str = "·", style: str = "dim") -> RenderableType:
-    grid = Table.grid(padding=(0, 1))
-    grid.add_column(width=3, justify="right")
-    grid.add_column(overflow="fold")
-    grid.add_row(Text(mark, style=style), Text.assemble((head, "bold"), text))
-    return grid
-
-
-def _table(*columns: str | tuple[str, str]) -> Table:
-    """Return an empty table; a column is its head, or its head and how it is justified."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
-    for column in columns:
-        head, justify = (column, "left") if isinstance(column, str) else column
-        table.add_column(Text(head), justify=justify, no_wrap=justify == "right")  # type: ignore[arg-type]
-    return table
-
-
-def _right(*heads: str) -> list[tuple[str, str]]:
-    return [(head, "right") for head in heads]
-
-
-def _titled(title: str, *parts: RenderableType) -> list[RenderableType]:
-    return [Text(), Text(title, style="bold"), *parts]
 
 
 def _terms(result: Comparison) -> list[RenderableType]:
     heads = [f"{e}\nvs {result.reference}" for e in result.engines]
-    table = _table("term", *_right(*heads))
+    table = columns("term", *right(*heads))
     for term, rows in by_term(result).items():
         table.add_row(Text(inline(term)), *(_term_cell(rows.get(engine)) for engine in result.engines))
-    below = [_bullet(f"{inline(a.what)}: ", inline(a.reason, 400), *_ALLOWED) for a in allowances(result)]
-    return _titled("Terms: worst relative error, time per call", table, *below)
+    below = [bullet(f"{inline(a.what)}: ", inline(a.reason, 400), *_ALLOWED) for a in allowances(result)]
+    return titled("Terms: worst relative error, time per call", table, *below)
 
 
 def _term_cell(row: Row | None) -> Text:
@@ -132,7 +103,7 @@ def _term_cell(row: Row | None) -> Text:
 
 
 def _rollouts(result: Comparison) -> list[RenderableType]:
-    table = _table("integrator", "engine", *_right("horizon", "condition", "difference", "run time", "MuJoCo's"), "")
+    table = columns("integrator", "engine", *right("horizon", "condition", "difference", "run time", "MuJoCo's"), "")
     # Eighty columns are enough without it.
     table.padding = 0
     notes: dict[str, int] = {}
@@ -149,29 +120,17 @@ def _rollouts(result: Comparison) -> list[RenderableType]:
             Text(f"[{notes.setdefault(r.note, len(notes) + 1)}]" if r.note else "", style="dim"),
         )
     steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in judged(result)))
-    below = [_bullet("", inline(note), f"[{k}]") for note, k in notes.items()]
+    below = [bullet("", inline(note), f"[{k}]") for note, k in notes.items()]
     below += [
-        _bullet(f"{inline(r.method)} vs {inline(r.against)}: ", f"{error_text(r.error)} in q; {inline(r.note)}", "i")
+        bullet(f"{inline(r.method)} vs {inline(r.against)}: ", f"{error_text(r.error)} in q; {inline(r.note)}", "i")
         for r in told(result)
     ]
     title = f"Rollouts against MuJoCo's own, step {steps}: largest difference of q (rad or m)"
-    return _titled(title, table, *below)
-
-
-def _costs(result: Comparison) -> list[RenderableType]:
-    table = _table("engine", "method", *_right(*(f"≤ {e:.0e}" for e in _ERRORS), "best error"))
-    for (engine, method), points in curves(result).items():
-        best = min(points, key=lambda p: p.error)
-        found = [reached(points, e) for e in _ERRORS]
-        cells = [time_text(p.seconds) if p else Text("–", style="dim") for p in found]
-        table.add_row(Text(engine), Text(inline(method)), *cells, error_text(best.error))
-    floor = result.reference_floor
-    below = [] if math.isnan(floor) else [Text(f"reference known to {error_text(floor)}", style="dim")]
-    return _titled("Error against run time: fastest rollout with an error of q (rad or m)", table, *below)
+    return titled(title, table, *below)
 
 
 def _omissions(result: Comparison) -> list[RenderableType]:
-    table = _table("need", "in model", *_right("saves/call", "set-up", "change"), "what was off")
+    table = columns("need", "in model", *right("saves/call", "set-up", "change"), "what was off")
     # The page has these in full; here a line each is worth more.
     table.expand = True
     table.columns[-1].ratio = 1
@@ -190,25 +149,25 @@ def _omissions(result: Comparison) -> list[RenderableType]:
             Text(inline(o.what), style="dim"),
         )
         if state == "chosen":
-            below.append(_bullet(f"{inline(o.need)}: ", inline(o.note), "i"))
-    return _titled("Left out because the scene does not need it: change is that of the accelerations", table, *below)
+            below.append(bullet(f"{inline(o.need)}: ", inline(o.note), "i"))
+    return titled("Left out because the scene does not need it: change is that of the accelerations", table, *below)
 
 
 def _notes(result: Comparison) -> list[RenderableType]:
     lines = [
-        _bullet(inline(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", inline(n.reason, 400))
+        bullet(inline(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", inline(n.reason, 400))
         for n in notices(result.refusals)
     ]
-    lines += [_bullet("", inline(note, 300)) for note in result.facts.get("notes", ())]
+    lines += [bullet("", inline(note, 300)) for note in result.facts.get("notes", ())]
     bodies = list(result.facts.get("nonphysical", ()))
     if bodies:
-        lines.append(_bullet("bodies that no matter is like: ", inline("; ".join(bodies), 300)))
-    return [*(_titled("Notes", *lines) if lines else []), Text()]
+        lines.append(bullet("bodies that no matter is like: ", inline("; ".join(bodies), 300)))
+    return [*(titled("Notes", *lines) if lines else []), Text()]
 
 
 def sweep(result: Sweep) -> RenderableType:
     """Return the table of many robots, the reasons, and the verdict last, where the eye is at the end."""
-    table = _table("result", "robot", *_right("nv", "engines", "digits", "worst"))
+    table = columns("result", "robot", *right("nv", "engines", "digits", "worst"))
     table.padding = 0
     table.columns[0].no_wrap = table.columns[1].no_wrap = True
     for column, width in zip(table.columns, (9, 20, 3, 7, 6, 7), strict=True):
@@ -227,14 +186,14 @@ def sweep(result: Sweep) -> RenderableType:
             error_text(worst.relative) if worst else "",
         )
         if o.reason:
-            reasons.append(_bullet(f"{inline(o.robot)}: ", inline(o.reason, 300), mark, style))
-    parts = [table, *(_titled("Reasons", *reasons) if reasons else [])]
+            reasons.append(bullet(f"{inline(o.robot)}: ", inline(o.reason, 300), mark, style))
+    parts = [table, *(titled("Reasons", *reasons) if reasons else [])]
     return Group(*parts, Text(), verdict("", result.verdict, result.passed), Text())
 
 
 def robots(records: Iterable[Any], systems: Iterable[str]) -> RenderableType:
     """Return the table of robots that there are, and the names of catalog systems."""
-    table = _table("robot", "short names", *_right("nq", "nv", "mass, kg"), "")
+    table = columns("robot", "short names", *right("nq", "nv", "mass, kg"), "")
     count = 0
     for r in records:
         count += 1

@@ -1,6 +1,22 @@
 """Questions asked of several engines at once."""
 
 from mbkit.studies.compare import compare
-from mbkit.studies.result import Comparison, CostPoint, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.precision_result import Curve, InterruptedSweepError, PrecisionPoint, WorkPrecision
+from mbkit.studies.reference import Reference
+from mbkit.studies.result import Comparison, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.work_precision import work_precision
 
-__all__ = ["Comparison", "CostPoint", "Omission", "Refusal", "RolloutRow", "Row", "compare"]
+__all__ = [
+    "Comparison",
+    "Curve",
+    "InterruptedSweepError",
+    "Omission",
+    "PrecisionPoint",
+    "Reference",
+    "Refusal",
+    "RolloutRow",
+    "Row",
+    "WorkPrecision",
+    "compare",
+    "work_precision",
+]

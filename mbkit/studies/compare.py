@@ -12,18 +12,29 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, MbkitError, UnknownNameError
 from mbkit.model import Model
 from mbkit.studies import stamp
-from mbkit.studies.costs import costs
+from mbkit.studies.facts import facts_of
 from mbkit.studies.judge import Judge
 from mbkit.studies.omissions import omissions
 from mbkit.studies.result import Comparison, Refusal, Row
 from mbkit.studies.rollouts import free_of_mimic, rollouts
 from mbkit.studies.states import states
+from mbkit.studies.work_precision import work_precision
 
 __all__ = ["COMPARABLE", "compare"]
 
 #: Engines that can be compared: all but the one that they are measured by.
 COMPARABLE: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
 Progress = Callable[[float, str], None]
+
+#: What a comparison shows of `work_precision`: a few methods, and the time that takes, s.
+_METHODS: Final = {
+    "pinocchio": ("rk4", "semi_implicit_euler", "dop853"),
+    "lagrangian": ("rk853", "rk4"),
+    "mujoco": ("mujoco_euler", "mujoco_implicitfast", "mujoco_rk4"),
+}
+_HORIZON: Final = 0.5
+_REPEATS: Final = 3
+_SECONDS: Final = 8.0
 
 
 def compare(
@@ -83,7 +94,7 @@ def compare(
     tell(1.0, "done")
     return Comparison(
         model=model.name,
-        facts=_facts(model),
+        facts=facts_of(model),
         engines=tuple(made),
         reference=reference,
         samples=samples,
@@ -102,7 +113,7 @@ def compare(
 def _beyond_terms(
     model: Model, made: dict[str, Dynamics], seed: int, tell: Progress
 ) -> tuple[dict[str, Any], list[Refusal]]:
-    """Return rollouts, costs and omissions; what fails is told, and loses nothing else."""
+    """Return rollouts, run times and omissions; what fails is told, and loses nothing else."""
     result: dict[str, Any] = {}
     refusals: list[Refusal] = []
     moving, movers, note = model, made, ""
@@ -120,15 +131,23 @@ def _beyond_terms(
     def run_rollouts() -> None:
         result["rollouts"] = rollouts(moving, movers, seed, note)
 
-    def run_costs() -> None:
-        result["costs"], result["reference_floor"], refused = costs(moving, movers, seed)
-        refusals.extend(refused)
+    def run_times() -> None:
+        result["precision"] = work_precision(
+            moving,
+            tuple(movers),
+            {engine: _METHODS[engine] for engine in movers if engine in _METHODS},
+            duration=_HORIZON,
+            seed=seed,
+            repeats=_REPEATS,
+            seconds=_SECONDS,
+            progress=lambda fraction, text: tell(0.6 + 0.3 * fraction, text),
+        )
 
     def run_omissions() -> None:
         result["omissions"] = omissions(model, made, seed)
 
     study(0.42, "rollouts", run_rollouts)
-    study(0.6, "error against run time", run_costs)
+    study(0.6, "error against run time", run_times)
     study(0.9, "what was left out", run_omissions)
     return result, refusals
 
@@ -179,16 +198,3 @@ def _made(
             refusals.append(Refusal(name, "", str(error).removeprefix(f"{name}: ")))
         setup[name] = time.perf_counter() - start
     return made, refusals, setup
-
-
-def _facts(model: Model) -> dict[str, Any]:
-    return {
-        "nq": model.nq,
-        "nv": model.nv,
-        "mass": model.mass,
-        "digest": model.digest,
-        "needs": model.needs.as_dict(),
-        "joints": list(model.joint_names),
-        "notes": list(model.notes),
-        "nonphysical": [f"{name}: {why}" for name, why in model.nonphysical],
-    }

@@ -7,14 +7,17 @@ import json
 import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import OutputError
 
-__all__ = ["Comparison", "CostPoint", "Omission", "Refusal", "RolloutRow", "Row"]
+if TYPE_CHECKING:
+    from mbkit.studies.precision_result import WorkPrecision
+
+__all__ = ["Comparison", "Omission", "Refusal", "RolloutRow", "Row"]
 
 
 @dataclass(frozen=True)
@@ -126,34 +129,6 @@ class RolloutRow:
 
 
 @dataclass(frozen=True)
-class CostPoint:
-    """One run of one method: its error against a tight reference, and its run time.
-
-    Attributes
-    ----------
-    engine, method : str
-    setting : str
-        The step or tolerance.
-    error : float
-        Largest difference of q to the reference over the saved times.
-    seconds : float
-        Median run time.
-    spread : float
-        Half the interquartile range of the run times, s.
-    evaluations : int
-        Of forward dynamics; 0 where the engine does not tell.
-    """
-
-    engine: str
-    method: str
-    setting: str
-    error: float
-    seconds: float
-    spread: float
-    evaluations: int
-
-
-@dataclass(frozen=True)
 class Omission:
     """One thing that was left out, need by need.
 
@@ -203,10 +178,8 @@ class Comparison:
     tolerance : float
     rows : tuple of Row
     rollouts : tuple of RolloutRow
-    costs : tuple of CostPoint
-        Error against run time of the rollouts.
-    reference_floor : float
-        How well the tight reference of `costs` is known.
+    precision : WorkPrecision or None
+        Error against run time of a few methods on a short horizon.
     omissions : tuple of Omission
     refusals : tuple of Refusal
     setup : dict
@@ -226,8 +199,7 @@ class Comparison:
     tolerance: float
     rows: tuple[Row, ...]
     rollouts: tuple[RolloutRow, ...] = ()
-    costs: tuple[CostPoint, ...] = ()
-    reference_floor: float = math.nan
+    precision: WorkPrecision | None = None
     omissions: tuple[Omission, ...] = ()
     refusals: tuple[Refusal, ...] = ()
     setup: dict[str, float] = field(default_factory=dict)
@@ -276,7 +248,9 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        return asdict(self) | {"passed": self.passed, "verdict": self.verdict, "digits": self.digits}
+        precision = self.precision.to_dict() if self.precision is not None else None
+        judged = {"passed": self.passed, "verdict": self.verdict, "digits": self.digits}
+        return asdict(self) | {"precision": precision} | judged
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Return the result as JSON, and write it to `path` if given. NaN becomes null."""

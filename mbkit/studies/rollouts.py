@@ -26,7 +26,7 @@ from mbkit.simulate import Trajectory, simulate
 from mbkit.studies.result import RolloutRow
 from mbkit.studies.states import inside
 
-__all__ = ["free_of_mimic", "patience", "quiet_simulate", "rollouts", "start_state"]
+__all__ = ["TooLongError", "free_of_mimic", "patience", "quiet_simulate", "rollouts", "start_state"]
 
 DURATION: Final = 1.0
 STEP: Final = 1e-3
@@ -56,7 +56,7 @@ def start_state(model: Model, seed: int) -> tuple[Array, Array]:
     return q, 0.1 * v
 
 
-class _TooLongError(MbkitError):
+class TooLongError(MbkitError):
     """A run took longer than it is worth."""
 
 
@@ -66,7 +66,7 @@ def patience(seconds: float) -> Callable[[float], None]:
 
     def look(done: float) -> None:
         if time.perf_counter() > end:
-            raise _TooLongError(f"given up after {seconds:g} s, {done:.0%} done: stiff, or very fast motion")
+            raise TooLongError(f"given up after {seconds:g} s, {done:.0%} done: stiff, or very fast motion")
 
     return look
 

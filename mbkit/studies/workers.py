@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from typing import Final, TypeVar
 
-__all__ = ["WorkerDiedError", "processors", "run"]
+__all__ = ["Pool", "WorkerDiedError", "processors", "run"]
 
 T = TypeVar("T")
 
@@ -58,7 +58,7 @@ def run(
     while left:
         before = len(left)
         suspects: list[str] = []
-        with _Pool(width) as pool:
+        with Pool(width) as pool:
             for name, result in _through(pool, left, width):
                 if isinstance(result, WorkerDiedError):
                     suspects.append(name)
@@ -66,7 +66,7 @@ def run(
                     del left[name]
                     yield name, result
         for name in suspects:
-            with _Pool(1) as pool:
+            with Pool(1) as pool:
                 yield from _through(pool, {name: left.pop(name)}, 1)
         if len(left) == before:
             yield from _unmade(left)
@@ -85,30 +85,35 @@ def _through(
     waiting = list(calls.items())[::-1]
     running: dict[Future[T], str] = {}
     broken = False
-    while running or (waiting and not broken):
-        while waiting and len(running) < width and not broken:
-            name, call = waiting[-1]
-            try:
-                running[executor.submit(call)] = name
-                waiting.pop()
-            except RuntimeError:
-                broken = True
-        done, _ = wait(running, return_when=FIRST_COMPLETED)
-        for future in done:
-            name = running.pop(future)
-            error = None if future.cancelled() else future.exception()
-            if future.cancelled() or isinstance(error, BrokenExecutor):
-                broken = True
-                yield name, WorkerDiedError("its process ended without an answer: a crash, or no memory left")
-            elif error is None:
-                yield name, future.result()
-            elif isinstance(error, Exception):
-                yield name, error
-            else:
-                raise error
+    try:
+        while running or (waiting and not broken):
+            while waiting and len(running) < width and not broken:
+                name, call = waiting[-1]
+                try:
+                    running[executor.submit(call)] = name
+                    waiting.pop()
+                except RuntimeError:
+                    broken = True
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                name = running.pop(future)
+                error = None if future.cancelled() else future.exception()
+                if future.cancelled() or isinstance(error, BrokenExecutor):
+                    broken = True
+                    yield name, WorkerDiedError("its process ended without an answer: a crash, or no memory left")
+                elif error is None:
+                    yield name, future.result()
+                elif isinstance(error, Exception):
+                    yield name, error
+                else:
+                    raise error
+    finally:
+        # Whoever stopped listening does not want what has not begun.
+        for future in running:
+            future.cancel()
 
 
-class _Pool(ProcessPoolExecutor):
+class Pool(ProcessPoolExecutor):
     """A pool whose processes leave Ctrl-C to the parent, work in a folder of their own, and end with it."""
 
     def __init__(self, width: int) -> None:

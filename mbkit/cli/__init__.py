@@ -1,0 +1,36 @@
+"""The command `mbkit`: checks arguments, calls the library, prints, and says how it ended.
+
+Exit status: 0 done, and the engines agree, 1 they differ, 2 misuse or bad input, 70 a fault of
+mbkit's own, 130 interrupted. A command is a file.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from mbkit._version import __version__
+from mbkit.cli import bench, check, export, robots
+from mbkit.cli.door import Door
+
+__all__ = ["cli", "main"]
+
+
+@click.group(cls=Door, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="mbkit")
+def cli() -> None:
+    """Equations of motion that can be trusted: Pinocchio, MuJoCo and an own derivation, compared."""
+
+
+for _command in (check.check, bench.bench, export.export, robots.robots):
+    cli.add_command(_command)
+
+
+def main() -> None:
+    """Run the command."""
+    for stream in (sys.stdout, sys.stderr):
+        # Marks and units are not ASCII, whatever the locale says.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
+    cli()

@@ -1,0 +1,162 @@
+"""`mbkit check`: do the engines agree on a model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from mbkit.cli.door import AGREE, DIFFER, INTERRUPTED, MISUSE, leave, say
+from mbkit.cli.options import check_engines, load_options, model_options, split
+from mbkit.cli.output import File, show
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+__all__ = ["check"]
+
+
+@click.command()
+@click.argument("target", required=False)
+@click.option("--all", "everything", is_flag=True, help="Check every robot of example-robot-data.")
+@click.option("--engines", default="pinocchio,lagrangian,mujoco", show_default=True, callback=split, metavar="A,B,...")
+@click.option("--samples", default=64, show_default=True, type=click.IntRange(min=1), help="Random states.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
+@model_options
+@click.option("--no-rollouts", is_flag=True, help="Terms only: no trajectories, run times or omissions.")
+@click.option("--jobs", type=click.IntRange(min=1), help="With --all: processes.  [default: one per processor]")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@click.option(
+    "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
+)
+def check(
+    target: str | None,
+    everything: bool,
+    engines: tuple[str, ...],
+    samples: int,
+    seed: int,
+    floating_base: bool,
+    mimic: Literal["reduce", "free"] | None,
+    nonphysical: Literal["error", "warn"] | None,
+    no_rollouts: bool,
+    jobs: int | None,
+    as_json: bool,
+    out: Path,
+) -> None:
+    """Compare engines on TARGET, and write a page and JSON.
+
+    TARGET is a robot (mbkit robots lists them), a catalog system, a path to a URDF or
+    MJCF file, or package.module:function for a function that returns a Model.
+    """
+    if everything and (target is not None or nonphysical is not None):
+        raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")
+    if not everything and jobs is not None:
+        raise click.UsageError("--jobs goes with --all")
+    from mbkit.report.folder import check_writable
+
+    check_engines(engines, least=2)
+    check_writable(out)
+    if everything:
+        _check_all(engines, samples, seed, floating_base, mimic or "reduce", jobs, as_json, out)
+    elif target is not None:
+        options = load_options(floating_base, mimic, nonphysical)
+        _check_one(target, options, engines, samples, seed, no_rollouts, as_json, out)
+    else:
+        raise click.UsageError("give a TARGET, such as panda, or --all; mbkit robots lists what there is")
+
+
+def _check_one(
+    target: str,
+    options: Mapping[str, Any],
+    engines: tuple[str, ...],
+    samples: int,
+    seed: int,
+    no_rollouts: bool,
+    as_json: bool,
+    out: Path,
+) -> None:
+    from mbkit.load.names import find
+    from mbkit.report.folder import file_stem
+    from mbkit.report.progress import Bar
+    from mbkit.studies import compare
+    from mbkit.studies.target import model_of
+
+    model = model_of(target, options)
+    with Bar(f"check {model.name}") as bar:
+        result = compare(model, engines, samples, seed, terms_only=no_rollouts, progress=bar)
+
+    def table() -> RenderableType:
+        from mbkit.report import tables
+
+        return tables.comparison(result, target)
+
+    def page() -> str:
+        from mbkit.report.page import check_page
+
+        return check_page(result, asked=target, data=f"{stem}.json")
+
+    # Several robots' files hold the same name.
+    stem = file_stem(target if find(target) else model.name)
+    data = result.to_json()
+    files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
+    written = show(data, table, files, out, as_json=as_json)
+    if not result.rows:
+        say("error", f"{result.verdict}; two engines that hold the model are needed")
+    leave(MISUSE if not written or not result.rows else AGREE if result.passed else DIFFER)
+
+
+def _check_all(
+    engines: tuple[str, ...],
+    samples: int,
+    seed: int,
+    floating_base: bool,
+    mimic: Literal["reduce", "free"],
+    jobs: int | None,
+    as_json: bool,
+    out: Path,
+) -> None:
+    from mbkit.load import robots
+    from mbkit.report.progress import Bar
+    from mbkit.studies.all_robots import RobotOutcome, Sweep, all_robots
+
+    expected = len(robots())
+    outcomes: list[RobotOutcome] = []
+    begun = time.perf_counter()
+    interrupted = False
+    try:
+        with Bar("check --all") as bar:
+            for outcome in all_robots(
+                engines=engines, samples=samples, seed=seed, floating_base=floating_base, mimic=mimic, jobs=jobs
+            ):
+                outcomes.append(outcome)
+                bar(len(outcomes) / expected, f"{len(outcomes)}/{expected} {outcome.robot}: {outcome.status}")
+    except KeyboardInterrupt:
+        interrupted = True
+    result = Sweep(
+        outcomes=tuple(sorted(outcomes, key=lambda o: o.robot)),
+        expected=expected,
+        engines=engines,
+        samples=samples,
+        seed=seed,
+        seconds=time.perf_counter() - begun,
+    )
+
+    def table() -> RenderableType:
+        from mbkit.report import tables
+
+        return tables.sweep(result)
+
+    def page() -> str:
+        from mbkit.report.page import sweep_page
+
+        return sweep_page(result, data="all.json")
+
+    data = result.to_json()
+    files = (File("data", "all.json", lambda: data + "\n"), File("page", "all.html", page))
+    written = show(data, table, files, out, as_json=as_json)
+    if interrupted:
+        say("interrupted", f"{len(outcomes)} of {expected} robots were finished")
+    leave(INTERRUPTED if interrupted else MISUSE if not written else AGREE if result.passed else DIFFER)

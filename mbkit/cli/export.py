@@ -1,0 +1,68 @@
+"""`mbkit export`: the equations of motion as C."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from mbkit.cli.options import load_options, model_options
+
+__all__ = ["export"]
+
+
+@click.command()
+@click.argument("target")
+@click.option(
+    "--quantity",
+    "quantities",
+    multiple=True,
+    metavar="NAME",
+    help="What to compute; may be repeated.  [default: inverse_dynamics, forward_dynamics]",
+)
+@model_options
+@click.option("--name", help="Prefix of every name in C, and stem of the files.  [default: the target's name]")
+@click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@click.option(
+    "--out", default="mbkit-export", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
+)
+def export(
+    target: str,
+    quantities: tuple[str, ...],
+    floating_base: bool,
+    mimic: str | None,
+    nonphysical: str | None,
+    name: str | None,
+    force: bool,
+    as_json: bool,
+    out: Path,
+) -> None:
+    """Write the equations of motion of TARGET as C99 that needs no library.
+
+    TARGET is what `mbkit check` takes. The header tells how to compile and call it, the
+    units, the conventions and the order of the joints. A file that mbkit wrote before is
+    replaced; an unknown quantity lists those that there are.
+    """
+    from mbkit.lagrangian.export import DEFAULT, c_identifier, export_c
+    from mbkit.load.names import find
+    from mbkit.studies.target import model_of
+
+    model = model_of(target, load_options(floating_base, mimic, nonphysical))
+    # Several robots' files hold the same name.
+    stem = name if name is not None else c_identifier(target) if find(target) else None
+    made = export_c(model, quantities or DEFAULT, name=stem)
+    paths = made.write(out, force=force)
+    if as_json:
+        import json
+        from dataclasses import asdict
+
+        told: dict[str, Any] = {"name": made.name, "model": model.name, "digest": made.digest}
+        told |= {"versions": made.versions, "header": str(paths[0]), "source": str(paths[1])}
+        told["functions"] = [asdict(f) | {"inputs": dict(f.inputs), "outputs": dict(f.outputs)} for f in made.functions]
+        click.echo(json.dumps(told, indent=1))
+        return
+    for function in made.functions:
+        click.echo(f"{function.signature}: {function.operations} operations")
+    click.echo(f"header {paths[0]}\nsource {paths[1]}")

@@ -1,0 +1,102 @@
+"""What every figure shares: colours, markers, style and logarithmic axes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["PLAIN", "Palette", "engine_index", "engine_mark", "log_ticks", "one_line", "style"]
+
+#: An engine keeps its colour and marker in every figure, whichever others are beside it.
+_ENGINES: Final = ("pinocchio", "lagrangian", "mujoco", "drake", "oracle")
+_MARKS: Final = "osD^vP"
+_SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Colours by what they are for; six series, as many as engines can be told apart."""
+
+    ink: str
+    muted: str
+    grid: str
+    bad: str
+    series: tuple[str, str, str, str, str, str]
+
+    def engine(self, name: str) -> str:
+        """Return the colour of an engine."""
+        return self.series[engine_index(name)]
+
+
+#: For white paper; the series are the page's own in its light form.
+PLAIN: Final = Palette(
+    "#1b1f24", "#5c6570", "#d9dde2", "#b3261e", ("#0072b2", "#b35900", "#00805e", "#a03c82", "#6b6b00", "#555555")
+)
+
+
+def engine_index(name: str) -> int:
+    """Return which of the six series an engine is drawn with."""
+    return _ENGINES.index(name) if name in _ENGINES else len(_ENGINES)
+
+
+def engine_mark(name: str) -> str:
+    """Return an engine's marker."""
+    return _MARKS[engine_index(name)]
+
+
+def one_line(text: str, most: int) -> str:
+    """Return a name as a figure can hold it: printable, at most so long."""
+    told = "".join(c if c.isprintable() else "?" for c in text)
+    return told if len(told) <= most else told[: most - 1] + "…"
+
+
+def style(palette: Palette) -> dict[str, Any]:
+    """Return Matplotlib's settings for figures of this package."""
+    return {
+        "svg.fonttype": "none",
+        # A dollar sign in a name does not begin a formula.
+        "text.parse_math": False,
+        "font.family": "sans-serif",
+        "font.size": 10.0,
+        "text.color": palette.ink,
+        "axes.edgecolor": palette.muted,
+        "axes.labelcolor": palette.ink,
+        "axes.titlesize": 10.0,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.8,
+        "axes.axisbelow": True,
+        "xtick.color": palette.muted,
+        "ytick.color": palette.muted,
+        "xtick.labelcolor": palette.ink,
+        "ytick.labelcolor": palette.ink,
+        "grid.color": palette.grid,
+        "grid.linewidth": 0.8,
+        "lines.linewidth": 1.6,
+        "lines.markersize": 6.0,
+        "legend.frameon": False,
+        "legend.fontsize": 9.5,
+    }
+
+
+def log_ticks(ax: Axes, most: int = 9) -> None:
+    """Label powers of ten on the logarithmic axes, with at most so many ticks."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    for axis in (ax.xaxis, ax.yaxis):
+        if axis.get_scale() == "log":
+            low, high = (math.log10(x) for x in axis.get_view_interval())
+            if math.floor(high) - math.ceil(low) < 1:
+                # Whole decades, so that there are two labels at least.
+                axis.set_view_interval(10.0 ** math.floor(low), 10.0 ** math.ceil(high), ignore=True)
+            axis.set_major_locator(LogLocator(10, numticks=most))
+            axis.set_major_formatter(FuncFormatter(_power))
+            axis.set_minor_locator(NullLocator())
+
+
+def _power(x: float, _: object) -> str:
+    return f"10{str(round(math.log10(x))).translate(_SUPERSCRIPT)}" if x > 0 else ""

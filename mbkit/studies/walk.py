@@ -1,0 +1,391 @@
+"""One curve of error against run time while it is measured: coarse settings first, then finer ones."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.model import Model
+from mbkit.simulate import Trajectory
+from mbkit.studies.first_run import made_ready
+from mbkit.studies.orders import observed_order
+from mbkit.studies.precision_result import Curve, PrecisionPoint
+from mbkit.studies.result import Refusal
+from mbkit.studies.rollouts import TooLongError, patience, quiet_simulate
+from mbkit.studies.sweep import Plan
+
+__all__ = ["Scene", "Walk", "explore", "repeat"]
+
+#: A run shorter than this is repeated within a round, s.
+_SHORT: Final = 2e-3
+_MOST_IN_A_ROUND: Final = 100
+#: Settings in a row that bring nothing, after which a sweep of our own grid ends.
+_IN_VAIN: Final = 2
+#: Errors above this may still fall again, as those of steps that are too large do.
+_SMALL: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is integrated, and the trajectory that errors are measured by.
+
+    Attributes
+    ----------
+    model : Model
+    q0, v0 : (nq,), (nv,) arrays
+    torque : (nv,) array, callable or None
+    times : (K,) array
+        From 0 to the horizon, s.
+    q : (K, nq) array
+        The reference there.
+    floor : float
+        How well it is known.
+    """
+
+    model: Model
+    q0: Array
+    v0: Array
+    torque: Any
+    times: Array
+    q: Array
+    floor: float
+
+    @property
+    def duration(self) -> float:
+        """The horizon, s."""
+        return float(self.times[-1])
+
+    @property
+    def motion(self) -> float:
+        """How far any coordinate gets from the start."""
+        return float(np.abs(self.model.difference(np.broadcast_to(self.q[0], self.q.shape), self.q)).max())
+
+    def run(self, dyn: Dynamics, plan: Plan, value: float, bound: float | None = None) -> Trajectory:
+        """Integrate to the horizon; what is still under way after `bound` seconds is given up."""
+        return self._simulate(dyn, plan, value, self.duration, self.times, bound)
+
+    def begin(self, dyn: Dynamics, plan: Plan, value: float) -> Trajectory:
+        """Integrate a step, or the thousandth part of an interval."""
+        duration = value if plan.setting == "dt" else 1e-3 * float(self.times[1])
+        return self._simulate(dyn, plan, value, duration, np.array([duration]), None)
+
+    def _simulate(
+        self, dyn: Dynamics, plan: Plan, value: float, duration: float, save: Array, bound: float | None
+    ) -> Trajectory:
+        setting: dict[str, Any] = {plan.setting: value}
+        progress = None if bound is None else patience(bound)
+        return quiet_simulate(
+            dyn, self.q0, self.v0, duration, plan.method, torque=self.torque, save=save, progress=progress, **setting
+        )
+
+    def error(self, run: Trajectory) -> float:
+        """Return the largest difference to the reference over times and coordinates."""
+        return float(np.abs(self.model.difference(self.q, run.q)).max())
+
+    def energy(self, dyn: Dynamics, run: Trajectory) -> float:
+        """Return the drift of the energy, relative to the larger of T and of the change of V.
+
+        NaN where there are dampers or applied forces: their work is not known from so few
+        states as well as the methods are good.
+        """
+        if self.torque is not None or self.model.needs.damping:
+            return math.nan
+        kinetic = 0.5 * np.einsum("ni,nij,nj->n", run.v, dyn.mass_matrix(run.q), run.v)
+        potential = dyn.potential_energy(run.q)
+        drift = np.abs((kinetic - kinetic[0]) + (potential - potential[0])).max()
+        size = max(float(kinetic.max()), float(np.ptp(potential)))
+        return float(drift) / size if size > 0 else math.nan
+
+
+@dataclass
+class _Point:
+    """A setting that was run.
+
+    Attributes
+    ----------
+    value : float
+    once, before : float
+        Seconds of its first run, and of what only had to be made for it.
+    times : list of float
+        Timings that count.
+    """
+
+    value: float
+    once: float = math.nan
+    before: float = 0.0
+    error: float = math.nan
+    energy: float = math.nan
+    steps: int = 0
+    evaluations: int = 0
+    note: str = ""
+    times: list[float] = field(default_factory=list)
+
+
+class Walk:
+    """One engine and method under way.
+
+    Parameters
+    ----------
+    scene : Scene
+    plan : Plan
+
+    Attributes
+    ----------
+    refusal : Refusal or None
+        Why the engine and method gave nothing more.
+    """
+
+    def __init__(self, scene: Scene, plan: Plan) -> None:
+        self.scene, self.plan = scene, plan
+        self.refusal: Refusal | None = None
+        self._left = list(plan.values)
+        self._points: list[_Point] = []
+        self._dyn: Dynamics | None = None
+        self._compile = math.nan
+        self._over = False
+        if not self._left:
+            self.refuse(f"takes no tolerance below {plan.kind.least:.3g}, and none above was asked for")
+
+    @property
+    def over(self) -> bool:
+        """Whether there is no setting left that is worth a run."""
+        return self._over or not self._left
+
+    @property
+    def expected(self) -> float:
+        """Seconds that the next run will take, guessed from the last; 0 before the first."""
+        if not self._points:
+            return 0.0
+        last = self._points[-1]
+        finer = last.value / self._left[0]
+        # A method of order p takes finer**(1/p) as many steps; 2 per decade is p = 3.
+        return last.once * (finer if self.plan.setting == "dt" else finer**0.3)
+
+    @property
+    def ahead(self) -> float:
+        """Seconds until the next run will be done, with what has to be made for it."""
+        return self.expected + (self._points[-1].before if self._points else 0.0)
+
+    def make_ready(self) -> None:
+        """Derive, compile and build, timed."""
+        # Where a tolerance decides on what is compiled, the middle one stands for all.
+        value = self._left[len(self._left) // 2]
+        with self._refusals():
+            self._dyn, self._compile = made_ready(
+                self.scene.model,
+                self.plan.engine,
+                self.plan.method,
+                lambda dyn: self.scene.begin(dyn, self.plan, value),
+            )
+
+    def step(self, bound: float) -> None:
+        """Run the next setting, and give it up after `bound` seconds."""
+        point = _Point(self._left.pop(0))
+        with self._refusals():
+            self._run(point, bound)
+            self._points.append(point)
+            self._over = self._over or (not self.plan.asked and self._in_vain())
+
+    def _run(self, point: _Point, bound: float) -> None:
+        assert self._dyn is not None
+        begun = time.perf_counter()
+        try:
+            # What this very setting needs first is no run time.
+            self.scene.begin(self._dyn, self.plan, point.value)
+            point.before, begun = time.perf_counter() - begun, time.perf_counter()
+            run = self.scene.run(self._dyn, self.plan, point.value, bound)
+        except TooLongError as error:
+            point.once, point.note = time.perf_counter() - begun, str(error)
+            # What is finer takes longer still.
+            self._over = not self.plan.asked
+            return
+        except UnsupportedError:
+            raise
+        except MbkitError as error:
+            point.once, point.note = time.perf_counter() - begun, str(error)
+            return
+        point.once = time.perf_counter() - begun
+        point.steps, point.evaluations = run.stats.steps, run.stats.evaluations
+        if not run.stats.finished or len(run.t) != len(self.scene.times):
+            point.note = run.stats.message or f"ended at t = {run.t[-1]:g} s"
+            return
+        point.error = self.scene.error(run)
+        try:
+            point.energy = self.scene.energy(self._dyn, run)
+        except MbkitError as error:
+            point.note = f"no energy: {error}"
+
+    def _in_vain(self) -> bool:
+        """Whether the last settings brought nothing: the reference's floor, or rounding."""
+        errors = [p.error for p in self._points]
+        before, last = errors[:-_IN_VAIN], errors[-_IN_VAIN:]
+        finite = [e for e in before if math.isfinite(e)]
+        if not finite or min(finite) > _SMALL:
+            return False
+        return all(not e < max(0.5 * min(finite), self.scene.floor) or e <= self.scene.floor for e in last)
+
+    def give_up(self, why: str) -> None:
+        """End here; whoever asked for the settings that are left is told why they were not run."""
+        if self.plan.asked:
+            self._points += [_Point(value, note=why) for value in self._left]
+        elif not self._points and self.refusal is None:
+            self.refusal = self._refused(why)
+        self._left, self._over = [], True
+
+    def _refusals(self) -> _Refusals:
+        return _Refusals(self)
+
+    def refuse(self, why: str) -> None:
+        """End here, for a reason that holds for all settings."""
+        self.refusal, self._over = self._refused(why), True
+
+    def _refused(self, why: str) -> Refusal:
+        return Refusal(self.plan.engine, self.plan.method, why.removeprefix(f"{self.plan.engine}: "))
+
+    @property
+    def timed(self) -> list[tuple[float, Runs]]:
+        """The runs worth timing again: what one took, and how to repeat it."""
+        return [(p.once, Runs(self, p)) for p in self._points if math.isfinite(p.error)]
+
+    def once_more(self, point: _Point) -> None:
+        """Time one setting, a short run several times over."""
+        assert self._dyn is not None
+        count = int(np.clip(_SHORT / max(point.once, 1e-9), 1, _MOST_IN_A_ROUND))
+        begun = time.perf_counter()
+        for _ in range(count):
+            self.scene.run(self._dyn, self.plan, point.value)
+        point.times.append((time.perf_counter() - begun) / count)
+
+    def curve(self) -> Curve | None:
+        """Return what there is so far, None where there is nothing."""
+        if not self._points:
+            return None
+        plan, scene = self.plan, self.scene
+        fixed = plan.setting == "dt"
+        seen = observed_order(
+            [p.value for p in self._points] if fixed else [],
+            [p.error for p in self._points] if fixed else [],
+            floor=scene.floor,
+            motion=scene.motion,
+        )
+        expected = plan.kind.order if fixed and plan.kind.order is not None else math.nan
+        points = tuple(self._frozen(p) for p in self._points)
+        return Curve(plan.engine, plan.method, points, seen.order, seen.points, float(expected), compile=self._compile)
+
+    def _frozen(self, p: _Point) -> PrecisionPoint:
+        # The first run of all counts only where there is no other.
+        times = p.times or [p.once]
+        low, median, high = np.percentile(times, [25, 50, 75])
+        return PrecisionPoint(
+            setting=self.plan.setting,
+            value=p.value,
+            error=p.error,
+            energy=p.energy,
+            seconds=float(median),
+            spread=float(high - low) / 2 if len(times) > 1 else math.nan,
+            steps=p.steps,
+            evaluations=p.evaluations,
+            repeats=len(times) if math.isfinite(times[0]) else 0,
+            note=p.note,
+        )
+
+
+@dataclass(frozen=True)
+class Runs:
+    """One setting of one walk, to be timed again."""
+
+    walk: Walk
+    point: _Point
+
+    def __call__(self) -> None:
+        """Time it once more."""
+        self.walk.once_more(self.point)
+
+
+class _Refusals:
+    """Turn whatever ends a method into the walk's refusal, so that no other curve is lost."""
+
+    def __init__(self, walk: Walk) -> None:
+        self._walk = walk
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> bool:
+        # Engines raise errors of many kinds; an interruption is none of them.
+        if not isinstance(error, Exception):
+            return False
+        self._walk.refuse(str(error) if isinstance(error, MbkitError) else f"{type(error).__name__}: {error}")
+        return True
+
+
+def explore(walks: Sequence[Walk], until: float, longest: float) -> Iterator[Walk]:
+    """Run each setting once, the cheapest next run of all walks first; yield whose it was.
+
+    All curves get about as far to the right of the figure, and whatever is coarse is
+    there before anything that is fine.
+
+    Parameters
+    ----------
+    walks : sequence of Walk
+    until : float
+        On `time.perf_counter`; nothing is begun that would probably not be done by then.
+    longest : float
+        Seconds that a run of our own grid may take.
+    """
+    while going := [w for w in walks if not w.over]:
+        walk = min(going, key=lambda w: w.expected)
+        left = until - time.perf_counter()
+        if walk.ahead > left:
+            for other in going:
+                other.give_up("not run: the time allowed was used up")
+            return
+        if walk.expected > longest and not walk.plan.asked:
+            walk.give_up(f"not run: it would take more than {longest:.2g} s")
+            continue
+        # A guess is a guess: one run must not take all that is left.
+        walk.step(bound=float(f"{max(left / 4, 2 * walk.expected, 0.1):.2g}"))
+        yield walk
+
+
+def repeat(walks: Sequence[Walk], repeats: int, until: float, seed: int) -> Iterator[int]:
+    """Time every setting in rounds, each round in another order; yield the round's number.
+
+    So a drift of the machine's speed meets all of them alike, and none is always timed
+    after the same neighbour. Where the time allowed is short, the longest runs are timed fewer
+    times.
+    """
+    runs = [x for walk in walks for x in walk.timed]
+    counts = shares([max(once, _SHORT) for once, _ in runs], repeats, until - time.perf_counter())
+    rng = np.random.default_rng(seed)
+    for k in range(repeats):
+        for i in rng.permutation(len(runs)):
+            if k < counts[i] and time.perf_counter() + runs[i][0] < until:
+                runs[i][1]()
+        yield k
+
+
+def shares(seconds: Sequence[float], most: int, budget: float) -> list[int]:
+    """Return how many times to repeat runs of these lengths within a budget, at most `most` each.
+
+    Examples
+    --------
+    >>> shares([0.1, 0.1, 5.0], most=5, budget=4.0)
+    [5, 5, 0]
+    >>> shares([0.1, 1.0, 1.0], most=5, budget=4.5)
+    [5, 2, 2]
+    """
+    counts, left = [0] * len(seconds), max(budget, 0.0)
+    by_length = sorted(range(len(seconds)), key=lambda i: seconds[i])
+    for k, i in enumerate(by_length):
+        counts[i] = min(most, int(left / (len(by_length) - k) / seconds[i] * (1 + 1e-9)))
+        left -= counts[i] * seconds[i]
+    return counts

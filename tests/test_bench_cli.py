@@ -1,0 +1,147 @@
+"""The command `mbkit bench`: what it prints, writes, and how it ends."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from mbkit.cli import cli
+from mbkit.errors import OutputError
+from mbkit.studies.precision_result import InterruptedSweepError
+
+SHORT = ("--engines", "pinocchio,mujoco", "--methods", "rk4,mujoco_rk4", "--quick", "--seconds", "30", "--repeats", "1")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder of the test's own."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
+    """A study in its shortest form, and the folder that it wrote to."""
+    out = tmp_path_factory.mktemp("bench")
+    return call("bench", "pendulum", *SHORT, "--out", str(out)), out
+
+
+def call(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, arguments)
+
+
+def test_a_study_is_printed_and_written(pendulum):
+    result, out = pendulum
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("pendulum: fastest of 3 curves")
+    for wanted in ("first run", "mujoco_rk4", "compile", "known to", str(out / "pendulum-bench.html")):
+        assert wanted in result.stdout, wanted
+    assert result.stderr == ""
+    suffixes = {".html", ".json", ".csv", ".png"}
+    assert {p.name for p in out.iterdir()} == {f"pendulum-bench{s}" for s in suffixes}
+    assert (out / "pendulum-bench.png").read_bytes().startswith(b"\x89PNG")
+    page = (out / "pendulum-bench.html").read_text(encoding="utf-8")
+    assert "<svg" in page
+    assert 'href="pendulum-bench.csv"' in page
+
+
+def test_json_and_csv_hold_the_same_points(pendulum):
+    _, out = pendulum
+    data = json.loads((out / "pendulum-bench.json").read_text())
+    assert data["complete"]
+    assert data["settings"]["repeats"] == 1
+    rows = list(csv.DictReader(io.StringIO((out / "pendulum-bench.csv").read_text())))
+    told = [(c["engine"], c["method"], p["value"], p["error"]) for c in data["curves"] for p in c["points"]]
+    assert len(told) > 5
+    assert [(r["engine"], r["method"], float(r["value"]), float(r["error"])) for r in rows] == told
+    assert {r["front"] for r in rows} == {"0", "1"}
+
+
+@pytest.mark.usefixtures("here")
+def test_json_is_all_there_is_on_stdout():
+    result = call("bench", "pendulum", *SHORT, "--json", "--out", "out")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["model"] == "pendulum"
+    assert "pendulum-bench.html" in result.stderr
+
+
+def test_processes_measure_too(here):
+    result = call("bench", "pendulum", *SHORT, "--jobs", "1")
+    assert result.exit_code == 0, result.output
+    data = json.loads((here / "mbkit-report" / "pendulum-bench.json").read_text())
+    assert {c["method"] for c in data["curves"]} == {"rk4", "mujoco_rk4"}
+    assert [p.name for p in here.iterdir()] == ["mbkit-report"]
+
+
+def test_what_was_finished_is_written_when_interrupted(here, monkeypatch):
+    from mbkit.studies import work_precision
+
+    def interrupted(*arguments: object, **more: object) -> None:
+        whole = work_precision(*arguments, **more)
+        raise InterruptedSweepError(replace(whole, complete=False, curves=whole.curves[:1]))
+
+    monkeypatch.setattr("mbkit.studies.work_precision", interrupted)
+    result = call("bench", "pendulum", *SHORT, "--json")
+    assert result.exit_code == 130
+    assert "interrupted: " in result.stderr
+    told = json.loads(result.stdout)
+    assert not told["complete"]
+    assert len(told["curves"]) == 1
+    assert "interrupted" in (here / "mbkit-report" / "pendulum-bench.html").read_text(encoding="utf-8")
+    assert (here / "mbkit-report" / "pendulum-bench.csv").exists()
+
+
+def test_interrupted_before_anything_was_finished(here, monkeypatch):
+    def at_once(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mbkit.studies.work_precision", at_once)
+    result = call("bench", "pendulum", *SHORT)
+    assert result.exit_code == 130
+    assert "nothing was finished" in result.stderr
+    assert not list(here.iterdir())
+
+
+@pytest.mark.usefixtures("here")
+def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
+    def full(*_: object) -> Path:
+        raise OutputError("cannot write there: No space left on device")
+
+    monkeypatch.setattr("mbkit.report.folder.write", full)
+    result = call("bench", "pendulum", *SHORT, "--json")
+    assert result.exit_code == 2
+    assert "No space left" in result.stderr
+    assert json.loads(result.stdout)["complete"]
+
+
+BAD = [
+    (["bench"], "TARGET"),
+    (["bench", "pandaa"], "did you mean 'panda'"),
+    (["bench", "panda", "--methods", "rk5"], "unknown method 'rk5'"),
+    (["bench", "pendulum", "--methods", "taylor", "--engines", "pinocchio"], "taylor is not on pinocchio"),
+    (["bench", "panda", "--engines", "bullet"], "unknown engine 'bullet'"),
+    (["bench", "panda", "--engines", "oracle"], "leave it out"),
+    (["bench", "panda", "--engines", ","], "at least one"),
+    (["bench", "pendulum", "--duration", "-1"], "duration"),
+    (["bench", "pendulum", "--duration", "nan"], "duration"),
+    (["bench", "pendulum", "--seconds", "0"], "seconds"),
+    (["bench", "panda", "--repeats", "0"], "--repeats"),
+    (["bench", "panda", "--jobs", "0"], "--jobs"),
+    (["bench", "panda", "--out", "regular/below"], "regular is not a folder"),
+    (["bench", "pendulum", "--floating-base"], "floating_base"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "told"), BAD, ids=[" ".join(a) for a, _ in BAD])
+def test_bad_input_is_one_message_and_exit_2(here, arguments, told):
+    (here / "regular").write_text("")
+    result = call(*arguments)
+    assert result.exit_code == 2, result.output
+    assert told in result.stderr
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+    assert [p.name for p in here.iterdir()] == ["regular"]
