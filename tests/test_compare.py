@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import pickle
+import sys
 import time
 from dataclasses import replace
 
@@ -25,6 +26,12 @@ from tests.random_trees import random_tree
 
 TERM_NAMES = {t.name for t in TERMS} | {"power balance"}
 SOUND_IN_BOTH = ("revolute", "continuous", "prismatic", "ball", "planar", "free", "fixed")
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Leave little time to error against run time, where a test asks for something else."""
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare"], "_SECONDS", 0.5)
 
 
 def terms(model, **kwargs):
@@ -61,6 +68,7 @@ def test_random_trees_agree_with_everything_that_acts(seed):
     assert result.facts["needs"]["damping"]
 
 
+@pytest.mark.usefixtures("brief")
 def test_armature_damping_and_both_kinds_of_spring_agree():
     b = mb.ModelBuilder("sprung")
     b.add_body("a", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.02))
@@ -148,6 +156,7 @@ def test_where_the_oracle_has_no_value_an_engine_stands_in():
     assert {r.engine: r.passed for r in rows} == {"pinocchio": False, "lagrangian": False, "mujoco": True}
 
 
+@pytest.mark.usefixtures("brief")
 def test_a_failing_study_loses_no_terms():
     """A spring whose ends meet has no direction there: Pinocchio and the derivation say so."""
     b = mb.ModelBuilder("tether")
@@ -262,6 +271,7 @@ def test_rollouts_equal_mujocos_own_to_1e_12(robot, method, native, engine):
     assert np.abs(model.difference(theirs.q, ours.q)).max() <= 1e-12
 
 
+@pytest.mark.usefixtures("brief")
 def test_mujocos_implicit_damping_is_shown_for_what_it_is():
     result = mb.compare(mb.load("double_pendulum"), samples=4)
     shown = [r for r in result.rollouts if "implicit" in r.against]

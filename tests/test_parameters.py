@@ -542,7 +542,7 @@ def test_parameters_have_finite_values(value):
         lambda: mb.load("ur5"),
         lambda: mb.catalog.cart_pole(),
         lambda: machine(symbols(draw(1))),
-        lambda: random_tree(1, 10, mimic=True),
+        lambda: random_tree(1, 6, mimic=True),
     ],
     ids=["panda", "ur5", "cart_pole", "machine", "tree"],
 )

@@ -27,14 +27,18 @@ EPS = np.finfo(float).eps
 # eps in a vector, √nv more in the norm of a matrix, which here is up to 69 by 69.
 K = 20
 CHUNKS, PER_CHUNK, SAMPLES = 20, 10, 2
-#: Joints of the ten trees of a chunk.
-SIZES = (2, 3, 4, 5, 6, 8, 10, 12, 18, 30)
+#: Joints of the ten trees of a chunk; in the last four, one of every shape, the tenth has 30.
+SIZES = (2, 3, 3, 4, 5, 6, 7, 8, 10, 14)
+LARGE = 30
 
 
 def tree(seed: int) -> Model:
     """Return the tree of a seed: shallow or deep, with and without mimic joints."""
     mimic, deep = seed // PER_CHUNK % 2 == 1, seed // (2 * PER_CHUNK) % 2 == 1
-    return random_tree(seed, SIZES[seed % PER_CHUNK], mimic=mimic, nearest=2 if deep else None)
+    size = SIZES[seed % PER_CHUNK]
+    if size == SIZES[-1] and seed // PER_CHUNK >= CHUNKS - 4:
+        size = LARGE
+    return random_tree(seed, size, mimic=mimic, nearest=2 if deep else None)
 
 
 class Derived:
