@@ -147,7 +147,7 @@ def test_tolerance_rules_the_error(method: str) -> None:
 
 @pytest.mark.parametrize("method", STIFF)
 def test_every_joint_kind_moves_as_with_dop853(method: str) -> None:
-    model = random_tree(3, 7)
+    model = random_tree(3, 12)
     q, v = model.random_state(np.random.default_rng(0))
     dyn, save = dynamics(model, "lagrangian"), [0.0, 0.04, 0.08]
     truth = simulate(dyn, q, v, 0.08, "dop853", rtol=1e-12, save=save)
