@@ -126,7 +126,9 @@ def draw(result):
         for method, row in scene["methods"].items():
             x, y = np.array(row["curve"]).T
             look = dict(LOOKS[method])
-            if row["exponent"] is not None:
+            if row["windows"] is not None and min(row["windows"]) > 0.5:
+                look["label"] += ":  error as large as the energy"
+            elif row["exponent"] is not None:
                 # A minus before zeros tells nothing.
                 look["label"] += f":  grows as $t^{{{abs(round(row['exponent'], 2)):.2f}}}$"
             else:
