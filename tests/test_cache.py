@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.lagrangian import cache
-from mbkit.lagrangian import compiled as module
+from mbkit.derivation import cache
+from mbkit.derivation import compiled as module
 from tests.random_trees import states
 
 

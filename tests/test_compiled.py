@@ -19,10 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
-from mbkit.lagrangian import cache, execution, jit, vector_code
-from mbkit.lagrangian.compiled import Compiled, compiled
-from mbkit.lagrangian.machine import Machine
-from mbkit.lagrangian.program import program
+from mbkit.derivation import cache, execution, jit, vector_code
+from mbkit.derivation.compiled import Compiled, compiled
+from mbkit.derivation.machine import Machine
+from mbkit.derivation.program import program
 from tests.random_trees import random_tree, states
 
 EPS = np.finfo(float).eps
@@ -138,7 +138,7 @@ def test_every_width_of_register_gives_the_same_numbers(monkeypatch, width):
         pytest.skip(f"this processor's registers hold {here.width} doubles")
     expected = built(mixed())
     monkeypatch.setattr(jit, "host", lambda: here._replace(width=width))
-    from mbkit.lagrangian import compiled as module
+    from mbkit.derivation import compiled as module
 
     monkeypatch.setattr(module, "_batch_object", jit.batch_object)
     narrow = built(mixed())

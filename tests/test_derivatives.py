@@ -9,9 +9,9 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import InputError, NumericalError
-from mbkit.lagrangian.arithmetic import arithmetic
-from mbkit.lagrangian.extended import Extended
-from mbkit.lagrangian.program import program
+from mbkit.derivation.arithmetic import arithmetic
+from mbkit.derivation.extended import Extended
+from mbkit.derivation.program import program
 from tests.random_trees import off, random_tree, states
 
 EPS = np.finfo(float).eps

@@ -8,7 +8,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import UnknownNameError
-from mbkit.lagrangian import FUNCTIONS, Equations
+from mbkit.derivation import FUNCTIONS, Equations
 from tests.random_trees import off, random_tree, states
 
 SEEDS = range(6)

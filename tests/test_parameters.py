@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnknownNameError
-from mbkit.lagrangian import FUNCTIONS, Equations
+from mbkit.derivation import FUNCTIONS, Equations
 from mbkit.model import Expression, Mimic, nominal
 from tests.random_trees import off, random_tree, states
 

@@ -16,8 +16,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mbkit.lagrangian import Equations
-from mbkit.lagrangian.kinematics import add
+from mbkit.derivation import Equations
+from mbkit.derivation.kinematics import add
 from mbkit.model import Model
 from mbkit.model.kinds import cross3
 from tests.random_trees import random_tree, states

@@ -19,9 +19,9 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
-from mbkit.lagrangian import Equations
-from mbkit.lagrangian.program import program
-from mbkit.lagrangian.taylor import TaylorSystem, _functions, order_of, precision, rates, taylor_system
+from mbkit.derivation import Equations
+from mbkit.derivation.program import program
+from mbkit.derivation.taylor import TaylorSystem, _functions, order_of, precision, rates, taylor_system
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, Trajectory, at_section, simulate
 from mbkit.simulate.progress import Progress
@@ -69,7 +69,7 @@ def double() -> Any:
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops for all but the smallest systems: what is run once is not worth more."""
-    monkeypatch.setattr("mbkit.lagrangian.taylor._UNROLLED", 2000)
+    monkeypatch.setattr("mbkit.derivation.taylor._UNROLLED", 2000)
 
 
 # Exact motions
@@ -365,7 +365,7 @@ def test_what_has_no_series_is_refused(swing: Any) -> None:
 
 
 def test_too_large_a_model_is_refused_before_it_is_derived(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbkit.lagrangian.taylor._MOST", 3)
+    monkeypatch.setattr("mbkit.derivation.taylor._MOST", 3)
     with pytest.raises(UnsupportedError, match=r"double_pendulum takes \d+ operations.*'rk853' or 'dop853'"):
         TaylorSystem(Equations(catalog.double_pendulum()))
 

@@ -40,8 +40,8 @@ import pinocchio as pin
 
 import mbkit as mb
 from mbkit.engines import mujoco_model, pinocchio_model
-from mbkit.lagrangian.compiled import cores
-from mbkit.lagrangian.program import program
+from mbkit.derivation.compiled import cores
+from mbkit.derivation.program import program
 from mbkit.studies.stamp import processor, versions
 from tests.random_trees import random_tree
 

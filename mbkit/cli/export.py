@@ -45,7 +45,7 @@ def export(
     units, the conventions and the order of the joints. A file that mbkit wrote before is
     replaced; an unknown quantity lists those that there are.
     """
-    from mbkit.lagrangian.export import DEFAULT, c_identifier, export_c
+    from mbkit.derivation.export import DEFAULT, c_identifier, export_c
     from mbkit.load.names import find
     from mbkit.studies.target import model_of
 

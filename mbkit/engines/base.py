@@ -205,12 +205,12 @@ class Dynamics(ABC):
     def function(self, name: str) -> Any:
         """Return a quantity as a `casadi.Function`; the lagrangian engine only.
 
-        Inputs are named as in `mbkit.lagrangian.FUNCTIONS` (q, v, a, tau), all of them
+        Inputs are named as in `mbkit.derivation.FUNCTIONS` (q, v, a, tau), all of them
         column vectors; of a model with parameters the last one is "parameters", in
         the order of ``model.parameters``. The output has the quantity's name and is
         dense: (nv, nv), (nv, 1) or (1, 1); derivatives are by_q, by_v and by_a or
         by_tau. It may be called with MX or SX and differentiated.
-        `mbkit.lagrangian.export_c` writes it as C.
+        `mbkit.derivation.export_c` writes it as C.
         """
         self._require("function")
         return self._function(name)

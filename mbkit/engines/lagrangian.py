@@ -14,11 +14,11 @@ from mbkit.engines.base import Dynamics
 from mbkit.engines.lagrangian_direct import short_way
 from mbkit.engines.parameters import ParameterValues
 from mbkit.errors import InputError
-from mbkit.lagrangian.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
-from mbkit.lagrangian.equations import Equations
-from mbkit.lagrangian.execution import compile_by_default, executable
-from mbkit.lagrangian.factorize import elimination_size
-from mbkit.lagrangian.machine import Machine
+from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.execution import compile_by_default, executable
+from mbkit.derivation.factorize import elimination_size
+from mbkit.derivation.machine import Machine
 from mbkit.model import Model
 
 __all__ = ["LagrangianDynamics"]

@@ -17,7 +17,7 @@ from mbkit._check import Array
 from mbkit.model import Model
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.compiled import Compiled
+    from mbkit.derivation.compiled import Compiled
 
 __all__ = ["short_way"]
 

@@ -24,12 +24,12 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.lagrangian.arithmetic import Backend, arithmetic, digits
-from mbkit.lagrangian.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
-from mbkit.lagrangian.equations import Equations
-from mbkit.lagrangian.extended import Extended
-from mbkit.lagrangian.extended_solve import product, solve
-from mbkit.lagrangian.program import program
+from mbkit.derivation.arithmetic import Backend, arithmetic, digits
+from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.extended import Extended
+from mbkit.derivation.extended_solve import product, solve
+from mbkit.derivation.program import program
 from mbkit.model import Model
 from mbkit.model.substitution import moved
 
@@ -77,7 +77,7 @@ class OracleDynamics(Dynamics):
 
     Attributes
     ----------
-    equations : mbkit.lagrangian.Equations
+    equations : mbkit.derivation.Equations
         The expressions, with the model's numbers as symbols.
     """
 

@@ -1,7 +1,12 @@
-"""Energies to equations to functions: mbkit's own derivation."""
+"""Mechanics on paper, and the own derivation's expressions and C code to take out."""
 
-from mbkit.lagrangian.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
-from mbkit.lagrangian.equations import FUNCTIONS, Equations
-from mbkit.lagrangian.export import CSource, export_c
+from mbkit.derivation import (
+    FUNCTIONS,
+    CSource,
+    Equations,
+    ForwardDynamicsDerivatives,
+    InverseDynamicsDerivatives,
+    export_c,
+)
 
 __all__ = ["FUNCTIONS", "CSource", "Equations", "ForwardDynamicsDerivatives", "InverseDynamicsDerivatives", "export_c"]

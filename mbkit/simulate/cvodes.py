@@ -18,7 +18,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.equations import Equations
+from mbkit.derivation.equations import Equations
 from mbkit.simulate.events import Event
 from mbkit.simulate.members import Member, check_save, gathered, reporter
 from mbkit.simulate.methods import Tolerances

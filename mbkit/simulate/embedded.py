@@ -84,7 +84,7 @@ def _trials(
     if dyn.engine == "lagrangian" and not torque.callable and dyn.model.nv:
         # Other engines need no CasADi.
         from mbkit.engines.lagrangian import LagrangianDynamics
-        from mbkit.lagrangian.execution import has_compiler
+        from mbkit.derivation.execution import has_compiler
 
         if isinstance(dyn, LagrangianDynamics) and dyn.compile and dyn.written_out and has_compiler():
             # Loads LLVM, which interpreting never needs.

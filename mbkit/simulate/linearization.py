@@ -1,7 +1,7 @@
 """The exact Jacobian of q̇ = D(q) v, v̇ = forward_dynamics on y = (q, v), for implicit methods.
 
 The derivatives of the acceleration come from the own derivation, whatever engine
-evaluates the dynamics (`mbkit.lagrangian.derivatives`). They are along the manifold;
+evaluates the dynamics (`mbkit.derivation.derivatives`). They are along the manifold;
 for a quaternion x of any length the tangent of a change dx is 2 Eᵀ dx / |x|², with
 ẋ = ½ E(x) ω, since Eᵀ E = |x|².
 """
@@ -23,7 +23,7 @@ from mbkit.simulate.rates import unit_quaternions
 from mbkit.simulate.torque import Force
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.derivatives import ForwardDynamicsDerivatives
+    from mbkit.derivation.derivatives import ForwardDynamicsDerivatives
 
 __all__ = ["Linearization"]
 

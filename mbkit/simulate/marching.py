@@ -8,9 +8,9 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.lagrangian.compiled import Compiled, aligned
-from mbkit.lagrangian.sequence import Call, CallSequence
-from mbkit.lagrangian.step import Part, march, march_in_stages
+from mbkit.derivation.compiled import Compiled, aligned
+from mbkit.derivation.sequence import Call, CallSequence
+from mbkit.derivation.step import Part, march, march_in_stages
 from mbkit.simulate.methods import METHODS
 
 __all__ = ["BLOCK", "Chunk", "Plan"]

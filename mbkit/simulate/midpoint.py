@@ -1,4 +1,4 @@
-"""Runs of the implicit midpoint rule in (q, p), on `mbkit.lagrangian.midpoint`'s parts.
+"""Runs of the implicit midpoint rule in (q, p), on `mbkit.derivation.midpoint`'s parts.
 
 The state from step to step is (q, π), and velocities are made of it only where they are
 kept. With no torque or an array, blocks of steps run as machine code, chunks of a batch
@@ -21,8 +21,8 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import FunctionError, UnsupportedError
-from mbkit.lagrangian.machine import Machine
-from mbkit.lagrangian.midpoint import GUESS, Midpoint
+from mbkit.derivation.machine import Machine
+from mbkit.derivation.midpoint import GUESS, Midpoint
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.midpoint_solver import MidpointSolver, called
@@ -103,7 +103,7 @@ class _Run:
     def in_chunks(self, bar: Progress) -> None:
         """Run every trajectory, some side by side, and such chunks at once on several cores."""
         # These load LLVM, which interpreting never needs.
-        from mbkit.lagrangian.compiled import cores
+        from mbkit.derivation.compiled import cores
         from mbkit.simulate.midpoint_chunk import WIDEST, MidpointChunk
 
         n, workers = len(self._q0), self._dyn.threads or cores()

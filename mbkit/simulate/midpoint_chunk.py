@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.lagrangian.compiled import aligned
-from mbkit.lagrangian.midpoint import GUESS, MOST, Midpoint
-from mbkit.lagrangian.sequence import Call, CallSequence
+from mbkit.derivation.compiled import aligned
+from mbkit.derivation.midpoint import GUESS, MOST, Midpoint
+from mbkit.derivation.sequence import Call, CallSequence
 from mbkit.simulate.grid import Indices
 
 __all__ = ["WIDEST", "MidpointChunk"]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.lagrangian.midpoint import LEAST, MOST, SMALL, Midpoint
-from mbkit.lagrangian.step import Part
+from mbkit.derivation.midpoint import LEAST, MOST, SMALL, Midpoint
+from mbkit.derivation.step import Part
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Indices
 from mbkit.simulate.torque import Torque

@@ -52,7 +52,7 @@ def _compiles(dyn: Dynamics) -> bool:
         return False
     # Other engines need no CasADi.
     from mbkit.engines.lagrangian import LagrangianDynamics
-    from mbkit.lagrangian.machine import Machine
+    from mbkit.derivation.machine import Machine
 
     if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out:
         return False

@@ -17,7 +17,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
-from mbkit.lagrangian.taylor import Precision, TaylorSystem, precision, taylor_system
+from mbkit.derivation.taylor import Precision, TaylorSystem, precision, taylor_system
 from mbkit.model import Model
 from mbkit.simulate.events import Event, State, Watch
 from mbkit.simulate.members import Member, check_save, gathered, reporter

@@ -12,7 +12,7 @@ from typing import Any
 from mbkit.catalog import pendulum
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import MbkitError
-from mbkit.lagrangian.cache import anew
+from mbkit.derivation.cache import anew
 from mbkit.model import Model
 from mbkit.studies.rollouts import quiet_simulate
 

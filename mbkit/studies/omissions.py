@@ -100,8 +100,8 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
 
 def _coriolis(model: Model, q: Array, v: Array) -> Omission:
     """Measure the Coriolis matrix, derived only when somebody asks for it."""
-    from mbkit.lagrangian import Equations
-    from mbkit.lagrangian.machine import Machine
+    from mbkit.derivation import Equations
+    from mbkit.derivation.machine import Machine
 
     equations = Equations(model)
     nle = Machine(equations.function("coriolis_force"))

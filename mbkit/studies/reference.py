@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitError, UnsupportedError
-from mbkit.lagrangian.machine import Machine
-from mbkit.lagrangian.taylor import order_of, precision, taylor_system
+from mbkit.derivation.machine import Machine
+from mbkit.derivation.taylor import order_of, precision, taylor_system
 from mbkit.model import Model
 from mbkit.simulate.applied import TorqueFunction
 from mbkit.simulate.grid import save_times

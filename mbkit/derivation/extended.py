@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit.lagrangian.arithmetic import Arithmetic
-from mbkit.lagrangian.program import Program
+from mbkit.derivation.arithmetic import Arithmetic
+from mbkit.derivation.program import Program
 
 __all__ = ["Extended"]
 

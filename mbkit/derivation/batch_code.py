@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from llvmlite import ir
 
-from mbkit.lagrangian.vector_code import BODY
+from mbkit.derivation.vector_code import BODY
 
 __all__ = ["MOST_ARRAYS", "RUN", "batch_code"]
 

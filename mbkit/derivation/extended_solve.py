@@ -1,6 +1,6 @@
 """Solve M a = f in extended precision, for all states at once.
 
-The same elimination as `mbkit.lagrangian.factorize` (Featherstone 2008, Rigid Body
+The same elimination as `mbkit.derivation.factorize` (Featherstone 2008, Rigid Body
 Dynamics Algorithms, ch. 6.5), on arrays of numbers instead of expressions.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.lagrangian.arithmetic import Arithmetic
+from mbkit.derivation.arithmetic import Arithmetic
 
 __all__ = ["product", "solve"]
 

@@ -15,9 +15,9 @@ from typing import Any, Final, NamedTuple
 import llvmlite
 from llvmlite import binding as llvm
 
-from mbkit.lagrangian.batch_code import MOST_ARRAYS, RUN, batch_code
-from mbkit.lagrangian.program import Program
-from mbkit.lagrangian.vector_code import vector_code
+from mbkit.derivation.batch_code import MOST_ARRAYS, RUN, batch_code
+from mbkit.derivation.program import Program
+from mbkit.derivation.vector_code import vector_code
 
 __all__ = ["Host", "Loaded", "batch_object", "host", "load", "object_code", "program_object"]
 

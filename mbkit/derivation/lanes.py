@@ -27,15 +27,15 @@ from weakref import WeakValueDictionary
 import casadi as ca
 
 from mbkit._version import __version__
-from mbkit.lagrangian import cache as disk
-from mbkit.lagrangian import jit
-from mbkit.lagrangian.batch_code import RUN
-from mbkit.lagrangian.llvm_text import declarations
-from mbkit.lagrangian.program import Program, program
-from mbkit.lagrangian.sincos import sincos
-from mbkit.lagrangian.sources import SOURCES
-from mbkit.lagrangian.step import Part
-from mbkit.lagrangian.vector_code import Piece, pieces_of, slots_of
+from mbkit.derivation import cache as disk
+from mbkit.derivation import jit
+from mbkit.derivation.batch_code import RUN
+from mbkit.derivation.llvm_text import declarations
+from mbkit.derivation.program import Program, program
+from mbkit.derivation.sincos import sincos
+from mbkit.derivation.sources import SOURCES
+from mbkit.derivation.step import Part
+from mbkit.derivation.vector_code import Piece, pieces_of, slots_of
 
 __all__ = ["Lanes", "lanes", "width"]
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import casadi as ca
 
-from mbkit.lagrangian.kinematics import Kinematics, add, constant_times, dot3
-from mbkit.lagrangian.values import is_zero
+from mbkit.derivation.kinematics import Kinematics, add, constant_times, dot3
+from mbkit.derivation.values import is_zero
 from mbkit.model.kinds import cross3
 
 __all__ = ["damping_forces", "gravity_energy", "kinetic_energy", "spring_energy"]

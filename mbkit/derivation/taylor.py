@@ -27,9 +27,9 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import UnsupportedError
-from mbkit.lagrangian.equations import Equations
-from mbkit.lagrangian.factorize import elimination_size
-from mbkit.lagrangian.program import Operation, program
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.factorize import elimination_size
+from mbkit.derivation.program import Operation, program
 
 __all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
 

@@ -28,10 +28,10 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.lagrangian import energies
-from mbkit.lagrangian.equations import Equations
-from mbkit.lagrangian.factorize import solve
-from mbkit.lagrangian.step import Part, SymbolicSpace, function_of
+from mbkit.derivation import energies
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.factorize import solve
+from mbkit.derivation.step import Part, SymbolicSpace, function_of
 from mbkit.model import rotation
 
 __all__ = ["GUESS", "LEAST", "MOST", "SMALL", "Midpoint", "eliminated"]

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Final
 import casadi as ca
 
 from mbkit.errors import NoCompilerWarning
-from mbkit.lagrangian.machine import Machine
+from mbkit.derivation.machine import Machine
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.compiled import Compiled
+    from mbkit.derivation.compiled import Compiled
 
 __all__ = ["compile_by_default", "executable", "has_compiler"]
 
@@ -46,7 +46,7 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
     if not compile or not _compiler():
         return Machine(make())
     # Loads LLVM, which interpreting never needs.
-    from mbkit.lagrangian.compiled import compiled
+    from mbkit.derivation.compiled import compiled
 
     def checked() -> ca.Function:
         function = make()

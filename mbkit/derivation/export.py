@@ -12,10 +12,10 @@ import casadi as ca
 
 from mbkit._version import __version__
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian.c_code import c_body, places, variables
-from mbkit.lagrangian.c_header import CFunction, header, output_names, prototype
-from mbkit.lagrangian.equations import FUNCTIONS, Equations
-from mbkit.lagrangian.program import program
+from mbkit.derivation.c_code import c_body, places, variables
+from mbkit.derivation.c_header import CFunction, header, output_names, prototype
+from mbkit.derivation.equations import FUNCTIONS, Equations
+from mbkit.derivation.program import program
 from mbkit.model import Model
 
 __all__ = ["DEFAULT", "CSource", "c_identifier", "export_c"]
@@ -102,7 +102,7 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     ----------
     model : Model
     quantities : iterable of str
-        Keys of `mbkit.lagrangian.FUNCTIONS`.
+        Keys of `mbkit.derivation.FUNCTIONS`.
     name : str, optional
         Prefix of every name in C, and stem of the files; the model's name in lower
         case letters, digits and underscores if not given.

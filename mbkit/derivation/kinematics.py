@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 
-from mbkit.lagrangian.values import Constants, Values, is_zero
+from mbkit.derivation.values import Constants, Values, is_zero
 from mbkit.model import Joint, Model
 from mbkit.model.kinds import cross3
 

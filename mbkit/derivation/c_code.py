@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Final
 
-from mbkit.lagrangian.program import Program
+from mbkit.derivation.program import Program
 
 __all__ = ["c_body", "places", "variables"]
 

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.lagrangian import jit
-from mbkit.lagrangian.batch_code import RUN
-from mbkit.lagrangian.compiled import Compiled, aligned, shared_object
+from mbkit.derivation import jit
+from mbkit.derivation.batch_code import RUN
+from mbkit.derivation.compiled import Compiled, aligned, shared_object
 
 __all__ = ["Call", "CallSequence"]
 

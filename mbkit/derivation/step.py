@@ -15,7 +15,7 @@ from typing import Any, Final
 import casadi as ca
 
 from mbkit.errors import UnknownNameError
-from mbkit.lagrangian.equations import Equations
+from mbkit.derivation.equations import Equations
 from mbkit.model.rotation import Arithmetic
 from mbkit.model.space import Space
 

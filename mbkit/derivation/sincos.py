@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from mbkit.lagrangian.llvm_text import Text, number
+from mbkit.derivation.llvm_text import Text, number
 
 __all__ = ["LIMIT", "sincos"]
 

@@ -21,10 +21,10 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.lagrangian.factorize import solve
+from mbkit.derivation.factorize import solve
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.equations import Equations
+    from mbkit.derivation.equations import Equations
 
 __all__ = [
     "ForwardDynamicsDerivatives",

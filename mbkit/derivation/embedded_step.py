@@ -7,7 +7,7 @@ DOP853 as SciPy has it. The controller looks at the last error too (Gustafsson 1
 Hairer, Wanner 1996, IV.2): with the exponents below, a fifth to a third fewer tries are
 rejected than by DOP853's own, and 15 % fewer tries reach an error of 1e-9 of the UR5,
 30 % of the double pendulum. On rotations the step is Munthe-Kaas's, as in
-`mbkit.lagrangian.step`, and the error is that of the rotation vector, relative to 1.
+`mbkit.derivation.step`, and the error is that of the rotation vector, relative to 1.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any, Final
 import casadi as ca
 
 from mbkit._check import Array
-from mbkit.lagrangian.equations import Equations
-from mbkit.lagrangian.step import Part, SymbolicSpace, choose, function_of
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.step import Part, SymbolicSpace, choose, function_of
 
 __all__ = ["GROWTH", "LAST", "SAFETY", "SHRINK", "STATE", "embedded_parts"]
 

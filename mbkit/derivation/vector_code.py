@@ -18,9 +18,9 @@ from typing import Final
 
 import numpy as np
 
-from mbkit.lagrangian.llvm_text import Text, declarations, number
-from mbkit.lagrangian.program import Program
-from mbkit.lagrangian.sincos import sincos
+from mbkit.derivation.llvm_text import Text, declarations, number
+from mbkit.derivation.program import Program
+from mbkit.derivation.sincos import sincos
 
 __all__ = ["BODY", "Piece", "pieces_of", "slots_of", "vector_code"]
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._version import __version__
-from mbkit.lagrangian import cache as disk
-from mbkit.lagrangian import jit
-from mbkit.lagrangian.program import program
-from mbkit.lagrangian.sources import SOURCES
+from mbkit.derivation import cache as disk
+from mbkit.derivation import jit
+from mbkit.derivation.program import program
+from mbkit.derivation.sources import SOURCES
 
 __all__ = ["Compiled", "aligned", "compiled", "cores", "shared_object"]
 

@@ -1,0 +1,7 @@
+"""Energies to equations to functions: mbkit's own derivation."""
+
+from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
+from mbkit.derivation.equations import FUNCTIONS, Equations
+from mbkit.derivation.export import CSource, export_c
+
+__all__ = ["FUNCTIONS", "CSource", "Equations", "ForwardDynamicsDerivatives", "InverseDynamicsDerivatives", "export_c"]
