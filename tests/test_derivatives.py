@@ -8,10 +8,10 @@ import pinocchio as pin
 import pytest
 
 import mbkit as mb
-from mbkit.errors import InputError, NumericalError
 from mbkit.derivation.arithmetic import arithmetic
 from mbkit.derivation.extended import Extended
 from mbkit.derivation.program import program
+from mbkit.errors import InputError, NumericalError
 from tests.random_trees import off, random_tree, states
 
 EPS = np.finfo(float).eps

@@ -18,10 +18,10 @@ from click.testing import CliRunner
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.derivation import FUNCTIONS, export_c
 from mbkit.derivation.c_code import c_body
 from mbkit.derivation.program import program
+from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from tests.random_trees import off, random_tree, states
 
 CC, CXX = shutil.which("cc"), shutil.which("c++")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.errors import UnknownNameError
 from mbkit.derivation import FUNCTIONS, Equations
+from mbkit.errors import UnknownNameError
 from tests.random_trees import off, random_tree, states
 
 SEEDS = range(6)

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
-from mbkit.errors import InputError, ModelError, UnknownNameError
 from mbkit.derivation import FUNCTIONS, Equations
+from mbkit.errors import InputError, ModelError, UnknownNameError
 from mbkit.model import Expression, Mimic, nominal
 from tests.random_trees import off, random_tree, states
 

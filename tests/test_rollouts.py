@@ -15,12 +15,12 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
-from mbkit.engines import dynamics
-from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import MbkitWarning, UnknownNameError
 from mbkit.derivation import Equations
 from mbkit.derivation.machine import Machine
 from mbkit.derivation.step import march, march_in_stages, step
+from mbkit.engines import dynamics
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import MbkitWarning, UnknownNameError
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.space import Space
 from mbkit.simulate import RK4, Trajectory, marching, rollout, simulate

@@ -10,9 +10,9 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
+from mbkit.derivation.midpoint import Midpoint, _MomentumSpace, eliminated
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError, UnsupportedError
-from mbkit.derivation.midpoint import Midpoint, _MomentumSpace, eliminated
 from mbkit.model import Model, ModelBuilder, rotation
 from mbkit.simulate import simulate
 from mbkit.spatial import rotate

@@ -17,11 +17,11 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
-from mbkit.engines import dynamics
-from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.derivation import Equations
 from mbkit.derivation.program import program
 from mbkit.derivation.taylor import TaylorSystem, _functions, order_of, precision, rates, taylor_system
+from mbkit.engines import dynamics
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, Trajectory, at_section, simulate
 from mbkit.simulate.progress import Progress

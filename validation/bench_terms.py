@@ -39,9 +39,9 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
-from mbkit.engines import mujoco_model, pinocchio_model
 from mbkit.derivation.compiled import cores
 from mbkit.derivation.program import program
+from mbkit.engines import mujoco_model, pinocchio_model
 from mbkit.studies.stamp import processor, versions
 from tests.random_trees import random_tree
 

@@ -16,12 +16,12 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.errors import UnknownNameError
 from mbkit.derivation import derivatives, energies
 from mbkit.derivation.factorize import elimination_order, solve
 from mbkit.derivation.kinematics import Kinematics, add, constant_transposed_times
 from mbkit.derivation.sources import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
 from mbkit.derivation.values import Constants
+from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 from mbkit.model.kinds import cross3
 

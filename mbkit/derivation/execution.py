@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import casadi as ca
 
-from mbkit.errors import NoCompilerWarning
 from mbkit.derivation.machine import Machine
+from mbkit.errors import NoCompilerWarning
 
 if TYPE_CHECKING:
     from mbkit.derivation.compiled import Compiled

@@ -11,11 +11,11 @@ from typing import Final
 import casadi as ca
 
 from mbkit._version import __version__
-from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.derivation.c_code import c_body, places, variables
 from mbkit.derivation.c_header import CFunction, header, output_names, prototype
 from mbkit.derivation.equations import FUNCTIONS, Equations
 from mbkit.derivation.program import program
+from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 
 __all__ = ["DEFAULT", "CSource", "c_identifier", "export_c"]

@@ -14,8 +14,8 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.errors import UnknownNameError
 from mbkit.derivation.equations import Equations
+from mbkit.errors import UnknownNameError
 from mbkit.model.rotation import Arithmetic
 from mbkit.model.space import Space
 

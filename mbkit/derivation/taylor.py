@@ -26,10 +26,10 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.errors import UnsupportedError
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.program import Operation, program
+from mbkit.errors import UnsupportedError
 
 __all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
 

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count
-from mbkit.engines.base import Dynamics
-from mbkit.engines.lagrangian_direct import short_way
-from mbkit.engines.parameters import ParameterValues
-from mbkit.errors import InputError
 from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.execution import compile_by_default, executable
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.machine import Machine
+from mbkit.engines.base import Dynamics
+from mbkit.engines.lagrangian_direct import short_way
+from mbkit.engines.parameters import ParameterValues
+from mbkit.errors import InputError
 from mbkit.model import Model
 
 __all__ = ["LagrangianDynamics"]

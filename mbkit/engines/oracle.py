@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of
-from mbkit.engines.base import Dynamics
-from mbkit.errors import InputError, UnknownNameError
 from mbkit.derivation.arithmetic import Backend, arithmetic, digits
 from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.extended import Extended
 from mbkit.derivation.extended_solve import product, solve
 from mbkit.derivation.program import program
+from mbkit.engines.base import Dynamics
+from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 from mbkit.model.substitution import moved
 

@@ -15,10 +15,10 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.derivation.equations import Equations
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.derivation.equations import Equations
 from mbkit.simulate.events import Event
 from mbkit.simulate.members import Member, check_save, gathered, reporter
 from mbkit.simulate.methods import Tolerances

@@ -83,8 +83,8 @@ def _trials(
 ) -> Trials:
     if dyn.engine == "lagrangian" and not torque.callable and dyn.model.nv:
         # Other engines need no CasADi.
-        from mbkit.engines.lagrangian import LagrangianDynamics
         from mbkit.derivation.execution import has_compiler
+        from mbkit.engines.lagrangian import LagrangianDynamics
 
         if isinstance(dyn, LagrangianDynamics) and dyn.compile and dyn.written_out and has_compiler():
             # Loads LLVM, which interpreting never needs.

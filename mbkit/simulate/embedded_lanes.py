@@ -9,12 +9,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.derivation import Equations
 from mbkit.derivation import cache as disk
 from mbkit.derivation.compiled import aligned
 from mbkit.derivation.embedded_step import GROWTH, LAST, STATE, embedded_parts
 from mbkit.derivation.lanes import Lanes, lanes, width
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.space import Space
 from mbkit.simulate.embedded_trials import Stretch, first_length
 from mbkit.simulate.methods import Tolerances

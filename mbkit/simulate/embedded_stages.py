@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines import Dynamics
 from mbkit.derivation.embedded_step import GROWTH, LAST, SAFETY, SHRINK
+from mbkit.engines import Dynamics
 from mbkit.model.space import Space
 from mbkit.simulate.embedded_trials import Stretch, first_length
 from mbkit.simulate.methods import Tolerances

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.derivation.compiled import Compiled, aligned
 from mbkit.derivation.sequence import Call, CallSequence
 from mbkit.derivation.step import Part, march, march_in_stages
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.simulate.methods import METHODS
 
 __all__ = ["BLOCK", "Chunk", "Plan"]

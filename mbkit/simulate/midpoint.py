@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.derivation.machine import Machine
+from mbkit.derivation.midpoint import GUESS, Midpoint
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import FunctionError, UnsupportedError
-from mbkit.derivation.machine import Machine
-from mbkit.derivation.midpoint import GUESS, Midpoint
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.midpoint_solver import MidpointSolver, called

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.derivation.compiled import aligned
 from mbkit.derivation.midpoint import GUESS, MOST, Midpoint
 from mbkit.derivation.sequence import Call, CallSequence
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.simulate.grid import Indices
 
 __all__ = ["WIDEST", "MidpointChunk"]

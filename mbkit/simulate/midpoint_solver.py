@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.derivation.midpoint import LEAST, MOST, SMALL, Midpoint
 from mbkit.derivation.step import Part
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Indices
 from mbkit.simulate.torque import Torque

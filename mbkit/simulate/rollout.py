@@ -19,9 +19,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.derivation import Equations
 from mbkit.derivation.compiled import cores
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.marching import BLOCK, Chunk, Plan

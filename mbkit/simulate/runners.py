@@ -51,8 +51,8 @@ def _compiles(dyn: Dynamics) -> bool:
     if dyn.engine != "lagrangian":
         return False
     # Other engines need no CasADi.
-    from mbkit.engines.lagrangian import LagrangianDynamics
     from mbkit.derivation.machine import Machine
+    from mbkit.engines.lagrangian import LagrangianDynamics
 
     if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out:
         return False

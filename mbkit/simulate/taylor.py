@@ -13,11 +13,11 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.derivation.taylor import Precision, TaylorSystem, precision, taylor_system
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
-from mbkit.derivation.taylor import Precision, TaylorSystem, precision, taylor_system
 from mbkit.model import Model
 from mbkit.simulate.events import Event, State, Watch
 from mbkit.simulate.members import Member, check_save, gathered, reporter

@@ -10,9 +10,9 @@ from functools import cache
 from typing import Any
 
 from mbkit.catalog import pendulum
+from mbkit.derivation.cache import anew
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import MbkitError
-from mbkit.derivation.cache import anew
 from mbkit.model import Model
 from mbkit.studies.rollouts import quiet_simulate
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real
-from mbkit.engines import dynamics
-from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.derivation.machine import Machine
 from mbkit.derivation.taylor import order_of, precision, taylor_system
+from mbkit.engines import dynamics
+from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.applied import TorqueFunction
 from mbkit.simulate.grid import save_times

@@ -14,10 +14,10 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines import dynamics
-from mbkit.errors import MbkitWarning, UnsupportedError
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.taylor import PRECISIONS, order_of, precision, taylor_system
+from mbkit.engines import dynamics
+from mbkit.errors import MbkitWarning, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.applied import TorqueFunction
 from mbkit.simulate.methods import METHODS
