@@ -25,7 +25,7 @@ from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 from mbkit.model.kinds import cross3
 
-__all__ = ["FUNCTIONS", "Equations"]
+__all__ = ["FUNCTIONS", "Equations", "equations_of"]
 
 #: Name of each quantity -> the arguments of its function.
 FUNCTIONS: Final = {
@@ -43,6 +43,11 @@ FUNCTIONS: Final = {
     "inverse_dynamics_derivatives": ("q", "v", "a"),
     "forward_dynamics_derivatives": ("q", "v", "tau"),
 }
+
+
+def equations_of(model: Model, constants: Constants = "literal") -> Equations:
+    """Return a model's equations: derived from its bodies, or from the energies that it was written as."""
+    return Equations(model, constants) if model.written is None else model.written(constants)
 
 
 class Equations:
@@ -104,10 +109,14 @@ class Equations:
         return self.kin.pullback(ca.gradient(energies.gravity_energy(self.kin), self.q))
 
     @cached_property
+    def damping(self) -> Any:
+        """Forces of dampers."""
+        return energies.damping_forces(self.kin)
+
+    @cached_property
     def passive(self) -> Any:
         """Forces of springs and dampers."""
-        stored = self.kin.pullback(ca.gradient(energies.spring_energy(self.kin), self.q))
-        return energies.damping_forces(self.kin) - stored
+        return self.damping - self.kin.pullback(ca.gradient(energies.spring_energy(self.kin), self.q))
 
     @cached_property
     def _hamel(self) -> Any:

@@ -13,7 +13,7 @@ import casadi as ca
 from mbkit._version import __version__
 from mbkit.derivation.c_code import c_body, places, variables
 from mbkit.derivation.c_header import CFunction, header, output_names, prototype
-from mbkit.derivation.equations import FUNCTIONS, Equations
+from mbkit.derivation.equations import FUNCTIONS, equations_of
 from mbkit.derivation.program import program
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
@@ -137,7 +137,7 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     prefix = c_identifier(model.name) if name is None else name
     if not _IDENTIFIER.fullmatch(prefix):
         raise InputError(f"name: expected letters, digits and _, a letter first, got {name!r}")
-    equations = Equations(model)
+    equations = equations_of(model)
     made = [_function(prefix, model, quantity, equations.function(quantity)) for quantity in wanted]
     functions = tuple(function for function, _ in made)
     versions = {"mbkit": __version__, "casadi": str(ca.CasadiMeta.version())}

@@ -28,7 +28,6 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.derivation import energies
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.factorize import solve
 from mbkit.derivation.step import Part, SymbolicSpace, function_of
@@ -176,7 +175,7 @@ class Midpoint:
         w = self._s["w"]
         v = space.leave(eq.q, w)
         kinetic = ca.substitute(eq.kinetic_energy, eq.v, v)
-        applied = eq.tau + ca.substitute(energies.damping_forces(eq.kin), eq.v, v)
+        applied = eq.tau + ca.substitute(eq.damping, eq.v, v)
         f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.enter(eq.q, applied)
         given = [eq.q, w, eq.tau, *eq.trailing.values()]
         return ca.Function("forces", given, [ca.gradient(kinetic, w), f], {"cse": True})

@@ -59,6 +59,8 @@ class Values:
     gravity : list of 3 scalars
     bodies, joints, springs : dict of str to SimpleNamespace
         By name. A joint that mimics has `ratio` and `offset` too.
+    named : dict of str to casadi.SX
+        The parameters' symbols.
     parameters : (p, 1) casadi.SX
         In the order of `model.parameters`; empty where they are among the constants.
     constants : (k, 1) casadi.SX
@@ -74,7 +76,7 @@ class Values:
         self.model = model
         self._symbolic = constants == "symbols"
         self._pool: dict[float, Any] = {}
-        named = {name: ca.SX.sym(name) for name in model.parameters}
+        named = self.named = {name: ca.SX.sym(name) for name in model.parameters}
         if self._symbolic:
             model.require_values("constants='symbols'")
         self.parameters = ca.SX(0, 1) if self._symbolic else ca.vertcat(ca.SX(0, 1), *named.values())
@@ -87,9 +89,22 @@ class Values:
         self.joints = {j.name: self._joint(j) for j in model.joints}
         self.springs = {s.name: self._read("springs", s.name, s, _SPRING) for s in model.springs}
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
-        first = named if self._symbolic else {}
-        self.constants = ca.vertcat(ca.SX(0, 1), *first.values(), *self._pool.values())
-        self.constant_values: Array = np.array([*(model.parameters[n] for n in first), *self._pool], dtype=np.float64)
+
+    @property
+    def constants(self) -> Any:
+        """The symbols that stand for numbers so far."""
+        first = self.named.values() if self._symbolic else ()
+        return ca.vertcat(ca.SX(0, 1), *first, *self._pool.values())
+
+    @property
+    def constant_values(self) -> Array:
+        """What they stand for."""
+        first = self.named if self._symbolic else ()
+        return np.array([*(self.model.parameters[n] for n in first), *self._pool], dtype=np.float64)
+
+    def number(self, value: float) -> Any:
+        """Return what stands for a number that is no part's."""
+        return self._scalar(value)
 
     def frame(self, frame: Frame) -> Any:
         """Return a frame's rotation and translation; a body's own has zeros and ones only."""

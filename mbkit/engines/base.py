@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.substitution import moved
 
 __all__ = ["QUANTITIES", "Dynamics"]
 
@@ -60,8 +59,15 @@ class Dynamics(ABC):
     refuses: ClassVar[dict[str, str]] = {}
     #: Whether parameters' values may still be missing when the engine is made.
     takes_parameters: ClassVar[bool] = False
+    #: Whether a model may be energies without bodies.
+    takes_written: ClassVar[bool] = False
 
     def __init__(self, model: Model) -> None:
+        if model.written is not None and not self.takes_written:
+            raise UnsupportedError(
+                f"{self.engine}: {model.name} was written as energies and has no bodies; "
+                "the lagrangian engine and the oracle take it"
+            )
         if not self.takes_parameters:
             model.require_values(self.engine)
         for needed, told in ((model.needs.loops, "loop closures"), (model.needs.time, "motions prescribed in time")):
@@ -115,7 +121,7 @@ class Dynamics(ABC):
         >>> float(dyn.mass_matrix([0.0])[0, 0]), float(dyn.at(m=3.0).mass_matrix([0.0])[0, 0])
         (2.0, 3.0)
         """
-        return type(self)(moved(self.model, values))
+        return type(self)(self.model.with_nominal(values))
 
     @property
     def samples(self) -> int | None:

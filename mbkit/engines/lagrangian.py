@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count
 from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
-from mbkit.derivation.equations import Equations
+from mbkit.derivation.equations import Equations, equations_of
 from mbkit.derivation.execution import compile_by_default, executable
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.machine import Machine
@@ -52,6 +52,7 @@ class LagrangianDynamics(Dynamics):
 
     engine = "lagrangian"
     takes_parameters = True
+    takes_written = True
 
     def __init__(self, model: Model, *, compile: bool | None = None, threads: int | None = None) -> None:  # noqa: A002  # the word that users look for
         super().__init__(model)
@@ -66,7 +67,7 @@ class LagrangianDynamics(Dynamics):
     @cached_property
     def equations(self) -> Equations:
         """The expressions, free to read."""
-        return Equations(self.model)
+        return equations_of(self.model)
 
     def code(self, name: str, *extra: str, make: Callable[[], Any] | None = None) -> Any:
         """Return a `Compiled` or `Machine` of a quantity, or of what `make` derives from this model.

@@ -24,14 +24,13 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of
 from mbkit.derivation.arithmetic import Backend, arithmetic, digits
 from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
-from mbkit.derivation.equations import Equations
+from mbkit.derivation.equations import equations_of
 from mbkit.derivation.extended import Extended
 from mbkit.derivation.extended_solve import product, solve
 from mbkit.derivation.program import program
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
-from mbkit.model.substitution import moved
 
 __all__ = ["OracleDynamics"]
 
@@ -82,6 +81,7 @@ class OracleDynamics(Dynamics):
     """
 
     engine = "oracle"
+    takes_written = True
     refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 
     def __init__(
@@ -93,7 +93,7 @@ class OracleDynamics(Dynamics):
         super().__init__(model)
         self._arithmetic = arithmetic(backend)
         self._given = constants
-        self.equations = Equations(model, constants="symbols")
+        self.equations = equations_of(model, constants="symbols")
         own = self._arithmetic
         if constants is None:
             values = own.array(self.equations.constant_values)
@@ -170,7 +170,7 @@ class OracleDynamics(Dynamics):
         """Return the same dynamics at other values of the model's named parameters."""
         if self._given is not None:
             raise InputError("at: this oracle was given its constants; give the parameters' values among them")
-        return type(self)(moved(self.model, values), backend=self._arithmetic.name)
+        return type(self)(self.model.with_nominal(values), backend=self._arithmetic.name)
 
     # Every method below takes batches, and returns 113-bit numbers.
 

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, finite_array
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
-from mbkit.model.substitution import moved
 
 __all__ = ["ParameterValues"]
 
@@ -50,7 +49,7 @@ class ParameterValues:
             told = ", ".join(f"{name} has {len(x)}" for name, x in batched.items())
             raise InputError(f"parameters: batches of different sizes: {told}")
         single: dict[str, Any] = {name: x for name, x in values.items() if name not in many}
-        return ParameterValues(moved(self.model, single) if single else self.model, batched)
+        return ParameterValues(self.model.with_nominal(single) if single else self.model, batched)
 
     @property
     def samples(self) -> int | None:

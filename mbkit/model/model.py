@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -251,6 +251,13 @@ class Model:
         names = [f.name for f in self.frames] + [b.name for b in self.bodies]
         raise UnknownNameError("frame", name, names)
 
+    # What else a model may be
+
+    #: Makes the equations of a model that was written as energies and has no bodies.
+    written: ClassVar[Callable[[Any], Any] | None] = None
+    #: The parameter that is the time, where the equation depends on it.
+    clock: ClassVar[str | None] = None
+
     # Configurations
 
     def neutral(self) -> Array:
@@ -360,6 +367,10 @@ class Model:
             No matter is like the result, as `ModelBuilder.build` would say.
         """
         return substitution.fixed(self, values)
+
+    def with_nominal(self, values: Mapping[str, Any]) -> Model:
+        """Return the same parametrised model at other nominal values."""
+        return substitution.moved(self, values)
 
     def _without(self, feature: str) -> Model:
         if feature == "gravity":

@@ -100,10 +100,10 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
 
 def _coriolis(model: Model, q: Array, v: Array) -> Omission:
     """Measure the Coriolis matrix, derived only when somebody asks for it."""
-    from mbkit.derivation import Equations
+    from mbkit.derivation import equations_of
     from mbkit.derivation.machine import Machine
 
-    equations = Equations(model)
+    equations = equations_of(model)
     nle = Machine(equations.function("coriolis_force"))
     start = time.perf_counter()
     matrix = Machine(equations.function("coriolis_matrix"))

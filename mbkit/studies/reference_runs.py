@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.equations import Equations
+from mbkit.derivation.equations import Equations, equations_of
 from mbkit.derivation.taylor import PRECISIONS, order_of, precision, taylor_system
 from mbkit.engines import dynamics
 from mbkit.errors import MbkitWarning, UnsupportedError
@@ -101,7 +101,7 @@ class Motion:
     @cached_property
     def equations(self) -> Equations:
         """The own derivation, with every number of the model as a symbol."""
-        return Equations(self.model, constants="symbols")
+        return equations_of(self.model, constants="symbols")
 
     @property
     def stops(self) -> list[float]:

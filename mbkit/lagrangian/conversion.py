@@ -1,0 +1,125 @@
+"""SymPy's expressions as CasADi's, in which everything else is derived, compiled and measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import casadi as ca
+import sympy as sp
+
+from mbkit.errors import UnsupportedError
+
+__all__ = ["Conversion"]
+
+_UNARY: Final[dict[Any, Callable[[Any], Any]]] = {
+    sp.sin: ca.sin,
+    sp.cos: ca.cos,
+    sp.tan: ca.tan,
+    sp.asin: ca.asin,
+    sp.acos: ca.acos,
+    sp.atan: ca.atan,
+    sp.sinh: ca.sinh,
+    sp.cosh: ca.cosh,
+    sp.tanh: ca.tanh,
+    sp.exp: ca.exp,
+    sp.log: ca.log,
+    sp.Abs: ca.fabs,
+    sp.sign: ca.sign,
+    sp.sec: lambda x: 1 / ca.cos(x),
+    sp.csc: lambda x: 1 / ca.sin(x),
+    sp.cot: lambda x: ca.cos(x) / ca.sin(x),
+}
+
+
+class Conversion:
+    """From SymPy to CasADi, each subexpression once.
+
+    Parameters
+    ----------
+    symbols : mapping of sympy.Symbol to casadi.SX
+    number : callable
+        What stands for a float: itself, or a symbol where no number may be rounded.
+    """
+
+    def __init__(self, symbols: Mapping[sp.Symbol, Any], number: Callable[[float], Any]) -> None:
+        self._done: dict[Any, Any] = dict(symbols)
+        self._number = number
+
+    def __call__(self, x: Any) -> Any:
+        """Return an expression."""
+        if x not in self._done:
+            self._done[x] = self._made(x)
+        return self._done[x]
+
+    def matrix(self, x: Any) -> Any:
+        """Return a column of expressions."""
+        return ca.vertcat(ca.SX(0, 1), *(ca.SX(self(e)) for e in x))
+
+    def _made(self, x: Any) -> Any:
+        if x.is_Rational:
+            # Two whole numbers are exact where one quotient is rounded.
+            top = self._whole(int(x.p))
+            return top if x.q == 1 else top / self._whole(int(x.q))
+        if x.is_number:
+            return self._number(float(x))
+        if x.is_Add:
+            return sum((self(e) for e in x.args[1:]), self(x.args[0]))
+        if x.is_Mul:
+            return self._product(x)
+        if x.is_Pow:
+            return self._power(x.base, x.exp)
+        if x.func in _UNARY:
+            return _UNARY[x.func](self(x.args[0]))
+        if x.func is sp.atan2:
+            return ca.atan2(self(x.args[0]), self(x.args[1]))
+        if x.func in (sp.Min, sp.Max):
+            pick, out = (ca.fmin if x.func is sp.Min else ca.fmax), self(x.args[0])
+            for e in x.args[1:]:
+                out = pick(out, self(e))
+            return out
+        raise UnsupportedError(
+            f"{x.func}: no engine computes this function; there are powers, sin, cos, tan, their inverses, "
+            "sinh, cosh, tanh, exp, log, Abs, sign, Min and Max"
+        )
+
+    def _whole(self, n: int) -> Any:
+        # Small powers of two change no digit, so they need no symbol.
+        return float(n) if abs(n) in (0, 1, 2, 4) else self._number(float(n))
+
+    def _product(self, x: Any) -> Any:
+        above, below = [], []
+        for e in x.args:
+            if e.is_Pow and e.exp.is_Rational and e.exp.is_negative:
+                below.append(self._power(e.base, -e.exp))
+            else:
+                above.append(self(e))
+        out: Any = 1.0
+        for e in above:
+            out = out * e
+        for e in below:
+            out = out / e
+        return out
+
+    def _power(self, base: Any, exponent: Any) -> Any:
+        if exponent.is_Rational and exponent.is_negative:
+            return 1.0 / self._power(base, -exponent)
+        if exponent.is_Integer and int(exponent) <= 64:
+            return _repeated(self(base), int(exponent))
+        if exponent.is_Rational and exponent.q == 2 and int(exponent.p) <= 64:
+            return ca.sqrt(_repeated(self(base), int(exponent.p)))
+        if base is sp.E:
+            return ca.exp(self(exponent))
+        return ca.power(self(base), self(exponent))
+
+
+def _repeated(x: Any, n: int) -> Any:
+    """Return xⁿ by squaring: products are exact to rounding in any precision."""
+    out = None
+    while n:
+        if n & 1:
+            out = x if out is None else out * x
+        n >>= 1
+        if n:
+            x = x * x
+    return 1.0 if out is None else out

@@ -1,0 +1,123 @@
+"""The equation of motion in symbols, term by term, to read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import sympy as sp
+
+from mbkit.lagrangian.tidy import tidy, tidy_matrix
+
+__all__ = ["EquationsOfMotion", "christoffel"]
+
+
+@dataclass(frozen=True)
+class EquationsOfMotion:
+    """M v̇ + C v + d + ∂V/∂q = Q (+ Jᵀ λ), with q̇ = D v.
+
+    Attributes
+    ----------
+    coordinates, velocities, accelerations : tuple of sympy.Symbol
+    mass_matrix : (n, n) sympy.Matrix
+        M = ∂²T/∂v².
+    coriolis_matrix : (n, n) sympy.Matrix
+        C of Christoffel's symbols, so that Ṁ - 2C is skew.
+    drift : (n, 1) sympy.Matrix
+        d: gyroscopic terms of T1, rates of M and T1 with time, centrifugal ones of T0.
+        Zero where T has neither time nor terms below the second degree.
+    potential_gradient : (n, 1) sympy.Matrix
+        ∂V/∂q.
+    forces : (n, 1) sympy.Matrix
+        Q: generalized forces, Rayleigh's dissipation -∂R/∂v among them.
+    constraint_jacobian : (m, n) sympy.Matrix
+        J; no rows without constraints.
+    multipliers : tuple of sympy.Symbol
+        λ.
+    """
+
+    coordinates: tuple[sp.Symbol, ...]
+    velocities: tuple[sp.Symbol, ...]
+    accelerations: tuple[sp.Symbol, ...]
+    mass_matrix: sp.ImmutableMatrix
+    coriolis_matrix: sp.ImmutableMatrix
+    drift: sp.ImmutableMatrix
+    potential_gradient: sp.ImmutableMatrix
+    forces: sp.ImmutableMatrix
+    constraint_jacobian: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 0, []))
+    multipliers: tuple[sp.Symbol, ...] = ()
+
+    @property
+    def coriolis_force(self) -> sp.ImmutableMatrix:
+        """C v, (n, 1)."""
+        return tidy_matrix(self.coriolis_matrix * sp.Matrix(self.velocities))
+
+    @property
+    def applied(self) -> sp.ImmutableMatrix:
+        """Q - C v - d - ∂V/∂q (+ Jᵀ λ): what M v̇ is, (n, 1)."""
+        out = self.forces - self.coriolis_force - self.drift - self.potential_gradient
+        if self.multipliers:
+            out += self.constraint_jacobian.T * sp.Matrix(self.multipliers)
+        return sp.ImmutableMatrix(out)
+
+    def _rows(self) -> list[tuple[list[sp.Expr], sp.Expr]]:
+        """Return the terms of each left side in the order of a blackboard, and its right side."""
+        right = self.forces
+        if self.multipliers:
+            right += self.constraint_jacobian.T * sp.Matrix(self.multipliers)
+        out = []
+        for i, force in enumerate(right):
+            terms = [m * a for m, a in zip(self.mass_matrix[i, :], self.accelerations, strict=True)]
+            terms += [self.coriolis_force[i], self.drift[i], self.potential_gradient[i]]
+            out.append(([x for x in terms if x != 0], force))
+        return out
+
+    def equations(self) -> tuple[sp.Eq, ...]:
+        """Return one equation per coordinate: M v̇ + C v + d + ∂V/∂q on the left, Q on the right."""
+        return tuple(sp.Eq(sp.Add(*terms), force, evaluate=False) for terms, force in self._rows())
+
+    def explicit(self) -> tuple[sp.Eq, ...]:
+        """Return v̇ of each velocity, solved for in symbols: M⁻¹ (Q - C v - d - ∂V/∂q).
+
+        Grows fast with the number of coordinates; `Lagrangian.dynamics` solves numerically instead.
+        """
+        solved = self.mass_matrix.LUsolve(self.applied)
+        return tuple(
+            sp.Eq(a, tidy(sp.factor_terms(x)), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True)
+        )
+
+    def latex(self) -> str:
+        """Return the equations as an aligned LaTeX block, accelerations first."""
+        rows = [f"{_joined(terms, sp.latex)} &= {sp.latex(force)}" for terms, force in self._rows()]
+        return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
+
+    def _repr_latex_(self) -> str:
+        return f"${self.latex()}$"
+
+    def __str__(self) -> str:
+        return "\n".join(f"{_joined(terms, str)} = {force}" for terms, force in self._rows())
+
+
+def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
+    """Return a sum in the order given: SymPy's own order is the alphabet's."""
+    flat = [x for term in terms for x in sp.Add.make_args(term)]
+    out = ""
+    for x in flat:
+        text = printed(x)
+        if not out:
+            out = text
+        else:
+            out += f" - {text.removeprefix('-').lstrip()}" if text.startswith("-") else f" + {text}"
+    return out or "0"
+
+
+def christoffel(M: Any, coordinates: Any, velocities: Any) -> sp.ImmutableMatrix:
+    """Return C_ij = ½ Σ_k (∂M_ij/∂q_k + ∂M_ik/∂q_j - ∂M_jk/∂q_i) v_k (Spong, Hutchinson, Vidyasagar 2006, eq. (7.63))."""
+    n = len(coordinates)
+    dM = [sp.diff(M, q) for q in coordinates]
+
+    def entry(i: int, j: int) -> sp.Expr:
+        return tidy(sum((dM[k][i, j] + dM[j][i, k] - dM[i][j, k]) * velocities[k] for k in range(n)) / 2)
+
+    return sp.ImmutableMatrix(n, n, entry)
