@@ -13,7 +13,7 @@ from mbkit._check import real
 from mbkit.errors import InputError
 from mbkit.lagrangian.degree import KineticSplit, split
 from mbkit.lagrangian.motion import EquationsOfMotion, christoffel
-from mbkit.lagrangian.symbols import Plain, acceleration_of, plain
+from mbkit.lagrangian.symbols import Plain, acceleration_of, plain, velocity_of
 from mbkit.lagrangian.tidy import tidy_matrix
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Lagrangian:
         self.coordinates, self.velocities, self.time = into.coordinates, into.velocities, into.time
         # A velocity of a name of its own, such as omega, has its derivative named after it.
         self.accelerations = tuple(
-            acceleration_of(q) if w.name == _default(q) else sp.Symbol(_dotted(w))
+            acceleration_of(q) if w.name == velocity_of(q).name else velocity_of(w)
             for q, w in zip(self.coordinates, self.velocities, strict=True)
         )
         self.parameters = _parameters(parameters)
@@ -283,18 +283,6 @@ class Lagrangian:
 
     def _repr_latex_(self) -> str:
         return f"$T = {sp.latex(self.T)},\\quad V = {sp.latex(self.V)}$"
-
-
-def _default(coordinate: sp.Symbol) -> str:
-    from mbkit.lagrangian.symbols import velocity_of
-
-    return velocity_of(coordinate).name
-
-
-def _dotted(velocity: sp.Symbol) -> str:
-    from mbkit.lagrangian.symbols import velocity_of
-
-    return velocity_of(velocity).name
 
 
 def _parameters(given: Any) -> Mapping[sp.Symbol, float | None]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -53,12 +53,13 @@ class WrittenModel(Model):
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return type(self), (self.system, self._values)
 
-    def written(self, constants: Constants = "literal") -> WrittenEquations:  # type: ignore[override]
-        """Return the equations."""
-        return WrittenEquations(self, constants)
+    @property
+    def written(self) -> Callable[..., WrittenEquations]:
+        """What makes the equations: a function of how numbers stand in them."""
+        return partial(WrittenEquations, self)
 
     @property
-    def clock(self) -> str | None:  # type: ignore[override]
+    def clock(self) -> str | None:
         """Name of the time, a parameter that simulation moves."""
         return self.system.time.name if self.system.time is not None else None
 
@@ -148,7 +149,7 @@ class WrittenEquations(Equations):
         names |= {w: self.v[i] for i, w in enumerate(s.velocities)}
         self.time = values.named[model.clock] if model.clock else None
         if s.time is not None:
-            names[s.time] = self.time
+            names[s.time] = values.named[s.time.name]
         read = Conversion(names, values.number)
         self._T, self._V, self._R = ca.SX(read(s.T)), ca.SX(read(s.V)), ca.SX(read(s.dissipation))
         self._Q = read.matrix(s.forces)

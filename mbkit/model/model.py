@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -253,10 +253,15 @@ class Model:
 
     # What else a model may be
 
-    #: Makes the equations of a model that was written as energies and has no bodies.
-    written: ClassVar[Callable[[Any], Any] | None] = None
-    #: The parameter that is the time, where the equation depends on it.
-    clock: ClassVar[str | None] = None
+    @property
+    def written(self) -> Callable[..., Any] | None:
+        """What makes the equations of a model that was written as energies and has no bodies; else None."""
+        return None
+
+    @property
+    def clock(self) -> str | None:
+        """The parameter that is the time, where the equation depends on it."""
+        return None
 
     # Configurations
 
