@@ -150,7 +150,7 @@ class Midpoint:
 
     @property
     def velocity_system(self) -> Part:
-        """(q, pi) -> M and the momentum p = M v in mbkit's velocity, to be solved elsewhere."""
+        """(q, pi) -> M and M v, the momentum less what it is at rest, in mbkit's velocity, to be solved elsewhere."""
         return self._part("midpoint_velocity_system", ("q", "pi"), ("M", "p"), self._velocity_system)
 
     def _part(self, name: str, reads: tuple[str, ...], writes: tuple[str, ...], make: Any) -> Part:
@@ -217,8 +217,9 @@ class Midpoint:
 
     def _velocity_system(self) -> tuple[Any, Any]:
         eq, s = self._equations, self._s
-        M = ca.substitute(eq.mass_matrix, eq.q, s["q"])
-        return M, self._space.leave(s["q"], self._space.to_body(s["q"], s["pi"]))
+        at_rest = ca.substitute(eq.momentum, eq.v, ca.SX(eq.model.nv, 1))
+        M, b = (ca.substitute(x, eq.q, s["q"]) for x in (eq.mass_matrix, at_rest))
+        return M, self._space.leave(s["q"], self._space.to_body(s["q"], s["pi"])) - b
 
     def _velocity(self) -> tuple[Any]:
         return (solve(*self._velocity_system(), self._equations.elimination_order),)

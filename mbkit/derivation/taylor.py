@@ -30,6 +30,7 @@ from mbkit.derivation.equations import Equations
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.program import Operation, program
 from mbkit.errors import UnsupportedError
+from mbkit.model import Model
 
 __all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
 
@@ -38,7 +39,16 @@ _MOST: Final = 100_000
 # Up to this many operations times order², the recurrences are written out: 2 to 3
 # times as fast to run as loops over them, compiled in about a second.
 _UNROLLED: Final = 25_000
-_KINKS: Final = frozenset({"sqrt", "fabs", "sign", "lt", "if_else_zero"})
+_KINKS: Final = frozenset(
+    {"fabs", "sign", "fmin", "fmax", "lt", "le", "eq", "ne", "not", "and", "or", "if_else_zero"}
+    # A series follows the branch that it began on.
+    | {"sqrt", "hypot", "pow", "asin", "acos", "acosh", "atan2"}
+)
+#: Functions that heyoka calls as we do.
+_SAME: Final = (
+    *("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
+    *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
 _REMEDY: Final = "method='rk853' and method='dop853' go without it"
 
 
@@ -148,8 +158,9 @@ class TaylorSystem:
     rates : casadi.Function
         As `rates` gives it.
     kinked : bool
-        Whether a length or an absolute value enters, at whose zero forces can jump. A
-        series goes on analytically there, as if nothing had happened.
+        Whether a length, an absolute value, a decision or a function with branches enters,
+        where forces can jump. A series goes on analytically there, as if nothing had
+        happened.
 
     Raises
     ------
@@ -178,18 +189,22 @@ class TaylorSystem:
         self._places: dict[tuple[int, int], int] = {}
         variables = heyoka.make_vars(*(f"y{i}" for i in range(self._nq + self._nv)))
         variables = [variables] if self._nq + self._nv == 1 else list(variables)
-        self._system = list(zip(variables, self._expressions(heyoka, made, variables), strict=True))
+        self._system = list(zip(variables, self._expressions(heyoka, made, variables, equations.model), strict=True))
         self._idle: dict[tuple[int, int], list[Any]] = {}
         self._lock = threading.Lock()
 
-    def _expressions(self, heyoka: Any, made: Any, variables: list[Any]) -> list[Any]:
+    def _expressions(self, heyoka: Any, made: Any, variables: list[Any], model: Model) -> list[Any]:
         functions = _functions(heyoka)
+        # Parameters stand first among what is behind tau.
+        clock = list(model.parameters).index(model.clock) if model.clock else None
         values: list[Any] = []
 
         def entry(operation: Operation) -> Any:
             which, at = operation.arguments
             if which < 2:
                 return variables[at + which * self._nq]
+            if which == 3 and at == clock:
+                return heyoka.time
             return heyoka.par[self._places.setdefault((which, at), len(self._places))]
 
         for operation in made.operations:
@@ -253,8 +268,10 @@ def taylor_system(equations: Equations) -> TaylorSystem:
 
 def _functions(heyoka: Any) -> dict[str, Any]:
     zero, one = heyoka.expression(0.0), heyoka.expression(1.0)
-    select, below = heyoka.select, heyoka.lt
+    select, below, other = heyoka.select, heyoka.lt, heyoka.neq
+    either, both = heyoka.logical_or, heyoka.logical_and
     return {
+        **{name: getattr(heyoka, name) for name in _SAME},
         "add": lambda a, b: a + b,
         "sub": lambda a, b: a - b,
         "mul": lambda a, b: a * b,
@@ -263,11 +280,18 @@ def _functions(heyoka: Any) -> dict[str, Any]:
         "sq": lambda a: a * a,
         "twice": lambda a: 2.0 * a,
         "inv": lambda a: one / a,
-        "sqrt": heyoka.sqrt,
-        "sin": heyoka.sin,
-        "cos": heyoka.cos,
+        "pow": lambda a, b: a**b,
+        "hypot": lambda a, b: heyoka.sqrt(a * a + b * b),
         "fabs": lambda a: select(below(a, zero), -a, a),
         "sign": lambda a: select(below(a, zero), -one, select(below(zero, a), one, zero)),
+        "fmin": lambda a, b: select(either([below(a, b), other(a, a)]), a, b),
+        "fmax": lambda a, b: select(either([below(b, a), other(a, a)]), a, b),
         "lt": below,
-        "if_else_zero": lambda a, b: select(heyoka.neq(a, zero), b, zero),
+        "le": heyoka.lte,
+        "eq": heyoka.eq,
+        "ne": other,
+        "not": lambda a: heyoka.eq(a, zero),
+        "and": lambda a, b: both([other(a, zero), other(b, zero)]),
+        "or": lambda a, b: either([other(a, zero), other(b, zero)]),
+        "if_else_zero": lambda a, b: select(other(a, zero), b, zero),
     }

@@ -221,11 +221,11 @@ class OracleDynamics(Dynamics):
         eq = self.equations
         if name != "terms":
             return getattr(eq, name)(*extra) if name in ("pose", "jacobian") else eq.function(name)
-        outs = [ca.densify(x) for x in (eq.mass_matrix, eq.coriolis_force, eq.gravity, eq.passive)]
+        outs = [ca.densify(x) for x in (eq.mass_matrix, eq.coriolis_force, eq.gravity, eq.passive, eq.nle)]
         return ca.Function("terms", [eq.q, eq.v, *eq.trailing.values()], outs, {"cse": True})
 
     def _terms(self, q: Array, v: Array | None = None) -> list[Any]:
-        """Return M, C v, g and the passive forces; the last answer is kept, M and g for any v."""
+        """Return M, C v, g, the passive forces and nle; the last answer is kept, M and g for any v."""
         held = self._held
         if held and held[0] == _key(q) and (v is None or held[1] == _key(v)):
             return held[2]
@@ -248,16 +248,15 @@ class OracleDynamics(Dynamics):
         return self._terms(q, v)[3]
 
     def _nle(self, q: Array, v: Array) -> Any:
-        _, coriolis, gravity, _ = self._terms(q, v)
-        return coriolis + gravity
+        return self._terms(q, v)[4]
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Any:
-        M, coriolis, gravity, passive = self._terms(q, v)
-        return product(M, self._arithmetic.array(a)) + coriolis + gravity - passive
+        M, _, _, passive, nle = self._terms(q, v)
+        return product(M, self._arithmetic.array(a)) + nle - passive
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Any:
-        M, coriolis, gravity, passive = self._terms(q, v)
-        force = self._arithmetic.array(tau) + passive - coriolis - gravity
+        M, _, _, passive, nle = self._terms(q, v)
+        force = self._arithmetic.array(tau) + passive - nle
         return solve(M, force, self._pattern, self.equations.elimination_order, self._arithmetic)
 
     @cached_property

@@ -23,6 +23,7 @@ def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array],
     Parameters
     ----------
     dyn : Dynamics
+        Of a model in which time enters, with one sample for each state (`mbkit.engines.clock.at_times`).
     shape : tuple of int
         Of the quantity at one state.
     evaluate : callable
@@ -39,7 +40,10 @@ def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array],
     out = np.full((int(np.prod(lead)), *shape), np.nan)
     for start in range(0, len(good), _MANY):
         which = good[start : start + _MANY]
-        own = dyn.of_samples(which // lead[1]) if len(lead) == 2 else dyn
+        if dyn.model.clock is not None:
+            own = dyn.of_samples(which)
+        else:
+            own = dyn.of_samples(which // lead[1]) if len(lead) == 2 else dyn
         out[which] = evaluate(own, *(x[which] for x in flat))
     return out.reshape(*lead, *shape)
 

@@ -24,6 +24,9 @@ _NEAR: Final = 1e-4
 
 def kinetic_energy(dyn: Dynamics, q: Array, v: Array) -> Array:
     """Return ½ vᵀ M v, which no known defect of an engine touches; (K,) or (N, K)."""
+    if dyn.model.written is not None:
+        # T may have terms of lower degree.
+        return along(dyn, (), lambda own, q, v: own.kinetic_energy(q, v), q, v)
     return along(dyn, (), lambda own, q, v: 0.5 * np.einsum("ni,nij,nj->n", v, own.mass_matrix(q), v), q, v)
 
 
@@ -92,11 +95,15 @@ def _damped(dyn: Dynamics, h: Array, q: Array, v: Array, a: Array) -> tuple[Arra
 def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
     if not _is_damped(dyn.model):
         return np.zeros(v.shape)
+    if dyn.model.written is not None:
+        return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v), q, v)
     # Springs are what is left of the passive force at rest.
     return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v) - own.passive(q, np.zeros_like(v)), q, v)
 
 
 def _is_damped(model: Model) -> bool:
+    if model.written is not None:
+        return model.needs.damping
     bound = any(b.field == "damping" for b in model.bindings)
     return bound or any(j.damping.any() for j in model.joints) or any(s.damping for s in model.springs)
 

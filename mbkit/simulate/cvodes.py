@@ -71,6 +71,8 @@ def run_cvodes(
         )
     if torque.callable or events:
         raise UnsupportedError(f"{method}: takes neither torque functions nor events; use method='bdf' or 'lsoda'")
+    if dyn.model.clock:
+        raise UnsupportedError(f"{method}: {dyn.model.name} depends on the time; use method='bdf' or 'radau'")
     batch = None if q0.ndim == 1 else len(q0)
     if save is None:
         raise InputError(

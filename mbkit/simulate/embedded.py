@@ -81,7 +81,7 @@ def run_embedded(
 def _trials(
     dyn: Dynamics, space: Space, tolerances: Tolerances, torque: Torque, duration: float, batch: int | None
 ) -> Trials:
-    if dyn.engine == "lagrangian" and not torque.callable and dyn.model.nv:
+    if dyn.engine == "lagrangian" and not torque.callable and dyn.model.nv and not dyn.model.clock:
         # Other engines need no CasADi.
         from mbkit.derivation.execution import has_compiler
         from mbkit.engines.lagrangian import LagrangianDynamics

@@ -24,8 +24,11 @@ class _OneOf(Field):
     """The field of one member of a batch, on single states."""
 
     def one(self, member: int) -> None:
-        forward = self._dyn.of_samples([member]).forward_dynamics
-        self._forward = lambda q, v, tau: forward(q, v, tau).reshape(-1)
+        self._use(self._dyn.of_samples([member]))
+
+    def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ of a single state; one of a batch with parameters of its own is a batch of one."""
+        return super().__call__(t, q, w, force).reshape(-1)
 
 
 class StageTrials:

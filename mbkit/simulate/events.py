@@ -14,6 +14,7 @@ import numpy as np
 
 from mbkit._check import Array, real
 from mbkit.engines import Dynamics
+from mbkit.engines.clock import at_time
 from mbkit.errors import EventError, InputError, UnknownNameError
 from mbkit.model import Model
 
@@ -222,6 +223,7 @@ def _beyond(i: int, value: float, _t: float, q: Array, _v: Array) -> float:
     return float(q[i] - value)
 
 
-def _above(dyn: Dynamics, level: float, _t: float, q: Array, v: Array) -> float:
-    kinetic = 0.5 * v @ dyn.mass_matrix(q) @ v
-    return float(kinetic + dyn.potential_energy(q) - level)
+def _above(dyn: Dynamics, level: float, t: float, q: Array, v: Array) -> float:
+    own = at_time(dyn, t)
+    kinetic = 0.5 * v @ own.mass_matrix(q) @ v if own.model.written is None else own.kinetic_energy(q, v)
+    return float(kinetic + own.potential_energy(q) - level)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.clock import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
 from mbkit.model.kinds import JointKind
@@ -52,7 +53,7 @@ class Linearization:
 
     def __init__(self, dyn: Dynamics) -> None:
         self._twin, self._model = _twin(dyn), dyn.model
-        self._derivatives = cast("_Differentiable", self._twin).forward_dynamics_derivatives
+        self._own = self._twin
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         self._last: Array = np.zeros((dyn.model.nq + dyn.model.nv,) * 2)
@@ -60,8 +61,7 @@ class Linearization:
 
     def only(self, member: int) -> None:
         """Go on with this member of a batch."""
-        twin = self._twin.of_samples([member])
-        self._derivatives = cast("_Differentiable", twin).forward_dynamics_derivatives
+        self._own = self._twin.of_samples([member])
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return the Jacobian, (nq + nv, nq + nv); the last one where there is none."""
@@ -72,8 +72,9 @@ class Linearization:
         q, lengths = unit_quaternions(self._model, y[:nq])
         v = y[nq:]
         tau = force if isinstance(force, np.ndarray) else force(t, q, v)
+        own = cast("_Differentiable", at_time(self._own, t))
         try:
-            by_q, by_v, by_tau = (x.reshape(nv, nv) for x in self._derivatives(q, v, tau))
+            by_q, by_v, by_tau = (x.reshape(nv, nv) for x in own.forward_dynamics_derivatives(q, v, tau))
         except NumericalError:
             return self._last
         self.evaluations += 1

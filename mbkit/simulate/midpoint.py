@@ -57,6 +57,11 @@ def run_midpoint(
             f"{method}: {dyn.engine} gives neither momenta nor ∂T/∂q, which the midpoint rule in (q, p) is made of; "
             "mbkit.dynamics(model, 'lagrangian') has them; 'gauss4' and 'gauss6' run on any engine"
         )
+    if dyn.model.clock:
+        raise UnsupportedError(
+            f"{method}: {dyn.model.name} depends on the time, where (q, p) alone has no symplectic flow; "
+            "'gauss4' and 'gauss6' are the implicit methods for it"
+        )
     single = q0.ndim == 1
     q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
     check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])

@@ -15,12 +15,23 @@ __all__ = ["canonical_momentum", "member_of", "momentum"]
 
 
 def canonical_momentum(dyn: Dynamics, q: Array, v: Array) -> Array:
-    """Return p = M v; (K, nv) or (N, K, nv)."""
-    return along(dyn, v.shape[-1:], lambda own, q, v: np.einsum("nij,nj->ni", own.mass_matrix(q), v), q, v)
+    """Return p = ∂T/∂v; (K, nv) or (N, K, nv)."""
+    return along(dyn, v.shape[-1:], _canonical, q, v)
+
+
+def _canonical(dyn: Dynamics, q: Array, v: Array) -> Array:
+    p = np.einsum("nij,nj->ni", dyn.mass_matrix(q), v)
+    if dyn.model.written is None:
+        return np.asarray(p)
+    # T's part of first degree is half of what changes with the sign of v.
+    first = [dyn.kinetic_energy(q, e + 0 * v) - dyn.kinetic_energy(q, -e + 0 * v) for e in np.eye(v.shape[1])]
+    return np.asarray(p + 0.5 * np.array(first).T)
 
 
 def momentum(dyn: Dynamics, q: Array, v: Array) -> Array:
     """Return the bodies' linear and angular momentum about the world's origin; (K, 6) or (N, K, 6)."""
+    if dyn.model.written is not None:
+        raise UnsupportedError(f"momentum: {dyn.model.name} was written as energies and has no bodies")
     if dyn.samples is None:
         return along(dyn, (6,), lambda own, q, v: _momentum(own, dyn.model, q, v), q, v)
     # Of a batch with values of its own, each trajectory is a system of its own.

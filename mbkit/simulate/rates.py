@@ -6,6 +6,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.clock import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
 from mbkit.simulate.steps import credible
@@ -29,7 +30,8 @@ class Rates:
     """
 
     def __init__(self, dyn: Dynamics) -> None:
-        self._dyn, self._model, self._forward = dyn, dyn.model, dyn.forward_dynamics
+        self._dyn, self._model, self._own = dyn, dyn.model, dyn
+        self._forward, self._timed = dyn.forward_dynamics, dyn.model.clock is not None
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         self.evaluations = 0
@@ -37,7 +39,8 @@ class Rates:
 
     def only(self, member: int) -> None:
         """Go on with this member of a batch."""
-        self._forward = self._dyn.of_samples([member]).forward_dynamics
+        self._own = self._dyn.of_samples([member])
+        self._forward = self._own.forward_dynamics
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
@@ -49,6 +52,8 @@ class Rates:
         v = y[nq:]
         tau = force if isinstance(force, np.ndarray) else force(t, q, v)
         self.evaluations += 1
+        if self._timed:
+            self._forward = at_time(self._own, t).forward_dynamics
         try:
             # One of a batch with parameters of its own is a batch of one.
             a = self._forward(q, v, tau).reshape(-1)

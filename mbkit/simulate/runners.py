@@ -54,6 +54,7 @@ def _compiles(dyn: Dynamics) -> bool:
     from mbkit.derivation.machine import Machine
     from mbkit.engines.lagrangian import LagrangianDynamics
 
-    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out:
+    # A compiled step has one value of each parameter, the time among them.
+    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out or dyn.model.clock:
         return False
     return not isinstance(dyn.code("forward_dynamics"), Machine)

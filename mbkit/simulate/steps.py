@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.clock import at_time
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.space import Space
 from mbkit.simulate.grid import Indices
@@ -60,12 +61,16 @@ class Field:
     """
 
     def __init__(self, dyn: Dynamics, space: Space) -> None:
-        self._dyn, self._forward, self._space = dyn, dyn.forward_dynamics, space
+        self._dyn, self._space = dyn, space
+        self._use(dyn)
         self.evaluations = 0
 
     def only(self, members: Indices) -> None:
         """Go on with these members of the whole batch."""
-        self._forward = self._dyn.of_samples(members).forward_dynamics
+        self._use(self._dyn.of_samples(members))
+
+    def _use(self, own: Dynamics) -> None:
+        self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.clock is not None
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""
@@ -76,6 +81,8 @@ class Field:
                 raise DivergenceError(RAN_AWAY)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
+        if self._timed:
+            self._forward = at_time(self._own, t).forward_dynamics
         try:
             a = self._forward(q, v, force)
         except NumericalError as error:

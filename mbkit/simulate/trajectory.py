@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from mbkit import _check
 from mbkit._check import Array
 from mbkit.engines import ENGINES, Dynamics, dynamics
+from mbkit.engines.clock import at_times
 from mbkit.errors import InputError, OutputError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.applied import Applied, Asked, Held, Sampled
@@ -181,16 +182,16 @@ class Trajectory:
             if self._dyn is None:
                 object.__setattr__(self, "_dyn", dynamics(self.model, self.engine))
             assert self._dyn is not None
-            return self._dyn
+            return at_times(self._dyn, self.t, len(self.q) if self.q.ndim == 3 else None)
         if isinstance(engine, Dynamics):
             if engine.model.coordinate_names != self.model.coordinate_names:
                 raise InputError(f"engine: expected a Dynamics of {self.model.name}, got one of {engine.model.name}")
-            return engine
+            return at_times(engine, self.t, len(self.q) if self.q.ndim == 3 else None)
         if self._dyn is not None and self._dyn.samples is not None:
             raise UnsupportedError(
                 f"{engine}: the trajectories have parameters of their own, which only the {self.engine} engine holds"
             )
-        return dynamics(self.model, engine)
+        return at_times(dynamics(self.model, engine), self.t, len(self.q) if self.q.ndim == 3 else None)
 
     def _acted(self) -> Held | Sampled | None:
         if isinstance(self._applied, Asked):

@@ -14,7 +14,8 @@ def facts_of(model: Model) -> dict[str, Any]:
     return {
         "nq": model.nq,
         "nv": model.nv,
-        "mass": model.mass,
+        # Energies do not tell it.
+        **({} if model.written is not None else {"mass": model.mass}),
         "digest": model.digest,
         "needs": model.needs.as_dict(),
         "joints": list(model.joint_names),

@@ -47,7 +47,8 @@ class Judge:
             # Where a term has no value, its own row says so.
             with contextlib.suppress(NumericalError):
                 acting = acting + np.abs(quantity(at.q, at.v))
-        heavy = float(np.linalg.norm(model.gravity)) * np.sqrt(model.mass)
+        gravity = float(np.linalg.norm(model.gravity))
+        heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
         #: The joint of each velocity.
         self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]

@@ -93,13 +93,16 @@ class Scene:
     def energy(self, dyn: Dynamics, run: Trajectory) -> float:
         """Return the drift of the energy, relative to the larger of T and of the change of V.
 
-        NaN where there are dampers or applied forces: their work is not known from so few
-        states as well as the methods are good.
+        NaN where there are dampers or applied forces, whose work is not known from so few
+        states as well as the methods are good, or where time enters.
         """
-        if self.torque is not None or self.model.needs.damping:
+        if self.torque is not None or self.model.needs.damping or self.model.clock is not None:
             return math.nan
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", run.v, dyn.mass_matrix(run.q), run.v)
         potential = dyn.potential_energy(run.q)
+        if self.model.written is not None:
+            # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
+            potential = potential - dyn.kinetic_energy(run.q, 0 * run.v)
         drift = np.abs((kinetic - kinetic[0]) + (potential - potential[0])).max()
         size = max(float(kinetic.max()), float(np.ptp(potential)))
         return float(drift) / size if size > 0 else math.nan
