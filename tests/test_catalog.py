@@ -199,7 +199,10 @@ def test_bad_parameters_are_named(name: str, parameter: str, value: Any) -> None
 
 
 def test_registry() -> None:
-    names = "pendulum double_pendulum cart_pole spherical_pendulum chain heavy_top free_body"
+    names = (
+        "pendulum double_pendulum cart_pole spherical_pendulum elastic_pendulum acrobot furuta_pendulum chain "
+        "heavy_top gyroscope free_body spacecraft_with_wheels clamped_beam flexible_spacecraft"
+    )
     assert set(catalog.systems()) == set(names.split())
     assert catalog.get("cart_pole") is catalog.cart_pole
     assert set(catalog.systems()) <= set(dir(catalog))

@@ -3,37 +3,67 @@
 Every function takes keyword parameters in SI units, numbers or `mbkit.Parameter`;
 its docstring gives the coordinates, the zero pose and the source. Planar systems move in the x-z plane,
 gravity along -z, with angles from the downward vertical that grow towards +x: a
-right-handed turn about -y.
+right-handed turn about -y. Planar systems without gravity move in the x-y plane.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+from mbkit.catalog.acrobot import acrobot
 from mbkit.catalog.cart_pole import cart_pole
 from mbkit.catalog.chain import chain
+from mbkit.catalog.clamped_beam import clamped_beam
 from mbkit.catalog.double_pendulum import double_pendulum
+from mbkit.catalog.elastic_pendulum import elastic_pendulum
+from mbkit.catalog.flexible_spacecraft import flexible_spacecraft
 from mbkit.catalog.free_body import free_body
+from mbkit.catalog.furuta_pendulum import furuta_pendulum
+from mbkit.catalog.gyroscope import gyroscope
 from mbkit.catalog.heavy_top import heavy_top
 from mbkit.catalog.pendulum import pendulum
+from mbkit.catalog.spacecraft_with_wheels import spacecraft_with_wheels
 from mbkit.catalog.spherical_pendulum import spherical_pendulum
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 
 __all__ = [
+    "acrobot",
     "cart_pole",
     "chain",
+    "clamped_beam",
     "double_pendulum",
+    "elastic_pendulum",
+    "flexible_spacecraft",
     "free_body",
+    "furuta_pendulum",
     "get",
+    "gyroscope",
     "heavy_top",
     "pendulum",
+    "spacecraft_with_wheels",
     "spherical_pendulum",
     "systems",
 ]
 
 _SYSTEMS: dict[str, Callable[..., Model]] = {
-    f.__name__: f for f in (pendulum, double_pendulum, cart_pole, spherical_pendulum, chain, heavy_top, free_body)
+    f.__name__: f
+    for f in (
+        pendulum,
+        double_pendulum,
+        cart_pole,
+        spherical_pendulum,
+        elastic_pendulum,
+        acrobot,
+        furuta_pendulum,
+        chain,
+        heavy_top,
+        gyroscope,
+        free_body,
+        spacecraft_with_wheels,
+        clamped_beam,
+        flexible_spacecraft,
+    )
 }
 
 
@@ -43,8 +73,8 @@ def systems() -> dict[str, Callable[..., Model]]:
     Examples
     --------
     >>> import mbkit as mb
-    >>> list(mb.catalog.systems())
-    ['pendulum', 'double_pendulum', 'cart_pole', 'spherical_pendulum', 'chain', 'heavy_top', 'free_body']
+    >>> list(mb.catalog.systems())[:4]
+    ['pendulum', 'double_pendulum', 'cart_pole', 'spherical_pendulum']
     """
     return dict(_SYSTEMS)
 

@@ -13,7 +13,7 @@ from mbkit._check import finite_array, real
 from mbkit.errors import InputError
 from mbkit.model import Expression, Number, known, nominal
 
-__all__ = ["SWING", "Vector", "count", "down", "moments", "point", "positive"]
+__all__ = ["SWING", "Vector", "count", "down", "moments", "nonnegative", "point", "positive"]
 
 #: What a system takes for three numbers.
 Vector = ArrayLike | Sequence[Number]
@@ -31,13 +31,18 @@ def positive(name: str, value: Number) -> Number:
     return value
 
 
+def nonnegative(name: str, value: Number) -> Number:
+    """Return a number of at least zero, or an expression that is so as far as is known."""
+    if not isinstance(value, Expression):
+        return real(name, value, nonnegative=True)
+    if known(value):
+        real(name, nominal(value), nonnegative=True)
+    return value
+
+
 def down(value: Number) -> tuple[float, float, Number]:
     """Return the gravity vector of an acceleration of at least zero along -z."""
-    if not isinstance(value, Expression):
-        value = real("gravity", value, nonnegative=True)
-    elif known(value):
-        real("gravity", nominal(value), nonnegative=True)
-    return (0.0, 0.0, -value)
+    return (0.0, 0.0, -nonnegative("gravity", value))
 
 
 def point(name: str, value: Any) -> tuple[Number, Number, Number]:
