@@ -17,6 +17,12 @@ from mbkit.derivation.program import Program
 
 __all__ = ["c_body", "places", "variables"]
 
+#: Functions of math.h.
+_OF_ONE: Final = (
+    *("fabs", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "exp", "expm1", "log", "log1p"),
+    *("sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
+_OF_TWO: Final = ("atan2", "pow", "hypot")
 _FORMS: Final = {
     "add": "{0} + {1}",
     "sub": "{0} - {1}",
@@ -26,12 +32,19 @@ _FORMS: Final = {
     "sq": "{0} * {0}",
     "twice": "2.0 * {0}",
     "inv": "1.0 / {0}",
-    "sqrt": "sqrt({0})",
-    "sin": "sin({0})",
-    "cos": "cos({0})",
-    "fabs": "fabs({0})",
-    "sign": "(double)(({0} > 0.0) - ({0} < 0.0))",
+    **{name: f"{name}({{0}})" for name in _OF_ONE},
+    **{name: f"{name}({{0}}, {{1}})" for name in _OF_TWO},
+    "sign": "{0} > 0.0 ? 1.0 : {0} < 0.0 ? -1.0 : {0}",
+    # Not C's own, which pass over what is no number.
+    "fmin": "{0} < {1} || {0} != {0} ? {0} : {1}",
+    "fmax": "{0} > {1} || {0} != {0} ? {0} : {1}",
     "lt": "(double)({0} < {1})",
+    "le": "(double)({0} <= {1})",
+    "eq": "(double)({0} == {1})",
+    "ne": "(double)({0} != {1})",
+    "not": "(double)({0} == 0.0)",
+    "and": "(double)({0} != 0.0 && {1} != 0.0)",
+    "or": "(double)({0} != 0.0 || {1} != 0.0)",
     "if_else_zero": "{0} != 0.0 ? {1} : 0.0",
 }
 

@@ -57,8 +57,8 @@ Conventions
 
 Calls
     Nothing is allocated, kept or locked: any number of threads may call at once.
-    An output may lie on an input of the same size. Arguments are not checked, and a
-    singular mass matrix gives NaN or infinity."""
+    An output may lie on an input of the same size. Arguments are not checked: a singular
+    mass matrix, or a function outside of its domain, gives NaN or infinity."""
 
 
 @dataclass(frozen=True)

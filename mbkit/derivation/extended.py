@@ -67,8 +67,8 @@ class Extended:
         n = max((len(x) for x in arguments), default=1) if all(len(x) for x in arguments) else 0
         own = self.arithmetic
         outputs = [np.empty((n, *shape), dtype=own.dtype) for shape in self.program.shapes]
-        columns = [np.ascontiguousarray(own.array(x).T) for x in arguments]
         with np.errstate(all="ignore"):
+            columns = [np.ascontiguousarray(own.array(x).T) for x in arguments]
             for start in range(0, n, _LANES):
                 part = slice(start, start + _LANES)
                 self._run([c if c.shape[1] == 1 else c[:, part] for c in columns], [out[part] for out in outputs])
@@ -91,7 +91,12 @@ class Extended:
 
 def _functions(own: Arithmetic) -> dict[str, Callable[..., Any]]:
     zero, one = own.array(np.zeros(1)), own.array(np.ones(1))
+
+    def truth(holds: Any) -> Any:
+        return np.where(holds, one, zero)
+
     return {
+        **own.functions,
         "add": np.add,
         "sub": np.subtract,
         "mul": np.multiply,
@@ -100,11 +105,17 @@ def _functions(own: Arithmetic) -> dict[str, Callable[..., Any]]:
         "sq": lambda x: x * x,
         "twice": lambda x: x + x,
         "inv": lambda x: own.divide(one, x),
-        "sqrt": own.sqrt,
-        "sin": own.sin,
-        "cos": own.cos,
+        "hypot": lambda a, b: own.sqrt(a * a + b * b),
         "fabs": lambda x: np.where(x < zero, -x, x),
         "sign": lambda x: np.where(x > zero, one, np.where(x < zero, -one, x)),
-        "lt": lambda a, b: np.where(a < b, one, zero),
+        "fmin": lambda a, b: np.where((a < b) | (a != a), a, b),
+        "fmax": lambda a, b: np.where((a > b) | (a != a), a, b),
+        "lt": lambda a, b: truth(a < b),
+        "le": lambda a, b: truth(a <= b),
+        "eq": lambda a, b: truth(a == b),
+        "ne": lambda a, b: truth(a != b),
+        "not": lambda a: truth(a == zero),
+        "and": lambda a, b: truth((a != zero) & (b != zero)),
+        "or": lambda a, b: truth((a != zero) | (b != zero)),
         "if_else_zero": lambda a, b: np.where(a != zero, b, zero),
     }

@@ -30,9 +30,9 @@ from mbkit._version import __version__
 from mbkit.derivation import cache as disk
 from mbkit.derivation import jit
 from mbkit.derivation.batch_code import RUN
+from mbkit.derivation.lane_calls import library
 from mbkit.derivation.llvm_text import declarations
 from mbkit.derivation.program import Program, program
-from mbkit.derivation.sincos import sincos
 from mbkit.derivation.sources import SOURCES
 from mbkit.derivation.step import Part
 from mbkit.derivation.vector_code import Piece, pieces_of, slots_of
@@ -113,7 +113,9 @@ def _made(key: str, parts: Sequence[Part], state: Sequence[str]) -> Lanes:
     calls = [f"  call void @{_NAME}_{p.name}(ptr %arena, ptr %out_{p.writes[0]})" for p in parts]
     first, count = rows[state[0]][0], sum(rows[name][1] for name in state)
     round_ = _round(calls, {p.writes[0]: rows[p.writes[0]][0] for p in parts}, (first, rows[f"{state[0]}1"][0], count))
-    text = "\n".join([declarations(width()), sincos(width()), *(f.text for f in written.values()), round_])
+    text = "\n".join(
+        [declarations(width()), library(width(), *programs.values()), *(f.text for f in written.values()), round_]
+    )
     code = jit.object_code(text)
     operations = sum(programs[part.name].arithmetic for part in parts)
     about = {"rows": rows, "size": size, "operations": operations}

@@ -56,3 +56,15 @@ class Text:
         """Append a b + c with one rounding."""
         V = self.vector
         return self.put(f"call {V} @llvm.fma.v{self.width}f64({V} {a}, {V} {b}, {V} {c})")
+
+    def compare(self, how: str, a: str, b: str) -> str:
+        """Append a comparison: a bit in every lane."""
+        return self.put(f"fcmp {how} {self.vector} {a}, {b}")
+
+    def bits(self, name: str, a: str, b: str) -> str:
+        """Append a logical operation on bits."""
+        return self.put(f"{name} <{self.width} x i1> {a}, {b}")
+
+    def select(self, which: str, yes: str, no: str) -> str:
+        """Append a choice of each lane by its bit."""
+        return self.put(f"select <{self.width} x i1> {which}, {self.vector} {yes}, {self.vector} {no}")

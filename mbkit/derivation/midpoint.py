@@ -176,7 +176,7 @@ class Midpoint:
         v = space.leave(eq.q, w)
         kinetic = ca.substitute(eq.kinetic_energy, eq.v, v)
         applied = eq.tau + ca.substitute(eq.damping, eq.v, v)
-        f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.enter(eq.q, applied)
+        f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.enter_force(eq.q, applied)
         given = [eq.q, w, eq.tau, *eq.trailing.values()]
         return ca.Function("forces", given, [ca.gradient(kinetic, w), f], {"cse": True})
 
@@ -212,14 +212,13 @@ class Midpoint:
     def _momentum(self) -> tuple[Any]:
         eq, s = self._equations, self._s
         p = ca.substitute(eq.momentum, ca.vertcat(eq.q, eq.v), ca.vertcat(s["q"], s["v"]))
-        # ∂v/∂w turns the free joints' linear parts, as velocities turn.
-        return (self._space.to_fixed(s["q"], self._space.enter(s["q"], p)),)
+        return (self._space.to_fixed(s["q"], self._space.enter_force(s["q"], p)),)
 
     def _velocity_system(self) -> tuple[Any, Any]:
         eq, s = self._equations, self._s
-        at_rest = ca.substitute(eq.momentum, eq.v, ca.SX(eq.model.nv, 1))
+        at_rest = ca.substitute(eq.momentum, eq.v, ca.SX.zeros(eq.model.nv))
         M, b = (ca.substitute(x, eq.q, s["q"]) for x in (eq.mass_matrix, at_rest))
-        return M, self._space.leave(s["q"], self._space.to_body(s["q"], s["pi"])) - b
+        return M, self._space.leave_force(s["q"], self._space.to_body(s["q"], s["pi"])) - b
 
     def _velocity(self) -> tuple[Any]:
         return (solve(*self._velocity_system(), self._equations.elimination_order),)

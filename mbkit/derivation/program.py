@@ -14,28 +14,56 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from mbkit.errors import UnsupportedError
+
 __all__ = ["Operation", "Program", "program"]
 
-#: CasADi's codes -> our names, of the operations that derivations and steps use.
-_NAMES: Final = {
-    ca.OP_ASSIGN: "copy",
-    ca.OP_ADD: "add",
-    ca.OP_SUB: "sub",
-    ca.OP_MUL: "mul",
-    ca.OP_DIV: "div",
+#: CasADi's codes -> our names, of the operations that every backend knows.
+_UNARY: Final = {
     ca.OP_NEG: "neg",
     ca.OP_SQ: "sq",
     ca.OP_TWICE: "twice",
     ca.OP_INV: "inv",
+    ca.OP_FABS: "fabs",
+    ca.OP_SIGN: "sign",
+    ca.OP_NOT: "not",
     ca.OP_SQRT: "sqrt",
     ca.OP_SIN: "sin",
     ca.OP_COS: "cos",
-    ca.OP_FABS: "fabs",
-    ca.OP_SIGN: "sign",
+    ca.OP_TAN: "tan",
+    ca.OP_ASIN: "asin",
+    ca.OP_ACOS: "acos",
+    ca.OP_ATAN: "atan",
+    ca.OP_EXP: "exp",
+    ca.OP_EXPM1: "expm1",
+    ca.OP_LOG: "log",
+    ca.OP_LOG1P: "log1p",
+    ca.OP_SINH: "sinh",
+    ca.OP_COSH: "cosh",
+    ca.OP_TANH: "tanh",
+    ca.OP_ASINH: "asinh",
+    ca.OP_ACOSH: "acosh",
+    ca.OP_ATANH: "atanh",
+}
+_BINARY: Final = {
+    ca.OP_ADD: "add",
+    ca.OP_SUB: "sub",
+    ca.OP_MUL: "mul",
+    ca.OP_DIV: "div",
+    ca.OP_POW: "pow",
+    ca.OP_CONSTPOW: "pow",
+    ca.OP_HYPOT: "hypot",
+    ca.OP_ATAN2: "atan2",
+    ca.OP_FMIN: "fmin",
+    ca.OP_FMAX: "fmax",
     ca.OP_LT: "lt",
+    ca.OP_LE: "le",
+    ca.OP_EQ: "eq",
+    ca.OP_NE: "ne",
+    ca.OP_AND: "and",
+    ca.OP_OR: "or",
     ca.OP_IF_ELSE_ZERO: "if_else_zero",
 }
-_UNARY: Final = frozenset({"neg", "sq", "twice", "inv", "sqrt", "sin", "cos", "fabs", "sign"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +73,13 @@ class Operation:
     Attributes
     ----------
     name : str
-        "input", "const", or an arithmetic one: add, sub, mul, div, neg, sq, twice,
-        inv, sqrt, sin, cos, fabs, sign (0 of 0), lt (1 where a < b, else 0), if_else_zero (b where a is
-        not 0, else 0).
+        "input", "const", or one that computes. Arithmetic: add, sub, mul, div, neg, sq, twice, inv, fabs,
+        sign (0 of 0), fmin, fmax. Functions, as C names them: sqrt, sin, cos, tan, asin, acos, atan, atan2,
+        exp, expm1, log, log1p, sinh, cosh, tanh, asinh, acosh, atanh, pow, hypot. Decisions, 1 or 0: lt
+        (a < b), le, eq, ne, and, or, not; if_else_zero (b where a is not 0, else 0).
+
+        Of what is no number, fmin and fmax are none either; no comparison but ne holds of
+        it, and in a logical operation it counts as true, as in C.
     arguments : tuple of int
         Indices of earlier operations; of an input, (which argument, which entry).
     value : float
@@ -91,7 +123,9 @@ def program(function: ca.Function) -> Program:
     Raises
     ------
     ValueError
-        A sparse output, or an operation that no derivation here makes.
+        A sparse output.
+    UnsupportedError
+        An operation that the backends do not have.
     """
     where: dict[int, int] = {}
     operations: list[Operation] = []
@@ -109,16 +143,16 @@ def program(function: ca.Function) -> Program:
             made = Operation("input", (given[0], given[1]))
         elif code == ca.OP_CONST:
             made = Operation("const", (), function.instruction_constant(k))
-        elif code in _NAMES:
-            name = _NAMES[code]
-            if name == "copy":
-                where[out[0]] = where[given[0]]
-                continue
-            # CasADi names the argument of a unary operation twice.
-            used = given[:1] if name in _UNARY else given
-            made = Operation(name, tuple(where[i] for i in used))
+        elif code == ca.OP_ASSIGN:
+            where[out[0]] = where[given[0]]
+            continue
+        elif code in _UNARY:
+            # CasADi names the argument of some of them twice.
+            made = Operation(_UNARY[code], (where[given[0]],))
+        elif code in _BINARY:
+            made = Operation(_BINARY[code], (where[given[0]], where[given[1]]))
         else:
-            raise ValueError(f"{function.name()}: operation {code} of CasADi is not known here")
+            raise UnsupportedError(_unknown(function, code))
         where[out[0]] = len(operations)
         operations.append(made)
     return Program(
@@ -127,4 +161,14 @@ def program(function: ca.Function) -> Program:
         operations=tuple(operations),
         # CasADi counts down the columns.
         outputs=tuple(out.reshape(shape, order="F") for out, shape in zip(outputs, shapes, strict=True)),
+    )
+
+
+def _unknown(function: ca.Function, code: int) -> str:
+    """Return what to say of an operation that is in neither table."""
+    name = next((n for n in dir(ca) if n.startswith("OP_") and getattr(ca, n) == code), f"number {code}")
+    known = sorted({*_UNARY.values(), *_BINARY.values()})
+    return (
+        f"{function.name()}: CasADi's operation {name.removeprefix('OP_').lower()} has no counterpart in machine code, "
+        f"113-bit numbers, Taylor series and C; write it with {', '.join(known)} (of an MX function, .expand() first)"
     )

@@ -18,9 +18,9 @@ from typing import Final
 
 import numpy as np
 
+from mbkit.derivation.lane_calls import CALLS, call, library
 from mbkit.derivation.llvm_text import Text, declarations, number
 from mbkit.derivation.program import Program
-from mbkit.derivation.sincos import sincos
 
 __all__ = ["BODY", "Piece", "pieces_of", "slots_of", "vector_code"]
 
@@ -31,8 +31,16 @@ _WHOLE: Final = 20000
 _PIECE: Final = 3000
 _STORE: Final = 4  # weight of a store, in operations
 _ARGUMENTS: Final = "ptr noalias %in, ptr noalias %is, ptr noalias %out, ptr noalias %os, ptr noalias %work"
-_HIDING: Final = frozenset({"div", "inv", "lt", "if_else_zero", "sign"})
+_COMPARISONS: Final = {"lt": "olt", "le": "ole", "eq": "oeq", "ne": "une"}
+_LOGICAL: Final = {"and": "and", "or": "or"}
+#: What can be finite where an argument is not: 1/inf, exp(-inf), atan(inf), NaN to the power of 0.
+_HIDING: Final = frozenset(
+    {"div", "inv", "sign", "fmin", "fmax", "not", "if_else_zero", *_COMPARISONS, *_LOGICAL}
+    | {"exp", "expm1", "tanh", "atan", "atan2", "pow"}
+)
 _BINARY: Final = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
+_INTRINSICS: Final = frozenset({"sqrt", "fabs"})
+_CALLED: Final = frozenset({"sin", "cos", *CALLS})
 
 
 def vector_code(program: Program, width: int) -> tuple[str, int]:
@@ -47,7 +55,7 @@ def vector_code(program: Program, width: int) -> tuple[str, int]:
     calls = "\n".join(f"  call void @{BODY}_{k}({_ARGUMENTS.replace('noalias ', '')})" for k in range(len(written)))
     calls += f"\n  call void @{BODY}_zeros(ptr %out, ptr %os)"
     whole = f"define void @{BODY}({_ARGUMENTS}) nounwind {{\n{calls}\n  ret void\n}}\n"
-    text = "\n".join([declarations(width), sincos(width), *functions, whole])
+    text = "\n".join([declarations(width), library(width, program), *functions, whole])
     return text, max(slots.values(), default=0) + 1
 
 
@@ -98,8 +106,8 @@ def _is_zero(program: Program, k: int) -> bool:
 def _seen(program: Program) -> set[tuple[int, ...]]:
     """Return the entries of the arguments whose NaN or infinity shows in some result by itself.
 
-    All that is read does where nothing is divided or decided by it: sums, products,
-    sines and roots of what is not finite are not finite.
+    All that is read does where nothing hides it: sums, products, sines, roots and logarithms
+    of what is not finite are not finite.
     """
     if any(o.name in _HIDING for o in program.operations):
         return set()
@@ -158,11 +166,12 @@ class Piece:
                         continue
                     place = self._place("in", "is", i, j)
                     self._watched.append(self._text.put(f"load {self._text.vector}, ptr {place}, align 8"))
-        # A call spills what is live: sines of inputs come first, when little is.
+        # A call spills what is live: functions of inputs come first, when little is.
         early = [
             k
             for k in self._own
-            if operations[k].name in ("sin", "cos") and operations[operations[k].arguments[0]].name == "input"
+            if operations[k].name in _CALLED
+            and all(operations[j].name in ("input", "const") for j in operations[k].arguments)
         ]
         for k in [*early, *self._own]:
             if k in self._names:
@@ -223,7 +232,7 @@ class Piece:
 
     def _operation(self, k: int, slots: dict[int, int]) -> str:
         o, t = self._program.operations[k], self._text
-        V, B = t.vector, f"<{t.width} x i1>"
+        V = t.vector
         a = [self._value(j, slots) for j in o.arguments]
         if o.name in _BINARY:
             return t.op(_BINARY[o.name], a[0], a[1], "contract ")
@@ -232,6 +241,8 @@ class Piece:
             if x not in self._pairs:
                 self._pairs[x] = t.put(f"call {{ {V}, {V} }} @mbkit_sincos({V} {a[0]})")
             return t.put(f"extractvalue {{ {V}, {V} }} {self._pairs[x]}, {int(o.name == 'cos')}")
+        if o.name in CALLS:
+            return call(t, o.name, a)
         if o.name == "sq":
             return t.op("fmul", a[0], a[0], "contract ")
         if o.name == "twice":
@@ -240,21 +251,31 @@ class Piece:
             return t.op("fdiv", number(1.0), a[0])
         if o.name == "neg":
             return t.neg(a[0])
-        if o.name == "sqrt":
-            return t.call("sqrt", a[0])
-        if o.name == "fabs":
-            return t.call("fabs", a[0])
-        if o.name == "sign":
-            above, below = (t.put(f"fcmp {how} {V} {a[0]}, {number(0.0)}") for how in ("ogt", "olt"))
-            negative = t.put(f"select {B} {below}, {V} {number(-1.0)}, {V} {a[0]}")
-            return t.put(f"select {B} {above}, {V} {number(1.0)}, {V} {negative}")
-        if o.name == "lt":
-            less = t.put(f"fcmp olt {V} {a[0]}, {a[1]}")
-            return t.put(f"select {B} {less}, {V} {number(1.0)}, {V} {number(0.0)}")
-        if o.name == "if_else_zero":
-            yes = t.put(f"fcmp une {V} {a[0]}, {number(0.0)}")
-            return t.put(f"select {B} {yes}, {V} {a[1]}, {V} {number(0.0)}")
-        raise ValueError(f"operation {o.name!r} has no vector code")
+        if o.name in _INTRINSICS:
+            return t.call(o.name, a[0])
+        return self._choice(o.name, a)
+
+    def _choice(self, name: str, a: list[str]) -> str:
+        """Append an operation that compares, or decides by it."""
+        t = self._text
+        zero, one = number(0.0), number(1.0)
+        if name in _COMPARISONS:
+            return t.select(t.compare(_COMPARISONS[name], a[0], a[1]), one, zero)
+        if name in _LOGICAL:
+            both = (t.compare("une", x, zero) for x in a)
+            return t.select(t.bits(_LOGICAL[name], *both), one, zero)
+        if name == "not":
+            return t.select(t.compare("oeq", a[0], zero), one, zero)
+        if name == "if_else_zero":
+            return t.select(t.compare("une", a[0], zero), a[1], zero)
+        if name == "sign":
+            negative = t.select(t.compare("olt", a[0], zero), number(-1.0), a[0])
+            return t.select(t.compare("ogt", a[0], zero), one, negative)
+        if name in ("fmin", "fmax"):
+            better = t.compare("olt" if name == "fmin" else "ogt", a[0], a[1])
+            # What is no number is taken, so that it comes to light.
+            return t.select(t.bits("or", better, t.compare("uno", a[0], a[0])), a[0], a[1])
+        raise ValueError(f"operation {name!r} has no vector code")
 
     def function(self, name: str) -> str:
         """Return this piece's text."""
