@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import casadi as ca
+import numpy as np
 import sympy as sp
 
 from mbkit.errors import UnsupportedError
@@ -22,6 +23,9 @@ _UNARY: Final[dict[Any, Callable[[Any], Any]]] = {
     sp.sinh: ca.sinh,
     sp.cosh: ca.cosh,
     sp.tanh: ca.tanh,
+    sp.asinh: ca.asinh,
+    sp.acosh: ca.acosh,
+    sp.atanh: ca.atanh,
     sp.exp: ca.exp,
     sp.log: ca.log,
     sp.Abs: ca.fabs,
@@ -29,6 +33,14 @@ _UNARY: Final[dict[Any, Callable[[Any], Any]]] = {
     sp.sec: lambda x: 1 / ca.cos(x),
     sp.csc: lambda x: 1 / ca.sin(x),
     sp.cot: lambda x: ca.cos(x) / ca.sin(x),
+}
+
+
+_COMPARED: Final[dict[Any, Callable[[Any, Any], Any]]] = {
+    sp.StrictLessThan: lambda a, b: a < b,
+    sp.LessThan: lambda a, b: a <= b,
+    sp.StrictGreaterThan: lambda a, b: b < a,
+    sp.GreaterThan: lambda a, b: b <= a,
 }
 
 
@@ -78,10 +90,29 @@ class Conversion:
             for e in x.args[1:]:
                 out = pick(out, self(e))
             return out
+        if x.func is sp.Piecewise:
+            return self._pieces(x)
         raise UnsupportedError(
             f"{x.func}: no engine computes this function; there are powers, sin, cos, tan, their inverses, "
-            "sinh, cosh, tanh, exp, log, Abs, sign, Min and Max"
+            "sinh, cosh, tanh and theirs, exp, log, Abs, sign, Min, Max and Piecewise"
         )
+
+    def _pieces(self, x: Any) -> Any:
+        out: Any = ca.SX(np.nan)
+        for value, condition in reversed(x.args):
+            out = self(value) if condition is sp.true else ca.if_else(self._holds(condition), self(value), out)
+        return out
+
+    def _holds(self, condition: Any) -> Any:
+        """Return a comparison, or several joined, as 1 or 0."""
+        if condition.func in _COMPARED:
+            return _COMPARED[condition.func](ca.SX(self(condition.lhs)), ca.SX(self(condition.rhs)))
+        if condition.func in (sp.And, sp.Or):
+            join, out = (ca.logic_and if condition.func is sp.And else ca.logic_or), self._holds(condition.args[0])
+            for e in condition.args[1:]:
+                out = join(out, self._holds(e))
+            return out
+        raise UnsupportedError(f"Piecewise: {condition} is no comparison of numbers, nor several joined by & or |")
 
     def _whole(self, n: int) -> Any:
         # Small powers of two change no digit, so they need no symbol.

@@ -42,9 +42,16 @@ class Plain:
     ----------
     coordinates, velocities : tuple of sympy.Symbol
     time : sympy.Symbol or None
+
+    Parameters
+    ----------
+    coordinates, velocities, time
+        As `Lagrangian` takes them.
+    among : iterable of sympy.Symbol
+        Where velocities that are not given may stand already, by their names.
     """
 
-    def __init__(self, coordinates: Any, velocities: Any, time: Any) -> None:
+    def __init__(self, coordinates: Any, velocities: Any, time: Any, among: Iterable[sp.Symbol] = ()) -> None:
         given = _several("coordinates", coordinates)
         functions = [c for c in given if isinstance(c, AppliedUndef)]
         times = {c.args for c in functions}
@@ -67,12 +74,14 @@ class Plain:
             else:
                 raise InputError(f"coordinates: expected SymPy symbols or dynamicsymbols, got {c!r}")
         self.coordinates = tuple(made)
-        self.velocities = self._velocities(given, velocities)
+        self.velocities = self._velocities(given, velocities, among)
         _differ((*self.coordinates, *self.velocities, *([self.time] if self.time else [])))
 
-    def _velocities(self, given: Sequence[Any], velocities: Any) -> tuple[sp.Symbol, ...]:
+    def _velocities(self, given: Sequence[Any], velocities: Any, among: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
         if velocities is None:
-            own = [velocity_of(c) for c in self.coordinates]
+            # One of that name that stands there already may have assumptions of its own.
+            named = {s.name: s for s in among}
+            own = [named.get(velocity_of(c).name, velocity_of(c)) for c in self.coordinates]
         else:
             told = _several("velocities", velocities)
             if len(told) != len(given):
