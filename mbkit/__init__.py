@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mbkit import lagrangian as lagrangian
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
+    from mbkit.lagrangian.equilibrium import equilibrium as equilibrium
     from mbkit.errors import MbkitError as MbkitError
     from mbkit.load import load as load
     from mbkit.load import robots as robots
@@ -44,6 +45,7 @@ _HOME = {
     "Trajectory": "mbkit.simulate",
     "compare": "mbkit.studies",
     "dynamics": "mbkit.engines",
+    "equilibrium": "mbkit.lagrangian.equilibrium",
     "load": "mbkit.load",
     "robots": "mbkit.load",
     "simulate": "mbkit.simulate",

@@ -18,27 +18,58 @@ from mbkit.derivation import (
 )
 
 if TYPE_CHECKING:
+    from mbkit.lagrangian import systems as systems
+    from mbkit.lagrangian.cyclic import ConservedQuantity as ConservedQuantity
+    from mbkit.lagrangian.embedding import Embedded as Embedded
+    from mbkit.lagrangian.equilibrium import Equilibrium as Equilibrium
+    from mbkit.lagrangian.from_model import from_model as from_model
+    from mbkit.lagrangian.hamilton import Hamiltonian as Hamiltonian
     from mbkit.lagrangian.motion import EquationsOfMotion as EquationsOfMotion
+    from mbkit.lagrangian.particles import from_particles as from_particles
+    from mbkit.lagrangian.quasi import QuasiLagrangian as QuasiLagrangian
+    from mbkit.lagrangian.routh import Routhian as Routhian
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
+    from mbkit.lagrangian.virtual_work import generalized_force as generalized_force
 
 _HOME = {
+    "ConservedQuantity": "mbkit.lagrangian.cyclic",
+    "Embedded": "mbkit.lagrangian.embedding",
     "EquationsOfMotion": "mbkit.lagrangian.motion",
+    "Equilibrium": "mbkit.lagrangian.equilibrium",
+    "Hamiltonian": "mbkit.lagrangian.hamilton",
     "Lagrangian": "mbkit.lagrangian.system",
+    "QuasiLagrangian": "mbkit.lagrangian.quasi",
+    "Routhian": "mbkit.lagrangian.routh",
+    "from_model": "mbkit.lagrangian.from_model",
+    "from_particles": "mbkit.lagrangian.particles",
+    "generalized_force": "mbkit.lagrangian.virtual_work",
 }
 
 __all__ = [
     "FUNCTIONS",
     "CSource",
+    "ConservedQuantity",
+    "Embedded",
     "Equations",
     "EquationsOfMotion",
+    "Equilibrium",
     "ForwardDynamicsDerivatives",
+    "Hamiltonian",
     "InverseDynamicsDerivatives",
     "Lagrangian",
+    "QuasiLagrangian",
+    "Routhian",
     "export_c",
+    "from_model",
+    "from_particles",
+    "generalized_force",
+    "systems",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "systems":
+        return importlib.import_module("mbkit.lagrangian.systems")
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module 'mbkit.lagrangian' has no attribute {name!r}; it has: {', '.join(__all__)}")
