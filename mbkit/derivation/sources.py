@@ -12,7 +12,9 @@ __all__ = ["SOURCES"]
 def _digest() -> str:
     here = Path(__file__).parent
     total = hashlib.sha256()
-    for path in sorted([*here.glob("*.py"), *(here.parent / "model").glob("*.py")]):
+    # What is written on paper brings equations of its own.
+    beside = (here, here.parent / "model", here.parent / "lagrangian")
+    for path in sorted(path for folder in beside for path in folder.glob("*.py")):
         total.update(path.name.encode() + b"\0" + path.read_bytes())
     return total.hexdigest()
 

@@ -299,6 +299,14 @@ class Dynamics(ABC):
         where = np.argwhere(~np.isfinite(out))[0]
         state = f" in sample {where[0]}" if next(iter(arguments.values())).ndim == 2 else ""
         index = tuple(int(i) for i in where)
+        if self.model.written is not None:
+            q = np.atleast_2d(arguments["q"])[where[0] if arguments["q"].ndim == 2 else 0]
+            there = ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, q, strict=True))
+            constraints = ", or the constraints depend on each other," if self.model.constrained else ""
+            raise NumericalError(
+                f"{self.engine}: {quantity} of {self.model.name} is not finite at {there}{state}; perhaps the mass "
+                f"matrix is singular{constraints} there, or numbers are so large that they overflow"
+            )
         raise NumericalError(
             f"{self.engine}: {quantity} of {self.model.name} is not finite at index {index}{state}{self._blame()}"
         )

@@ -192,7 +192,8 @@ class LagrangianDynamics(Dynamics):
     @cached_property
     def written_out(self) -> bool:
         """Whether forward dynamics is one expression; else M is formed and solved numerically."""
-        return elimination_size(self.model) <= _WRITTEN_OUT[self.compile]
+        # Under constraints there is no other way.
+        return self.model.constrained or elimination_size(self.model) <= _WRITTEN_OUT[self.compile]
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self.written_out:

@@ -255,6 +255,8 @@ class OracleDynamics(Dynamics):
         return product(M, self._arithmetic.array(a)) + nle - passive
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Any:
+        if self.model.constrained:
+            return self._run(("forward_dynamics",), self._state(q), v, tau)[0][:, :, 0]
         M, _, _, passive, nle = self._terms(q, v)
         force = self._arithmetic.array(tau) + passive - nle
         return solve(M, force, self._pattern, self.equations.elimination_order, self._arithmetic)

@@ -23,21 +23,25 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.embedding import Embedded as Embedded
     from mbkit.lagrangian.equilibrium import Equilibrium as Equilibrium
     from mbkit.lagrangian.from_model import from_model as from_model
+    from mbkit.lagrangian.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.hamilton import Hamiltonian as Hamiltonian
     from mbkit.lagrangian.motion import EquationsOfMotion as EquationsOfMotion
     from mbkit.lagrangian.particles import from_particles as from_particles
+    from mbkit.lagrangian.quasi import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.quasi import QuasiLagrangian as QuasiLagrangian
     from mbkit.lagrangian.routh import Routhian as Routhian
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
     from mbkit.lagrangian.virtual_work import generalized_force as generalized_force
 
 _HOME = {
+    "CanonicalEquations": "mbkit.lagrangian.hamilton",
     "ConservedQuantity": "mbkit.lagrangian.cyclic",
     "Embedded": "mbkit.lagrangian.embedding",
     "EquationsOfMotion": "mbkit.lagrangian.motion",
     "Equilibrium": "mbkit.lagrangian.equilibrium",
     "Hamiltonian": "mbkit.lagrangian.hamilton",
     "Lagrangian": "mbkit.lagrangian.system",
+    "QuasiEquationsOfMotion": "mbkit.lagrangian.quasi",
     "QuasiLagrangian": "mbkit.lagrangian.quasi",
     "Routhian": "mbkit.lagrangian.routh",
     "from_model": "mbkit.lagrangian.from_model",
@@ -48,6 +52,7 @@ _HOME = {
 __all__ = [
     "FUNCTIONS",
     "CSource",
+    "CanonicalEquations",
     "ConservedQuantity",
     "Embedded",
     "Equations",
@@ -57,6 +62,7 @@ __all__ = [
     "Hamiltonian",
     "InverseDynamicsDerivatives",
     "Lagrangian",
+    "QuasiEquationsOfMotion",
     "QuasiLagrangian",
     "Routhian",
     "export_c",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import sympy as sp
@@ -33,6 +34,10 @@ class EquationsOfMotion:
         Q: generalized forces, Rayleigh's dissipation -∂R/∂v among them.
     constraint_jacobian : (m, n) sympy.Matrix
         J; no rows without constraints.
+    constraint_acceleration : (m, 1) sympy.Matrix
+        γ: J̇ v and the time's own terms, so that J v̇ + γ = 0.
+    constraints : (m, 1) sympy.Matrix
+        f(q, t), which is zero.
     multipliers : tuple of sympy.Symbol
         λ.
     """
@@ -46,9 +51,11 @@ class EquationsOfMotion:
     potential_gradient: sp.ImmutableMatrix
     forces: sp.ImmutableMatrix
     constraint_jacobian: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 0, []))
+    constraint_acceleration: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 1, []))
+    constraints: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 1, []))
     multipliers: tuple[sp.Symbol, ...] = ()
 
-    @property
+    @cached_property
     def coriolis_force(self) -> sp.ImmutableMatrix:
         """C v, (n, 1)."""
         return tidy_matrix(self.coriolis_matrix * sp.Matrix(self.velocities))
@@ -71,10 +78,13 @@ class EquationsOfMotion:
             terms = [m * a for m, a in zip(self.mass_matrix[i, :], self.accelerations, strict=True)]
             terms += [self.coriolis_force[i], self.drift[i], self.potential_gradient[i]]
             out.append(([x for x in terms if x != 0], force))
-        return out
+        return out + [([f], sp.Integer(0)) for f in self.constraints]
 
     def equations(self) -> tuple[sp.Eq, ...]:
-        """Return one equation per coordinate: M v̇ + C v + d + ∂V/∂q on the left, Q on the right."""
+        """Return one equation per coordinate: M v̇ + C v + d + ∂V/∂q on the left, Q on the right.
+
+        Constraints follow, f = 0 each.
+        """
         return tuple(sp.Eq(sp.Add(*terms), force, evaluate=False) for terms, force in self._rows())
 
     def explicit(self) -> tuple[sp.Eq, ...]:
@@ -82,10 +92,11 @@ class EquationsOfMotion:
 
         Grows fast with the number of coordinates; `Lagrangian.dynamics` solves numerically instead.
         """
+        n = len(self.accelerations)
+        # One quotient is worth shortening; SymPy has no bound on its time for a solved system.
+        shorter = tidy if n == 1 else sp.factor_terms
         solved = self.mass_matrix.LUsolve(self.applied)
-        return tuple(
-            sp.Eq(a, tidy(sp.factor_terms(x)), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True)
-        )
+        return tuple(sp.Eq(a, shorter(x), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True))
 
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block, accelerations first."""

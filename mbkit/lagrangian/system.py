@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,9 @@ import sympy as sp
 
 from mbkit._check import real
 from mbkit.errors import InputError
+from mbkit.lagrangian import cyclic
+from mbkit.lagrangian.constrained import Constrained
+from mbkit.lagrangian.cyclic import ConservedQuantity
 from mbkit.lagrangian.degree import KineticSplit, split
 from mbkit.lagrangian.motion import EquationsOfMotion, christoffel
 from mbkit.lagrangian.symbols import Plain, acceleration_of, plain, velocity_of
@@ -18,12 +21,15 @@ from mbkit.lagrangian.tidy import tidy_matrix
 
 if TYPE_CHECKING:
     from mbkit.engines import Dynamics
+    from mbkit.lagrangian.hamilton import Hamiltonian
+    from mbkit.lagrangian.quasi import QuasiLagrangian
+    from mbkit.lagrangian.routh import Routhian
     from mbkit.lagrangian.written import WrittenModel
 
 __all__ = ["Lagrangian"]
 
 
-class Lagrangian:
+class Lagrangian(Constrained):
     """A system as its energies in generalized coordinates, to read and to run.
 
     Parameters
@@ -57,6 +63,7 @@ class Lagrangian:
     coordinates, velocities, accelerations : tuple of sympy.Symbol
         Plain symbols, whatever was given.
     time : sympy.Symbol or None
+        Where something depends on it.
     forces : (n, 1) sympy.Matrix
         Without the dissipation.
     inputs : mapping of coordinate to sympy.Symbol
@@ -95,7 +102,7 @@ class Lagrangian:
         constraints: Sequence[Any] = (),
         name: str = "system on paper",
     ) -> None:
-        into = Plain(coordinates, velocities, time)
+        into = Plain(coordinates, velocities, time, among=getattr(T, "free_symbols", ()))
         self.name = name
         self.coordinates, self.velocities, self.time = into.coordinates, into.velocities, into.time
         # A velocity of a name of its own, such as omega, has its derivative named after it.
@@ -108,6 +115,10 @@ class Lagrangian:
         self.dissipation = into("dissipation", dissipation)
         given = _forces(into, forces or {}, self.coordinates)
         self.constraints = tuple(into(f"constraints[{k}]", c) for k, c in enumerate(constraints))
+        # Dynamicsymbols bring a time that need not enter by itself.
+        held = (self.T, self.V, self.dissipation, *given.values(), *self.constraints)
+        if not any(self.time in x.free_symbols for x in held):
+            self.time = None
         self.inputs = self._inputs(given)
         self.forces = sp.ImmutableMatrix([x if q not in self.inputs else 0 for q, x in given.items()])
         self._check()
@@ -153,7 +164,11 @@ class Lagrangian:
                 raise InputError(
                     f"{part}: expected coordinates, time and parameters only, got the velocity {plain(moving)}"
                 )
-        if self.kinetic.M.det(method="berkowitz") == 0 and self.kinetic.M.shape[0] <= 4:
+        # Coordinates that move no mass can still be bound to some that do.
+        idle = [w for i, w in enumerate(self.velocities) if not any(self.kinetic.M[i, :])]
+        if idle and not self.constraints:
+            raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {plain(idle)}")
+        if not self.constraints and self.kinetic.M.shape[0] <= 4 and self.kinetic.M.det(method="berkowitz") == 0:
             raise InputError(
                 f"T: its mass matrix {self.kinetic.M.tolist()} is singular everywhere; a velocity is missing"
             )
@@ -194,6 +209,11 @@ class Lagrangian:
         inputs = [self.inputs.get(x, sp.Integer(0)) for x in q]
         forces = sp.Matrix(self.forces) + sp.Matrix(inputs) - sp.Matrix(friction)
         m = len(self.constraints)
+        f = sp.Matrix(m, 1, self.constraints)
+        jacobian = f.jacobian(q) if m else sp.zeros(0, len(q))
+        by_time = sp.zeros(m, 1) if t is None else sp.diff(f, t)
+        rate = jacobian * v + by_time
+        gamma = rate.jacobian(q) * v + (sp.zeros(m, 1) if t is None else sp.diff(rate, t)) if m else rate
         return EquationsOfMotion(
             coordinates=q,
             velocities=self.velocities,
@@ -203,7 +223,9 @@ class Lagrangian:
             drift=tidy_matrix(drift),
             potential_gradient=tidy_matrix([sp.diff(self.V, x) for x in q]),
             forces=tidy_matrix(forces),
-            constraint_jacobian=sp.ImmutableMatrix(m, len(q), [sp.diff(c, x) for c in self.constraints for x in q]),
+            constraint_jacobian=sp.ImmutableMatrix(jacobian),
+            constraint_acceleration=tidy_matrix(gamma),
+            constraints=sp.ImmutableMatrix(f),
             multipliers=tuple(sp.Symbol(f"lambda{i + 1}") for i in range(m)),
         )
 
@@ -211,10 +233,85 @@ class Lagrangian:
         """Return the equation of motion, frozen: its matrices, and `latex()` and `explicit()`."""
         return self._equations
 
+    # What it keeps, and other forms of it
+
+    def cyclic_coordinates(self) -> tuple[sp.Symbol, ...]:
+        """Return the coordinates that L does not hold and along which nothing acts: their momenta are constant."""
+        return cyclic.cyclic_coordinates(self)[1]
+
+    def forced_cyclic_coordinates(self) -> dict[sp.Symbol, sp.Expr]:
+        """Return the other coordinates that L does not hold, each with the force that acts along it."""
+        return {q: force for q, force in cyclic.cyclic_coordinates(self)[0].items() if force != 0}
+
+    def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
+        """Return p = ∂L/∂v of each cyclic coordinate, by coordinate."""
+        return cyclic.conserved_momenta(self)
+
+    def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
+        """Return what is constant along every motion: those momenta, and the energy or Jacobi's integral."""
+        return cyclic.conserved_quantities(self)
+
+    @property
+    def energy_function(self) -> sp.Expr:
+        """h = vᵀ ∂L/∂v - L = T2 - T0 + V: Jacobi's integral, the energy T + V where T = T2."""
+        return cyclic.energy_function(self)
+
+    def routhian(self, cyclic: sp.Symbol | Sequence[sp.Symbol] | None = None) -> Routhian:
+        """Return Routh's reduction: the same system less its cyclic coordinates, or those given.
+
+        Raises
+        ------
+        InputError
+            One is not cyclic or a force acts along it; none is, or none would remain.
+        """
+        from mbkit.lagrangian.routh import routhian
+
+        return routhian(self, cyclic)
+
+    def hamiltonian(self) -> Hamiltonian:
+        """Return Hamilton's function H(q, p, t) with its canonical equations.
+
+        Raises
+        ------
+        UnsupportedError
+            Constraints act on the system.
+        """
+        return self._hamiltonian
+
+    @cached_property
+    def _hamiltonian(self) -> Hamiltonian:
+        from mbkit.lagrangian.hamilton import hamiltonian
+
+        return hamiltonian(self)
+
+    def quasi_velocities(self, D: sp.Matrix, names: str | Sequence[str | sp.Symbol] | None = None) -> QuasiLagrangian:
+        """Return the same system in velocities w that are no coordinates' rates: q̇ = D(q) w.
+
+        Parameters
+        ----------
+        D : (n, n) sympy.Matrix
+            Of coordinates (and parameters), one row per coordinate.
+        names : str or sequence of str or sympy.Symbol, optional
+            Of w; ``w1``, ``w2``, ... when not given.
+
+        Raises
+        ------
+        InputError
+            D of another shape, with other symbols, or singular everywhere.
+        UnsupportedError
+            Constraints act on the system.
+        """
+        from mbkit.lagrangian.quasi import QuasiLagrangian
+
+        return QuasiLagrangian(self, D, names)
+
     # Variants
 
-    def _like(self, **changes: Any) -> Lagrangian:
-        given: dict[str, Any] = {
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(Lagrangian, **self._given()), ()
+
+    def _given(self) -> dict[str, Any]:
+        return {
             "T": self.T,
             "V": self.V,
             "coordinates": self.coordinates,
@@ -222,11 +319,13 @@ class Lagrangian:
             "time": self.time,
             "forces": {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)},
             "dissipation": self.dissipation,
-            "parameters": self.parameters,
+            "parameters": dict(self.parameters),
             "constraints": self.constraints,
             "name": self.name,
         }
-        return Lagrangian(**{**given, **changes})
+
+    def _like(self, **changes: Any) -> Lagrangian:
+        return Lagrangian(**{**self._given(), **changes})
 
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> Lagrangian:
         """Return the same system with numbers for some parameters."""

@@ -5,29 +5,45 @@ from __future__ import annotations
 from typing import Any, Final
 
 import sympy as sp
+from sympy.functions.elementary.trigonometric import TrigonometricFunction
 
-__all__ = ["SMALL", "tidy", "tidy_matrix"]
+from mbkit.lagrangian.compact import cost
+from mbkit.lagrangian.reading import shortened
 
-#: Operations up to which an expression is simplified unasked.
+__all__ = ["LARGE", "SMALL", "tidy", "tidy_matrix"]
+
+#: Operations up to which an expression is simplified unasked: any, and one of symbols, cosines and sines only.
 SMALL: Final = 120
+LARGE: Final = 2000
 
 
 def tidy(x: sp.Expr, *, small: int = SMALL) -> sp.Expr:
     """Return a shorter form of a small expression; a large one as it is.
 
-    Of several forms that SymPy finds, the one with the fewest operations, so that no
-    rewriting makes it worse. `sympy.simplify` itself has no bound on its time.
+    The shortest of several forms, so that no rewriting makes it worse. Cosines and sines are
+    combined exactly (`reading.shortened`): `sympy.simplify` and `trigsimp` search, with no bound on their time.
     """
-    if not x.free_symbols or x.count_ops() > small:
+    if not x.free_symbols or x.count_ops() > LARGE:
+        return x
+    short = shortened(x)
+    if short is not None and (x.count_ops() > small or not _has_quotients(x)):
+        return min((x, short), key=cost)
+    if x.count_ops() > small:
         return x
     expanded = sp.expand(x)
-    forms = [x, expanded, sp.factor_terms(expanded)]
-    if x.has(sp.sin, sp.cos):
+    forms = [x, short or x, expanded, sp.factor_terms(expanded)]
+    if x.has(TrigonometricFunction):
         turned = sp.trigsimp(expanded)
         forms += [turned, sp.factor_terms(turned), sp.factor_terms(sp.fu(expanded))]
-    if expanded.is_rational_function(*expanded.free_symbols) or len(forms) == 3:
+    if expanded.is_rational_function(*expanded.free_symbols) or len(forms) == 4:
         forms.append(sp.factor_terms(sp.cancel(sp.together(expanded))))
-    return min(forms, key=lambda form: (form.count_ops(), forms.index(form)))
+    return min(forms, key=lambda form: (cost(form), forms.index(form)))
+
+
+def _has_quotients(x: sp.Expr) -> bool:
+    """Return whether a sum or a cosine stands below a line, where more may cancel than in polynomials."""
+    below = (p for p in x.atoms(sp.Pow) if p.exp.is_Integer and p.exp.is_negative)
+    return x.has(sp.tan, sp.cot, sp.sec, sp.csc) or any(not p.base.is_Symbol for p in below)
 
 
 def tidy_matrix(x: Any, *, small: int = SMALL) -> sp.ImmutableMatrix:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property, partial
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -12,19 +13,25 @@ import casadi as ca
 import numpy as np
 import sympy as sp
 
-from mbkit._check import real
+from mbkit._check import Array, count, real
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.values import Constants, Values
-from mbkit.errors import UnknownNameError, UnsupportedError
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.lagrangian.constraints import ConstraintTerms, Manifold, manifold_of
 from mbkit.lagrangian.conversion import Conversion
+from mbkit.lagrangian.multipliers import constrained, derivatives
 from mbkit.model import Model
 from mbkit.model.needs import Needs
-from mbkit.model.parts import Body, Joint
+from mbkit.model.parts import Body, Frame, Joint
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
 
-__all__ = ["WrittenEquations", "WrittenModel"]
+__all__ = ["WrittenEquations", "WrittenModel", "abstract_parts"]
+
+#: Random states that are tried, of which each may be too far from the constraints.
+_DRAWS = 50
 
 
 class WrittenModel(Model):
@@ -38,14 +45,12 @@ class WrittenModel(Model):
     """
 
     def __init__(self, system: Lagrangian, values: Mapping[str, float | None] | None = None) -> None:
-        # One coordinate a joint, each on the one before: the pattern of a full mass matrix.
-        names = [q.name for q in system.coordinates]
-        joints = tuple(_coordinate(name, before) for name, before in zip(names, ["world", *names], strict=False))
+        bodies, joints = abstract_parts([q.name for q in system.coordinates])
         # The parts of a frozen class are set once, here.
         put = object.__setattr__
         put(self, "system", system)
         put(self, "_values", dict(values or {s.name: x for s, x in system.parameters.items()}))
-        super().__init__(system.name, np.zeros(3), tuple(_massless(name) for name in names), joints)
+        super().__init__(system.name, np.zeros(3), bodies, joints)
 
     system: Lagrangian
     _values: dict[str, float | None]
@@ -62,6 +67,11 @@ class WrittenModel(Model):
     def clock(self) -> str | None:
         """Name of the time, a parameter that simulation moves."""
         return self.system.time.name if self.system.time is not None else None
+
+    @property
+    def constrained(self) -> bool:
+        """Whether constraints bind the coordinates to each other."""
+        return bool(self.system.constraints)
 
     @cached_property
     def parameters(self) -> Mapping[str, float | None]:
@@ -105,7 +115,7 @@ class WrittenModel(Model):
         moved = {n: real(f"parameter {n!r}", x) for n, x in values.items()}
         out = object.__new__(type(self))
         # Nothing but the values differs: what was derived from the rest is kept.
-        kept = {k: x for k, x in self.__dict__.items() if k not in ("parameters", "digest")}
+        kept = {k: x for k, x in self.__dict__.items() if k not in ("parameters", "digest", "_states")}
         out.__dict__.update(kept, _values={**self._values, **moved})
         return out
 
@@ -127,6 +137,29 @@ class WrittenModel(Model):
             f"without: {self.name} was written as energies, of which only 'damping' can be left out, got {features}"
         )
 
+    def random_state(self, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
+        """Draw a random state as `Model.random_state` does; under constraints the consistent one that is nearest."""
+        if not self.constrained:
+            return super().random_state(rng, size)
+        drawn = [self._consistent_state(rng) for _ in range(1 if size is None else count("size", size))]
+        q, v = np.array(drawn).reshape(len(drawn), 2, self.nv).transpose(1, 0, 2)
+        return (q[0], v[0]) if size is None else (q, v)
+
+    def _consistent_state(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        for _ in range(_DRAWS):
+            # From some places there is no way to the constraints.
+            with suppress(InputError):
+                return self._states.project(*super().random_state(rng))
+        return self._states.project(*super().random_state(rng))
+
+    @cached_property
+    def _states(self) -> Manifold:
+        return manifold_of(LagrangianDynamics(self, compile=False))
+
+    def frame(self, name: str) -> Frame:
+        """Refuse: energies have no frames."""
+        raise UnsupportedError(f"frame {name!r}: {self.name} was written as energies and has no frames")
+
     def __repr__(self) -> str:
         return f"<WrittenModel {self.name!r}: coordinates {', '.join(self.coordinate_names)}>"
 
@@ -142,7 +175,6 @@ class WrittenEquations(Equations):
         self.model = model
         self.q, self.v = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
         self.a, self.tau = ca.SX.sym("a", model.nv), ca.SX.sym("tau", model.nv)
-        self.kin = SimpleNamespace(qdot=self.v, pullback=lambda x: x)  # type: ignore[assignment]
         s = model.system
         names = {**{p: values.named[p.name] for p in s.parameters}}
         names |= {c: self.q[i] for i, c in enumerate(s.coordinates)}
@@ -153,8 +185,18 @@ class WrittenEquations(Equations):
         read = Conversion(names, values.number)
         self._T, self._V, self._R = ca.SX(read(s.T)), ca.SX(read(s.V)), ca.SX(read(s.dissipation))
         self._Q = read.matrix(s.forces)
+        self.constraints = ConstraintTerms(read.matrix(s.constraints), self.q, self.v, self.time)
+        self._kinematics(read)
         self.parameters = values.parameters
         self.constants, self.constant_values = values.constants, values.constant_values
+
+    def _kinematics(self, read: Conversion) -> None:  # noqa: ARG002  # quasi-velocities have something to read
+        """Set what velocities are to coordinates: their rates."""
+        self.kin = SimpleNamespace(qdot=self.v, pullback=lambda x: x)  # type: ignore[assignment]
+
+    def _turned(self, p: Any) -> Any:  # noqa: ARG002
+        """Return what quasi-velocities add to the rate of a momentum."""
+        return 0
 
     @property
     def kinetic_energy(self) -> Any:
@@ -169,7 +211,7 @@ class WrittenEquations(Equations):
     @cached_property
     def gravity(self) -> Any:
         """∂V/∂q, whatever it comes from."""
-        return ca.gradient(self._V, self.q)
+        return self.kin.pullback(ca.gradient(self._V, self.q))
 
     @cached_property
     def damping(self) -> Any:
@@ -185,27 +227,47 @@ class WrittenEquations(Equations):
     def energy_rate(self) -> Any:
         """d/dt (T + V) along (v, a), with the time's own part."""
         E = self._T + self._V
-        rate = ca.jtimes(E, ca.vertcat(self.q, self.v), ca.vertcat(self.v, self.a))
+        rate = ca.jtimes(E, ca.vertcat(self.q, self.v), ca.vertcat(self.kin.qdot, self.a))
         return rate if self.time is None else rate + ca.gradient(E, self.time)
 
     def _inertial(self, a: ca.SX) -> Any:
         """D/dt ∂T/∂v - ∂T/∂q: M a + C v + d."""
-        rate = ca.jtimes(self.momentum, ca.vertcat(self.q, self.v), ca.vertcat(self.v, a))
+        rate = ca.jtimes(self.momentum, ca.vertcat(self.q, self.v), ca.vertcat(self.kin.qdot, a))
         if self.time is not None:
             rate += ca.jacobian(self.momentum, self.time)
-        return rate - ca.gradient(self._T, self.q)
+        return rate + self._turned(self.momentum) - self.kin.pullback(ca.gradient(self._T, self.q))
 
     @cached_property
     def coriolis_force(self) -> Any:
         """C(q, v) v, of T2 alone."""
         T2 = 0.5 * ca.dot(self.v, ca.mtimes(self.mass_matrix, self.v))
         p = ca.mtimes(self.mass_matrix, self.v)
-        return ca.jtimes(p, self.q, self.v) - ca.gradient(T2, self.q)
+        rate = ca.jtimes(p, self.q, self.kin.qdot) + self._turned(p)
+        return rate - self.kin.pullback(ca.gradient(T2, self.q))
 
     @cached_property
     def nle(self) -> Any:
         """C v + d + ∂V/∂q."""
         return self._inertial(ca.SX(self.model.nv, 1)) + self.gravity
+
+    @cached_property
+    def _constrained(self) -> tuple[Any, Any]:
+        return constrained(self)
+
+    @property
+    def multipliers(self) -> Any:
+        """λ(q, v, τ) of the constraints."""
+        return self._constrained[1]
+
+    @cached_property
+    def forward_dynamics(self) -> Any:
+        """M⁻¹ (τ + τ_passive - nle + Jᵀ λ); every other term of the equation is the one without constraints."""
+        return self._constrained[0] if self.model.constrained else super().forward_dynamics
+
+    @cached_property
+    def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
+        """∂FD/∂q, ∂FD/∂v and ∂FD/∂τ, under the constraints."""
+        return derivatives(self) if self.model.constrained else super().forward_dynamics_derivatives
 
     @property
     def elimination_order(self) -> tuple[int, ...]:
@@ -214,6 +276,13 @@ class WrittenEquations(Equations):
 
     def _frame(self, name: str) -> tuple[str, Any]:
         raise UnsupportedError(f"frame {name!r}: {self.model.name} was written as energies and has no frames")
+
+
+def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint, ...]]:
+    """Return what gives a model coordinates of these names, and nothing else."""
+    # One coordinate a joint, each on the one before: the pattern of a full mass matrix.
+    joints = tuple(_coordinate(name, before) for name, before in zip(names, ["world", *names], strict=False))
+    return tuple(_massless(name) for name in names), joints
 
 
 def _coordinate(name: str, before: str) -> Joint:

@@ -263,6 +263,16 @@ class Model:
         """The parameter that is the time, where the equation depends on it."""
         return None
 
+    @property
+    def constrained(self) -> bool:
+        """Whether constraints bind the coordinates to each other, so that not every state is one."""
+        return False
+
+    @property
+    def rates(self) -> Any:
+        """How velocities become the coordinates' rates where no joint says it, for `mbkit.model.space`; else None."""
+        return None
+
     # Configurations
 
     def neutral(self) -> Array:

@@ -15,17 +15,24 @@ class Space:
     """Configurations and velocities of one model as the integrators hold them.
 
     A configuration is mbkit's q. A velocity `w` is mbkit's v with the linear part
-    of each free joint in the axes of the joint's fixed frame. All methods take
-    one state or a batch; whoever reckons with something else than arrays overrides
-    the methods at the end. On a model without quaternions all cost one addition.
+    of each free joint in the axes of the joint's fixed frame; where the model has `rates` of
+    its own, it is q̇. All methods take one state or a batch; whoever reckons with something
+    else than arrays overrides the methods at the end. Where w is v and positions add, all
+    cost one addition.
 
     Parameters
     ----------
     model : Model
+
+    Attributes
+    ----------
+    flat : bool
+        Whether positions add and w is v.
     """
 
     def __init__(self, model: Model) -> None:
-        self.flat = not model.quaternions
+        self._rates, self._adds = model.rates, not model.quaternions
+        self.flat = self._adds and self._rates is None
         self.nv = model.nv
         self._turns: list[tuple[slice, slice]] = []
         self._free: list[tuple[slice, slice, slice]] = []
@@ -52,7 +59,7 @@ class Space:
 
     def move(self, q: Any, u: Any) -> Any:
         """Return q moved by u: positions add, rotations turn by exp(u) in body axes."""
-        if self.flat:
+        if self._adds:
             return q + u
         m, out = self.arithmetic(q), self.copied(q)
         for a, b in self._sums:
@@ -64,7 +71,7 @@ class Space:
 
     def rate(self, u: Any, w: Any) -> Any:
         """Return u̇ where q moved by u(t) has the velocity w: dexp⁻¹ on rotations."""
-        if self.flat:
+        if self._adds:
             return w
         m, out = self.arithmetic(w), self.copied(w)
         for _, b in self._turns:
@@ -73,7 +80,7 @@ class Space:
 
     def sizes(self, q: Any, u: Any) -> Any:
         """Return how large q is along each component of a u: |q| where positions add, 1 for a rotation."""
-        if self.flat:
+        if self._adds:
             return abs(q)
         out = 0 * u + 1
         for a, b in self._sums:
@@ -82,11 +89,27 @@ class Space:
 
     def enter(self, q: Any, v: Any) -> Any:
         """Return w of mbkit's v."""
+        if self._rates is not None:
+            return self._rates.enter(q, v)
         return self._changed(q, v, velocity_in_parent)
 
     def leave(self, q: Any, w: Any) -> Any:
         """Return mbkit's v of w."""
+        if self._rates is not None:
+            return self._rates.leave(q, w)
         return self._changed(q, w, velocity_in_body)
+
+    def enter_force(self, q: Any, f: Any) -> Any:
+        """Return the momentum or force on w of one on mbkit's v; on free joints they turn as velocities do."""
+        if self._rates is not None:
+            return self._rates.enter_force(q, f)
+        return self.enter(q, f)
+
+    def leave_force(self, q: Any, f: Any) -> Any:
+        """Return the momentum or force on mbkit's v of one on w."""
+        if self._rates is not None:
+            return self._rates.leave_force(q, f)
+        return self.leave(q, f)
 
     def _changed(self, q: Any, v: Any, change: Any) -> Any:
         if not self._free:
@@ -98,6 +121,8 @@ class Space:
 
     def acceleration(self, q: Any, v: Any, a: Any) -> Any:
         """Return ẇ of mbkit's v and v̇."""
+        if self._rates is not None:
+            return self._rates.acceleration(q, v, a)
         if not self._free:
             return a
         out = self.copied(a)

@@ -243,6 +243,9 @@ class _Solve:
         if not credible(solver.y) or not np.isfinite(getattr(solver, "f", 0.0)).all():
             member.stop("diverged", f"diverged: {self.rates.why or RAN_AWAY}")
             return None
+        if self._model.constrained and not self._scheme.dense:
+            solver.y = self.rates.settled(float(solver.t), solver.y)
+            solver.f = self.rates(float(solver.t), solver.y, force)
         return solver
 
     def _shorten(self, solver: Any, stop: float) -> float:

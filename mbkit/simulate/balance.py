@@ -111,6 +111,8 @@ def _is_damped(model: Model) -> bool:
 def _plain(model: Model) -> list[tuple[int, int]]:
     """Return (coordinate, velocity) of those where v = q̇: all but free and ball joints'."""
     out: list[tuple[int, int]] = []
+    if model.rates is not None:
+        return out
     for joint in model.independent_joints:
         if joint.type.coordinate_velocities:
             q, v = model.layout.q[joint.name], model.layout.v[joint.name]

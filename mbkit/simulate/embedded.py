@@ -81,7 +81,9 @@ def run_embedded(
 def _trials(
     dyn: Dynamics, space: Space, tolerances: Tolerances, torque: Torque, duration: float, batch: int | None
 ) -> Trials:
-    if dyn.engine == "lagrangian" and not torque.callable and dyn.model.nv and not dyn.model.clock:
+    # A compiled step has one value of the time, and does not look for constraints.
+    plain = not torque.callable and not dyn.model.clock and not dyn.model.constrained
+    if dyn.engine == "lagrangian" and plain and dyn.model.nv:
         # Other engines need no CasADi.
         from mbkit.derivation.execution import has_compiler
         from mbkit.engines.lagrangian import LagrangianDynamics

@@ -103,6 +103,7 @@ class StageTrials:
         good = self._error < 1 and step > 0
         self._settle(step, good)
         if good:
+            q, w = self._field.settled(t, q, w)
             self._t, self._q, self._w, self._fresh = t, q, w, True
             for row, x in zip(before, (t, q, w), strict=True):
                 row.append(x)

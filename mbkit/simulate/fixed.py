@@ -94,6 +94,7 @@ class _Run:
             if not len(self._members):
                 return False
             self._field.only(self._members)
+        q, w = self._field.settled(self._grid.time(k + 1), q, w)
         self._q, self._w = q, w
         self._steps += 1 if self._members is None else len(self._members)
         if k + 1 == self._next:

@@ -91,6 +91,9 @@ class Linearization:
     def _kinematics(self, q: Array, v: Array, lengths: Array) -> tuple[Array, Array, Array]:
         """Return ∂(D v)/∂q, D, and the tangent of a change of q, (nv, nq)."""
         nq, nv = self._model.nq, self._model.nv
+        if self._model.rates is not None:
+            rate, D, tangent = self._model.rates.linear(q, v)
+            return rate, D, tangent
         if not self._model.quaternions:
             return np.zeros((nq, nq)), np.eye(nq), np.eye(nq)
         rate, D, tangent = np.zeros((nq, nq)), np.zeros((nq, nv)), np.zeros((nv, nq))

@@ -24,6 +24,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import FunctionError, UnsupportedError
 from mbkit.model.space import Space
+from mbkit.simulate.consistent import refuse_constraints
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.midpoint_solver import MidpointSolver, called
 from mbkit.simulate.outcome import Outcome
@@ -62,6 +63,7 @@ def run_midpoint(
             f"{method}: {dyn.model.name} depends on the time, where (q, p) alone has no symplectic flow; "
             "'gauss4' and 'gauss6' are the implicit methods for it"
         )
+    refuse_constraints(dyn, method, "which its step in (q, p) does not know")
     single = q0.ndim == 1
     q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
     check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])

@@ -9,6 +9,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
+from mbkit.simulate.consistent import settled
 from mbkit.simulate.steps import credible
 from mbkit.simulate.torque import Force
 
@@ -42,6 +43,13 @@ class Rates:
         self._own = self._dyn.of_samples([member])
         self._forward = self._own.forward_dynamics
 
+    def settled(self, t: float, y: Array) -> Array:
+        """Return the state that a step led to, on its constraints if there are some."""
+        if not self._model.constrained:
+            return y
+        nq = self._model.nq
+        return np.concatenate(settled(self._own, t, y[:nq], y[nq:]))
+
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
         # A user's function never sees a state that is none.
@@ -63,6 +71,8 @@ class Rates:
         return np.concatenate([self._qdot(q, v, lengths), a])
 
     def _qdot(self, q: Array, v: Array, lengths: Array) -> Array:
+        if self._model.rates is not None:
+            return np.asarray(self._model.rates.enter(q, v))
         if not self._model.quaternions:
             return v
         out = np.empty(len(q))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.simulate.applied import Applied, TorqueFunction
+from mbkit.simulate.consistent import along_constraints, from_consistent
 from mbkit.simulate.events import Event, as_events
 from mbkit.simulate.grid import Grid, save_times
 from mbkit.simulate.methods import METHODS, Method, Tolerances, method_of
@@ -25,6 +26,9 @@ from mbkit.simulate.stats import Stats
 from mbkit.simulate.torque import Torque
 from mbkit.simulate.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from mbkit.lagrangian.embedding import Embedded
+
 __all__ = ["simulate"]
 
 # The oracle computes with 113 bits.
@@ -32,7 +36,7 @@ _LEAST_EXTENDED: Final = 1e-32
 
 
 def simulate(
-    dyn: Dynamics,
+    dyn: Dynamics | Embedded,
     q0: ArrayLike,
     v0: ArrayLike,
     duration: float,
@@ -49,8 +53,9 @@ def simulate(
 
     Parameters
     ----------
-    dyn : Dynamics
-        From `mbkit.dynamics`.
+    dyn : Dynamics or Embedded
+        From `mbkit.dynamics`; or a system under constraints on independent coordinates,
+        from ``lag.embedded()``, with states and torques on all coordinates.
     q0 : (nq,) or (N, nq) array_like
     v0 : (nv,) or (N, nv) array_like
         A single state beside a batch is repeated.
@@ -130,15 +135,24 @@ def simulate(
     True
     """
     if not isinstance(dyn, Dynamics):
+        if hasattr(dyn, "chart"):
+            # Only where SymPy and CasADi are loaded already.
+            from mbkit.simulate.charts import run_on_charts
+
+            given = q0, v0, duration, dt, rtol, atol, torque, save, as_events(events)
+            return run_on_charts(dyn, method_of(method), *given)
         raise InputError(f"dyn: expected a Dynamics, got {type(dyn).__name__}; mbkit.dynamics(model, engine) makes one")
     chosen = method_of(method)
     model = dyn.model
     q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
+    if model.rates is not None:
+        model.rates.check_start(q, v)
     batch = _batch(dyn, batch_of(q0=q, v0=v))
     if batch is not None:
         q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
     duration, dt = real("duration", duration, nonnegative=True), real("dt", dt, positive=True)
     _require_engine(dyn, chosen)
+    q, v = from_consistent(dyn, q, v)
     wanted = as_events(events)
     if wanted and not chosen.events:
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
@@ -153,7 +167,7 @@ def simulate(
         else:
             _refuse_tolerances(chosen, rtol, atol)
             applied, outcome = _stepped(dyn, chosen, q, v, duration, dt, **arguments)
-    return _wrapped(dyn, chosen, applied, outcome, time.perf_counter() - started)
+    return _wrapped(dyn, chosen, applied, along_constraints(dyn, outcome), time.perf_counter() - started)
 
 
 def _require_engine(dyn: Dynamics, method: Method) -> None:

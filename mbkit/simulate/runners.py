@@ -57,4 +57,7 @@ def _compiles(dyn: Dynamics) -> bool:
     # A compiled step has one value of each parameter, the time among them.
     if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out or dyn.model.clock:
         return False
+    # Nor does it look for constraints after each step.
+    if dyn.model.constrained:
+        return False
     return not isinstance(dyn.code("forward_dynamics"), Machine)

@@ -21,6 +21,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_time
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.space import Space
+from mbkit.simulate.consistent import settled
 from mbkit.simulate.grid import Indices
 from mbkit.simulate.tableau import RK4, Tableau
 from mbkit.simulate.torque import Force
@@ -71,6 +72,10 @@ class Field:
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.clock is not None
+
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+        """Return the state that a step led to, on its constraints if there are some."""
+        return settled(self._own, t, q, w) if self._own.model.constrained else (q, w)
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""

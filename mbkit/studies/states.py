@@ -39,17 +39,23 @@ def states(model: Model, samples: int, seed: int) -> States:
 
     Near-singular states are at the closed and straight poses where axes align:
     every angle at a multiple of a right angle, pushed off by 1e-4, which puts
-    spherical-ZYX joints next to gimbal lock and arms next to stretched.
+    spherical-ZYX joints next to gimbal lock and arms next to stretched. Of a model with
+    constraints they are no states, and left out.
     """
     rng = np.random.default_rng(seed)
     q, v = model.random_state(rng, samples)
     parts, kinds = [q], ["random"] * samples
     few = max(2, samples // 16)
-    for kind, made in (
-        ("neutral", np.tile(model.neutral(), (2, 1))),
-        ("at limits", _at_limits(model, rng, few)),
-        ("near singular", _near_singular(model, rng, few)),
-    ):
+    special = (
+        []
+        if model.constrained
+        else [
+            ("neutral", np.tile(model.neutral(), (2, 1))),
+            ("at limits", _at_limits(model, rng, few)),
+            ("near singular", _near_singular(model, rng, few)),
+        ]
+    )
+    for kind, made in special:
         parts.append(made)
         kinds += [kind] * len(made)
     q = np.concatenate(parts)
@@ -61,6 +67,8 @@ def states(model: Model, samples: int, seed: int) -> States:
 def inside(model: Model, rng: np.random.Generator, share: float = 0.5) -> tuple[Array, Array]:
     """Return a random state in the middle `share` of the limits."""
     q, v = model.random_state(rng)
+    if model.constrained:
+        return q, v
     lower, upper = limits_box(model)
     bounded = np.isfinite(lower)
     middle = 0.5 * (lower[bounded] + upper[bounded])

@@ -78,6 +78,9 @@ def _from_function(module_name: str, name: str) -> Model:
     if callable(made):
         with _blamed(f"{target}: the function failed"):
             made = made()
+    if not isinstance(made, Model) and isinstance(getattr(made, "model", None), Model):
+        # A system on paper, which knows itself as a model.
+        made = made.model
     if not isinstance(made, Model):
         told = f"expected a Model, got {type(made).__name__}; return mbkit.load(...) or builder.build()"
         raise LoadError(f"{target}: {told}")

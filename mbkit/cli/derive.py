@@ -1,0 +1,130 @@
+"""`mbkit derive`: the equations of motion to read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mbkit.cli.door import say
+from mbkit.cli.options import load_options, model_options
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.system import Lagrangian
+    from mbkit.model import Model
+
+__all__ = ["derive"]
+
+_WIDTH: Final = 100
+
+
+@click.command()
+@click.argument("system")
+@click.option("--latex", "form", flag_value="latex", help="Print LaTeX.")
+@click.option("--python", "form", flag_value="python", help="Print a Python module that needs NumPy only.")
+@click.option("--c", "form", flag_value="c", help="Write C99, as mbkit export does.")
+@model_options
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write to, instead of printing.")
+@click.option("--force", is_flag=True, help="Replace C files that mbkit did not write.")
+def derive(
+    system: str,
+    form: str | None,
+    floating_base: bool,
+    mimic: str | None,
+    nonphysical: str | None,
+    as_json: bool,
+    out: Path | None,
+    force: bool,
+) -> None:
+    """Print T, V, M, C, g and the equation of motion of SYSTEM, and what it conserves.
+
+    SYSTEM is a catalog system, a system on paper such as kepler, a small robot, a path to a URDF or MJCF file, or
+    package.module:function for a function that returns a Model or a Lagrangian. Where catalog and paper
+    have the same name, this is the catalog's; mbkit.lagrangian.systems:NAME is the other.
+    """
+    if as_json and form:
+        raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
+    from mbkit.report.folder import check_writable
+
+    if out is not None:
+        check_writable(out)
+    target = _model(system, load_options(floating_base, mimic, nonphysical))
+    if form == "c":
+        _write_c(target, system, out or Path("mbkit-export"), force)
+        return
+    from mbkit.lagrangian.from_model import from_model
+    from mbkit.lagrangian.textbook import letters
+    from mbkit.lagrangian.written import WrittenModel
+    from mbkit.report.progress import Bar
+
+    with Bar(f"derive {target.name}") as bar:
+        names = None if isinstance(target, WrittenModel) else letters(target)
+        lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.5 * x, text))
+        text, ending = _text(lag, target, form, as_json, bar)
+    if out is None:
+        click.echo(text)
+        return
+    from mbkit.report.folder import file_stem, write
+
+    path = write(out, f"{file_stem(lag.name)}{ending}", text + "\n")
+    click.echo(str(path))
+
+
+def _model(name: str, options: dict[str, Any]) -> Model:
+    """Return what a name stands for; one that only paper has, or the catalog has with quaternions, is paper's."""
+    from mbkit import catalog
+    from mbkit.errors import UnknownNameError
+    from mbkit.lagrangian import systems
+    from mbkit.load.names import find
+    from mbkit.studies.target import model_of
+
+    made = catalog.systems()[name]() if name in catalog.systems() and not options else None
+    if name in systems.names() and not options and (made is None or made.quaternions):
+        if made is not None:
+            say("note", f"{name} is in Euler angles here; the catalog's has a quaternion, which mbkit check takes")
+        return systems.get(name)().model
+    if made is not None:
+        if find(name) is not None:
+            say("note", f"{name} is also a robot; this is the catalog's system, and a path or another name is the robot")
+        return made
+    try:
+        return model_of(name, options)
+    except UnknownNameError as error:
+        if error.what != "robot or catalog system":
+            raise
+        known = [*systems.names(), *error.known]
+        raise UnknownNameError("robot, catalog system or system on paper", name, known, error.hint) from None
+
+
+def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
+    from mbkit.derivation.export import c_identifier, export_c
+    from mbkit.lagrangian.textbook import in_symbols
+    from mbkit.lagrangian.written import WrittenModel
+    from mbkit.load.names import find
+
+    if not isinstance(model, WrittenModel):
+        model = in_symbols(model) or model
+    made = export_c(model, name=c_identifier(name) if find(name) else None)
+    paths = made.write(out, force=force)
+    for function in made.functions:
+        click.echo(f"{function.signature}: {function.operations} operations")
+    click.echo(f"header {paths[0]}\nsource {paths[1]}")
+
+
+def _text(lag: Lagrangian, model: Model, form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
+    if form == "python":
+        from mbkit.lagrangian.python_code import python_code
+
+        bar(0.5, "equations")
+        return python_code(lag).rstrip("\n"), ".py"
+    from mbkit.lagrangian.account import Account
+
+    bar(0.5, "equations")
+    account = Account(lag, names=dict(zip((q.name for q in lag.coordinates), model.coordinate_names, strict=False)))
+    if as_json:
+        import json
+
+        return json.dumps(account.data(), indent=1, ensure_ascii=False), ".json"
+    return (account.latex(), ".tex") if form == "latex" else (account.text(_WIDTH), ".txt")

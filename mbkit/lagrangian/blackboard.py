@@ -1,0 +1,242 @@
+"""Expressions in the order of a blackboard: ½ (m₁ + m₂) l₁² θ̇₁² + m₂ l₁ l₂ θ̇₁ θ̇₂ cos(θ₁ - θ₂).
+
+SymPy's printers take factors in the order of the alphabet. Here a number comes first, then masses and inertias, g and
+lengths, coordinates, velocities, accelerations, and cosines last; in sums what turns comes after what does not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any, Final
+
+import sympy as sp
+from sympy.printing.latex import LatexPrinter
+from sympy.printing.pretty.pretty_symbology import pretty_symbol
+
+from mbkit.lagrangian.motion import EquationsOfMotion
+from mbkit.lagrangian.tidy import tidy
+
+__all__ = ["Blackboard", "spread", "written"]
+
+_FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
+_HIGH: Final = str.maketrans("0123456789-/", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ")
+_MASS: Final = re.compile(r"[mM](\d*|_\w+)")
+_INERTIA: Final = re.compile(r"[A-CIJ](\d*|_\w+)|EI")
+
+
+class Blackboard:
+    """How expressions of one system are written, on one line of text or in LaTeX.
+
+    Parameters
+    ----------
+    equations : EquationsOfMotion
+    """
+
+    def __init__(self, equations: EquationsOfMotion) -> None:
+        e = self._equations = equations
+        self._moving = {s: k for k, group in enumerate((e.coordinates, e.velocities, e.accelerations)) for s in group}
+
+    # Order
+
+    def _rank(self, x: sp.Expr) -> tuple[Any, ...]:
+        """Return what a factor is ordered by."""
+        base = x.base if x.is_Pow and x.exp.is_number else x
+        if base.is_Number:
+            return (0, "")
+        if base.is_Symbol:
+            name = base.name
+            if base in self._moving:
+                return (5 + self._moving[base], list(self._moving).index(base))
+            kinds = (_MASS.fullmatch(name), _INERTIA.fullmatch(name), name == "g")
+            greek = written(name)[0] != name[0]
+            return (next((k for k, hit in enumerate(kinds, start=1) if hit), 4), greek, name)
+        if base.is_Add:
+            inside = [self._rank(s) for s in base.free_symbols]
+            least, most = min(inside, default=(4,))[0], max(inside, default=(4,))[0]
+            turns = base.has(sp.sin, sp.cos)
+            return (least if least == most < 4 and not turns else 4.5, str(base))
+        if isinstance(base, sp.Function):
+            return (8, str(base.args[0]), base.func is sp.cos, str(base))
+        return (7.5, str(base))
+
+    def _ordered(self, terms: Iterable[sp.Expr]) -> list[sp.Expr]:
+        """Return the terms of a sum, positive ones and those that do not turn first."""
+
+        def key(term: sp.Expr) -> tuple[Any, ...]:
+            powers = dict(f.as_base_exp() for f in sp.Mul.make_args(term))
+            speeds = [-int(powers.get(s, 0)) for s, k in self._moving.items() if k]
+            turned = sorted((len(a.free_symbols), str(a)) for a in term.atoms(sp.sin, sp.cos))
+            return (speeds, len(turned), turned, _minus(term), str(term))
+
+        out = sorted(terms, key=key)
+        # A sum does not begin with a minus where it need not.
+        first = next((t for t in out if not _minus(t)), None)
+        if first is not None and _minus(out[0]):
+            out.remove(first)
+            out.insert(0, first)
+        return out
+
+    def _factors(self, x: sp.Expr) -> list[sp.Expr]:
+        return sorted(sp.Mul.make_args(x), key=self._rank)
+
+    # Text
+
+    def text(self, x: Any) -> str:
+        """Return an expression on one line."""
+        x = sp.sympify(x)
+        return self._joined(self._ordered(sp.Add.make_args(x)))
+
+    def _joined(self, terms: list[sp.Expr]) -> str:
+        out = ""
+        for term in terms:
+            minus = _minus(term)
+            told = self._product(-term if minus else term)
+            out += (("-" if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
+        return out or "0"
+
+    def _product(self, x: sp.Expr) -> str:
+        if x.is_Add:
+            return self._atom(x)
+        number, rest = x.as_coeff_Mul()
+        below = sp.Mul(*(1 / f for f in sp.Mul.make_args(rest) if _below(f)))
+        above = sp.Mul(*(f for f in sp.Mul.make_args(rest) if not _below(f)))
+        factors = self._factors(above) if above != 1 else []
+        told = [self._atom(f) for f in factors]
+        if number != 1 or not told:
+            told.insert(0, _number(number))
+        line = " ".join(told)
+        if below == 1:
+            return line
+        under = self._factors(below)
+        bottom = " ".join(self._atom(f) for f in under)
+        return f"{line}/{bottom}" if len(under) == 1 else f"{line}/({bottom})"
+
+    def _atom(self, x: sp.Expr) -> str:
+        if x.is_Add:
+            return f"({self.text(x)})"
+        if x.is_Symbol:
+            return written(x.name)
+        if x.is_Number:
+            return _number(x)
+        if x.is_Pow and x.exp == sp.Rational(1, 2):
+            return f"√{self._atom(x.base)}" if x.base.is_Symbol else f"√({self.text(x.base)})"
+        if x.is_Pow and x.exp.is_Rational:
+            high = str(x.exp).translate(_HIGH)
+            if isinstance(x.base, (sp.sin, sp.cos, sp.tan)) and x.exp.is_Integer:
+                told = self._argument(x.base.args[0])
+                return f"{x.base.func.__name__}{high}{'' if told.startswith('(') else ' '}{told}"
+            return f"{self._atom(x.base) if x.base.is_Symbol or x.base.is_Add else f'({self.text(x.base)})'}{high}"
+        if isinstance(x, sp.Abs):
+            return f"|{self.text(x.args[0])}|"
+        if isinstance(x, sp.Function) and len(x.args) == 1:
+            space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
+            told = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
+            return f"{x.func.__name__}{space if not told.startswith('(') else ''}{told}"
+        if x.is_Mul:
+            return self._product(x)
+        return str(x)
+
+    def _argument(self, x: sp.Expr) -> str:
+        if x.is_Symbol:
+            return self._atom(x)
+        number, rest = x.as_coeff_Mul()
+        if rest.is_Symbol and number.is_Integer and number > 0:
+            return f"{number}{self._atom(rest)}"
+        return f"({self.text(x)})"
+
+    # LaTeX
+
+    def latex(self, x: Any) -> str:
+        """Return an expression in LaTeX."""
+        return self._latex(self._ordered(sp.Add.make_args(sp.sympify(x))))
+
+    def _latex(self, terms: list[sp.Expr]) -> str:
+        printer = _Latex({"order": "none", "full_prec": False})
+        out = ""
+        for term in terms:
+            minus = _minus(term)
+            told = printer.doprint(self._arranged(-term if minus else term))
+            out += (("- " if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
+        return out or "0"
+
+    def _arranged(self, x: sp.Expr) -> sp.Expr:
+        """Return an expression whose sums and products are in order, for a printer that keeps it."""
+        if x.is_Add:
+            return sp.Add(*(self._arranged(t) for t in self._ordered(x.args)), evaluate=False)
+        if x.is_Mul:
+            return sp.Mul(*(self._arranged(f) for f in self._factors(x)), evaluate=False)
+        if x.is_Pow:
+            return sp.Pow(self._arranged(x.base), x.exp, evaluate=False)
+        return x
+
+    # Equations
+
+    def rows(self, *, latex: bool = False) -> list[tuple[str, str]]:
+        """Return the two sides of each equation: accelerations, then velocities, then the potential."""
+        e = self._equations
+        join = self._latex if latex else self._joined
+        right = e.forces
+        if e.multipliers:
+            right = right + e.constraint_jacobian.T * sp.Matrix(e.multipliers)
+        out = []
+        for i, force in enumerate(right):
+            parts = [m * a for m, a in zip(e.mass_matrix[i, :], e.accelerations, strict=True)]
+            parts += [self._by_speeds(e.coriolis_force[i]), e.drift[i], spread(e.potential_gradient[i])]
+            left = [t for part in parts if part != 0 for t in self._ordered(sp.Add.make_args(part))]
+            out.append((join(left), join(self._ordered(sp.Add.make_args(force)) if force != 0 else [])))
+        return out + [(join(self._ordered(sp.Add.make_args(f))), "0") for f in e.constraints]
+
+
+    def _by_speeds(self, x: sp.Expr) -> sp.Expr:
+        """Return what is quadratic in the velocities term by term, where it would hold cosines in brackets."""
+        if not any(a.has(sp.sin, sp.cos) for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add):
+            return x
+        form = sp.Poly(x, *self._equations.velocities)
+        powers = [sp.Mul(*(v**n for v, n in zip(form.gens, m, strict=True))) for m in form.monoms()]
+        return sp.Add(*(tidy(c) * p for c, p in zip(form.coeffs(), powers, strict=True)))
+
+
+class _Latex(LatexPrinter):  # type: ignore[misc]
+    """SymPy's, with ½ before what it halves."""
+
+    def _print_Mul(self, expr: sp.Expr) -> str:
+        number = expr.args[0]
+        if number.is_Rational and number.q != 1 and len(expr.args) > 1 and not any(_below(f) for f in expr.args):
+            rest = sp.Mul(*expr.args[1:], evaluate=False) if len(expr.args) > 2 else expr.args[1]
+            told = self._print(rest)
+            told = rf"\left({told}\right)" if rest.is_Add else told
+            return rf"\tfrac{{{number.p}}}{{{number.q}}} {told}"
+        return str(super()._print_Mul(expr))
+
+
+def spread(x: sp.Expr) -> sp.Expr:
+    """Return a sum over angles without what its terms share in front: m g l sin θ + m g l sin φ."""
+    number, rest = x.as_coeff_Mul()
+    sums = [f for f in sp.Mul.make_args(rest) if f.is_Add and f.has(sp.sin, sp.cos)]
+    others = [f for f in sp.Mul.make_args(rest) if f not in sums]
+    if len(sums) != 1 or any(f.has(sp.sin, sp.cos) for f in others) or not all(t.has(sp.sin, sp.cos) for t in sums[0].args):
+        return x
+    return sp.Add(*(sp.Mul(number, *others, term) for term in sums[0].args))
+
+
+def written(name: str) -> str:
+    """Return a symbol's name in Unicode: θ̇₁; a letter below the line stays behind its mark: m_p."""
+    stem, mark, index = name.partition("_")
+    if mark and index[:1].isalpha() and stem:
+        return f"{pretty_symbol(stem)}_{pretty_symbol(index)}"
+    return str(pretty_symbol(name))
+
+
+def _below(x: sp.Expr) -> bool:
+    return bool(x.is_Pow and x.exp.is_Rational and x.exp.is_negative)
+
+
+def _minus(x: sp.Expr) -> bool:
+    return bool(x.as_coeff_Mul()[0].is_negative)
+
+
+def _number(x: sp.Expr) -> str:
+    if x.is_Rational and x.q != 1:
+        return _FRACTIONS.get((int(x.p), int(x.q)), str(x))
+    return f"{float(x):.15g}" if x.is_Float else str(x)

@@ -1,0 +1,282 @@
+"""Exact sums of cosines and sines as a teacher would write them: the shortest of several equal forms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from itertools import combinations
+from math import comb, gcd, lcm
+from typing import Final
+
+import sympy as sp
+
+from mbkit.lagrangian.harmonic import Harmonic
+
+__all__ = ["cost", "number", "written_out"]
+
+#: Terms up to which products of cosines and sines are looked for.
+_SMALL: Final = 60
+#: Forms of fewest terms that are made into SymPy's expressions, to count their operations.
+_TRIED: Final = 4
+#: Terms up to which a sum is tried to be a product of sums.
+_FACTORED: Final = 10
+
+#: Powers (angle, of cos, of sin) of single angles.
+_Powers = tuple[tuple[int, int, int], ...]
+#: Those, the kind and multiples of what is left, exponents of the generators.
+_Key = tuple[_Powers, int, tuple[int, ...], tuple[int, ...]]
+_Form = dict[_Key, Fraction]
+#: A product of powers of atoms -> its coefficient.
+_Poly = dict[tuple[tuple[sp.Expr, int], ...], Fraction]
+
+
+def cost(x: sp.Expr) -> int:
+    """Return how long an expression reads: its operations, more for a sum that begins with a minus or stands deep."""
+    sums = x.atoms(sp.Add)
+    return int(x.count_ops()) + sum(e.could_extract_minus_sign() for e in sums) + 2 * max(_depth(x) - 2, 0)
+
+
+def _depth(x: sp.Expr) -> int:
+    """Return how many sums stand in one another, outside of cosines and the like."""
+    if not (x.is_Add or x.is_Mul or x.is_Pow):
+        return 0
+    return max(map(_depth, x.args)) + bool(x.is_Add)
+
+
+def number(x: Fraction) -> sp.Expr:
+    """Return a fraction where people write one: 1/2, 1/12; a decimal for 9.81 and what is longer."""
+    # A decimal that ends after few digits reads better as one, unless it is a half, a quarter or an eighth.
+    ends = _without(_without(x.denominator, 2), 5) == 1
+    if x.denominator in (1, 2, 4, 8) or (x.denominator <= 1000 and not ends):
+        return sp.Rational(x.numerator, x.denominator)
+    return sp.Float(float(x))
+
+
+def _without(n: int, p: int) -> int:
+    while n % p == 0:
+        n //= p
+    return n
+
+
+def written_out(x: Harmonic, *, whole: bool = True, decimals: bool = True) -> sp.Expr:
+    """Return a sum of cosines and sines as a SymPy expression that is short to read.
+
+    Parameters
+    ----------
+    x : Harmonic
+    whole : bool
+        Whether what all terms share is taken out of the sum.
+    decimals : bool
+        Whether numbers such as 9.81 are decimals; else all are fractions.
+    """
+    if not x:
+        return sp.Integer(0)
+    writer = _Writer(x, whole, decimals)
+    if len(x.terms) > _SMALL:
+        return writer.expression(writer.as_it_is())
+    forms = sorted(writer.forms(), key=len)
+    near = [form for form in forms[:_TRIED] if len(form) <= len(forms[0]) + 2]
+    made = [writer.expression(form) for form in near]
+    return min(made, key=lambda e: (cost(e), made.index(e)))
+
+
+class _Writer:
+    def __init__(self, x: Harmonic, whole: bool, decimals: bool) -> None:
+        self._x, self._whole, self._decimals = x, whole, decimals
+
+    def as_it_is(self) -> _Form:
+        return {((), kind, multiples, powers): value for (kind, multiples, powers), value in self._x.terms.items()}
+
+    def forms(self) -> list[_Form]:
+        """Return the sum with the angles of each subset split off as powers of their own cosine and sine."""
+        x = self._x
+        present = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
+        subsets: list[tuple[int, ...]] = [()]
+        if len(present) <= 4:
+            subsets = [s for n in range(len(present) + 1) for s in combinations(present, n)]
+        forms: list[_Form] = []
+        for subset in subsets:
+            # The square that stays, of cosines (0) or sines (1); neither is shorter always.
+            for kept in (0, 1) if subset else (0,):
+                form = _split(x, subset, kept)
+                if form not in forms:
+                    forms.append(form)
+        return forms
+
+    def expression(self, form: _Form) -> sp.Expr:
+        poly = _paired(dict(self._term(key, value) for key, value in form.items()))
+        by_angle = self._by_angle(poly)
+        if not self._whole or len(by_angle) == len(poly):
+            made = [sp.Add(*map(self._written, by_angle))]
+        else:
+            shared, scale, left = _content(poly)
+            inside = sp.Add(*map(self._written, self._by_angle(left)))
+            made = [sp.Mul(self._number(scale), *(a**e for a, e in shared), inside)]
+        if self._whole:
+            made.append(self._written(poly))
+        return min(made, key=lambda e: (cost(e), made.index(e)))
+
+    def _by_angle(self, poly: _Poly) -> list[_Poly]:
+        """Return the terms of each cosine and sine."""
+        groups: dict[tuple[tuple[sp.Expr, int], ...], _Poly] = {}
+        for atoms, value in poly.items():
+            turned = tuple(a for a in atoms if isinstance(a[0], (sp.sin, sp.cos)))
+            groups.setdefault(turned, {})[atoms] = value
+        return list(groups.values())
+
+    def _term(self, key: _Key, value: Fraction) -> tuple[tuple[tuple[sp.Expr, int], ...], Fraction]:
+        done, kind, rest, powers = key
+        space = self._x.space
+        out = [(g, e) for g, e in zip(space.generators, powers, strict=True) if e]
+        for i, c, s in done:
+            out += [(f(space.angles[i]), e) for f, e in ((sp.sin, s), (sp.cos, c)) if e]
+        if any(rest):
+            angle = sp.Add(*(k * a for k, a in zip(rest, space.angles, strict=True) if k))
+            turned = sp.sin(angle) if kind else sp.cos(angle)
+            if turned.is_Mul:
+                # SymPy writes sin(b - a) as -sin(a - b).
+                turned, value = -turned, -value
+            out.append((turned, 1))
+        return tuple(out), value
+
+    def _number(self, x: Fraction) -> sp.Expr:
+        return number(x) if self._decimals else sp.Rational(x.numerator, x.denominator)
+
+    def _written(self, poly: _Poly) -> sp.Expr:
+        """Return a polynomial with what its terms share taken out, most shared first."""
+        if len(poly) == 1:
+            ((atoms, value),) = poly.items()
+            return sp.Mul(self._number(value), *(a**e for a, e in atoms))
+        shared, scale, left = _content(poly)
+        outside = sp.Mul(self._number(scale), *(a**e for a, e in shared))
+        inside = self._sum(left)
+        if outside.is_Number and isinstance(inside, sp.Add):
+            # SymPy multiplies a number into a sum; the terms then hold it.
+            return self._sum({atoms: scale * value for atoms, value in left.items()}) if outside != 1 else inside
+        return sp.Mul(outside, inside)
+
+    def _sum(self, poly: _Poly) -> sp.Expr:
+        """Return a sum by the atom that most of its terms have, and what has it not likewise."""
+        counts: dict[sp.Expr, int] = {}
+        for atoms in poly:
+            for a, e in atoms:
+                counts[a] = counts.get(a, 0) + (e > 0)
+        most = max(counts.values(), default=0)
+        if len(poly) > _FACTORED:
+            return self._taken(poly, next(a for a in counts if counts[a] == most)) if most > 1 else self._plain(poly)
+        tried = [self._plain(poly)]
+        if len(poly) > 2:
+            tried += [self._taken(poly, a) for a in counts if counts[a] == most > 1]
+            tried += _product(poly, tried[0])
+        return min(tried, key=lambda e: (cost(e), -tried.index(e)))
+
+    def _plain(self, poly: _Poly) -> sp.Expr:
+        return sp.Add(*(self._written({atoms: value}) for atoms, value in poly.items()))
+
+    def _taken(self, poly: _Poly, atom: sp.Expr) -> sp.Expr:
+        with_it = {atoms: value for atoms, value in poly.items() if dict(atoms).get(atom, 0) > 0}
+        without = {atoms: value for atoms, value in poly.items() if atoms not in with_it}
+        if not without:
+            return self._plain(poly)
+        return sp.Add(self._written(with_it), self._written(without) if len(without) == 1 else self._sum(without))
+
+
+def _product(poly: _Poly, x: sp.Expr) -> list[sp.Expr]:
+    """Return a sum as a product of sums, if it is one; its atoms are as good as symbols."""
+    # The factors of a sum with decimals would have others.
+    if x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms):
+        return []
+    symbols = {a: sp.Dummy(f"x{i}") for i, a in enumerate(dict.fromkeys(a for atoms in poly for a, _ in atoms))}
+    named = sp.Add(
+        *(sp.Rational(v.numerator, v.denominator) * sp.Mul(*(symbols[a] ** e for a, e in atoms)) for atoms, v in poly.items())
+    )
+    product = sp.factor(named)
+    return [] if product.is_Add else [product.xreplace({symbol: a for a, symbol in symbols.items()})]
+
+
+def _content(poly: _Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, _Poly]:
+    """Return the powers and the number that all terms share, and what is left."""
+    first, *others = (dict(atoms) for atoms in poly)
+    shared = {a: min([e, *(o.get(a, 0) for o in others)]) for a, e in first.items()}
+    shared = {a: e for a, e in shared.items() if e > 0}
+    values = list(poly.values())
+    scale = min(map(abs, values))
+    if any(v.denominator > 1 or abs(v) > 100 for v in (x / scale for x in values)):
+        scale = Fraction(gcd(*(v.numerator for v in values)), lcm(*(v.denominator for v in values)))
+        # Decimals share many numbers by accident; a common factor of a sum is read where it is a small one.
+        if scale.numerator > 100 or scale.denominator > 100:
+            scale = Fraction(1)
+    if sum(v > 0 for v in values) == 0:
+        scale = -scale
+    left = {tuple((a, e - shared.get(a, 0)) for a, e in atoms if e != shared.get(a, 0)): v / scale for atoms, v in poly.items()}
+    return list(shared.items()), scale, left
+
+
+def _paired(poly: _Poly) -> _Poly:
+    """Write c - c cos² a as c sin² a, and c - c sin² a as c cos² a."""
+    out = dict(poly)
+    for atoms, value in poly.items():
+        for a, e in atoms:
+            if e != 2 or not isinstance(a, (sp.sin, sp.cos)) or atoms not in out:
+                continue
+            alone = tuple(x for x in atoms if x[0] != a)
+            if out.get(alone) == -value:
+                other = (sp.cos if isinstance(a, sp.sin) else sp.sin)(*a.args)
+                del out[alone], out[atoms]
+                out[(*alone, (other, 2))] = -value
+    return out
+
+
+def _split(x: Harmonic, subset: tuple[int, ...], kept: int) -> _Form:
+    """Return a form: Re or Im of Π (cos a + i sin a)^k (cos rest + i sin rest), power by power."""
+    out: _Form = {}
+    for (kind, multiples, powers), value in x.terms.items():
+        rest = tuple(0 if i in subset else k for i, k in enumerate(multiples))
+        first = next((k for k in rest if k), 0)
+        sign = -1 if first < 0 else 1
+        rest = tuple(sign * k for k in rest)
+        parts: list[tuple[_Powers, int, int]] = [((), 0, 1)]
+        for i in subset:
+            if multiples[i]:
+                parts = [
+                    ((*done, (i, c, s)), turns + (s if multiples[i] > 0 else -s), factor * times)
+                    for done, turns, factor in parts
+                    for c, s, times in _powers(abs(multiples[i]))
+                ]
+        for done, turns, factor in parts:
+            for part in (0, 1) if first else (0,):
+                # A power of i: real for a cosine, imaginary for a sine.
+                total = (turns + part) % 4
+                if total % 2 == kind:
+                    amount = value * factor * (-1 if total >= 2 else 1) * (sign if part else 1)
+                    for reduced, weight in _reduced(done, kept):
+                        _gather(out, (reduced, part, rest, powers), amount * weight)
+    return out
+
+
+def _powers(k: int) -> list[tuple[int, int, int]]:
+    """Return (power of cos, of sin, coefficient) of (cos + i sin)^k, without the powers of i."""
+    return [(k - s, s, comb(k, s)) for s in range(k + 1)]
+
+
+def _reduced(done: _Powers, kept: int) -> Iterator[tuple[_Powers, int]]:
+    """Yield a product of powers with the square that is not kept replaced by 1 less the other's."""
+    if not done:
+        yield (), 1
+        return
+    (i, c, s), *others = done
+    gone, stays = (s, c) if kept == 0 else (c, s)
+    for rest, weight in _reduced(tuple(others), kept):
+        half = gone // 2
+        for n in range(half + 1):
+            a, b = stays + 2 * n, gone % 2
+            power = (i, a, b) if kept == 0 else (i, b, a)
+            yield ((power, *rest) if a or b else rest), weight * comb(half, n) * (-1) ** n
+
+
+def _gather(out: _Form, key: _Key, value: Fraction) -> None:
+    total = out.get(key, Fraction(0)) + value
+    if total:
+        out[key] = total
+    else:
+        out.pop(key, None)

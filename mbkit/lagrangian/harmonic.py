@@ -1,0 +1,201 @@
+"""Exact sums of cosines and sines of angles, with polynomials for coefficients.
+
+Every term of the kinetic energy of a tree of joints is such a sum. Products become sums at once
+(cos a cos b = ½ cos(a - b) + ½ cos(a + b)), so equal things always look equal, what cancels is gone, and a planar
+chain of n links never has more than n² terms: all that `sympy.trigsimp` searches for, in a time that is bounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
+from typing import Any, Final
+
+import sympy as sp
+
+from mbkit.errors import UnsupportedError
+
+__all__ = ["MOST", "Harmonic", "Space"]
+
+#: Products of terms that one system may cost: some ten seconds.
+MOST: Final = 5_000_000
+
+#: 0 for a cosine and 1 for a sine, whole multiples of the angles, exponents of the generators.
+Key = tuple[int, tuple[int, ...], tuple[int, ...]]
+
+
+class Space:
+    """Angles and generators that a system's terms are made of.
+
+    Parameters
+    ----------
+    name : str
+        The system's, for messages.
+    angles, generators : sequence of sympy.Expr
+        What stands inside cosines and sines, and what coefficients are polynomials of: parameters, whatever
+        else is not a number, and coordinates.
+    most : int
+        Products of terms that are not too many.
+    """
+
+    def __init__(
+        self, name: str, angles: Sequence[sp.Expr], generators: Sequence[sp.Expr], most: int = MOST
+    ) -> None:
+        self.name, self.angles, self.generators, self.most = name, tuple(angles), tuple(generators), most
+        self._angle = {x: i for i, x in enumerate(self.angles)}
+        self._generator = {x: i for i, x in enumerate(self.generators)}
+        self.still = (0,) * len(self.angles)
+        self.plain = (0,) * len(self.generators)
+        self.one: Key = (0, self.still, self.plain)
+        self.cost = 0
+
+    def number(self, value: Any) -> Harmonic:
+        """Return a constant."""
+        x = Fraction(value)
+        return Harmonic(self, {self.one: x} if x else {})
+
+    def of(self, expression: Any) -> Harmonic:
+        """Return a polynomial of the generators."""
+        terms: dict[Key, Fraction] = {}
+        for term in sp.Add.make_args(sp.expand(expression)):
+            number, rest = term.as_coeff_Mul()
+            exponents = list(self.plain)
+            if rest in self._generator:
+                exponents[self._generator[rest]] = 1
+            elif rest != 1:
+                for factor in sp.Mul.make_args(rest):
+                    base, exponent = (factor, 1) if factor in self._generator else factor.as_base_exp()
+                    exponents[self._generator[base]] += int(exponent)
+            if number:
+                _gather(terms, (0, self.still, tuple(exponents)), Fraction(int(number.p), int(number.q)))
+        return Harmonic(self, terms)
+
+    def power(self, generator: sp.Expr, exponent: int) -> Harmonic:
+        """Return a power of a generator, of either sign."""
+        exponents = list(self.plain)
+        exponents[self._generator[generator]] = exponent
+        return Harmonic(self, {(0, self.still, tuple(exponents)): Fraction(1)})
+
+    def cos(self, angle: Any) -> Harmonic:
+        """Return the cosine of a sum of angles."""
+        return self._turned(0, angle)
+
+    def sin(self, angle: Any) -> Harmonic:
+        """Return the sine of a sum of angles."""
+        return self._turned(1, angle)
+
+    def _turned(self, kind: int, angle: Any) -> Harmonic:
+        wanted = angle.expression
+        if wanted in self._angle:
+            return self.turned(kind, {wanted: 1})
+        value, rest = wanted.as_coeff_Mul()
+        return self.turned(kind, {rest: int(value)})
+
+    def turned(self, kind: int, multiples: Mapping[sp.Expr, int]) -> Harmonic:
+        """Return the cosine (0) or sine (1) of whole multiples of angles."""
+        out: dict[Key, Fraction] = {}
+        _put(out, kind, tuple(multiples.get(a, 0) for a in self.angles), self.plain, Fraction(1))
+        return Harmonic(self, out)
+
+    def spend(self, products: int) -> None:
+        """Count products of terms, and refuse too many of them."""
+        self.cost += products
+        if self.cost > self.most:
+            raise UnsupportedError(
+                f"{self.name}: its energies have too many terms to be written out; "
+                'mbkit.dynamics(model, "lagrangian") computes the same without writing them'
+            )
+
+
+class Harmonic:
+    """One sum; adds, multiplies and is asked for its terms. Numbers mix with it."""
+
+    __slots__ = ("space", "terms")
+
+    def __init__(self, space: Space, terms: dict[Key, Fraction]) -> None:
+        self.space, self.terms = space, terms
+
+    def _other(self, x: Any) -> Harmonic:
+        return x if isinstance(x, Harmonic) else self.space.number(x)
+
+    def __bool__(self) -> bool:
+        return bool(self.terms)
+
+    def __add__(self, x: Any) -> Harmonic:
+        other = self._other(x)
+        out = dict(self.terms)
+        for key, value in other.terms.items():
+            _gather(out, key, value)
+        return Harmonic(self.space, out)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Harmonic:
+        return Harmonic(self.space, {k: -x for k, x in self.terms.items()})
+
+    def __sub__(self, x: Any) -> Harmonic:
+        return self + (-self._other(x))
+
+    def __rsub__(self, x: Any) -> Harmonic:
+        return -self + x
+
+    def __mul__(self, x: Any) -> Harmonic:
+        other = self._other(x)
+        a, b = (self.terms, other.terms) if len(self.terms) < len(other.terms) else (other.terms, self.terms)
+        self.space.spend(len(a) * len(b))
+        still, out = self.space.still, {}
+        for (s, k, m), x1 in a.items():
+            for (t, l, n), x2 in b.items():
+                value = x1 * x2
+                powers = tuple(i + j for i, j in zip(m, n, strict=True))
+                if k == still:
+                    _gather(out, (t, l, powers), value)
+                elif l == still:
+                    _gather(out, (s, k, powers), value)
+                else:
+                    half = value / 2
+                    total = tuple(i + j for i, j in zip(k, l, strict=True))
+                    gap = tuple(i - j for i, j in zip(k, l, strict=True))
+                    _put(out, s ^ t, total, powers, -half if s and t else half)
+                    _put(out, s ^ t, gap, powers, -half if t and not s else half)
+        return Harmonic(self.space, out)
+
+    __rmul__ = __mul__
+
+    @property
+    def expression(self) -> sp.Expr:
+        """The sum of a polynomial that has neither cosine nor sine."""
+        return sp.Add(*(_rational(x) * self.monomial(m) for (_, _, m), x in self.terms.items()))
+
+    def monomial(self, exponents: Iterable[int]) -> sp.Expr:
+        """Return a product of powers of the generators."""
+        return sp.Mul(*(g**e for g, e in zip(self.space.generators, exponents, strict=True) if e))
+
+
+def _gather(out: dict[Key, Fraction], key: Key, value: Fraction) -> None:
+    total = out.get(key)
+    if total is None:
+        out[key] = value
+    elif total + value:
+        out[key] = total + value
+    else:
+        del out[key]
+
+
+def _put(
+    out: dict[Key, Fraction], kind: int, multiples: tuple[int, ...], powers: tuple[int, ...], value: Fraction
+) -> None:
+    """Add a term, of an angle and its negative only the one whose first multiple is positive."""
+    first = next((k for k in multiples if k), 0)
+    if not first:
+        if kind == 0:
+            _gather(out, (0, multiples, powers), value)
+        return
+    if first < 0:
+        multiples = tuple(-k for k in multiples)
+        value = -value if kind else value
+    _gather(out, (kind, multiples, powers), value)
+
+
+def _rational(x: Fraction) -> sp.Rational:
+    return sp.Rational(x.numerator, x.denominator)

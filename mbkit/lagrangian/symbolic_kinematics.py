@@ -1,0 +1,313 @@
+"""Energies of a model as SymPy expressions, from the joints' own formulas and nothing else.
+
+The same kinematics as the derivation's (`mbkit.derivation`), on exact sums of cosines and sines: every
+number is the decimal that was written, so what cancels is gone and the result is short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any, Final
+
+import sympy as sp
+
+from mbkit.lagrangian.compact import number, written_out
+from mbkit.lagrangian.harmonic import Harmonic, Space
+from mbkit.model import Joint, Model
+from mbkit.model.kinds import cross3
+
+__all__ = ["SymbolicKinematics"]
+
+Vector = list[Any]
+#: (linear, angular) velocity per unit of one velocity.
+Column = tuple[Vector, Vector]
+#: What enters the formulas of joints and energies; springs and dampers are kept as they are written.
+_FIELDS: Final = {
+    "bodies": ("mass", "com", "inertia"),
+    "joints": ("rotation", "translation", "axes", "pitch", "armature"),
+    "springs": ("point_a", "point_b"),
+}
+#: What rounded rotations leave of a term that is zero.
+_DUST: Final = Fraction(1, 10**15)
+
+
+class SymbolicKinematics:
+    """T's mass matrix, V and the dissipation of a model of coordinate velocities.
+
+    Parameters
+    ----------
+    model : Model
+        A tree without ball and free joints, loops and prescribed motions.
+    coordinates, velocities : list of sympy.Symbol
+    parameters : dict of str to sympy.Symbol
+    progress : callable
+        Called with a fraction and a text.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        coordinates: list[sp.Symbol],
+        velocities: list[sp.Symbol],
+        parameters: dict[str, sp.Symbol],
+        progress: Callable[[float, str], None],
+    ) -> None:
+        self.model, self.velocities, self._progress = model, velocities, progress
+        bound = {
+            # The exponent one half is the only float that comes this way.
+            (b.where, b.part, b.field, b.index): sp.nsimplify(
+                b.expression.evaluate(lambda p: parameters[p.name], exact), rational=True
+            )
+            for b in model.bindings
+        }
+        opaque = {x for x in bound.values() if not _is_polynomial(x)}
+        self._opaque = {x: sp.Dummy(f"n{i}") for i, x in enumerate(sorted(opaque, key=sp.default_sort_key))}
+        self._bound = {place: self._opaque.get(x, x) for place, x in bound.items()}
+        self._q = {j.name: self._own(j, coordinates, model.layout.q) for j in model.joints}
+        self._v = {j.name: self._own(j, velocities, model.layout.v, still=True) for j in model.joints}
+        angles = list(
+            dict.fromkeys(_turn(self._q[j.name][i]) for j in model.joints for i in j.type.angular)
+        )
+        lengths = {s for j in model.joints for i, x in enumerate(self._q[j.name]) if _advances(j, i) for s in x.free_symbols}
+        generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
+        self._coordinates = coordinates
+        self.space = Space(model.name, angles, generators)
+        self._values = {
+            (where, part.name): self._read(where, part, fields)
+            for where, fields in _FIELDS.items()
+            for part in getattr(model, where)
+        }
+        self._placements = {j.name: self._placement(j) for j in model.tree}
+        self._carrier = {j.child: j for j in model.joints}
+
+    # Numbers
+
+    def value(self, where: str, part: str, field: str, source: Any, *index: int) -> sp.Expr:
+        """Return a number of a part, exactly, or the expression of parameters that it stands for."""
+        if (where, part, field, index) in self._bound:
+            return self._bound[where, part, field, index]
+        x = getattr(source, field)
+        return exact(float(x[index] if index else x))
+
+    def _read(self, where: str, part: Any, fields: tuple[str, ...]) -> SimpleNamespace:
+        def entries(field: str, x: Any, *index: int) -> Any:
+            if getattr(x, "ndim", 0):
+                return [entries(field, y, *index, i) for i, y in enumerate(x)]
+            return self.space.of(self.value(where, part.name, field, part, *index))
+
+        return SimpleNamespace(**{f: entries(f, getattr(part, f)) for f in fields})
+
+    def _own(self, joint: Joint, symbols: list[sp.Symbol], layout: Any, *, still: bool = False) -> list[sp.Expr]:
+        """Return a joint's coordinates or velocities; those of a mimic joint from its leader's."""
+        if not joint.mimic:
+            return symbols[layout[joint.name]] if joint.type.nv else []
+        (leader,) = symbols[layout[joint.mimic.joint]]
+        ratio, offset = (self.value("joints", joint.name, f, joint.mimic) for f in ("ratio", "offset"))
+        return [ratio * leader + (0 if still else offset)]
+
+    # Kinematics
+
+    def _arguments(self, joint: Joint) -> list[Any]:
+        """Return a joint's coordinates as its formulas take them."""
+        q = self._q[joint.name]
+        return [self.space.of(x) if _advances(joint, i) else SimpleNamespace(expression=x) for i, x in enumerate(q)]
+
+    def _placement(self, joint: Joint) -> tuple[Any, Vector]:
+        q = self._arguments(joint)
+        return joint.type.placement(self.space, self._values["joints", joint.name], q)  # type: ignore[arg-type]
+
+    def _columns(self) -> dict[str, dict[int, Column]]:
+        """Return each body's velocity in its own axes per unit of each velocity that moves it."""
+        out: dict[str, dict[int, Column]] = {"world": {}}
+        for joint in self.model.tree:
+            values = self._values["joints", joint.name]
+            R, p = self._placements[joint.name]
+            moved = {}
+            for i, (linear, angular) in out[joint.parent].items():
+                at_joint = _add(linear, cross3(angular, values.translation))
+                turned = _transposed_times(values.rotation, angular)
+                along = _add(_transposed_times(values.rotation, at_joint), cross3(turned, p))
+                moved[i] = (_transposed_times(R, along), _transposed_times(R, turned))
+            for i, column in self._own_columns(joint):
+                moved[i] = tuple(map(_add, moved[i], column)) if i in moved else column  # type: ignore[assignment]
+            out[joint.child] = moved
+        return out
+
+    def _own_columns(self, joint: Joint) -> Iterator[tuple[int, Column]]:
+        q = self._arguments(joint)
+        for k in range(joint.type.nv):
+            unit = [self.space.number(int(i == k)) for i in range(joint.type.nv)]
+            values = self._values["joints", joint.name]
+            linear, angular = joint.type.twist(self.space, values, q, unit)  # type: ignore[arg-type]
+            i, ratio = self._velocity(joint, k)
+            yield i, ([ratio * x for x in linear], [ratio * x for x in angular])
+
+    def _velocity(self, joint: Joint, k: int) -> tuple[int, Harmonic]:
+        """Return the index of a joint's velocity, its leader's if it mimics, and the ratio to it."""
+        at = self.model.layout.v[joint.mimic.joint if joint.mimic else joint.name].start + k
+        return at, self.space.of(self._v[joint.name][k] / self.velocities[at])
+
+    def _to_world(self, body: str, x: Vector) -> Vector:
+        while body != "world":
+            joint = self._carrier[body]
+            x, body = self._to_parent(joint, x, 1), joint.parent
+        return x
+
+    def _to_parent(self, joint: Joint, x: Vector, weight: Any) -> Vector:
+        R, p = self._placements[joint.name]
+        values = self._values["joints", joint.name]
+        in_J = _add(_times(R, x), [weight * c for c in p])
+        return _add(_times(values.rotation, in_J), [weight * c for c in values.translation])
+
+    # Energies
+
+    @cached_property
+    def mass_matrix(self) -> list[list[sp.Expr]]:
+        """M of T = ½ vᵀ M v."""
+        n = self.model.nv
+        M: list[list[Any]] = [[self.space.number(0)] * n for _ in range(n)]
+        columns = self._columns()
+        for done, body in enumerate(self.model.bodies):
+            self._progress(0.5 * done / len(self.model.bodies), f"kinetic energy of {body.name}")
+            values = self._values["bodies", body.name]
+            own = columns.get(body.name, {})
+            at_com = {i: _add(linear, cross3(angular, values.com)) for i, (linear, angular) in own.items()}
+            spun = {i: _times(values.inertia, angular) for i, (_, angular) in own.items()}
+            for i in own:
+                for j in own:
+                    if i <= j:
+                        M[i][j] = M[i][j] + values.mass * _dot(at_com[i], at_com[j]) + _dot(own[i][1], spun[j])
+        for joint in self.model.joints:
+            for k, rotor in enumerate(self._values["joints", joint.name].armature):
+                i, ratio = self._velocity(joint, k)
+                M[i][i] = M[i][i] + rotor * ratio * ratio
+        self._dust([x for row in M for x in row])
+        made: dict[tuple[int, int], sp.Expr] = {}
+        for i in range(n):
+            self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
+            made.update({(i, j): self._shown(M[i][j]) for j in range(i, n)})
+        return [[made[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
+
+    @cached_property
+    def gravity_energy(self) -> sp.Expr:
+        """-Σ m g · p_com."""
+        model = self.model
+        masses: dict[str, Any] = {"world": self.space.number(0)}
+        moments: dict[str, Vector] = {"world": [self.space.number(0)] * 3}
+        for body in model.bodies:
+            values = self._values["bodies", body.name]
+            masses[body.name] = values.mass
+            moments[body.name] = [values.mass * c for c in values.com]
+        for joint in reversed(model.tree):
+            up = self._to_parent(joint, moments[joint.child], masses[joint.child])
+            moments[joint.parent] = _add(moments[joint.parent], up)
+            masses[joint.parent] = masses[joint.parent] + masses[joint.child]
+        gravity = [self.space.of(self.value("gravity", "", "gravity", model, i)) for i in range(3)]
+        total = -_dot(gravity, moments["world"])
+        self._dust([total])
+        # Height by height rather than with g before them all, so that forces read term by term.
+        return self._back(written_out(total, whole=False))
+
+    @cached_property
+    def spring_energy(self) -> sp.Expr:
+        """What joint springs and springs between points store."""
+        total = sp.Integer(0)
+        for joint in self.model.joints:
+            for k, q in enumerate(self._q[joint.name]):
+                stiffness, rest = (self._float("joints", joint, f, k) for f in ("stiffness", "rest"))
+                total += stiffness * (self._back(q) - rest) ** 2 / 2
+        for spring, square in self._squares():
+            stiffness, rest = (self._float("springs", spring, f) for f in ("stiffness", "rest_length"))
+            total += stiffness * (square if rest == 0 else (sp.sqrt(square) - rest) ** 2) / 2
+        return total
+
+    @cached_property
+    def dissipation(self) -> sp.Expr:
+        """Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
+        total = sp.Integer(0)
+        for joint in self.model.joints:
+            for k, v in enumerate(self._v[joint.name]):
+                total += self._float("joints", joint, "damping", k) * self._back(v) ** 2 / 2
+        for spring, square in self._squares():
+            damping = self._float("springs", spring, "damping")
+            if damping != 0:
+                pairs = zip(self._coordinates, self.velocities, strict=True)
+                rate = sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / 2
+                total += damping * rate**2 / square / 2
+        return total
+
+    def _squares(self) -> Iterator[tuple[Any, sp.Expr]]:
+        """Yield each spring between points with the square of its length."""
+        for spring in self.model.springs:
+            values = self._values["springs", spring.name]
+            ends = self._to_world(spring.body_a, values.point_a), self._to_world(spring.body_b, values.point_b)
+            gap = [y - x for x, y in zip(*ends, strict=True)]
+            yield spring, self._shown(_dot(gap, gap))
+
+    def _float(self, where: str, part: Any, field: str, *index: int) -> sp.Expr:
+        """Return a number as it is shown, for what is written down as it stands."""
+        x = self.value(where, part.name, field, part, *index)
+        return number(Fraction(int(x.p), int(x.q))) if x.is_Rational else self._back(x)
+
+    def _shown(self, x: Any) -> sp.Expr:
+        return self._back(written_out(x))
+
+    def _back(self, x: sp.Expr) -> sp.Expr:
+        return x.subs({dummy: e for e, dummy in self._opaque.items()}) if self._opaque else x
+
+    def _dust(self, sums: list[Any]) -> None:
+        """Drop the terms that only rounding of the model's rotations has left, of those with the same unit."""
+        largest: dict[Any, Fraction] = {}
+        for x in sums:
+            for (_, _, powers), value in x.terms.items():
+                largest[powers] = max(largest.get(powers, Fraction(0)), abs(value))
+        for x in sums:
+            for key in [k for k, value in x.terms.items() if abs(value) < _DUST * largest[k[2]]]:
+                del x.terms[key]
+
+
+def exact(x: float) -> sp.Rational:
+    """Return the decimal that was written: 0.1 is 1/10, which rounds to the same double."""
+    top, bottom = Fraction(repr(float(x))).as_integer_ratio()
+    return sp.Rational(top, bottom)
+
+
+def _is_polynomial(x: sp.Expr) -> bool:
+    """Return whether an expression is a sum of rational multiples of products of whole powers of symbols."""
+    for term in sp.Add.make_args(sp.expand(x)):
+        value, rest = term.as_coeff_Mul()
+        factors = () if rest == 1 else sp.Mul.make_args(rest)
+        powers = [f.as_base_exp() for f in factors]
+        if not value.is_Rational or any(not b.is_Symbol or not e.is_Integer for b, e in powers):
+            return False
+    return True
+
+
+def _advances(joint: Joint, i: int) -> bool:
+    """Return whether a coordinate moves something by its own length; others only turn."""
+    return i in joint.type.lengths or joint.kind == "helical"
+
+
+def _turn(angle: sp.Expr) -> sp.Expr:
+    """Return what a cosine is taken of: a coordinate where an angle is a whole multiple of it."""
+    value, rest = sp.expand(angle).as_coeff_Mul()
+    return rest if value.is_Integer and rest.is_Symbol else sp.expand(angle)
+
+
+def _add(a: Vector, b: Vector) -> Vector:
+    return [x + y for x, y in zip(a, b, strict=True)]
+
+
+def _dot(a: Vector, b: Vector) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _times(R: Any, x: Vector) -> Vector:
+    return [_dot(R[i], x) for i in range(3)]
+
+
+def _transposed_times(R: Any, x: Vector) -> Vector:
+    return [_dot([R[0][i], R[1][i], R[2][i]], x) for i in range(3)]
