@@ -76,8 +76,8 @@ class Alone:
     def steps(self) -> Iterator[tuple[float, str]]:
         """Make every engine ready, run every setting once, and time them in rounds."""
         until = self._allowance.until(_READY, _AT_LEAST)
-        # What takes long to derive must not keep the others from having any time at all.
-        for k, walk in enumerate(sorted(self._walks, key=lambda w: w.plan.engine == "lagrangian")):
+        # What takes long to derive, Jacobians most of all, must not keep the others from having any time at all.
+        for k, walk in enumerate(sorted(self._walks, key=_how_long_to_derive)):
             yield 0.2 * k / len(self._walks), f"compiling {walk.plan.method} on {walk.plan.engine}"
             if k and time.perf_counter() > until:
                 walk.give_up("not run: the time allowed was used up")
@@ -91,6 +91,11 @@ class Alone:
         yield 0.6, "timing"
         for k in repeat(self._walks, self._repeats, self._allowance.until(1.0, _AT_LEAST), self._seed):
             yield 0.6 + 0.4 * (k + 1) / self._repeats, f"timing, round {k + 1} of {self._repeats}"
+
+
+def _how_long_to_derive(walk: Walk) -> tuple[bool, bool]:
+    # Implicit methods and series vary in their stages; the others derive a step at the most.
+    return walk.plan.kind.stages == 0, walk.plan.engine == "lagrangian"
 
 
 class Shared:
