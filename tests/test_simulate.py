@@ -5,7 +5,10 @@
 from __future__ import annotations
 
 import csv
+import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -263,6 +266,34 @@ def test_native_methods_elsewhere_and_callables_are_refused() -> None:
         simulate(dynamics(model), [0.1], [0.0], 1.0, "mujoco_rk4")
     with pytest.raises(UnsupportedError, match="torque functions are not there"):
         simulate(dynamics(model, "mujoco"), [0.1], [0.0], 1.0, "mujoco_rk4", torque=lambda t, q, v: -v)
+
+
+@pytest.mark.parametrize(
+    ("method", "reason"),
+    [("implicit_midpoint", "momenta nor ∂T/∂q"), ("taylor", "no expressions"), ("cvodes", "no expressions")],
+)
+def test_a_method_that_only_some_engines_have_says_why(method: str, reason: str) -> None:
+    with pytest.raises(
+        UnsupportedError, match=rf"{method}: not on the mujoco engine, which .*{reason}.*; use mbkit.dyn"
+    ):
+        simulate(dynamics(catalog.pendulum(), "mujoco"), [0.1], [0.0], 1.0, method)
+
+
+@pytest.mark.parametrize(
+    ("engine", "method"),
+    [("pinocchio", "rk4"), ("pinocchio", "gauss4"), ("pinocchio", "rk853"), ("mujoco", "mujoco_rk4")],
+)
+def test_nothing_is_loaded_that_a_run_does_not_need(engine: str, method: str) -> None:
+    code = (
+        "import sys, mbkit as mb; model = mb.catalog.pendulum()\n"
+        f"run = mb.simulate(mb.dynamics(model, {engine!r}), [0.1], [0.0], 0.01, {method!r})\n"
+        "run.energy(), run.power_balance(), run.momentum(), repr(run)\n"
+        "heavy = {'casadi', 'heyoka', 'llvmlite', 'matplotlib', 'mujoco', 'pinocchio', 'scipy'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    made = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert made.stdout == f"[{engine!r}]\n", made.stderr
 
 
 # Conservation and published figures

@@ -9,11 +9,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._step_control import GROWTH, LAST
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.lagrangian import Equations
 from mbkit.lagrangian import cache as disk
 from mbkit.lagrangian.compiled import aligned
-from mbkit.lagrangian.embedded_step import GROWTH, LAST, STATE, embedded_parts
+from mbkit.lagrangian.embedded_step import STATE, embedded_parts
 from mbkit.lagrangian.lanes import Lanes, lanes, width
 from mbkit.model.space import Space
 from mbkit.simulate.embedded_trials import Stretch, first_length

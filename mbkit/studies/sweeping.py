@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -130,14 +131,16 @@ class Shared:
     def steps(self) -> Iterator[tuple[float, str]]:
         """Collect the curves as they come; one whose worker died is refused with that reason."""
         yield 0.0, f"{len(self._wanted)} curves by {type(self._executor).__name__}"
-        for name, made in run(self._calls, executor=self._executor):
-            plan = self._wanted[int(name)]
-            if isinstance(made, Exception):
-                why = f"{type(made).__name__}: {made}"
-                self._found[int(name)] = None, Refusal(plan.engine, plan.method, why)
-            else:
-                self._found[int(name)] = made
-            yield len(self._found) / len(self._wanted), f"{plan.method} on {plan.engine}"
+        # Threads that leave out warnings side by side put back each other's filters in the end.
+        with warnings.catch_warnings():
+            for name, made in run(self._calls, executor=self._executor):
+                plan = self._wanted[int(name)]
+                if isinstance(made, Exception):
+                    why = f"{type(made).__name__}: {made}"
+                    self._found[int(name)] = None, Refusal(plan.engine, plan.method, why)
+                else:
+                    self._found[int(name)] = made
+                yield len(self._found) / len(self._wanted), f"{plan.method} on {plan.engine}"
 
 
 def _one(scene: Scene, plan: Plan, repeats: int, seed: int, seconds: float) -> Found:
