@@ -46,10 +46,10 @@ _HOME = {
     "dynamics": "mbkit.engines",
     "load": "mbkit.load",
     "robots": "mbkit.load",
-    "simulate": "mbkit.simulate",
     "work_precision": "mbkit.studies",
 }
-_MODULES = ("catalog", "errors", "lagrangian")
+# `simulate` is called too, and its methods and events are in it.
+_MODULES = ("catalog", "errors", "lagrangian", "simulate")
 
 __all__ = sorted([*_HOME, *_MODULES, "__version__"])
 

@@ -785,3 +785,9 @@ def test_the_same_inputs_give_the_same_bits() -> None:
     model, q, v = tumbling()
     runs = [simulate(dynamics(model), q, v, 0.05).q for _ in range(2)]
     assert np.array_equal(*runs)
+
+
+def test_what_belongs_to_simulate_is_there_at_once() -> None:
+    code = "import mbkit as mb; assert 'rk4' in mb.simulate.METHODS; assert callable(mb.simulate); mb.simulate.at_limits"
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    subprocess.run([sys.executable, "-c", code], env=env, check=True)
