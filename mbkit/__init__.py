@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from mbkit import lagrangian as lagrangian
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
-    from mbkit.lagrangian.equilibrium import equilibrium as equilibrium
     from mbkit.errors import MbkitError as MbkitError
+    from mbkit.lagrangian.equilibrium import equilibrium as equilibrium
     from mbkit.load import load as load
     from mbkit.load import robots as robots
     from mbkit.model import Mimic as Mimic
@@ -48,10 +48,10 @@ _HOME = {
     "equilibrium": "mbkit.lagrangian.equilibrium",
     "load": "mbkit.load",
     "robots": "mbkit.load",
-    "simulate": "mbkit.simulate",
     "work_precision": "mbkit.studies",
 }
-_MODULES = ("catalog", "errors", "lagrangian")
+# `simulate` is called too, and its methods and events are in it.
+_MODULES = ("catalog", "errors", "lagrangian", "simulate")
 
 __all__ = sorted([*_HOME, *_MODULES, "__version__"])
 

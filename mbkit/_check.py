@@ -94,6 +94,8 @@ def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = F
         number = float(value)
     except (TypeError, ValueError):
         raise InputError(f"{name}: expected a number, got {value!r}") from None
+    except OverflowError:
+        raise InputError(f"{name}: expected a number that a double can hold, got an integer beyond 1e308") from None
     if not np.isfinite(number):
         raise InputError(f"{name}: expected a finite number, got {number}")
     if (positive and number <= 0) or (nonnegative and number < 0):

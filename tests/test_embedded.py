@@ -487,3 +487,13 @@ def test_extremes_of_time_and_start() -> None:
         fast = simulate(dyn, [1.0], [1e4], 1e-3, "rk853", rtol=1e-12, save=[1e-3])
         energy = fast.energy()[0] - simulate(dyn, [1.0], [1e4], 0.0, "rk853").energy()[0]
         assert abs(energy) < 1e-9 * 5e7
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
+@pytest.mark.parametrize("speed", [1e12, 1e20, 1e60])
+def test_a_first_step_below_rounding_is_told(engine: str, speed: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MbkitWarning)
+        run = mb.simulate(mb.dynamics(mb.catalog.pendulum(), engine), [1.0], [speed], 0.01, "rk853")
+    assert run.t[-1] == run.stats.reached
+    assert (run.t[-1] == 0.01) if run.stats.ended == "finished" else run.stats.message

@@ -223,6 +223,15 @@ def test_bad_events_are_named() -> None:
         at_section(model, "thet")
     with pytest.raises(InputError, match="direction"):
         Event(lambda t, q, v: 1.0, direction=2)
+    for wrong in ({"direction": True}, {"terminal": "no"}):
+        with pytest.raises(InputError, match=rf"events: {next(iter(wrong))} of 'event': expected"):
+            Event(lambda t, q, v: 1.0, **wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"at_limits: model: expected a Model, got Pin.*mbkit.load"):
+        at_limits(dyn)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="at_section: model: expected a Model, got Pin"):
+        at_section(dyn, "theta")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"at_energy: dyn: expected a Dynamics, got Model; mbkit.dynamics"):
+        at_energy(model, 1.0)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="events: expected"):
         simulate(dyn, [1.0], [0.0], 1.0, "dop853", events=4)  # type: ignore[arg-type]
     for method in (m.name for m in METHODS.values() if not m.events):

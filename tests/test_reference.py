@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import pickle
 import sys
@@ -267,7 +268,8 @@ def test_a_reference_is_frozen_and_travels() -> None:
     again = pickle.loads(pickle.dumps(truth))
     assert np.array_equal(again.q, truth.q)
     assert again.how == truth.how
-    assert not truth.q.flags.writeable
+    for one in (truth, again, copy.deepcopy(truth)):
+        assert not any(getattr(one, x).flags.writeable for x in ("t", "q", "v", "q_low", "v_low", "floor"))
     assert repr(truth).startswith("<Reference to t = 1 s, ")
     with pytest.raises(dataclasses.FrozenInstanceError):
         truth.horizon = 2.0  # type: ignore[misc]

@@ -5,7 +5,10 @@
 from __future__ import annotations
 
 import csv
+import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -263,6 +266,34 @@ def test_native_methods_elsewhere_and_callables_are_refused() -> None:
         simulate(dynamics(model), [0.1], [0.0], 1.0, "mujoco_rk4")
     with pytest.raises(UnsupportedError, match="torque functions are not there"):
         simulate(dynamics(model, "mujoco"), [0.1], [0.0], 1.0, "mujoco_rk4", torque=lambda t, q, v: -v)
+
+
+@pytest.mark.parametrize(
+    ("method", "reason"),
+    [("implicit_midpoint", "momenta nor ∂T/∂q"), ("taylor", "no expressions"), ("cvodes", "no expressions")],
+)
+def test_a_method_that_only_some_engines_have_says_why(method: str, reason: str) -> None:
+    with pytest.raises(
+        UnsupportedError, match=rf"{method}: not on the mujoco engine, which .*{reason}.*; use mbkit.dyn"
+    ):
+        simulate(dynamics(catalog.pendulum(), "mujoco"), [0.1], [0.0], 1.0, method)
+
+
+@pytest.mark.parametrize(
+    ("engine", "method"),
+    [("pinocchio", "rk4"), ("pinocchio", "gauss4"), ("pinocchio", "rk853"), ("mujoco", "mujoco_rk4")],
+)
+def test_nothing_is_loaded_that_a_run_does_not_need(engine: str, method: str) -> None:
+    code = (
+        "import sys, mbkit as mb; model = mb.catalog.pendulum()\n"
+        f"run = mb.simulate(mb.dynamics(model, {engine!r}), [0.1], [0.0], 0.01, {method!r})\n"
+        "run.energy(), run.power_balance(), run.momentum(), repr(run)\n"
+        "heavy = {'casadi', 'heyoka', 'llvmlite', 'matplotlib', 'mujoco', 'pinocchio', 'scipy'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    made = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert made.stdout == f"[{engine!r}]\n", made.stderr
 
 
 # Conservation and published figures
@@ -754,3 +785,11 @@ def test_the_same_inputs_give_the_same_bits() -> None:
     model, q, v = tumbling()
     runs = [simulate(dynamics(model), q, v, 0.05).q for _ in range(2)]
     assert np.array_equal(*runs)
+
+
+def test_what_belongs_to_simulate_is_there_at_once() -> None:
+    code = (
+        "import mbkit as mb; assert 'rk4' in mb.simulate.METHODS; assert callable(mb.simulate); mb.simulate.at_limits"
+    )
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    subprocess.run([sys.executable, "-c", code], env=env, check=True)

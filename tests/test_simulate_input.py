@@ -48,6 +48,20 @@ def test_every_method_ends_exactly_at_the_end(method: str, duration: float, dt: 
             assert np.abs(run.q[..., -1, :] - run.q[..., 0, :]).max() > 1e-4
 
 
+@pytest.mark.parametrize("method", ["rk4", "gauss4", "dop853", "bdf", "mujoco_rk4"])
+def test_a_batch_of_none_has_its_times(method: str) -> None:
+    run = simulate(dynamics_for(method), np.zeros((0, 1)), np.zeros((0, 1)), END, method, save=[0.0, END])
+    assert run.t.tolist() == [0.0, END]
+    assert run.q.shape == (0, 2, 1)
+
+
+def test_a_tolerance_that_cannot_be_met_is_named() -> None:
+    # At rest the absolute one is all there is.
+    with pytest.warns(MbkitWarning, match="step below rounding at rtol = 1e-10, atol = 1e-300"):
+        run = simulate(dynamics(catalog.pendulum()), [1.0], [0.0], END, "dop853", atol=1e-300)
+    assert run.stats.ended == "step_too_small"
+
+
 def test_grids_name_their_own_times() -> None:
     for duration, dt in ((0.0, 1e-3), (1.0, 0.1), (1.0, 0.3), (0.7, 1 / 3), (5.0, 7.0)):
         grid = Grid.of(duration, dt)
@@ -68,6 +82,7 @@ def test_grids_name_their_own_times() -> None:
         ({"dt": np.nan}, "dt: expected a finite number"),
         ({"dt": np.inf}, "dt: expected a finite number"),
         ({"dt": [1e-3, 1e-3]}, "dt: expected a number"),
+        ({"dt": 10**400}, "dt: expected a number that a double can hold"),
         ({"save": [0.0, 2 * END]}, "save: expected times between 0 and 0.1"),
         ({"save": [-END, END]}, "save: expected times between 0 and 0.1"),
         ({"save": [0.0, END, END]}, "save: expected increasing times"),

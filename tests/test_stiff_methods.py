@@ -275,7 +275,7 @@ def test_the_same_inputs_give_the_same_bits_and_a_batch_may_be_empty(method: str
     v = np.array([1.0, 20.0, -4.0])
     runs = [simulate(dyn, model.neutral(), v, 0.2, method, rtol=1e-8, save=save).q for _ in range(2)]
     assert np.array_equal(*runs)
-    assert simulate(dyn, np.empty((0, 4)), v, 0.2, method, save=save).q.shape == (0, 0, 4)
+    assert simulate(dyn, np.empty((0, 4)), v, 0.2, method, save=save).q.shape == (0, 21, 4)
     still = simulate(dyn, model.neutral(), v, 0.0, method, save=[0.0])
     assert still.q.shape == (1, 4)
     assert still.stats.steps == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import itertools
 import json
@@ -11,6 +12,7 @@ import multiprocessing
 import os
 import pickle
 import time
+import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
 import numpy as np
@@ -23,7 +25,7 @@ import mbkit as mb
 from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
-from mbkit.studies.first_run import made_ready
+from mbkit.studies.first_run import _heyoka_anew, made_ready
 from mbkit.studies.orders import observed_order
 from mbkit.studies.precision_result import Curve, PrecisionPoint, WorkPrecision
 from mbkit.studies.sweep import plans
@@ -231,6 +233,7 @@ def test_a_reference_gives_start_times_and_horizon():
         (lambda _t: ([1.0, 2.0], [0.0]), "reference's q"),
         (lambda _t: ([math.nan], [0.0]), "reference's q"),
         (lambda _t: 1.0, r"expected the function to return \(q, v\)"),
+        (lambda t: 1 / t, "reference: the function raised ZeroDivisionError at t = 0 s"),
         (3.0, "expected a Reference or a function"),
     ],
 )
@@ -317,6 +320,12 @@ def test_a_tolerance_that_no_run_takes_is_said():
         ({"methods": ("rk5",)}, UnknownNameError, "'rk4'"),
         ({"methods": {"drake": ("rk4",)}}, InputError, "not among the engines"),
         ({"engines": ("pinocchio",), "methods": ("taylor",)}, InputError, "taylor is not on pinocchio"),
+        ({"methods": {}}, InputError, "methods: expected the methods of at least one engine"),
+        (
+            {"methods": {"pinocchio": ("rk4", "taylor"), "lagrangian": ("taylor",)}},
+            InputError,
+            r"methods\['pinocchio'\]: taylor is not on pinocchio; it is on lagrangian",
+        ),
         ({"steps": []}, InputError, "steps: expected at least one"),
         ({"steps": [0.1, -0.1]}, InputError, r"steps\[1\]: expected a number above 0"),
         ({"steps": 0.1}, InputError, "steps: expected several numbers"),
@@ -326,6 +335,7 @@ def test_a_tolerance_that_no_run_takes_is_said():
         ({"q0": [1.0, 2.0]}, InputError, r"q0: expected shape \(1,\)"),
         ({"q0": [[1.0], [2.0]]}, InputError, "expected one state"),
         ({"torque": [[1.0], [2.0]]}, InputError, r"torque: expected shape \(1,\)"),
+        ({"torque": [[1.0], [2.0, 3.0]]}, InputError, "torque: .*rows of different lengths"),
         ({"torque": [math.nan]}, InputError, "torque"),
         ({"repeats": 0}, InputError, "repeats"),
         ({"seed": -1}, InputError, "seed"),
@@ -403,6 +413,24 @@ def test_a_checkpoint_that_cannot_be_written_loses_no_result(tmp_path):
     assert not list(folder.iterdir())
 
 
+def test_a_checkpoint_function_that_fails_loses_no_result():
+    with pytest.warns(MbkitWarning, match=r"checkpoint: the function raised KeyError.*the study goes on"):
+        result = study(["pinocchio"], ["rk4"], checkpoint=lambda _: {}["x"])
+    assert result.complete
+
+
+def test_what_was_finished_is_kept_where_progress_fails():
+    def stop(fraction, _text):
+        if fraction > 0.7:
+            raise RuntimeError("enough")
+
+    got = []
+    with pytest.raises(RuntimeError, match="enough"):
+        study(["pinocchio"], ["rk4"], progress=stop, checkpoint=got.append, repeats=5)
+    assert not got[-1].complete
+    assert len(errors(got[-1])) == len(STEPS)
+
+
 def test_progress_is_told_and_grows():
     told = []
     study(["pinocchio"], ["rk4"], progress=lambda fraction, text: told.append((fraction, text)))
@@ -449,6 +477,27 @@ def die_elsewhere(_t, _q, _v):
     if multiprocessing.parent_process() is not None:
         os._exit(1)
     return [0.0]
+
+
+def test_threads_leave_warnings_and_caches_as_they_were():
+    filters = list(warnings.filters)
+    with ThreadPoolExecutor(4) as pool:
+        study(["lagrangian", "mujoco"], ["rk4", "dop853", "gauss4", "taylor"], executor=pool)
+    assert warnings.filters == filters
+
+
+def test_overlapping_first_runs_leave_heyokas_cache_as_it_was():
+    heyoka = pytest.importorskip("heyoka")
+    state = heyoka.llvm_state
+    if not hasattr(state, "set_diskcache_enabled"):
+        pytest.skip("this heyoka has no cache on disk")
+    before = state.get_diskcache_enabled()
+    first, second = _heyoka_anew(), _heyoka_anew()
+    for step in (first.__enter__, second.__enter__, lambda: first.__exit__(None, None, None)):
+        step()
+        assert not state.get_diskcache_enabled()
+    second.__exit__(None, None, None)
+    assert state.get_diskcache_enabled() == before
 
 
 def test_a_worker_that_dies_is_told():
@@ -567,6 +616,26 @@ def test_results_survive_json_and_csv(result):
         assert (row["engine"], row["method"], row["note"]) == (curve.engine, curve.method, point.note)
         assert row["error"] == ("" if math.isnan(point.error) else repr(point.error))
     assert sum(int(r["front"]) for r in rows) == len(result.front)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda d: d.pop("floor"), lambda d: d.update(curves=3), lambda d: d.update(curves=[{}])]
+)
+def test_what_is_no_result_is_refused(change, few):
+    data = json.loads(few.to_json())
+    change(data)
+    for text in (json.dumps(data), "", "[]", few.to_json()[:200], None):
+        with pytest.raises(InputError, match="text: expected the JSON of a WorkPrecision"):
+            WorkPrecision.from_json(text)
+
+
+@pytest.mark.parametrize("error", [math.nan, 20.0])
+def test_a_result_without_a_useful_point_has_a_figure_too(error, few):
+    curve = dataclasses.replace(few.curves[0], points=(dataclasses.replace(few.curves[0].points[0], error=error),))
+    result = dataclasses.replace(few, curves=(curve,))
+    result.plot().canvas.draw()
+    assert result.to_markdown()
+    assert result._repr_html_()
 
 
 def test_a_result_reads_well(few, tmp_path):

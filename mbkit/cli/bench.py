@@ -109,7 +109,7 @@ def bench(
     if not result.complete:
         settings, curves = sum(len(c.points) for c in result.curves), len(result.curves)
         say("interrupted", f"{settings} settings of {curves} curve{'s' * (curves != 1)} were finished")
-    if not result.front:
+    elif not result.front:
         say("error", "no run has an error that is known; the reasons are in the notes")
     leave(INTERRUPTED if not result.complete else MISUSE if not written or not result.front else DONE)
 

@@ -87,7 +87,9 @@ def _model(name: str, options: dict[str, Any]) -> Model:
         return systems.get(name)().model
     if made is not None:
         if find(name) is not None:
-            say("note", f"{name} is also a robot; this is the catalog's system, and a path or another name is the robot")
+            say(
+                "note", f"{name} is also a robot; this is the catalog's system, and a path or another name is the robot"
+            )
         return made
     try:
         return model_of(name, options)

@@ -17,10 +17,11 @@ from typing import Any, Final
 import casadi as ca
 
 from mbkit._check import Array
+from mbkit._step_control import GROWTH, LAST, SAFETY, SHRINK
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.step import Part, SymbolicSpace, choose, function_of
 
-__all__ = ["GROWTH", "LAST", "SAFETY", "SHRINK", "STATE", "embedded_parts"]
+__all__ = ["STATE", "embedded_parts"]
 
 #: What a round reads and the next one starts from; it writes the same names with a 1
 #: behind. `h` is the length to try, `most` what it may grow by at most, `last` the 32nd
@@ -28,12 +29,6 @@ __all__ = ["GROWTH", "LAST", "SAFETY", "SHRINK", "STATE", "embedded_parts"]
 #: last try in terms of the tolerance, and `go` is 1 while there is a way to go and a
 #: step to go it with.
 STATE: Final = ("q", "w", "t", "h", "most", "last", "end", "error", "go")
-
-SAFETY: Final = 0.8
-SHRINK: Final = 0.2
-GROWTH: Final = 10.0
-#: The 32nd root of the smallest error that is remembered, 1e-4.
-LAST: Final = 1e-4 ** (1 / 32)
 
 
 def embedded_parts(equations: Equations, A: Array, b: Array, errors: tuple[Array, Array]) -> tuple[Part, ...]:

@@ -52,7 +52,10 @@ class Account:
         out = {"M": (e.mass_matrix, "mass matrix")}
         if not self.long:
             out["C"] = (e.coriolis_matrix, "Coriolis matrix, of Christoffel's symbols")
-        out |= {"g": (e.potential_gradient.applyfunc(spread), "∂V/∂q"), "d": (e.drift, "drift: what time and T1, T0 add")}
+        out |= {
+            "g": (e.potential_gradient.applyfunc(spread), "∂V/∂q"),
+            "d": (e.drift, "drift: what time and T1, T0 add"),
+        }
         out["Q"] = (e.forces, "forces")
         return {n: (A, told) for n, (A, told) in out.items() if n == "M" or any(x != 0 for x in A)}
 

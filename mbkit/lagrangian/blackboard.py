@@ -187,7 +187,6 @@ class Blackboard:
             out.append((join(left), join(self._ordered(sp.Add.make_args(force)) if force != 0 else [])))
         return out + [(join(self._ordered(sp.Add.make_args(f))), "0") for f in e.constraints]
 
-
     def _by_speeds(self, x: sp.Expr) -> sp.Expr:
         """Return what is quadratic in the velocities term by term, where it would hold cosines in brackets."""
         if not any(a.has(sp.sin, sp.cos) for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add):
@@ -215,7 +214,11 @@ def spread(x: sp.Expr) -> sp.Expr:
     number, rest = x.as_coeff_Mul()
     sums = [f for f in sp.Mul.make_args(rest) if f.is_Add and f.has(sp.sin, sp.cos)]
     others = [f for f in sp.Mul.make_args(rest) if f not in sums]
-    if len(sums) != 1 or any(f.has(sp.sin, sp.cos) for f in others) or not all(t.has(sp.sin, sp.cos) for t in sums[0].args):
+    if (
+        len(sums) != 1
+        or any(f.has(sp.sin, sp.cos) for f in others)
+        or not all(t.has(sp.sin, sp.cos) for t in sums[0].args)
+    ):
         return x
     return sp.Add(*(sp.Mul(number, *others, term) for term in sums[0].args))
 

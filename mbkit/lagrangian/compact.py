@@ -188,7 +188,10 @@ def _product(poly: _Poly, x: sp.Expr) -> list[sp.Expr]:
         return []
     symbols = {a: sp.Dummy(f"x{i}") for i, a in enumerate(dict.fromkeys(a for atoms in poly for a, _ in atoms))}
     named = sp.Add(
-        *(sp.Rational(v.numerator, v.denominator) * sp.Mul(*(symbols[a] ** e for a, e in atoms)) for atoms, v in poly.items())
+        *(
+            sp.Rational(v.numerator, v.denominator) * sp.Mul(*(symbols[a] ** e for a, e in atoms))
+            for atoms, v in poly.items()
+        )
     )
     product = sp.factor(named)
     return [] if product.is_Add else [product.xreplace({symbol: a for a, symbol in symbols.items()})]
@@ -208,7 +211,10 @@ def _content(poly: _Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, _Poly]:
             scale = Fraction(1)
     if sum(v > 0 for v in values) == 0:
         scale = -scale
-    left = {tuple((a, e - shared.get(a, 0)) for a, e in atoms if e != shared.get(a, 0)): v / scale for atoms, v in poly.items()}
+    left = {
+        tuple((a, e - shared.get(a, 0)) for a, e in atoms if e != shared.get(a, 0)): v / scale
+        for atoms, v in poly.items()
+    }
     return list(shared.items()), scale, left
 
 

@@ -38,9 +38,7 @@ class Space:
         Products of terms that are not too many.
     """
 
-    def __init__(
-        self, name: str, angles: Sequence[sp.Expr], generators: Sequence[sp.Expr], most: int = MOST
-    ) -> None:
+    def __init__(self, name: str, angles: Sequence[sp.Expr], generators: Sequence[sp.Expr], most: int = MOST) -> None:
         self.name, self.angles, self.generators, self.most = name, tuple(angles), tuple(generators), most
         self._angle = {x: i for i, x in enumerate(self.angles)}
         self._generator = {x: i for i, x in enumerate(self.generators)}

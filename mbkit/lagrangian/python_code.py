@@ -80,8 +80,8 @@ def forward_dynamics(q, v, tau={(0.0,) * n!r}{clock}, **parameters):
 def _lines(system: Lagrangian, names: dict[sp.Symbol, str]) -> str:
     """Return the lines that read the parameters."""
     own = [names[s] for s in system.parameters]
-    lines = ['    unknown = set(parameters) - set(PARAMETERS)']
-    lines += ['    if unknown:', '        raise TypeError(f"no such parameters: {sorted(unknown)}")']
+    lines = ["    unknown = set(parameters) - set(PARAMETERS)"]
+    lines += ["    if unknown:", '        raise TypeError(f"no such parameters: {sorted(unknown)}")']
     if own:
         lines += ["    given = PARAMETERS | parameters"]
         lines += [f"    {name} = given[{name!r}]" for name in own]

@@ -68,10 +68,10 @@ class SymbolicKinematics:
         self._bound = {place: self._opaque.get(x, x) for place, x in bound.items()}
         self._q = {j.name: self._own(j, coordinates, model.layout.q) for j in model.joints}
         self._v = {j.name: self._own(j, velocities, model.layout.v, still=True) for j in model.joints}
-        angles = list(
-            dict.fromkeys(_turn(self._q[j.name][i]) for j in model.joints for i in j.type.angular)
-        )
-        lengths = {s for j in model.joints for i, x in enumerate(self._q[j.name]) if _advances(j, i) for s in x.free_symbols}
+        angles = list(dict.fromkeys(_turn(self._q[j.name][i]) for j in model.joints for i in j.type.angular))
+        lengths = {
+            s for j in model.joints for i, x in enumerate(self._q[j.name]) if _advances(j, i) for s in x.free_symbols
+        }
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
         self._coordinates = coordinates
         self.space = Space(model.name, angles, generators)

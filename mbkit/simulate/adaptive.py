@@ -235,8 +235,9 @@ class _Solve:
             member.stop("diverged", f"diverged: {self.rates.why}")
             return None
         if solver.status == "failed" or _below_rounding(solver, duration):
-            rtol = self._tolerances.rtol
-            told = f"step below rounding at rtol = {rtol:g}: stiff, singular or diverging"
+            rtol, atol = self._tolerances
+            own = "" if atol == rtol else f", atol = {atol:g}"
+            told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
             member.stop("step_too_small", told)
             return None
         # Radau and DOP853 go on from the rate at the end of a step.

@@ -175,8 +175,9 @@ class _Track:
         if stuck:
             self.member.stop("diverged", f"diverged: {self._trials.why(place)}")
         elif stuck is False:
-            rtol = self._tolerances.rtol
-            told = f"step below rounding at rtol = {rtol:g}: stiff, singular or diverging"
+            rtol, atol = self._tolerances
+            own = "" if atol == rtol else f", atol = {atol:g}"
+            told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
             self.member.stop("step_too_small", told)
         return stuck is not None
 
@@ -247,9 +248,9 @@ def _outcome(
     if batch is None:
         t, q, v = kept[0]
         return replace(told, t=t, q=q, v=v)
-    count = max((len(t) for t, _, _ in kept), default=0)
+    assert save is not None
+    count = max((len(t) for t, _, _ in kept), default=len(save))
     q, v = (np.full((batch, count, n), np.nan) for n in (dyn.model.nq, dyn.model.nv))
     for i, (t, *state) in enumerate(kept):
         q[i, : len(t)], v[i, : len(t)] = state
-    assert save is not None
     return replace(told, t=save[:count], q=q, v=v)

@@ -9,10 +9,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._step_control import GROWTH, LAST
 from mbkit.derivation import Equations
 from mbkit.derivation import cache as disk
 from mbkit.derivation.compiled import aligned
-from mbkit.derivation.embedded_step import GROWTH, LAST, STATE, embedded_parts
+from mbkit.derivation.embedded_step import STATE, embedded_parts
 from mbkit.derivation.lanes import Lanes, lanes, width
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.space import Space

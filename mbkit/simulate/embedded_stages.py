@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.embedded_step import GROWTH, LAST, SAFETY, SHRINK
+from mbkit._step_control import GROWTH, LAST, SAFETY, SHRINK
 from mbkit.engines import Dynamics
 from mbkit.model.space import Space
 from mbkit.simulate.embedded_trials import Stretch, first_length
@@ -87,8 +87,9 @@ class StageTrials:
             h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe)[0])
         except DivergenceError:
             h = math.nan
-        # Where there is no rate, the step finds that out.
-        return h if h > 0 else 1e-6 * self._stop
+        # Where there is no rate, the step finds that out. At the least length no step
+        # would be tried at all, and nobody be told.
+        return max(h if h > 0 else 1e-6 * self._stop, 2 * self._least)
 
     def advance(self) -> list[tuple[int, Stretch]]:
         """Try one step."""

@@ -49,8 +49,10 @@ class Event:
             raise InputError(f"events: expected a function of (t, q, v), got {type(self.function).__name__}")
         if not isinstance(self.name, str):
             raise InputError(f"events: expected a name, got {self.name!r}")
-        if self.direction not in (-1, 0, 1):
+        if isinstance(self.direction, bool) or self.direction not in (-1, 0, 1):
             raise InputError(f"events: direction of {self.name!r}: expected -1, 0 or 1, got {self.direction!r}")
+        if not isinstance(self.terminal, (bool, np.bool_)):
+            raise InputError(f"events: terminal of {self.name!r}: expected True or False, got {self.terminal!r}")
 
     def __call__(self, t: float, q: Array, v: Array) -> float:
         """Return the function's value, checked."""
@@ -174,8 +176,9 @@ def at_limits(model: Model) -> tuple[Event, ...]:
     Raises
     ------
     InputError
-        No joint of the model has a limit.
+        No joint of the model has a limit, or it is no model.
     """
+    _require("at_limits: model", model, Model)
     out = []
     for i, (name, low, high) in enumerate(zip(model.coordinate_names, model.lower, model.upper, strict=True)):
         for limit, side in ((low, -1), (high, 1)):
@@ -188,6 +191,7 @@ def at_limits(model: Model) -> tuple[Event, ...]:
 
 def at_energy(dyn: Dynamics, joules: float, *, direction: int = 0) -> Event:
     """Return an event that ends a run where kinetic plus potential energy passes a value."""
+    _require("at_energy: dyn", dyn, Dynamics)
     level = real("joules", joules)
     return Event(partial(_above, dyn, level), f"energy {level:g} J", direction)
 
@@ -208,10 +212,17 @@ def at_section(
     terminal : bool
         Whether the run ends there, or goes on and notes it.
     """
+    _require("at_section: model", model, Model)
     if coordinate not in model.coordinate_names:
         raise UnknownNameError("coordinate", str(coordinate), model.coordinate_names)
     i, value = model.coordinate_names.index(coordinate), real("value", value)
     return _passes(i, value, direction, f"{coordinate} = {value:g}", terminal)
+
+
+def _require(what: str, given: object, kind: type) -> None:
+    if not isinstance(given, kind):
+        makes = "mbkit.load(...)" if kind is Model else "mbkit.dynamics(model, engine)"
+        raise InputError(f"{what}: expected a {kind.__name__}, got {type(given).__name__}; {makes} makes one")
 
 
 def _passes(i: int, value: float, direction: int, name: str, terminal: bool = True) -> Event:

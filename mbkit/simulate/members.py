@@ -111,7 +111,8 @@ def gathered(
     evaluations, jacobians : int
         Of all together.
     """
-    count = max((len(member.t) for member in members), default=0)
+    # A batch of none has all its times.
+    count = max((len(member.t) for member in members), default=0 if times is None or batch else len(times))
     y = np.full((1 if batch is None else batch, count, model.nq + model.nv), np.nan)
     for i, member in enumerate(members):
         for j, state in enumerate(member.y):

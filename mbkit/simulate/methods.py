@@ -35,6 +35,8 @@ class Method:
         The tightest tolerance that it takes.
     callables : bool
         Whether the torque may be a function.
+    lacks : str
+        Why other engines do not have it; empty for what is an engine's own.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Method:
     events: bool = False
     least: float = 0.0
     callables: bool = True
+    lacks: str = ""
 
 
 class Tolerances(NamedTuple):
@@ -76,6 +79,7 @@ METHODS: Final[dict[str, Method]] = {
             0,
             "the midpoint rule in (q, p), on rotations its variational form: symplectic",
             engines=("lagrangian",),
+            lacks="gives neither momenta nor ∂T/∂q with their derivatives, which the rule in (q, p) is made of",
         ),
         Method("gauss4", "fixed", 4, 0, "Gauss-Legendre collocation, 2 stages (Hairer, Nørsett, Wanner 1993, II.7)"),
         Method("gauss6", "fixed", 6, 0, "Gauss-Legendre collocation, 3 stages (Hairer, Nørsett, Wanner 1993, II.7)"),
@@ -98,6 +102,7 @@ METHODS: Final[dict[str, Method]] = {
             events=True,
             least=_EPS,
             callables=False,
+            lacks="gives numbers and no expressions, which a series is made of",
         ),
         _scipy("dop853", 8, 12, "SciPy's DOP853 (Hairer, Nørsett, Wanner 1993, II.5)"),
         _scipy("radau", 5, 0, "SciPy's Radau IIA, implicit (Hairer, Wanner 1996, IV.8)"),
@@ -112,6 +117,7 @@ METHODS: Final[dict[str, Method]] = {
             engines=("lagrangian",),
             least=100 * _EPS,
             callables=False,
+            lacks="gives numbers and no expressions, which it integrates",
         ),
         _mujoco("euler", 1, 1, "MuJoCo's own semi-implicit Euler"),
         _mujoco("rk4", 4, 4, "MuJoCo's own RK4"),

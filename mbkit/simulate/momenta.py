@@ -6,7 +6,6 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Frame, Model
 from mbkit.simulate.along import along
@@ -42,6 +41,9 @@ def member_of(dyn: Dynamics, i: int) -> Dynamics:
     """Return the dynamics of one trajectory of a batch, with plain values of the parameters."""
     if dyn.samples is None:
         return dyn
+    # Other engines need no CasADi.
+    from mbkit.engines.lagrangian import LagrangianDynamics
+
     assert isinstance(dyn, LagrangianDynamics)  # the others have no samples
     values = dyn.of_samples([i]).parameter_values[0].tolist()
     return dyn.at(**dict(zip(dyn.model.parameters, values, strict=True)))

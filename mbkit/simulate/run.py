@@ -86,14 +86,18 @@ def simulate(
     save : int or (K,) array_like, optional
         Which states to keep: every n-th and the last, or those at these times (for a
         fixed step, multiples of it). Everything when not given. An adaptive method
-        needs the times for a batch, and its steps then end on them.
+        takes times alone; a batch needs them, and so does ``"cvodes"``. Steps of
+        ``"dop853"`` and ``"radau"`` end on them; the others' do not depend on them.
     progress : bool or callable, optional
         True shows a bar when the run takes more than 2 s; a callable gets the
         fraction done.
     events : Event or sequence of Event, optional
         What ends the run or is noted on the way, for methods that have events:
         `mbkit.simulate.at_limits`, `at_energy`, `at_section`, or an `Event` of any
-        function of (t, q, v). What happened is in ``Trajectory.events``.
+        function of (t, q, v). What happened is in ``Trajectory.events``. Where one ends
+        a single run, its state is the last one of the trajectory too; each trajectory
+        of a batch ends by itself, is NaN at the saved times after that, and has the
+        event's state in ``Trajectory.events`` alone.
 
     Returns
     -------
@@ -109,6 +113,8 @@ def simulate(
     TorqueError
         The torque function raised, or returned something else than (nv,) finite
         numbers; its `trajectory` is the run up to then.
+    EventError
+        An event's function did; its `trajectory` likewise.
     UnknownNameError
         No method of this name.
     UnsupportedError
@@ -119,8 +125,9 @@ def simulate(
     On the lagrangian engine, ``"rk4"`` and ``"semi_implicit_euler"`` with no torque or
     an array run as machine code: the whole step is one function, or, where that would be
     beyond 20,000 operations, parts around the forward dynamics; chunks of a batch are
-    shared among the cores, and no number depends on how. The first run of a model
-    compiles its step, which is kept on disk. A callable torque, an engine made with
+    shared among the cores, and no number depends on how. ``"implicit_midpoint"``, and
+    ``"rk853"`` with the choice of its steps, are machine code too. The first run of a
+    model compiles its step, which is kept on disk. A callable torque, an engine made with
     ``compile=False``, and models so large that their forward dynamics is not written
     out are stepped stage by stage, by the same formulas.
 
@@ -173,8 +180,9 @@ def simulate(
 def _require_engine(dyn: Dynamics, method: Method) -> None:
     if method.engines and dyn.engine not in method.engines:
         has = " or ".join(f"mbkit.dynamics(model, {name!r})" for name in method.engines)
+        why = f", which {method.lacks}" if method.lacks else ""
         raise UnsupportedError(
-            f"{method.name}: not on the {dyn.engine} engine; use {has}, or a method that any engine has: "
+            f"{method.name}: not on the {dyn.engine} engine{why}; use {has}, or a method that any engine has: "
             + ", ".join(m.name for m in METHODS.values() if not m.engines)
         )
 

@@ -34,7 +34,9 @@ class Stats:
     rejected : int
         Steps that an adaptive method tried in vain, where it tells.
     jacobians : int
-        Evaluations of the Jacobian of the forward dynamics.
+        Of ``"radau"``, ``"bdf"``, ``"lsoda"`` and ``"cvodes"``: evaluations of the Jacobian of
+        the forward dynamics, summed over a batch; of ``"implicit_midpoint"``: iterations
+        of Newton's method, each with the exact Jacobian of the step's equations.
     """
 
     steps: int

@@ -67,7 +67,7 @@ class Torque:
             if batch is not None:
                 allowed.append((batch, steps, nv))
         if shape not in allowed:
-            hint = "" if steps is not None else "; one row per interval needs save=, the grid of times"
+            hint = "" if steps is not None else "; one row per interval needs save=, times from 0 to the end of the run"
             raise InputError(
                 f"torque: expected shape {' or '.join(map(str, allowed))}, got {shape}; {self._name} has nv = {nv}"
                 + (f" and the run has {steps} steps" if steps is not None else hint)

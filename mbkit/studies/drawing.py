@@ -89,6 +89,9 @@ def log_ticks(ax: Axes, most: int = 9) -> None:
 
     for axis in (ax.xaxis, ax.yaxis):
         if axis.get_scale() == "log":
+            if min(axis.get_view_interval()) <= 0:
+                # Of an empty axis; a logarithm has no zero.
+                axis.set_view_interval(1e-3, 1.0, ignore=True)
             low, high = (math.log10(x) for x in axis.get_view_interval())
             if math.floor(high) - math.ceil(low) < 1:
                 # Whole decades, so that there are two labels at least.

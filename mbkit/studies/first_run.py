@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Any
+from typing import Any, Final
 
 from mbkit.catalog import pendulum
 from mbkit.derivation.cache import anew
@@ -17,6 +18,10 @@ from mbkit.model import Model
 from mbkit.studies.rollouts import quiet_simulate
 
 __all__ = ["made_ready"]
+
+#: heyoka has one switch for all threads: what it was when each of those came that are in the block.
+_BEFORE: Final[list[bool]] = []
+_SWITCHING: Final = threading.Lock()
 
 
 def made_ready(model: Model, engine: str, method: str, first: Callable[[Dynamics], Any]) -> tuple[Dynamics, float]:
@@ -71,10 +76,15 @@ def _heyoka_anew() -> Iterator[None]:
         llvm_state.clear_memcache()
         yield
         return
-    before = llvm_state.get_diskcache_enabled()
-    llvm_state.set_diskcache_enabled(False)
+    with _SWITCHING:
+        _BEFORE.append(llvm_state.get_diskcache_enabled())
+        llvm_state.set_diskcache_enabled(False)
     llvm_state.clear_memcache()
     try:
         yield
     finally:
-        llvm_state.set_diskcache_enabled(before)
+        with _SWITCHING:
+            before = _BEFORE.pop()
+            # The last one left, so that of the first that came: what it was before all of them.
+            if not _BEFORE:
+                llvm_state.set_diskcache_enabled(before)

@@ -63,9 +63,14 @@ class Keeper:
             self._kept = time.perf_counter()
 
     def keep(self, result: WorkPrecision) -> None:
-        """Hand a result over."""
+        """Hand a result over; where that fails, the study goes on, and that is told."""
         if callable(self._checkpoint):
-            self._checkpoint(result)
+            try:
+                self._checkpoint(result)
+            except Exception as error:
+                # What is measured must not be lost by whoever looks at it.
+                told = f"checkpoint: the function raised {type(error).__name__}: {error}; the study goes on"
+                warnings.warn(told, MbkitWarning, stacklevel=3)
         elif self._checkpoint is not None:
             try:
                 _write_whole(Path(self._checkpoint), result.to_json() + "\n")

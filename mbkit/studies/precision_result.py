@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mbkit.errors import OutputError
+from mbkit.errors import InputError, OutputError
 from mbkit.studies.result import Refusal
 
 if TYPE_CHECKING:
@@ -193,8 +193,23 @@ class WorkPrecision:
 
     @classmethod
     def from_json(cls, text: str) -> WorkPrecision:
-        """Return the result that `to_json` told."""
-        data = json.loads(text)
+        """Return the result that `to_json` told.
+
+        Raises
+        ------
+        InputError
+            The text is no such result.
+        """
+        try:
+            return cls._from_plain(json.loads(text))
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            raise InputError(
+                f"text: expected the JSON of a WorkPrecision, such as Path(...).read_text() of a file "
+                f"that to_json wrote; it has no such content ({type(error).__name__}: {error})"
+            ) from None
+
+    @classmethod
+    def _from_plain(cls, data: dict[str, Any]) -> WorkPrecision:
         curves = []
         for told in data["curves"]:
             points = tuple(_remade(PrecisionPoint, point) for point in told["points"])

@@ -109,7 +109,10 @@ def _start(
 
 
 def _state(model: Model, exact: Exact, t: float) -> tuple[Array, Array]:
-    told = exact(float(t))
+    try:
+        told = exact(float(t))
+    except Exception as error:
+        raise InputError(f"reference: the function raised {type(error).__name__} at t = {t:g} s: {error}") from error
     if not isinstance(told, Sequence) or len(told) != 2:
         raise InputError(f"reference: expected the function to return (q, v), got {told!r} at t = {t:g} s")
     q = finite_array("reference's q", told[0], (model.nq,))

@@ -8,7 +8,7 @@ the reference ends and says so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -89,6 +89,10 @@ class Reference:
             array = np.array(getattr(self, name), dtype=np.float64)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        # Arrays come out of a pickle writeable, unless they are made read-only anew.
+        return type(self), tuple(getattr(self, f.name) for f in fields(self))
 
     def __repr__(self) -> str:
         return f"<Reference to t = {self.horizon:g} s, {self.digits:.1f} digits: {self.how}>"

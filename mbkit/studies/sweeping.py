@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -76,8 +77,8 @@ class Alone:
     def steps(self) -> Iterator[tuple[float, str]]:
         """Make every engine ready, run every setting once, and time them in rounds."""
         until = self._allowance.until(_READY, _AT_LEAST)
-        # What takes long to derive must not keep the others from having any time at all.
-        for k, walk in enumerate(sorted(self._walks, key=lambda w: w.plan.engine == "lagrangian")):
+        # What takes long to derive, Jacobians most of all, must not keep the others from having any time at all.
+        for k, walk in enumerate(sorted(self._walks, key=_how_long_to_derive)):
             yield 0.2 * k / len(self._walks), f"compiling {walk.plan.method} on {walk.plan.engine}"
             if k and time.perf_counter() > until:
                 walk.give_up("not run: the time allowed was used up")
@@ -91,6 +92,11 @@ class Alone:
         yield 0.6, "timing"
         for k in repeat(self._walks, self._repeats, self._allowance.until(1.0, _AT_LEAST), self._seed):
             yield 0.6 + 0.4 * (k + 1) / self._repeats, f"timing, round {k + 1} of {self._repeats}"
+
+
+def _how_long_to_derive(walk: Walk) -> tuple[bool, bool]:
+    # Implicit methods and series vary in their stages; the others derive a step at the most.
+    return walk.plan.kind.stages == 0, walk.plan.engine == "lagrangian"
 
 
 class Shared:
@@ -125,14 +131,16 @@ class Shared:
     def steps(self) -> Iterator[tuple[float, str]]:
         """Collect the curves as they come; one whose worker died is refused with that reason."""
         yield 0.0, f"{len(self._wanted)} curves by {type(self._executor).__name__}"
-        for name, made in run(self._calls, executor=self._executor):
-            plan = self._wanted[int(name)]
-            if isinstance(made, Exception):
-                why = f"{type(made).__name__}: {made}"
-                self._found[int(name)] = None, Refusal(plan.engine, plan.method, why)
-            else:
-                self._found[int(name)] = made
-            yield len(self._found) / len(self._wanted), f"{plan.method} on {plan.engine}"
+        # Threads that leave out warnings side by side put back each other's filters in the end.
+        with warnings.catch_warnings():
+            for name, made in run(self._calls, executor=self._executor):
+                plan = self._wanted[int(name)]
+                if isinstance(made, Exception):
+                    why = f"{type(made).__name__}: {made}"
+                    self._found[int(name)] = None, Refusal(plan.engine, plan.method, why)
+                else:
+                    self._found[int(name)] = made
+                yield len(self._found) / len(self._wanted), f"{plan.method} on {plan.engine}"
 
 
 def _one(scene: Scene, plan: Plan, repeats: int, seed: int, seconds: float) -> Found:

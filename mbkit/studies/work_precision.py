@@ -71,10 +71,10 @@ def work_precision(
         are free: MuJoCo would make them soft.
     engines : sequence of str
     methods : sequence of str, or mapping of str to sequence of str, optional
-        Names of `mbkit.simulate.METHODS`, for all engines or for each; by default every
-        method on every engine that has it.
+        Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by
+        default every method on every engine that has it.
     duration : float
-        Horizon, s; cut where the reference stops holding.
+        Horizon, s; cut where the reference stops holding, or the one given ends.
     q0 : (nq,) array_like, optional
     v0 : (nv,) array_like, optional
         Where the motion starts; by default near the middle of the joints' ranges,
@@ -103,7 +103,8 @@ def work_precision(
         The motion itself: of `mbkit.studies.reference`, whose times are then the saved
         ones, or an exact function from t to (q, v). By default made here.
     progress : callable, optional
-        Called as ``progress(fraction, text)``.
+        Called as ``progress(fraction, text)``. What it raises ends the study, after
+        `checkpoint` has got what was finished.
     checkpoint : path or callable, optional
         Where the result so far goes every few seconds and at the end: a JSON file, which is
         whole at any time, or a function.
@@ -217,6 +218,10 @@ def work_precision(
         part = result(complete=False)
         keeper.keep(part)
         raise InterruptedSweepError(part) from None
+    except Exception:
+        # A progress function's, or a fault: what was finished is not lost with it.
+        keeper.keep(result(complete=False))
+        raise
     keeper.keep(whole)
     keeper.tell(1.0, "done")
     return whole
@@ -254,6 +259,14 @@ def _pairs(
             if engine not in names:
                 raise InputError(f"methods: {engine!r} is not among the engines {list(names)}")
         asked = {engine: _names(f"methods[{engine!r}]", methods[engine]) for engine in names if engine in methods}
+        if not asked:
+            raise InputError("methods: expected the methods of at least one engine, got none")
+        for engine, own in asked.items():
+            for method in map(method_of, own):
+                if method.engines and engine not in method.engines:
+                    raise InputError(
+                        f"methods[{engine!r}]: {method.name} is not on {engine}; it is on {', '.join(method.engines)}"
+                    )
     else:
         given = tuple(METHODS) if methods is None else _names("methods", methods)
         asked = dict.fromkeys(names, given)
@@ -289,11 +302,6 @@ def _check_model(model: Model) -> None:
 
 def _moving(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
     """Return the model that all integrate."""
-    if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
-    if not model.nv:
-        raise InputError(f"model: nothing moves in {model.name} (nv = 0), nothing to integrate; add a joint")
-    model.require_values("a study of run time")
     if model.parameters:
         model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
     native = any(METHODS[m].kind == "native" for ms in pairs.values() for m in ms)
@@ -303,10 +311,15 @@ def _moving(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
 def _torque(torque: ArrayLike | TorqueFunction | None, model: Model) -> Any:
     if torque is None or callable(torque):
         return torque
-    if np.shape(torque) != (model.nv,):
+    try:
+        shape: tuple[int, ...] | None = np.shape(torque)
+    except ValueError:
+        shape = None
+    if shape != (model.nv,):
+        got = "rows of different lengths" if shape is None else f"shape {shape}"
         raise InputError(
             f"torque: expected shape ({model.nv},), held all the time, or a function of (t, q, v), "
-            f"got shape {np.shape(torque)}; rows would be held for other times with every other step"
+            f"got {got}; rows would be held for other times with every other step"
         )
     return finite_array("torque", torque, (model.nv,))
 

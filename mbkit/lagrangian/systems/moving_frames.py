@@ -11,9 +11,7 @@ from mbkit.lagrangian.systems._values import Value, values
 __all__ = ["bead_on_hoop", "driven_pendulum"]
 
 
-def bead_on_hoop(
-    *, mass: Value = 1.0, radius: Value = 1.0, speed: Value = 4.0, gravity: Value = 9.81
-) -> Lagrangian:
+def bead_on_hoop(*, mass: Value = 1.0, radius: Value = 1.0, speed: Value = 4.0, gravity: Value = 9.81) -> Lagrangian:
     """Return a bead on a hoop that turns about its vertical diameter: T = ½ m R² (θ̇² + Ω² sin² θ).
 
     One coordinate, ``theta``, the bead's angle from the bottom; T0 = ½ m R² Ω² sin² θ is not zero. Where

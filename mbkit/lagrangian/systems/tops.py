@@ -71,9 +71,7 @@ def gyroscope(
     positive = {"rotor_mass": (m, rotor_mass), "rotor_axial": (C, rotor_axial), "rotor_across": (A, rotor_across)}
     free = {"offset": (l, offset), "inner_hinge": (Ai, inner_hinge), "inner_axial": (Bi, inner_axial)}
     free |= {"inner_across": (Ci, inner_across), "outer_inertia": (Jo, outer_inertia), "gravity": (g, gravity)}
-    return Lagrangian(
-        T, m * g * l * sp.sin(be), [al, be, ga], parameters=values(positive, free), name="gyroscope"
-    )
+    return Lagrangian(T, m * g * l * sp.sin(be), [al, be, ga], parameters=values(positive, free), name="gyroscope")
 
 
 def rigid_body(*, A: Value = 1.0, B: Value = 2.0, C: Value = 2.5) -> Lagrangian:

@@ -93,6 +93,4 @@ def furuta_pendulum(
     positive = {"arm_length": (L, arm_length), "arm_inertia": (J, arm_inertia), "pendulum_mass": (m, pendulum_mass)}
     positive |= {"pendulum_com": (l, pendulum_com), "pendulum_inertia": (I, pendulum_inertia)}
     given = values(positive, {"gravity": (g, gravity)})
-    return Lagrangian(
-        T, -m * g * l * sp.cos(th), [al, th], forces={al: tau}, parameters=given, name="furuta_pendulum"
-    )
+    return Lagrangian(T, -m * g * l * sp.cos(th), [al, th], forces={al: tau}, parameters=given, name="furuta_pendulum")
