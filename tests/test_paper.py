@@ -16,7 +16,7 @@ from mbkit.lagrangian import Lagrangian
 from mbkit.simulate import METHODS as METHODS_OF
 
 EPS = np.finfo(float).eps
-m, l, g, k, c, a, W = sp.symbols("m l g k c a Omega", positive=True)  # noqa: E741  # the field's letter
+m, l, g, k, c, a, W = sp.symbols("m l g k c a Omega", positive=True)  # the field's letter
 th, x, t = sp.symbols("theta x t")
 w, u = sp.symbols("thetadot xdot")
 VALUES = {m: 0.7, l: 0.4, g: 9.81}

@@ -54,7 +54,7 @@ def derive(
     if form == "c":
         _write_c(target, system, out or Path("mbkit-export"), force)
         return
-    from mbkit.lagrangian.from_model import from_model
+    from mbkit.lagrangian.on_paper import from_model
     from mbkit.lagrangian.textbook import letters
     from mbkit.lagrangian.written import WrittenModel
     from mbkit.report.progress import Bar
@@ -86,10 +86,9 @@ def _model(name: str, options: dict[str, Any]) -> Model:
             say("note", f"{name} is in Euler angles here; the catalog's has a quaternion, which mbkit check takes")
         return systems.get(name)().model
     if made is not None:
-        if find(name) is not None:
-            say(
-                "note", f"{name} is also a robot; this is the catalog's system, and a path or another name is the robot"
-            )
+        robot = find(name)
+        if robot is not None:
+            say("note", f"{name} is also a robot; this is the catalog's system, and {robot.path} is the robot")
         return made
     try:
         return model_of(name, options)

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.cyclic import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.embedding import Embedded as Embedded
     from mbkit.lagrangian.equilibrium import Equilibrium as Equilibrium
-    from mbkit.lagrangian.from_model import from_model as from_model
     from mbkit.lagrangian.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.hamilton import Hamiltonian as Hamiltonian
     from mbkit.lagrangian.motion import EquationsOfMotion as EquationsOfMotion
+    from mbkit.lagrangian.on_paper import from_model as from_model
     from mbkit.lagrangian.particles import from_particles as from_particles
     from mbkit.lagrangian.quasi import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.quasi import QuasiLagrangian as QuasiLagrangian
@@ -44,7 +44,7 @@ _HOME = {
     "QuasiEquationsOfMotion": "mbkit.lagrangian.quasi",
     "QuasiLagrangian": "mbkit.lagrangian.quasi",
     "Routhian": "mbkit.lagrangian.routh",
-    "from_model": "mbkit.lagrangian.from_model",
+    "from_model": "mbkit.lagrangian.on_paper",
     "from_particles": "mbkit.lagrangian.particles",
     "generalized_force": "mbkit.lagrangian.virtual_work",
 }

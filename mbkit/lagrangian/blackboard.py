@@ -7,6 +7,7 @@ lengths, coordinates, velocities, accelerations, and cosines last; in sums what 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable
 from typing import Any, Final
 
@@ -226,9 +227,10 @@ def spread(x: sp.Expr) -> sp.Expr:
 def written(name: str) -> str:
     """Return a symbol's name in Unicode: θ̇₁; a letter below the line stays behind its mark: m_p."""
     stem, mark, index = name.partition("_")
-    if mark and index[:1].isalpha() and stem:
-        return f"{pretty_symbol(stem)}_{pretty_symbol(index)}"
-    return str(pretty_symbol(name))
+    split = mark and index[:1].isalpha() and stem
+    # One letter with its dot where there is such a letter.
+    told = f"{pretty_symbol(stem)}_{pretty_symbol(index)}" if split else str(pretty_symbol(name))
+    return unicodedata.normalize("NFC", told)
 
 
 def _below(x: sp.Expr) -> bool:

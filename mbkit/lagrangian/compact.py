@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 from itertools import combinations
 from math import comb, gcd, lcm
-from typing import Final
+from typing import Any, Final
 
 import sympy as sp
 
@@ -33,14 +33,15 @@ _Poly = dict[tuple[tuple[sp.Expr, int], ...], Fraction]
 def cost(x: sp.Expr) -> int:
     """Return how long an expression reads: its operations, more for a sum that begins with a minus or stands deep."""
     sums = x.atoms(sp.Add)
-    return int(x.count_ops()) + sum(e.could_extract_minus_sign() for e in sums) + 2 * max(_depth(x) - 2, 0)
+    minus = sum(bool(e.could_extract_minus_sign()) for e in sums)
+    return int(x.count_ops()) + minus + 2 * max(_depth(x) - 2, 0)
 
 
 def _depth(x: sp.Expr) -> int:
     """Return how many sums stand in one another, outside of cosines and the like."""
     if not (x.is_Add or x.is_Mul or x.is_Pow):
         return 0
-    return max(map(_depth, x.args)) + bool(x.is_Add)
+    return int(max(map(_depth, x.args))) + bool(x.is_Add)
 
 
 def number(x: Fraction) -> sp.Expr:
@@ -83,6 +84,7 @@ def written_out(x: Harmonic, *, whole: bool = True, decimals: bool = True) -> sp
 class _Writer:
     def __init__(self, x: Harmonic, whole: bool, decimals: bool) -> None:
         self._x, self._whole, self._decimals = x, whole, decimals
+        self._sums: dict[frozenset[Any], sp.Expr] = {}
 
     def as_it_is(self) -> _Form:
         return {((), kind, multiples, powers): value for (kind, multiples, powers), value in self._x.terms.items()}
@@ -157,6 +159,13 @@ class _Writer:
 
     def _sum(self, poly: _Poly) -> sp.Expr:
         """Return a sum by the atom that most of its terms have, and what has it not likewise."""
+        # The same parts come up in many forms.
+        key = frozenset(poly.items())
+        if key not in self._sums:
+            self._sums[key] = self._summed(poly)
+        return self._sums[key]
+
+    def _summed(self, poly: _Poly) -> sp.Expr:
         counts: dict[sp.Expr, int] = {}
         for atoms in poly:
             for a, e in atoms:
@@ -185,6 +194,13 @@ def _product(poly: _Poly, x: sp.Expr) -> list[sp.Expr]:
     """Return a sum as a product of sums, if it is one; its atoms are as good as symbols."""
     # The factors of a sum with decimals would have others.
     if x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms):
+        return []
+    where: dict[sp.Expr, list[int]] = {}
+    for atoms in poly:
+        for a, e in atoms:
+            where.setdefault(a, []).append(e)
+    # What is linear in an atom that one term holds is a product of nothing: all its terms share no factor.
+    if [1] in where.values():
         return []
     symbols = {a: sp.Dummy(f"x{i}") for i, a in enumerate(dict.fromkeys(a for atoms in poly for a, _ in atoms))}
     named = sp.Add(

@@ -17,8 +17,8 @@ from mbkit.errors import UnsupportedError
 
 __all__ = ["MOST", "Harmonic", "Space"]
 
-#: Products of terms that one system may cost: some ten seconds.
-MOST: Final = 5_000_000
+#: Products of terms that one system may cost. A robot with six joints costs 10,000, a planar chain of 19 twice that.
+MOST: Final = 200_000
 
 #: 0 for a cosine and 1 for a sine, whole multiples of the angles, exponents of the generators.
 Key = tuple[int, tuple[int, ...], tuple[int, ...]]
@@ -114,7 +114,9 @@ class Harmonic:
         self.space, self.terms = space, terms
 
     def _other(self, x: Any) -> Harmonic:
-        return x if isinstance(x, Harmonic) else self.space.number(x)
+        if isinstance(x, Harmonic):
+            return x
+        return self.space.number(x)
 
     def __bool__(self) -> bool:
         return bool(self.terms)
@@ -135,13 +137,14 @@ class Harmonic:
         return self + (-self._other(x))
 
     def __rsub__(self, x: Any) -> Harmonic:
-        return -self + x
+        return self._other(x) + (-self)
 
     def __mul__(self, x: Any) -> Harmonic:
         other = self._other(x)
         a, b = (self.terms, other.terms) if len(self.terms) < len(other.terms) else (other.terms, self.terms)
         self.space.spend(len(a) * len(b))
-        still, out = self.space.still, {}
+        still = self.space.still
+        out: dict[Key, Fraction] = {}
         for (s, k, m), x1 in a.items():
             for (t, l, n), x2 in b.items():
                 value = x1 * x2

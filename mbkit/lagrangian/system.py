@@ -85,7 +85,7 @@ class Lagrangian(Constrained):
     >>> T, V = m * l**2 * w**2 / 2, -m * g * l * sp.cos(th)
     >>> lag = mb.lagrangian.Lagrangian(T, V, [th], [w], forces={th: u}, parameters={m: 1.0, l: 1.0, g: 9.81})
     >>> print(lag.equations())
-    omegadot*l**2*m + g*l*m*sin(theta) = tau
+    l**2*m*omegadot + g*l*m*sin(theta) = tau
     """
 
     def __init__(

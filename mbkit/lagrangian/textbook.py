@@ -137,7 +137,8 @@ def _form(model: Model) -> Any:
 def _solved(made: Model, model: Model) -> dict[str, float]:
     """Return the values of parameters that give a model's numbers, as far as they can be told."""
     values: dict[str, float] = {}
-    left = [(b.expression, _number(model, b)) for b in made.bindings]
+    # Frames move nothing, and a model may be without them.
+    left = [(b.expression, _number(model, b)) for b in made.bindings if b.where != "frames"]
     progress = True
     while progress:
         progress = False
@@ -167,13 +168,11 @@ def _evaluated(expression: Expression, values: Mapping[str, float]) -> float:
 
 
 def _number(model: Model, binding: Any) -> float:
-    part = model if binding.where == "gravity" else _part(model, binding.where, binding.part)
+    part: Any = model
+    if binding.where != "gravity":
+        part = next(p for p in getattr(model, binding.where) if p.name == binding.part)
     value = getattr(part, binding.field)
     return float(value[binding.index] if binding.index else value)
-
-
-def _part(model: Model, where: str, name: str) -> Any:
-    return next((p for p in getattr(model, where) if p.name == name), None)
 
 
 def _same(a: Model, b: Model) -> bool:

@@ -26,8 +26,10 @@ def tidy(x: sp.Expr, *, small: int = SMALL) -> sp.Expr:
     if not x.free_symbols or x.count_ops() > LARGE:
         return x
     short = shortened(x)
-    if short is not None and (x.count_ops() > small or not _has_quotients(x)):
-        return min((x, short), key=cost)
+    # Roots of cosines are not taken apart, so what multiplies them is often better left as it was.
+    rooted = any(p.has(TrigonometricFunction) for p in x.atoms(sp.Pow) if not p.exp.is_Integer)
+    if short is not None and (rooted or x.count_ops() > small or not _has_quotients(x)):
+        return short if cost(short) <= (0.7 if rooted else 1.0) * cost(x) else x
     if x.count_ops() > small:
         return x
     expanded = sp.expand(x)

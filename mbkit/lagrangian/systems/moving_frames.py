@@ -38,14 +38,14 @@ def driven_pendulum(
 ) -> Lagrangian:
     """Return Kapitza's pendulum, whose pivot moves up and down as a cos Ωt.
 
-    One coordinate, ``theta``, the angle from the downward vertical, and the time ``t``; T1 and T0 are not zero. The mass
-    is at (l sin θ, a cos Ωt - l cos θ). Upright is stable where a² Ω² > 2 g l, as with the defaults.
+    One coordinate, ``theta``, the angle from the downward vertical, and the time ``t``; T1 and T0 are not zero.
+    The mass is at (l sin θ, a cos Ωt - l cos θ). Upright is stable where a² Ω² > 2 g l, as with the defaults.
 
     References
     ----------
     Landau, Lifshitz 1976, Mechanics, §30 problem 1; Kapitza 1951.
     """
-    m, l, a, Om, g, th, t = sp.symbols("m l a Omega g theta t")  # noqa: E741
+    m, l, a, Om, g, th, t = sp.symbols("m l a Omega g theta t")
     w = velocity_of(th)
     rise = -a * Om * sp.sin(Om * t)
     T = m * (l**2 * w**2 + 2 * l * rise * w * sp.sin(th) + rise**2) / 2

@@ -80,7 +80,7 @@ def slider_crank(
     ----------
     Biezeno, Grammel 1953, Technische Dynamik, vol. 2, on the crank drive.
     """
-    m, r, l, tau, F, th = sp.symbols("m r l tau F theta")  # noqa: E741
+    m, r, l, tau, F, th = sp.symbols("m r l tau F theta")
     # sin(θ + φ)/cos φ, without the angle φ: l cos φ is the root.
     lever = sp.sin(th) * (1 + r * sp.cos(th) / sp.sqrt(l**2 - r**2 * sp.sin(th) ** 2))
     positive = {"mass": (m, mass), "crank": (r, crank), "rod": (l, rod)}
@@ -100,8 +100,9 @@ def rigid_slider_crank(
 ) -> Lagrangian:
     """Return the slider-crank of thin rods with mass and a piston, without gravity.
 
-    One coordinate, ``theta``, the crank's angle from the dead centre at which the piston is farthest. ``tau`` is a torque on the
-    crank. J = J1 + m1 L1²/4 + m2 (x2′² + y2′²) + J2 ψ′² + m3 x3′², never zero: dead centres are passed.
+    One coordinate, ``theta``, the crank's angle from the dead centre at which the piston is farthest. ``tau`` is a
+    torque on the crank. J = J1 + m1 L1²/4 + m2 (x2′² + y2′²) + J2 ψ′² + m3 x3′², never zero: dead centres are
+    passed.
 
     References
     ----------
@@ -131,8 +132,8 @@ def sliding_block(
 ) -> Lagrangian:
     """Return a block that slides down a slope against dry friction: Q = -μ m g cos α tanh(ẋ/v₀).
 
-    One coordinate, ``x``, the way down the slope of angle α. Coulomb's friction is regularized: it reaches three quarters of its
-    value at the speed v₀ (v_0), so a block that would stick creeps, at v₀ artanh(tan α/μ).
+    One coordinate, ``x``, the way down the slope of angle α. Coulomb's friction is regularized: it reaches three
+    quarters of its value at the speed v₀ (v_0), so a block that would stick creeps, at v₀ artanh(tan α/μ).
 
     References
     ----------

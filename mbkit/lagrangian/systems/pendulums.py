@@ -20,7 +20,7 @@ def pendulum(*, mass: Value = 1.0, length: Value = 1.0, gravity: Value = 9.81) -
     ----------
     Landau, Lifshitz 1976, Mechanics, §11 problem 1.
     """
-    m, l, g, th = sp.symbols("m l g theta")  # noqa: E741
+    m, l, g, th = sp.symbols("m l g theta")
     w = velocity_of(th)
     given = values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})
     return Lagrangian(m * l**2 * w**2 / 2, -m * g * l * sp.cos(th), [th], parameters=given, name="pendulum")
@@ -66,7 +66,7 @@ def elastic_pendulum(
     Vitt, Gorelik 1933, Oscillations of an elastic pendulum as an example of two
     parametrically coupled linear systems.
     """
-    m, l, k, g, th, s = sp.symbols("m l k g theta s")  # noqa: E741
+    m, l, k, g, th, s = sp.symbols("m l k g theta s")
     w, u = velocity_of(th), velocity_of(s)
     T = m * (u**2 + (l + s) ** 2 * w**2) / 2
     V = k * s**2 / 2 - m * g * (l + s) * sp.cos(th)
@@ -86,7 +86,7 @@ def spherical_pendulum(*, mass: Value = 1.0, length: Value = 1.0, gravity: Value
     ----------
     Landau, Lifshitz 1976, Mechanics, §14 problem 1.
     """
-    m, l, g, th, ph = sp.symbols("m l g theta phi")  # noqa: E741
+    m, l, g, th, ph = sp.symbols("m l g theta phi")
     w, u = velocity_of(th), velocity_of(ph)
     T = m * l**2 * (w**2 + u**2 * sp.sin(th) ** 2) / 2
     given = values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})

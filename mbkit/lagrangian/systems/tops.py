@@ -21,9 +21,10 @@ def heavy_top(
 ) -> Lagrangian:
     """Return Lagrange's top: a symmetric body with a point of its axis fixed.
 
-    Three coordinates, Euler's angles z-x-z: ``phi``, the precession, ``theta``, the axis's angle from the upward vertical, and
-    ``psi``, the spin; φ and ψ are cyclic. A and C are the moments about the fixed point, across and along the
-    axis; the centre of mass lies l up the axis. The mass matrix is singular at θ = 0 and π, where φ and ψ turn the same way.
+    Three coordinates, Euler's angles z-x-z: ``phi``, the precession, ``theta``, the axis's angle from the upward
+    vertical, and ``psi``, the spin; φ and ψ are cyclic. A and C are the moments about the fixed point, across and
+    along the axis; the centre of mass lies l up the axis. The mass matrix is singular at θ = 0 and π, where φ and
+    ψ turn the same way.
 
     T = ½ A (θ̇² + φ̇² sin² θ) + ½ C (ψ̇ + φ̇ cos θ)², V = m g l cos θ.
 
@@ -31,7 +32,7 @@ def heavy_top(
     ----------
     Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 5.7; Landau, Lifshitz 1976, Mechanics, §35 problem 1.
     """
-    m, l, A, C, g, ph, th, ps = sp.symbols("m l A C g phi theta psi")  # noqa: E741
+    m, l, A, C, g, ph, th, ps = sp.symbols("m l A C g phi theta psi")
     u, w, s = velocity_of(ph), velocity_of(th), velocity_of(ps)
     T = A * (w**2 + u**2 * sp.sin(th) ** 2) / 2 + C * (s + u * sp.cos(th)) ** 2 / 2
     positive = {"mass": (m, mass), "length": (l, length), "across": (A, across), "axial": (C, axial)}
@@ -53,17 +54,18 @@ def gyroscope(
 ) -> Lagrangian:
     """Return a symmetric rotor in two gimbals, with its centre of mass on its axis.
 
-    Three coordinates: ``alpha``, the outer gimbal's turn about the vertical, ``beta``, the inner gimbal's turn about the outer
-    one, which is the elevation of the rotor's axis above the horizontal, and ``gamma``, the rotor's turn in the inner gimbal; α and γ are
-    cyclic. A and C are the rotor's moments across and along its axis, about its centre of mass, which lies l from
-    the gimbals' centre; A_i, B_i and C_i the inner gimbal's about its hinge, along the rotor's axis and
-    across both, J_o the outer one's about the vertical. At β = ±π/2 the mass matrix is singular but for J_o.
+    Three coordinates: ``alpha``, the outer gimbal's turn about the vertical, ``beta``, the inner gimbal's turn
+    about the outer one, which is the elevation of the rotor's axis above the horizontal, and ``gamma``, the
+    rotor's turn in the inner gimbal; α and γ are cyclic. A and C are the rotor's moments across and along its
+    axis, about its centre of mass, which lies l from the gimbals' centre; A_i, B_i and C_i the inner gimbal's
+    about its hinge, along the rotor's axis and across both, J_o the outer one's about the vertical. At β = ±π/2
+    the mass matrix is singular but for J_o.
 
     References
     ----------
     Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 5.7; Magnus 1971, Kreisel, for the gimbals.
     """
-    m, l, A, C, Ai, Bi, Ci, Jo, g = sp.symbols("m l A C A_i B_i C_i J_o g")  # noqa: E741
+    m, l, A, C, Ai, Bi, Ci, Jo, g = sp.symbols("m l A C A_i B_i C_i J_o g")
     al, be, ga = sp.symbols("alpha beta gamma")
     u, w, s = map(velocity_of, (al, be, ga))
     T = (A + Ai + m * l**2) * w**2 / 2 + C * (s + u * sp.sin(be)) ** 2 / 2
@@ -77,9 +79,9 @@ def gyroscope(
 def rigid_body(*, A: Value = 1.0, B: Value = 2.0, C: Value = 2.5) -> Lagrangian:
     """Return a body that turns about its centre of mass without torque: T = ½ (A ω₁² + B ω₂² + C ω₃²).
 
-    Three coordinates, Euler's angles z-x-z: ``phi``, which is cyclic, ``theta`` and ``psi``. A, B and C are the principal moments,
-    and ω in body axes is ω₁ = θ̇ cos ψ + φ̇ sin θ sin ψ, ω₂ = -θ̇ sin ψ + φ̇ sin θ cos ψ, ω₃ = ψ̇ + φ̇ cos θ. The mass
-    matrix is singular at θ = 0 and π.
+    Three coordinates, Euler's angles z-x-z: ``phi``, which is cyclic, ``theta`` and ``psi``. A, B and C are the
+    principal moments, and ω in body axes is ω₁ = θ̇ cos ψ + φ̇ sin θ sin ψ, ω₂ = -θ̇ sin ψ + φ̇ sin θ cos ψ, ω₃ =
+    ψ̇ + φ̇ cos θ. The mass matrix is singular at θ = 0 and π.
 
     References
     ----------

@@ -23,7 +23,7 @@ def cart_pole(
     ----------
     Tedrake, Underactuated Robotics, ch. 3.2.1.
     """
-    M, m, l, g, F, x, th = sp.symbols("m_c m_p l g F x theta")  # noqa: E741
+    M, m, l, g, F, x, th = sp.symbols("m_c m_p l g F x theta")
     u, w = velocity_of(x), velocity_of(th)
     T = (M + m) * u**2 / 2 + m * l * u * w * sp.cos(th) + m * l**2 * w**2 / 2
     positive = {"cart_mass": (M, cart_mass), "pole_mass": (m, pole_mass), "length": (l, length)}
@@ -86,7 +86,7 @@ def furuta_pendulum(
     ----------
     Furuta, Yamakita, Kobayashi 1992, Swing-up control of inverted pendulum using pseudo-state feedback.
     """
-    m, l, L, J, I, g, tau, al, th = sp.symbols("m l L J I g tau alpha theta")  # noqa: E741
+    m, l, L, J, I, g, tau, al, th = sp.symbols("m l L J I g tau alpha theta")
     u, w = velocity_of(al), velocity_of(th)
     T = (J + m * L**2 + (I + m * l**2) * sp.sin(th) ** 2) * u**2 / 2 + (I + m * l**2) * w**2 / 2
     T += m * L * l * u * w * sp.cos(th)

@@ -105,8 +105,8 @@ def _check(model: Model) -> None:
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
     if turning:
         raise UnsupportedError(
-            f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate; write it in Euler angles "
-            "(mbkit.lagrangian.systems.heavy_top, or spherical_zyx joints), or use Lagrangian.quasi_velocities"
+            f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate; write it in Euler "
+            "angles (mbkit.lagrangian.systems.heavy_top, or spherical_zyx joints), or use Lagrangian.quasi_velocities"
         )
     for feature, told in (("loops", model.loops), ("prescribed", model.prescribed)):
         if told:

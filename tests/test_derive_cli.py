@@ -1,0 +1,170 @@
+"""`mbkit derive`: what is printed reads like a textbook, and what is written runs by itself."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import sympy as sp
+from click.testing import CliRunner
+
+import mbkit as mb
+from mbkit.cli import cli
+from mbkit.lagrangian import systems
+from mbkit.lagrangian.blackboard import Blackboard, written
+from mbkit.lagrangian.python_code import python_code
+from mbkit.load.names import find
+
+
+def derive(*arguments, status=0):
+    out = CliRunner().invoke(cli, ["derive", *map(str, arguments)])
+    assert out.exit_code == status, out.output
+    return out
+
+
+def test_a_cart_pole_reads_as_in_a_textbook():
+    text = derive("cart_pole").stdout
+    assert "T = ½ (m_c + m_p) ẋ² + m_p l ẋ θ̇ cos θ + ½ m_p l² θ̇²\n" in text
+    assert "V = -m_p g l cos θ\n" in text
+    assert "  (m_c + m_p) ẍ + m_p l θ̈ cos θ - m_p l θ̇² sin θ = 0\n" in text
+    assert "  m_p l ẍ cos θ + m_p l² θ̈ + m_p g l sin θ = 0\n" in text
+    assert "Cyclic: x\nConserved: p_x = (m_c + m_p) ẋ + m_p l θ̇ cos θ\nConserved: E = T + V\n" in text
+
+
+def test_a_double_pendulum_reads_as_in_a_textbook():
+    out = derive("double_pendulum")
+    assert "  ⎣ m₂ l₂ (l₂ + l₁ cos θ₂)                       m₂ l₂²                 ⎦\n" in out.stdout
+    assert "V = -(m₁ + m₂) g l₁ cos θ₁ - m₂ g l₂ cos(θ₁ + θ₂)\n" in out.stdout
+    last = "  m₂ l₂ (l₂ + l₁ cos θ₂) θ̈₁ + m₂ l₂² θ̈₂ + m₂ l₁ l₂ θ̇₁² sin θ₂ + m₂ g l₂ sin(θ₁ + θ₂) = 0\n"
+    assert last in out.stdout
+    # The name is a robot's too.
+    assert "note" in out.stderr
+
+
+def test_systems_on_paper_and_functions_of_ones_own():
+    assert "V = -k/r\n" in derive("kepler").stdout
+    assert "Jacobi's integral" in derive("bead_on_hoop").stdout
+    assert "time t" in derive("mbkit.lagrangian.systems:driven_pendulum").stdout
+    out = derive("heavy_top")
+    assert "Cyclic: φ, ψ" in out.stdout
+    assert "Euler angles" in out.stderr
+
+
+def test_long_names_are_told_once():
+    text = derive("gyroscope").stdout
+    assert "coordinates α (precession), β (nutation), γ (spin)" in text
+    assert "C α̈ sin β + C γ̈ + C α̇ β̇ cos β = 0" in text
+
+
+def test_json_can_be_read_back():
+    data = json.loads(derive("cart_pole", "--json").stdout)
+    lag = mb.lagrangian.Lagrangian(
+        sp.sympify(data["T"], {n: sp.Symbol(n) for n in data["parameters"]}),
+        sp.sympify(data["V"], {n: sp.Symbol(n) for n in data["parameters"]}),
+        sp.symbols(data["coordinates"]),
+        parameters={sp.Symbol(n): x for n, x in data["parameters"].items()},
+    )
+    assert _matrix(lag.equations().mass_matrix) == data["mass_matrix"]
+    assert data["cyclic"] == ["x"]
+    assert [c["name"] for c in data["conserved"]] == ["p_x", "E"]
+    assert len(data["equations"]) == len(data["latex"]) == 2
+
+
+def _matrix(A):
+    return [[str(x) for x in A[i, :]] for i in range(A.rows)]
+
+
+def test_latex_has_what_a_document_needs():
+    text = derive("cart_pole", "--latex").stdout
+    assert text.count(r"\begin{align*}") == text.count(r"\end{align*}") == 3
+    assert r"T &= \tfrac{1}{2} \left(m_{c} + m_{p}\right) \dot{x}^{2} + m_{p} l \dot{x} \dot{\theta}" in text
+
+
+@pytest.mark.parametrize("name", ["double_pendulum", "driven_pendulum", "slider_crank", "sliding_block", "a robot"])
+def test_python_runs_by_itself(name, tmp_path):
+    if name == "a robot":
+        asked = find("double_pendulum").path
+        ref = mb.dynamics(mb.load(asked), "lagrangian")
+    else:
+        asked = name
+        read = mb.lagrangian.from_model(mb.catalog.get(name)()) if name == "double_pendulum" else systems.get(name)()
+        ref = read.dynamics(options={"compile": False})
+    path = derive(asked, "--python", "--out", tmp_path).stdout.split()[-1]
+    n = ref.model.nv
+    q, v, tau = np.random.default_rng(0).uniform(0.2, 1.0, (3, n))
+    more = ", t=0.3" if name == "driven_pendulum" else ""
+    program = f"""
+import sys, runpy
+sys.modules["mbkit"] = None
+m = runpy.run_path({path!r})
+q, v, tau = {q.tolist()}, {v.tolist()}, {tau.tolist()}
+out = [m["mass_matrix"](q{more}).ravel(), m["nonlinear"](q, v{more}), m["forward_dynamics"](q, v, tau{more})]
+print([float(x) for part in out for x in part])
+"""
+    out = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path)
+    got = np.array(json.loads(out.stdout))
+    at = ref.at(t=0.3) if more else ref
+    expected = [at.mass_matrix(q).ravel(), at.nle(q, v) - at.passive(q, v), at.forward_dynamics(q, v, tau)]
+    assert np.allclose(got, np.concatenate(expected), rtol=1e-12, atol=1e-13)
+
+
+def test_python_takes_parameters_by_name():
+    space = {}
+    exec(python_code(systems.pendulum()), space)
+    assert space["forward_dynamics"]([0.3], [0.0], l=2.0) == pytest.approx([-9.81 / 2 * np.sin(0.3)], rel=1e-15)
+    with pytest.raises(TypeError, match="no such parameters"):
+        space["mass_matrix"]([0.3], length=2.0)
+
+
+def test_c_compiles_and_holds_the_parameters(tmp_path):
+    out = derive("cart_pole", "--c", "--out", tmp_path).stdout
+    assert "cart_pole_forward_dynamics(q[2], v[2], tau[2], parameters[4])" in out
+    derive("driven_pendulum", "--c", "--out", tmp_path)
+    for stem in ("cart_pole", "driven_pendulum"):
+        command = ["cc", "-std=c99", "-Wall", "-Werror", "-c", f"{stem}.c", "-o", f"{stem}.o"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+
+
+def test_bad_input_is_one_message():
+    out = derive("keplr", status=2)
+    assert out.stderr.count("\n") == 1
+    assert "'kepler'" in out.stderr
+    assert "Euler angles" in derive("free_body", status=2).stderr
+    assert "exclude each other" in derive("pendulum", "--json", "--latex", status=2).stderr
+    assert "the function failed" in derive("json:dumps", status=2).stderr
+
+
+def test_an_unwritable_folder_is_told_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "is not a folder" in derive("pendulum", "--latex", "--out", tmp_path / "file", status=2).stderr
+
+
+def test_symbols_as_they_are_written():
+    assert [written(n) for n in ("thetadot1", "m_p", "l_c1", "Omega", "p_phi", "m1")] == [
+        "θ̇₁",
+        "m_p",
+        "l_c₁",
+        "Ω",
+        "p_φ",
+        "m₁",
+    ]
+
+
+def test_expressions_on_one_line():
+    board = Blackboard(systems.kepler().equations())
+    m, k, r, g, th = sp.symbols("m k r g theta")
+    told = {
+        -k / r: "-k/r",
+        sp.Rational(7, 2) * m * g: "7/2 m g",
+        k * sp.sin(th) ** 2 * sp.cos(th): "k sin² θ cos θ",
+        sp.sqrt(1 - k**2): "√(1 - k²)",
+        k * sp.Abs(g) / (m * r): "k |g|/(m r)",
+        sp.Float(9.81) * m: "9.81 m",
+        sp.cos(2 * th): "cos 2θ",
+        sp.tanh(k / m): "tanh(k/m)",
+        sp.Integer(0): "0",
+    }
+    assert {x: board.text(x) for x in told} == told

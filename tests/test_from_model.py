@@ -1,0 +1,207 @@
+"""A model as a Lagrangian to read: it moves as the model does, and it is short."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import mbkit as mb
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.lagrangian.compact import number
+from mbkit.lagrangian.on_paper import from_model
+from mbkit.lagrangian.reading import shortened
+from mbkit.lagrangian.textbook import in_symbols, letters
+from mbkit.lagrangian.tidy import tidy
+from tests.random_trees import off, random_tree, states
+
+ONE = ("revolute", "continuous", "prismatic", "helical")
+# Sums of some hundred rounded terms, in another order than the derivation's.
+CLOSE = 1e-13
+SMALL = {"chain": {"n": 3}, "clamped_beam": {"segments": 3}, "flexible_spacecraft": {"segments": 2}}
+READ = [n for n, f in mb.catalog.systems().items() if not f().quaternions]
+
+
+def assert_same(model, lag):
+    dyn, ref = lag.dynamics(options={"compile": False}), mb.dynamics(model, "lagrangian")
+    q, v, a, tau = states(model, 4)
+    M = ref.mass_matrix(q)
+    assert off(dyn.mass_matrix(q), M) < CLOSE
+    assert off(dyn.kinetic_energy(q, v), ref.kinetic_energy(q, v)) < CLOSE
+    assert off(dyn.coriolis_matrix(q, v), ref.coriolis_matrix(q, v)) < CLOSE
+    # Springs are in V on paper, and among the passive forces of a model.
+    for x in (0 * v, v):
+        assert off(dyn.nle(q, x) - dyn.passive(q, x), ref.nle(q, x) - ref.passive(q, x)) < CLOSE
+    assert off(dyn.inverse_dynamics(q, v, a), ref.inverse_dynamics(q, v, a)) < CLOSE
+    close = 1e-14 * np.linalg.cond(M).max()
+    assert off(dyn.forward_dynamics(q, v, tau), ref.forward_dynamics(q, v, tau)) < max(close, CLOSE)
+    potential = dyn.potential_energy(q) - ref.potential_energy(q)
+    assert np.abs(potential - potential[0]).max() < CLOSE * max(1.0, np.abs(ref.potential_energy(q)).max())
+    return dyn, ref
+
+
+@pytest.mark.parametrize("name", READ)
+def test_catalog_systems_move_as_they_do(name):
+    model = mb.catalog.get(name)(**SMALL.get(name, {}))
+    lag = from_model(model)
+    assert lag.parameters
+    assert [s.name for s in lag.coordinates] == list(model.coordinate_names)
+    assert_same(model, lag)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_trees_move_as_they_do(seed):
+    model = random_tree(seed, 4 if seed == 1 else 3, ONE, mimic=seed == 2, nearest=None if seed < 2 else 1)
+    assert_same(model, from_model(model))
+
+
+@pytest.mark.parametrize("kinds", [("universal", "revolute"), ("spherical_zyx",), ("planar", "revolute")])
+def test_joints_of_several_velocities_move_as_they_do(kinds):
+    model = random_tree(7, len(kinds), kinds, armature=False)
+    assert_same(model, from_model(model))
+
+
+def test_a_robot_moves_as_it_does():
+    model = mb.load("ur5")
+    assert_same(model, from_model(model, coordinates=[f"q{i}" for i in range(1, 7)]))
+
+
+def test_named_parameters_stay_and_move():
+    m, c = mb.Parameter("bob", 0.7), mb.Parameter("c", 0.2)
+    b = mb.ModelBuilder("swing")
+    b.add_body("bob", mass=m, com=(0, 0, -0.5 * c / m), inertia=(c**2, c**2 + 0.005, c**0.5 / 50))
+    b.add_joint("swing", "revolute", parent="world", child="bob", axis=(0, 1, 0), damping=c, stiffness=m * c, rest=0.1)
+    model = b.build()
+    lag = from_model(model)
+    assert {s.name for s in lag.parameters} == {"bob", "c"}
+    dyn, ref = assert_same(model, lag)
+    q, v, _, tau = states(model, 3)
+    moved = {"bob": 0.9, "c": 0.4}
+    assert off(dyn.at(**moved).forward_dynamics(q, v, tau), ref.at(**moved).forward_dynamics(q, v, tau)) < CLOSE
+
+
+def test_a_cart_pole_reads_as_on_a_blackboard():
+    lag = from_model(mb.catalog.cart_pole())
+    m_c, m_p, l, g, th, w, u = sp.symbols("m_c m_p l g theta thetadot xdot")
+    assert (m_c + m_p) * u**2 / 2 + m_p * l * u * w * sp.cos(th) + m_p * l**2 * w**2 / 2 == lag.T
+    assert -m_p * g * l * sp.cos(th) == lag.V
+    assert {s.name: x for s, x in lag.parameters.items()} == {"g": 9.81, "m_c": 1.0, "m_p": 1.0, "l": 1.0}
+
+
+def test_a_double_pendulum_holds_the_second_angle_only():
+    lag = from_model(mb.catalog.double_pendulum(mass1=3.0))
+    m1, m2, l1, l2, th2 = sp.symbols("m1 m2 l1 l2 theta2")
+    M = lag.equations().mass_matrix
+    assert M[0, 0] == (m1 + m2) * l1**2 + m2 * l2**2 + 2 * m2 * l1 * l2 * sp.cos(th2)
+    assert M[0, 1] == m2 * l2 * (l2 + l1 * sp.cos(th2))
+    assert M[1, 1] == m2 * l2**2
+    assert lag.parameters[m1] == 3.0
+
+
+def test_squares_are_found():
+    lag = from_model(mb.catalog.elastic_pendulum())
+    m, l, s, w, u = sp.symbols("m l stretch thetadot stretchdot")
+    assert m * u**2 / 2 + m * (l + s) ** 2 * w**2 / 2 == lag.T
+
+
+def test_numbers_are_the_description_s():
+    lag = from_model(mb.catalog.pendulum(length=0.5, mass=2.0), symbols=False)
+    w, th = sp.symbols("thetadot theta")
+    assert not lag.parameters
+    assert w**2 / 4 == lag.T
+    assert -9.81 * sp.cos(th) == lag.V
+
+
+def test_a_system_of_other_form_keeps_its_numbers():
+    b = mb.ModelBuilder("pendulum")
+    b.add_body("bob", mass=1.0, com=(0.1, 0, -1.0))
+    b.add_joint("theta", "continuous", parent="world", child="bob", axis=(0, -1, 0))
+    assert in_symbols(b.build()) is None
+    with pytest.raises(InputError, match="no system of the catalog"):
+        from_model(b.build(), symbols=True)
+    with pytest.raises(InputError, match="parameters already"):
+        from_model(mb.catalog.pendulum(mass=mb.Parameter("m", 1.0)), symbols=True)
+
+
+def test_a_catalog_system_is_known_without_its_gravity():
+    lag = from_model(mb.catalog.cart_pole(length=0.3).without("gravity"))
+    assert lag.V == 0
+    assert {s.name for s in lag.parameters} == {"m_c", "m_p", "l"}
+    assert lag.parameters[sp.Symbol("l")] == 0.3
+
+
+def test_letters_for_coordinates_of_long_names():
+    assert letters(mb.catalog.cart_pole()) is None
+    assert letters(mb.catalog.gyroscope()) == ["alpha", "beta", "gamma"]
+    assert letters(mb.load("ur5"))[5] == "q6"
+
+
+def test_what_cannot_be_written_is_refused_with_the_reason():
+    with pytest.raises(UnsupportedError, match=r"'spin'.*Euler angles"):
+        from_model(mb.catalog.heavy_top())
+    with pytest.raises(UnsupportedError, match="too many terms"):
+        from_model(mb.load("panda"))
+    with pytest.raises(UnsupportedError, match="32 coordinates"):
+        from_model(mb.load("talos"))
+    with pytest.raises(InputError, match="expected a Model, got str"):
+        from_model("cart_pole")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="2 different names"):
+        from_model(mb.catalog.cart_pole(), coordinates=["q"])
+    with pytest.raises(InputError, match="'l' is a parameter"):
+        from_model(mb.catalog.pendulum(), coordinates=["l"])
+
+
+def test_a_written_model_is_its_system():
+    lag = from_model(mb.catalog.pendulum())
+    assert from_model(lag.model) is lag
+
+
+a, b, c, x, y = sp.symbols("a b c x y")
+
+
+@pytest.mark.parametrize(
+    ("long", "short"),
+    [
+        (sp.sin(a) * sp.cos(b) - sp.cos(a) * sp.sin(b), sp.sin(a - b)),
+        (x * sp.sin(a) ** 2 + x * sp.cos(a) ** 2, x),
+        (x * sp.sin(a) ** 2 + y * sp.cos(a) ** 2, x * sp.sin(a) ** 2 + y * sp.cos(a) ** 2),
+        (x**2 + 2 * x * y + y**2, (x + y) ** 2),
+        (x / y * sp.cos(a) - x / y * sp.cos(a), 0),
+        (sp.Rational(2, 5) * x - x / 3, x / 15),
+        (sp.cos(a + b) + sp.cos(a - b), 2 * sp.cos(a) * sp.cos(b)),
+        (sp.sin(a * b) ** 2 + sp.cos(a * b) ** 2, 1),
+        (x * sp.sqrt(1 + y) ** 3 - x * (1 + y) * sp.sqrt(1 + y), 0),
+    ],
+)
+def test_short_forms(long, short):
+    assert tidy(long).equals(short)
+    assert tidy(long).count_ops() <= sp.sympify(short).count_ops()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_short_forms_are_equal(seed):
+    rng = np.random.default_rng(seed)
+
+    def term():
+        turned = [
+            f(int(rng.integers(1, 3)) * p + int(rng.integers(-1, 2)) * r)
+            for f, p, r in ((sp.sin, a, b), (sp.cos, b, c))
+        ]
+        return (
+            int(rng.integers(-3, 4))
+            * x ** int(rng.integers(0, 3))
+            * y
+            * sp.prod(f ** int(rng.integers(0, 3)) for f in turned)
+        )
+
+    long = sum(term() for _ in range(6))
+    at = dict(zip((a, b, c, x, y), rng.uniform(0.3, 1.2, 5), strict=True))
+    assert abs(float((shortened(long) - long).subs(at))) < 1e-12
+
+
+def test_fractions_where_people_write_them():
+    from fractions import Fraction
+
+    assert number(Fraction(1, 12)) == sp.Rational(1, 12)
+    assert number(Fraction("9.81")) == sp.Float(9.81)
+    assert number(Fraction(7, 2)) == sp.Rational(7, 2)
