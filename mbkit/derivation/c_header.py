@@ -180,10 +180,11 @@ def _safe(name: str) -> str:
 
 def _facts(model: Model, functions: Sequence[CFunction]) -> list[str]:
     present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on]
+    alone = "inertia alone" if model.written is None else "what was written as T and V"
     return [
         f"Model       {_safe(model.name)}",
         f"Digest      {model.digest}",
-        f"Holds       {', '.join(present) or 'inertia alone'}",
+        f"Holds       {', '.join(present) or alone}",
         f"Functions   {functions[0].name}",
         *(f"            {f.name}" for f in functions[1:]),
     ]
@@ -233,6 +234,8 @@ def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
 
 
 def _coordinate_units(model: Model) -> list[str]:
+    if model.written is not None:
+        return ["generalized"] * model.nq
     return [
         "m" if k in j.type.lengths else "rad" if k in j.type.angular else "1"
         for j in model.independent_joints
@@ -241,6 +244,8 @@ def _coordinate_units(model: Model) -> list[str]:
 
 
 def _velocity_units(model: Model) -> list[tuple[str, str]]:
+    if model.written is not None:
+        return [("generalized", "generalized")] * model.nv
     # Lengths come first and keep their places in v, whatever a quaternion takes.
     return [
         ("m/s", "N") if k in j.type.lengths else ("rad/s", "N m")

@@ -99,8 +99,10 @@ class EquationsOfMotion:
         return tuple(sp.Eq(a, shorter(x), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True))
 
     def latex(self) -> str:
-        """Return the equations as an aligned LaTeX block, accelerations first."""
-        rows = [f"{_joined(terms, sp.latex)} &= {sp.latex(force)}" for terms, force in self._rows()]
+        """Return the equations as an aligned LaTeX block, in the order of a blackboard."""
+        from mbkit.lagrangian.blackboard import Blackboard
+
+        rows = [f"{left} &= {right}" for left, right in Blackboard(self).rows(latex=True)]
         return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
