@@ -41,7 +41,7 @@ def test_robot(robot):
                 mb.load(robot)
             return
         model = mb.load(robot)
-    result = mb.compare(model, samples=16, terms_only=True)
+    result = mb.compare(model, samples=8, terms_only=True)
     assert result.passed, result.verdict
     if robot in TWO_ENGINES:
         assert result.engines == ("pinocchio", "lagrangian")

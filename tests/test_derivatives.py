@@ -63,7 +63,7 @@ class Differences:
         if i < turn:
             out[at : at + 3] = q[at : at + 3] + t * times(times(quaternion, unit), conjugate(quaternion))[:3]
         else:
-            step = own.sin(t / 2) * unit + own.cos(t / 2) * own.array(np.eye(4)[3])
+            step = own.functions["sin"](t / 2) * unit + own.functions["cos"](t / 2) * own.array(np.eye(4)[3])
             out[at + turn : at + turn + 4] = times(quaternion, step)
         return out
 

@@ -20,5 +20,5 @@ def test_notebook_runs(path, tmp_path):
     where = {"metadata": {"path": str(tmp_path)}}
     NotebookClient(notebook, timeout=120, kernel_name="python3", resources=where).execute()
     shown = [o for cell in notebook.cells for o in cell.get("outputs", [])]
-    assert any("text/html" in o.get("data", {}) for o in shown)
+    assert any({"text/html", "text/latex"} & set(o.get("data", {})) for o in shown)
     assert any("image/png" in o.get("data", {}) for o in shown)

@@ -122,7 +122,7 @@ def test_newton_and_euler_see_an_eps():
 @pytest.mark.parametrize("quantity", CALLS)
 @pytest.mark.parametrize("seed", range(2))
 def test_both_backends_agree(quantity, seed):
-    model = random_tree(seed, 5, mimic=bool(seed))
+    model = random_tree(seed, 4, mimic=bool(seed))
     given = arguments(quantity, *states(model, 3, seed))
     ours, theirs = (OracleDynamics(model, backend=b).digits(quantity, *given) for b in BACKENDS)
     condition = np.linalg.cond(mb.dynamics(model).mass_matrix(given[0])).max() if "forward" in quantity else 1.0

@@ -34,7 +34,7 @@ _METHODS: Final = {
 }
 _HORIZON: Final = 0.5
 _REPEATS: Final = 3
-_SECONDS: Final = 8.0
+_SECONDS: Final = 6.0
 
 
 def compare(
