@@ -29,7 +29,7 @@ EPS = float(np.finfo(float).eps)
 needs_cc = pytest.mark.skipif(CC is None, reason="no C compiler on PATH")
 STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Werror")
 # The compiler may then not contract a product and a sum, and what is computed is known to the bit.
-C99 = (str(CC), "-std=c99", "-O2", "-ffp-contract=off", *STRICT)
+C99 = (str(CC), "-std=c99", "-O1", "-ffp-contract=off", *STRICT)
 LIGHT = tuple(name for name in FUNCTIONS if name != "coriolis_matrix" and not name.endswith("derivatives"))
 CASES = {
     "panda": (lambda: mb.load("panda"), LIGHT),

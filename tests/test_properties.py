@@ -24,12 +24,12 @@ from tests.random_trees import random_tree, states
 
 EPS = np.finfo(float).eps
 # Rounding grows like the root of the number of roundings, not like the number: a few
-# eps in a vector, √nv more in the norm of a matrix, which here is up to 69 by 69.
+# eps in a vector, √nv more in the norm of a matrix, which here is up to some 60 by 60.
 K = 20
 CHUNKS, PER_CHUNK, SAMPLES = 20, 10, 1
-#: Joints of the ten trees of a chunk; in the last four, one of every shape, the tenth has 30.
+#: Joints of the ten trees of a chunk; in the last four, one of every shape, the tenth has 24.
 SIZES = (2, 3, 3, 4, 5, 6, 7, 8, 10, 14)
-LARGE = 30
+LARGE = 24
 
 
 def tree(seed: int) -> Model:

@@ -34,7 +34,11 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("command", [c for c in COMMANDS if "--all" not in c], ids=" ".join)
+#: Run from a cold start in test_cli, and there looked at more closely.
+ELSEWHERE = (["mbkit", "check", "panda"],)
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if "--all" not in c and c not in ELSEWHERE], ids=" ".join)
 def test_commands_end_well(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(cli, command[1:])

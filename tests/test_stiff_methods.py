@@ -81,7 +81,7 @@ def close(J: np.ndarray, numeric: np.ndarray, good: float) -> None:
 
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_the_jacobian_is_that_of_the_rates(seed: int, engine: str) -> None:
     kinds = tuple(k for k in ALL if k != "helical") if engine == "mujoco" else ALL
     model = random_tree(seed, 11, kinds)
