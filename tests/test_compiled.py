@@ -229,7 +229,7 @@ def test_memory_stays_flat_over_ten_thousand_batches():
 
 
 @pytest.mark.parametrize("to_code", [True, False])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 def test_the_engine_agrees_with_its_own_expressions_in_every_shape(seed, to_code):
     model = random_tree(seed, 6)
     dyn = mb.dynamics(model, "lagrangian", compile=to_code)

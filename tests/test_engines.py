@@ -39,7 +39,7 @@ def arguments(letters, q, v, a, tau):
 
 
 @pytest.mark.parametrize("mimic", [False, True])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_engines_agree_on_trees_of_every_joint_kind(engine, seed, mimic):
     model = random_tree(seed, 10, IN_MUJOCO if engine == "mujoco" else SOUND, mimic=mimic, armature=engine == "mujoco")

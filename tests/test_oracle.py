@@ -87,7 +87,7 @@ def off(x, y):
 
 
 @pytest.mark.parametrize("mimic", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_newton_and_euler_agree_on_trees_of_every_joint_kind(seed, mimic):
     model = random_tree(seed, 12, mimic=mimic)
     assert {j.kind for j in model.joints} == set(ALL)
@@ -120,7 +120,7 @@ def test_newton_and_euler_see_an_eps():
 
 @pytest.mark.skipif("real128" not in BACKENDS, reason="heyoka is not installed")
 @pytest.mark.parametrize("quantity", CALLS)
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [1])
 def test_both_backends_agree(quantity, seed):
     model = random_tree(seed, 4, mimic=bool(seed))
     given = arguments(quantity, *states(model, 3, seed))
