@@ -15,6 +15,7 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.quasi import QuasiLagrangian
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.spatial import rotate
+from validation.textbook import WheeledSpacecraft
 
 I1, I2, I3, m, ell, g, c, t, tau = sp.symbols("I1 I2 I3 m l g c t tau")
 phi, theta, psi = sp.symbols("phi theta psi")
@@ -396,3 +397,41 @@ def test_a_singular_start_is_refused(pair, method):
     dyn = quasi.dynamics(options={"compile": False})
     with pytest.raises(InputError, match=r"singular at \[0.0, 0.0, 0.5\]"):
         mb.simulate(dyn, [[1.0, 1.0, 1.0], [0.0, 0.0, 0.5]], [0.1, 0.2, 0.3], 0.1, method, save=[0.0, 0.1])
+
+
+def test_a_spacecraft_with_wheels_in_eulers_angles_and_in_body_rates_is_the_catalogs():
+    closed = WheeledSpacecraft()
+    n, inertia = len(closed.axes), closed.central_inertia
+    # The pyramid is as good as a plane of symmetry: principal axes.
+    assert np.abs(inertia - np.diag(np.diag(inertia))).max() < 1e-15
+    A, B, C, J = sp.symbols("A B C J")
+    phi, th, psi, *turns = sp.symbols(f"phi theta psi s1:{n + 1}")
+    v = sp.symbols(f"phidot thetadot psidot sdot1:{n + 1}")
+    s, c = sp.sin, sp.cos
+    W = sp.Matrix([[s(th) * s(psi), c(psi), 0], [s(th) * c(psi), -s(psi), 0], [c(th), 0, 1]])
+    rates, spins = W * sp.Matrix(v[:3]), sp.Matrix(v[3:])
+    axes = sp.Matrix([[1, 0, 1], [0, 1, 1], [-1, 0, 1], [0, -1, 1]]) / sp.sqrt(2)
+    T = (rates.T * sp.diag(A, B, C) * rates)[0] / 2 + J * (spins.T * axes * rates)[0] + J * (spins.T * spins)[0] / 2
+    values = dict(zip((A, B, C, J), (*np.diag(inertia), closed.wheel_inertia), strict=True))
+    angles = Lagrangian(T, 0, [phi, th, psi, *turns], v, parameters=values, name="spacecraft")
+    body = angles.quasi_velocities(sp.diag(sp.simplify(W.inv()), sp.eye(n)), [f"w{i}" for i in range(3 + n)])
+    rng = np.random.default_rng(1)
+    q, w = np.array([0.3, 1.0, -0.4, *np.zeros(n)]), np.array([0.2, -0.1, 0.3, *rng.uniform(-40, 40, n)])
+    tau, save = np.array([0.0, 0.0, 0.0, *rng.uniform(-0.2, 0.2, n)]), [0.0, 1.0, 3.0]
+    setting = {"method": "rk853", "rtol": 1e-12, "torque": tau, "save": save}
+    one = mb.simulate(body.dynamics(), q, w, 3.0, **setting)
+    two = mb.simulate(angles.dynamics(), q, body.to_velocity(q, w), 3.0, **setting)
+    assert np.abs(one.q - two.q).max() < 1e-10
+    model = mb.catalog.spacecraft_with_wheels()
+    start = np.zeros(model.nv)
+    start[3:6], start[6:] = w[:3], w[3:]
+    # The centre of mass rests, so the hub's centre does not: what is compared does not depend on it.
+    start[:3] = -np.cross(w[:3], closed.com)
+    three = mb.simulate(
+        mb.dynamics(model, "lagrangian"),
+        model.neutral(),
+        start,
+        3.0,
+        **{**setting, "torque": np.array([0.0] * 6 + [*tau[3:]])},
+    )
+    assert np.abs(three.v[:, 3:] - one.v).max() < 1e-9
