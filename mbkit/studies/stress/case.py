@@ -1,0 +1,125 @@
+"""What is swept: a case makes one problem of each value, from mild to extreme."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from mbkit._check import Array
+from mbkit.model import Model
+
+__all__ = ["Case", "Family", "Measure", "Problem", "Truth"]
+
+Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "long", "step"]
+#: What an error is: of q along a run, of the energy along a run, or of terms at given states.
+Measure = Literal["motion", "energy", "terms"]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a run is measured by.
+
+    Attributes
+    ----------
+    times : (K,) array
+        From 0, s.
+    q : (K, nq) array
+    floor : float
+        How well it is known, rad or m.
+    how : str
+        The closed form with its source, or the runs that agree to the floor.
+    """
+
+    times: Array
+    q: Array
+    floor: float
+    how: str
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One value of a case.
+
+    Attributes
+    ----------
+    model : Model
+    q, v : (nq,) and (nv,) arrays, or (N, nq) and (N, nv) for terms
+        Where a run starts, or the states at which terms are measured.
+    tau : (N, nv) array or None
+        Generalized force of the terms' forward dynamics.
+    duration : float
+        Of a run, s; 0 for terms.
+    exact : callable or None
+        From the times (K,) to q (K, nq), where a closed form is known.
+    floor : float
+        How well `exact` is known, rad or m.
+    source : str
+        Of the closed form.
+    scale : float
+        What an error of q is divided by: the size of the motion, rad or m.
+    dt : float or None
+        Step of fixed-step methods, s, where the case prescribes it.
+    facts : dict
+        Numbers worth telling: the fastest frequency, a ratio, a condition number.
+    """
+
+    model: Model
+    q: Array
+    v: Array
+    tau: Array | None = None
+    duration: float = 0.0
+    exact: Callable[[Array], Array] | None = None
+    floor: float = 0.0
+    source: str = ""
+    scale: float = 1.0
+    dt: float | None = None
+    facts: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sweep of one number over decades.
+
+    Attributes
+    ----------
+    name : str
+        As `mbkit stress` takes it.
+    about : str
+        One sentence: the system, and what is asked of it.
+    family : str
+    parameter, unit : str
+        What is swept; the unit is empty for a pure number.
+    values, quick : tuple of float
+        From mild to extreme; the fewer of a quick run.
+    make : callable
+        From a value to its `Problem`; a function of a module, for it is called in other processes.
+    measure : {"motion", "energy", "terms"}
+    bar : float or None
+        The error up to which a value is held, where the study's own has no meaning here.
+    why : str
+        Reason of that bar.
+    methods : tuple of str
+        The only ones that are asked, where others have no meaning; all where empty.
+    theory : callable or None
+        From an engine and a method to the value at which linear theory lets it break, or None.
+    """
+
+    name: str
+    about: str
+    family: Family
+    parameter: str
+    unit: str
+    values: tuple[float, ...]
+    quick: tuple[float, ...]
+    make: Callable[[float], Problem]
+    measure: Measure = "motion"
+    bar: float | None = None
+    why: str = ""
+    methods: tuple[str, ...] = ()
+    theory: Callable[[str, str], float | None] | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a result keeps of it, as plain data."""
+        kept = ("name", "about", "family", "parameter", "unit", "measure", "bar", "why")
+        return {name: getattr(self, name) for name in kept}
