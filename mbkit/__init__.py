@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import simulate as simulate
     from mbkit.studies.compare import compare as compare
+    from mbkit.studies.stress.study import stress as stress
     from mbkit.studies.work_precision import work_precision as work_precision
 
 
@@ -48,6 +49,7 @@ _HOME = {
     "equilibrium": "mbkit.lagrangian.equilibrium",
     "load": "mbkit.load",
     "robots": "mbkit.load",
+    "stress": "mbkit.studies",
     "work_precision": "mbkit.studies",
 }
 # `simulate` is called too, and its methods and events are in it.

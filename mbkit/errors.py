@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 __all__ = [
+    "DoubtfulRunWarning",
     "EventError",
     "FunctionError",
     "InputError",
@@ -140,6 +141,10 @@ class NumericalError(MbkitError, ArithmeticError):
 
 class MbkitWarning(UserWarning):
     """Base of mbkit's warnings."""
+
+
+class DoubtfulRunWarning(MbkitWarning):
+    """A run finished with plausible numbers, and something measured speaks against them."""
 
 
 class KnownDefectWarning(MbkitWarning):

@@ -11,7 +11,7 @@ import sys
 import click
 
 from mbkit._version import __version__
-from mbkit.cli import bench, check, derive, export, robots
+from mbkit.cli import bench, check, derive, export, robots, stress
 from mbkit.cli.door import Door
 
 __all__ = ["cli", "main"]
@@ -23,7 +23,7 @@ def cli() -> None:
     """Equations of motion that can be trusted: Pinocchio, MuJoCo and an own derivation, compared."""
 
 
-for _command in (check.check, derive.derive, bench.bench, export.export, robots.robots):
+for _command in (check.check, derive.derive, bench.bench, stress.stress, export.export, robots.robots):
     cli.add_command(_command)
 
 

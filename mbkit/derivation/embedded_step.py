@@ -21,7 +21,7 @@ from mbkit._step_control import GROWTH, LAST, SAFETY, SHRINK
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.step import Part, SymbolicSpace, choose, function_of
 
-__all__ = ["STATE", "embedded_parts"]
+__all__ = ["STATE", "AdaptiveParts", "embedded_parts", "larger"]
 
 #: What a round reads and the next one starts from; it writes the same names with a 1
 #: behind. `h` is the length to try, `most` what it may grow by at most, `last` the 32nd
@@ -60,7 +60,19 @@ def embedded_parts(equations: Equations, A: Array, b: Array, errors: tuple[Array
     return tuple(stages.parts)
 
 
-class _Stages:
+class AdaptiveParts:
+    """The parts that any one-step method with an embedded error has, and how it goes on.
+
+    Parameters
+    ----------
+    equations : Equations
+
+    Attributes
+    ----------
+    parts : list of Part
+        What there is so far, in order.
+    """
+
     def __init__(self, equations: Equations) -> None:
         self.parts: list[Part] = []
         self._equations, self._space = equations, SymbolicSpace(equations.model)
@@ -69,16 +81,12 @@ class _Stages:
         sizes.update(dict.fromkeys(("step", "t_new", "rtol", "atol", "least"), 1))
         self._s = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
         self._at = {"q_i": ca.SX.sym("q_i", nq), "w_i": ca.SX.sym("w_i", nv), "u_i": ca.SX.sym("u_i", nv)}
-        self._rates: list[tuple[Any, Any]] = []
 
     def _part(self, name: str, given: dict[str, Any], made: dict[str, Any]) -> None:
         self.parts.append(Part(name, tuple(given), tuple(made), lambda: function_of(name, given, made)))
 
     def _given(self, *names: str) -> dict[str, Any]:
         return {name: self._s[name] for name in names}
-
-    def _named_rates(self) -> dict[str, Any]:
-        return {f"{kind}_{i}": x for i, pair in enumerate(self._rates) for kind, x in zip("kr", pair, strict=True)}
 
     def begin(self) -> None:
         """Settle the length of the step; the first stage is where the state is."""
@@ -92,8 +100,8 @@ class _Stages:
         made = {"step": t_new - t, "t_new": t_new, "q_i": given["q"], "w_i": given["w"], "u_i": 0 * given["w"]}
         self._part("begin", given, made)
 
-    def field(self, i: int) -> None:
-        """Evaluate the rates of stage i."""
+    def _field(self, k: str, r: str) -> None:
+        """Evaluate the rates ẇ and u̇ of a stage, under these names."""
         space, trailing = self._space, self._equations.trailing
         given = {**self._at, **self._given("tau"), **trailing}
 
@@ -103,7 +111,70 @@ class _Stages:
             a = self._equations.function("forward_dynamics")(q, v, self._s["tau"], *trailing.values())
             return function_of("field", given, {"k": space.acceleration(q, v, a), "r": space.rate(u, w)})
 
-        self.parts.append(Part("field", tuple(given), (f"k_{i}", f"r_{i}"), make))
+        self.parts.append(Part("field", tuple(given), (k, r), make))
+
+    def _scales(self, q1: Any, w1: Any, u: Any) -> list[Any]:
+        """Return what errors of w and of u count in."""
+        s, space = self._s, self._space
+        sizes = (
+            (larger(abs(s["w"]), abs(w1))),
+            (larger(space.sizes(s["q"], u), space.sizes(q1, u))),
+        )
+        return [s["atol"] + s["rtol"] * size for size in sizes]
+
+    def _decide(self, rates: dict[str, Any], q1: Any, w1: Any, error: Any) -> None:
+        """Go on to the new state if its error is below 1, or stay; settle the length of the next try."""
+        names = ("q", "w", "t", "h", "most", "last", "end", "step", "t_new", "rtol", "atol", "least")
+        s = self._s
+        # NaN is not below 1. Where there is no way to go, nothing changes.
+        good = (error < 1) * (s["step"] > 0)
+        h, most, last = self._next(error, good)
+        t = choose(good, s["t_new"], s["t"])
+        made = {
+            "q1": choose(good, q1, s["q"]),
+            "w1": choose(good, w1, s["w"]),
+            "t1": t,
+            "h1": h,
+            "most1": most,
+            "last1": last,
+            "end1": s["end"],
+            "error1": error,
+            "go1": (t < s["end"]) * (s["least"] < h),
+        }
+        self._part("end", {**self._given(*names), **rates}, made)
+
+    def _next(self, error: Any, good: Any) -> tuple[Any, Any, Any]:
+        """Return the length of the next step, what that may grow by, and the root to remember."""
+        s, step = self._s, self._s["step"]
+        factor, reduction, root = self._factors(error)
+        grown = step * choose(factor < s["most"], factor, s["most"])
+        # A step that was short only because the end was near says little.
+        grown = choose((2 * step < s["h"]) * (grown < s["h"]), s["h"], grown)
+        # NaN shrinks as much as anything does.
+        shrunk = step * choose(reduction > SHRINK, reduction, SHRINK)
+        idle = 1 - (step > 0)
+        h = choose(good, grown, choose(idle, s["h"], shrunk))
+        last = choose(good, larger(root, LAST), s["last"])
+        return h, choose(good, GROWTH, choose(idle, s["most"], 1.0)), last
+
+    def _factors(self, error: Any) -> tuple[Any, Any, Any]:
+        """Return what a step grows by after this error, or shrinks by, and the error's root to remember."""
+        raise NotImplementedError
+
+
+class _Stages(AdaptiveParts):
+    """Of an explicit method."""
+
+    def __init__(self, equations: Equations) -> None:
+        super().__init__(equations)
+        self._rates: list[tuple[Any, Any]] = []
+
+    def _named_rates(self) -> dict[str, Any]:
+        return {f"{kind}_{i}": x for i, pair in enumerate(self._rates) for kind, x in zip("kr", pair, strict=True)}
+
+    def field(self, i: int) -> None:
+        """Evaluate the rates of stage i."""
+        self._field(f"k_{i}", f"r_{i}")
         nv = self._equations.model.nv
         self._rates.append((ca.SX.sym(f"k_{i}", nv), ca.SX.sym(f"r_{i}", nv)))
 
@@ -130,37 +201,13 @@ class _Stages:
 
     def end(self, b: Array, errors: tuple[Array, Array]) -> None:
         """Form the new state and its error, and decide."""
-        names = ("q", "w", "t", "h", "most", "last", "end", "step", "t_new", "rtol", "atol", "least")
-        given = {**self._given(*names), **self._named_rates()}
         s, space = self._s, self._space
         dw, u = self._moved(b)
         q1, w1 = space.move(s["q"], u), s["w"] + dw
-        error = self._error(q1, w1, u, errors)
-        step = s["step"]
-        # NaN is not below 1. Where there is no way to go, nothing changes.
-        good = (error < 1) * (step > 0)
-        h, most, last = self._next(error, good)
-        t = choose(good, s["t_new"], s["t"])
-        made = {
-            "q1": choose(good, q1, s["q"]),
-            "w1": choose(good, w1, s["w"]),
-            "t1": t,
-            "h1": h,
-            "most1": most,
-            "last1": last,
-            "end1": s["end"],
-            "error1": error,
-            "go1": (t < s["end"]) * (s["least"] < h),
-        }
-        self._part("end", given, made)
+        self._decide(self._named_rates(), q1, w1, self._error(q1, w1, u, errors))
 
     def _error(self, q1: Any, w1: Any, u: Any, errors: tuple[Array, Array]) -> Any:
-        s, space = self._s, self._space
-        sizes = (
-            (_larger(abs(s["w"]), abs(w1))),
-            (_larger(space.sizes(s["q"], u), space.sizes(q1, u))),
-        )
-        scales = [s["atol"] + s["rtol"] * size for size in sizes]
+        scales = self._scales(q1, w1, u)
         squares = []
         for weights in errors:
             parts = self._sum(weights)
@@ -169,28 +216,17 @@ class _Stages:
         total = fifth + 0.01 * third
         # No error at all is no error, and not 0/0.
         safe = choose(total > 0, total, 1 + total)
-        return s["step"] * fifth / ca.sqrt(safe * (2 * self._equations.model.nv))
+        return self._s["step"] * fifth / ca.sqrt(safe * (2 * self._equations.model.nv))
 
-    def _next(self, error: Any, good: Any) -> tuple[Any, Any, Any]:
-        """Return the length of the next step, what that may grow by, and the root to remember."""
-        s, step = self._s, self._s["step"]
+    def _factors(self, error: Any) -> tuple[Any, Any, Any]:
         eighth = ca.sqrt(ca.sqrt(ca.sqrt(error)))
         sixteenth = ca.sqrt(eighth)
         root = ca.sqrt(sixteenth)
         # Error to the power of -3/32, times the last one's 1/32.
-        over, under = SAFETY * s["last"], sixteenth * root
-        factor = choose(GROWTH * under < over, GROWTH, over / under)
-        grown = step * choose(factor < s["most"], factor, s["most"])
-        # A step that was short only because the end was near says little.
-        grown = choose((2 * step < s["h"]) * (grown < s["h"]), s["h"], grown)
-        # NaN shrinks as much as anything does.
-        factor = SAFETY / eighth
-        shrunk = step * choose(factor > SHRINK, factor, SHRINK)
-        idle = 1 - (step > 0)
-        h = choose(good, grown, choose(idle, s["h"], shrunk))
-        last = choose(good, _larger(root, LAST), s["last"])
-        return h, choose(good, GROWTH, choose(idle, s["most"], 1.0)), last
+        over, under = SAFETY * self._s["last"], sixteenth * root
+        return choose(GROWTH * under < over, GROWTH, over / under), SAFETY / eighth, root
 
 
-def _larger(a: Any, b: Any) -> Any:
+def larger(a: Any, b: Any) -> Any:
+    """Return the larger of two, entry by entry."""
     return choose(a < b, b, a)

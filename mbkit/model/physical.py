@@ -95,7 +95,9 @@ def idle_joints(model: Model) -> list[str]:
     # What is left of a mass on its own axis is the square of a rounded length.
     zero = diagonal <= 1e-28 * float(diagonal.max())
     if not zero.any():
-        scaled = M / np.sqrt(np.outer(diagonal, diagonal))
+        # One root after the other: the product of two would leave the range of doubles.
+        root = np.sqrt(diagonal)
+        scaled = M / root[:, None] / root
         values, vectors = np.linalg.eigh(scaled)
         if values[0] > 4 * model.nv * np.finfo(float).eps:
             return []

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from mbkit.report import figures, precision
+from mbkit.report import figures, precision, stress
 from mbkit.report.numbers import count_text, error_text, plain, time_text
 from mbkit.report.reading import allowances, by_term, failures, headline, judged, notices, omission_state, told
+from mbkit.report.stress_figures import stable_steps
+from mbkit.report.stress_map import section
+from mbkit.report.stress_methods import methods
+from mbkit.report.stress_silent import avoid, silences
+from mbkit.report.stress_steps import kinds, rules, steps
 from mbkit.report.terms_figure import term_costs
+from mbkit.studies import drawing
 from mbkit.studies.all_robots import Sweep
 from mbkit.studies.precision_result import WorkPrecision
 from mbkit.studies.result import Comparison
+from mbkit.studies.stress.figure import error_short, number_text
+from mbkit.studies.stress.reading import engines_of, name_of
+from mbkit.studies.stress.result import StressResult
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["bench_page", "check_page", "sweep_page"]
+__all__ = ["bench_page", "check_page", "stress_page", "sweep_page"]
 
 
 def check_page(result: Comparison, *, asked: str = "", data: str = "", when: datetime | None = None) -> str:
@@ -104,6 +114,48 @@ def sweep_page(result: Sweep, *, data: str = "", when: datetime | None = None) -
     return _render("all.html", when, data, result, figure=Markup(figures.robots(result)) if compared else None)
 
 
+def stress_page(result: StressResult, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
+    """Return the page of where engines and methods break.
+
+    Parameters
+    ----------
+    result : StressResult
+    data, table : str
+        Names of the JSON and CSV files beside the page.
+    when : datetime, optional
+        Stamped on the page; by default now.
+    """
+    from markupsafe import Markup
+
+    told = stress.overview(result)
+    step_cases = steps(told)
+    step_rules = rules(step_cases)
+    engines = engines_of(result.cases)
+    return _render(
+        "stress.html",
+        when,
+        data,
+        result,
+        table=table,
+        headline=stress.headline(result),
+        avoid=avoid(result),
+        silences=silences(result),
+        asked=[o for o in told if o.choice is not None],
+        behind=[o for o in told if o.behind],
+        methods=methods(result),
+        run_families=stress.families([o for o in told if stress.ranks(o.case)]),
+        families=stress.families(told),
+        sections={o.anchor: section(o) for o in told},
+        engines=engines,
+        series={e: drawing.engine_index(e) + 1 for e in engines},
+        steps=step_cases,
+        rules=step_rules,
+        kinds=kinds(step_rules),
+        step_figure=Markup(stable_steps(step_cases)) if step_cases else None,
+        bars=stress.bars(result),
+    )
+
+
 def _render(template: str, when: datetime | None, data: str, result: Any, **more: Any) -> str:
     stamp = (when or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M:%S %Z").strip()
     return _environment().get_template(template).render(result=result, when=stamp, data=data, **more)
@@ -123,7 +175,20 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters.update(
-        error=error_text, time=time_text, count=count_text, unchanged=omission_state, setting=precision.setting_text
+        error=error_text,
+        time=time_text,
+        count=count_text,
+        short=error_short,
+        number=number_text,
+        fact=_three_digits,
+        limit=_limit,
+        unchanged=omission_state,
+        setting=precision.setting_text,
+        value=stress.value_text,
+        held=stress.held_text,
+        how=lambda outcome: stress.HOW.get(outcome, ""),
+        told=stress.told,
+        rowname=name_of,
     )
     return made
 
@@ -131,3 +196,14 @@ def _environment() -> Environment:
 def _harmless(value: Any) -> Any:
     # Control characters too; markup made here is of another type.
     return plain(value) if type(value) is str else value
+
+
+def _three_digits(x: float) -> str:
+    return "" if math.isnan(x) else number_text(float(f"{x:.3g}"))
+
+
+def _limit(x: float | None, unit: str = "") -> str:
+    """Return where theory lets something break."""
+    if x is None or math.isnan(x):
+        return "–"
+    return "no limit" if math.isinf(x) else f"{_three_digits(x)} {unit}".rstrip()

@@ -5,6 +5,7 @@ from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.methods import METHODS, Method
 from mbkit.simulate.run import simulate
 from mbkit.simulate.stats import Stats
+from mbkit.simulate.stiffness import Stiffness, stiffness
 from mbkit.simulate.tableau import RK4, Tableau
 from mbkit.simulate.trajectory import Trajectory
 
@@ -15,12 +16,14 @@ __all__ = [
     "Hit",
     "Method",
     "Stats",
+    "Stiffness",
     "Tableau",
     "Trajectory",
     "at_energy",
     "at_limits",
     "at_section",
     "simulate",
+    "stiffness",
 ]
 
 make_callable(__name__, simulate)

@@ -15,7 +15,7 @@ from mbkit.model import Model
 from mbkit.simulate.along import along, moved
 from mbkit.simulate.applied import Held, Sampled
 
-__all__ = ["kinetic_energy", "potential_energy", "work"]
+__all__ = ["is_damped", "kinetic_energy", "potential_energy", "work"]
 
 # Of an interval: far enough from the state for a difference that loses a third of the
 # digits of a term that is h/12 of the whole, near enough to be that of a parabola.
@@ -61,7 +61,7 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, tau: Array) -> Array:
     nv = v.shape[-1]
     pushed = np.broadcast_to(tau, (*v.shape[:-2], len(h), nv))
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
-    damped, turned = _is_damped(dyn.model), len(plain) < nv and bool(pushed.any())
+    damped, turned = is_damped(dyn.model), len(plain) < nv and bool(pushed.any())
     ends = [(q[..., i : len(h) + i, :], v[..., i : len(h) + i, :]) for i in (0, 1)]
     a = [np.zeros(0)] * 2
     if damped or turned:
@@ -93,7 +93,7 @@ def _damped(dyn: Dynamics, h: Array, q: Array, v: Array, a: Array) -> tuple[Arra
 
 
 def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
-    if not _is_damped(dyn.model):
+    if not is_damped(dyn.model):
         return np.zeros(v.shape)
     if dyn.model.written is not None:
         return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v), q, v)
@@ -101,7 +101,8 @@ def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
     return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v) - own.passive(q, np.zeros_like(v)), q, v)
 
 
-def _is_damped(model: Model) -> bool:
+def is_damped(model: Model) -> bool:
+    """Return whether anything takes energy out."""
     if model.written is not None:
         return model.needs.damping
     bound = any(b.field == "damping" for b in model.bindings)

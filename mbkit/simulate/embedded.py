@@ -1,4 +1,4 @@
-"""The adaptive run of an embedded Runge-Kutta pair on the manifold: rk853.
+"""The adaptive run of a one-step method with an embedded error on the manifold: rk853, rodas5.
 
 Own steps do not depend on what is saved or looked for. A state within a step is made
 by a shorter step from the same start, of the same order as all others, so that there is
@@ -29,14 +29,14 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.steps import RAN_AWAY, credible
 from mbkit.simulate.torque import Torque
 
-__all__ = ["run_embedded"]
+__all__ = ["Track", "make_trials", "march", "outcome_of", "run_embedded", "stops_of"]
 
 _BEYOND: Final = f"diverged: {RAN_AWAY}"
 
 
 def run_embedded(
     dyn: Dynamics,
-    method: str,  # noqa: ARG001  # there is one such method
+    method: str,
     q0: Array,
     v0: Array,
     duration: float,
@@ -56,10 +56,9 @@ def run_embedded(
     q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
     check_save(save, batch, q0.shape[1] + v0.shape[1])
     space = Space(dyn.model)
-    trials = _trials(dyn, space, tolerances, torque, duration, batch)
-    tracks = [_Track(space, q0.shape[1], trials, i, batch, save, events, tolerances) for i in range(len(q0))]
-    held = save.tolist() if save is not None and torque.held else []
-    stops = sorted({*held, duration} - {0.0})
+    trials = make_trials(method, dyn, space, tolerances, torque, duration, batch)
+    tracks = [Track(space, q0.shape[1], i, batch, save, events, tolerances) for i in range(len(q0))]
+    stops = stops_of(duration, save, torque)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), trials.width):
             part = slice(first, first + trials.width)
@@ -68,19 +67,28 @@ def run_embedded(
                 for track, q, v in zip(group, q0[part], v0[part], strict=True):
                     track.begin(q, v)
                 trials.start(range(first, first + len(group)), q0[part], space.enter(q0[part], v0[part]))
-                for now in _march(trials, group, stops):
+                for _ in march(trials, group, stops):
+                    now = sum(track.member.reached for track in group) / len(group)
                     bar.update((first + len(group) * now / duration) / len(q0))
             except FunctionError as error:
                 # Where the torque is a function, trajectories run one by one.
                 which = getattr(error, "member", None)
                 group[0 if which is None else which - first].member.fail(error)
                 break
-    return _outcome(dyn, tracks, batch, save, trials.evaluations)
+    return outcome_of(dyn, tracks, batch, save, trials.evaluations, trials.jacobians)
 
 
-def _trials(
-    dyn: Dynamics, space: Space, tolerances: Tolerances, torque: Torque, duration: float, batch: int | None
+def make_trials(
+    method: str,
+    dyn: Dynamics,
+    space: Space,
+    tolerances: Tolerances,
+    torque: Torque,
+    duration: float,
+    batch: int | None,
 ) -> Trials:
+    """Return what tries the steps of ``"rk853"`` or ``"rodas5"``: machine code where there can be some."""
+    given = dyn, space, tolerances, torque, duration, batch
     # A compiled step has one value of the time, and does not look for constraints.
     plain = not torque.callable and not dyn.model.clock and not dyn.model.constrained
     if dyn.engine == "lagrangian" and plain and dyn.model.nv:
@@ -92,30 +100,70 @@ def _trials(
             # Loads LLVM, which interpreting never needs.
             from mbkit.simulate.embedded_lanes import LaneTrials
 
-            return LaneTrials(dyn, space, tolerances, torque, duration, batch)
-    return StageTrials(dyn, space, tolerances, torque, duration, batch)
+            return LaneTrials(dyn, *given[1:], method)
+    if method == "rodas5":
+        # Its Jacobian loads CasADi.
+        from mbkit.simulate.rosenbrock_stages import RosenbrockTrials
+
+        return RosenbrockTrials(*given)
+    return StageTrials(*given)
 
 
-def _march(trials: Trials, group: Sequence[_Track], stops: Sequence[float]) -> Iterator[float]:
-    """Take trajectories to the end; yields the mean time that they have reached."""
-    for k, stop in enumerate(stops):
-        trials.hold(k, stop)
+def stops_of(duration: float, save: Array | None, torque: Torque) -> list[float]:
+    """Return the times at which a run must stop on its way: where a held torque jumps, and the end."""
+    held = save.tolist() if save is not None and torque.held else []
+    return sorted({*held, duration} - {0.0})
+
+
+def march(
+    trials: Trials, group: Sequence[Track], stops: Sequence[float], first: int = 0
+) -> Iterator[list[tuple[int, Stretch]]]:
+    """Take trajectories to the end; yields what was made, after each look at it.
+
+    Parameters
+    ----------
+    trials : Trials
+        Begun.
+    group : sequence of Track
+    stops : sequence of float
+        As of `stops_of`.
+    first : int
+        Index of the stop to go to first.
+    """
+    for k in range(first, len(stops)):
+        trials.hold(k, stops[k])
         while made := trials.advance():
             for place, stretch in made:
                 track = group[place]
-                if not track.take(place, stretch) or track.stuck(place):
+                if not track.take(trials, place, stretch) or track.stuck(trials, place):
                     trials.drop(place)
-            yield sum(track.member.reached for track in group) / len(group)
+            yield made
 
 
-class _Track:
-    """One trajectory: what is kept of it, and how it ends."""
+class Track:
+    """One trajectory: what is kept of it, and how it ends.
+
+    Parameters
+    ----------
+    space : Space
+    nq : int
+    index : int
+        Which trajectory.
+    batch : int or None
+    save : (K,) array or None
+    events : tuple of Event
+    tolerances : Tolerances
+
+    Attributes
+    ----------
+    member : Member
+        Of which this holds the states.
+    """
 
     def __init__(
         self,
         space: Space,
         nq: int,
-        trials: Trials,
         index: int,
         batch: int | None,
         save: Array | None,
@@ -124,7 +172,7 @@ class _Track:
     ) -> None:
         which = None if batch is None else index
         self.member, self._nq = Member(), nq
-        self._space, self._trials, self._save, self._tolerances = space, trials, save, tolerances
+        self._space, self._save, self._tolerances = space, save, tolerances
         self._watch = Watch(events, which) if events else None
         self._kept: list[tuple[Array, Array, Array]] = []
 
@@ -143,7 +191,7 @@ class _Track:
         t, q, v = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
         return t, q, v
 
-    def take(self, place: int, made: Stretch) -> bool:
+    def take(self, trials: Trials, place: int, made: Stretch) -> bool:
         """Take in some steps; return whether to go on."""
         member = self.member
         steps = len(made.t) - 1
@@ -153,11 +201,11 @@ class _Track:
         if lost:
             good = credible(made.q[1:]) & credible(made.w[1:])
             steps = int(np.argmin(good))
-        hit = self._look(place, made, steps)
+        hit = self._look(trials, place, made, steps)
         if hit is not None:
             steps = int(np.searchsorted(made.t, hit.t))
         until = float(made.t[steps]) if hit is None else hit.t
-        if not self._keep(place, made, steps, until):
+        if not self._keep(trials, place, made, steps, until):
             # Never seen: a shorter step than one that was good met what is no number.
             steps, hit, lost = 0, None, True
             until = float(made.t[0])
@@ -169,11 +217,11 @@ class _Track:
             member.stop("diverged", _BEYOND)
         return hit is None and not lost
 
-    def stuck(self, place: int) -> bool:
+    def stuck(self, trials: Trials, place: int) -> bool:
         """Return whether no step can be made any more, and end there."""
-        stuck = self._trials.stuck(place)
+        stuck = trials.stuck(place)
         if stuck:
-            self.member.stop("diverged", f"diverged: {self._trials.why(place)}")
+            self.member.stop("diverged", f"diverged: {trials.why(place)}")
         elif stuck is False:
             rtol, atol = self._tolerances
             own = "" if atol == rtol else f", atol = {atol:g}"
@@ -181,29 +229,29 @@ class _Track:
             self.member.stop("step_too_small", told)
         return stuck is not None
 
-    def _look(self, place: int, made: Stretch, steps: int) -> Hit | None:
+    def _look(self, trials: Trials, place: int, made: Stretch, steps: int) -> Hit | None:
         if self._watch is None:
             return None
         for k in range(steps):
-            hits, last = self._watch.look(float(made.t[k + 1]), self._within(place, made, k))
+            hits, last = self._watch.look(float(made.t[k + 1]), self._within(trials, place, made, k))
             self.member.events += hits
             if last is not None:
                 return last
         return None
 
-    def _within(self, place: int, made: Stretch, k: int) -> State:
+    def _within(self, trials: Trials, place: int, made: Stretch, k: int) -> State:
         """Return the states of step k by time, each made by a step that ends there."""
 
         def state(t: float) -> tuple[Array, Array]:
             if t in (made.t[k], made.t[k + 1]):
                 at = k + int(t == made.t[k + 1])
                 return made.q[at], self._space.leave(made.q[at], made.w[at])
-            q, w = self._trials.within(place, _rows(made, np.array([k])), np.array([t]))
+            q, w = trials.within(place, _rows(made, np.array([k])), np.array([t]))
             return q[0], self._space.leave(q[0], w[0])
 
         return state
 
-    def _keep(self, place: int, made: Stretch, steps: int, until: float) -> bool:
+    def _keep(self, trials: Trials, place: int, made: Stretch, steps: int, until: float) -> bool:
         """Keep what is wanted after the start, up to a time in or at the end of the last step.
 
         Returns whether all that was wanted is a state; if not, nothing is kept.
@@ -217,7 +265,7 @@ class _Track:
         q, w = made.q[after], made.w[after]
         between = np.flatnonzero(made.t[after] != times)
         if len(between):
-            q[between], w[between] = self._trials.within(place, _rows(made, after[between] - 1), times[between])
+            q[between], w[between] = trials.within(place, _rows(made, after[between] - 1), times[between])
         return self._add(times, q, w)
 
     def _add(self, t: Array, q: Array, w: Array) -> bool:
@@ -237,13 +285,15 @@ def _rows(made: Stretch, which: Indices) -> Stretch:
     return Stretch(made.t[which], made.q[which], made.w[which], 0)
 
 
-def _outcome(
-    dyn: Dynamics, tracks: Sequence[_Track], batch: int | None, save: Array | None, evaluations: int
+def outcome_of(
+    dyn: Dynamics, tracks: Sequence[Track], batch: int | None, save: Array | None, evaluations: int, jacobians: int
 ) -> Outcome:
+    """Return all trajectories as an outcome."""
     for track in tracks:
         # The states are put in below, whole arrays of them.
         track.member.t, track.member.y = [], []
-    told = gathered(dyn.model, [track.member for track in tracks], batch, save, evaluations=evaluations)
+    members = [track.member for track in tracks]
+    told = gathered(dyn.model, members, batch, save, evaluations=evaluations, jacobians=jacobians)
     kept = [track.states() for track in tracks]
     if batch is None:
         t, q, v = kept[0]

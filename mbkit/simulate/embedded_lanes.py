@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
 from typing import Final
 from weakref import WeakKeyDictionary
 
@@ -15,41 +17,92 @@ from mbkit.derivation import cache as disk
 from mbkit.derivation.compiled import aligned
 from mbkit.derivation.embedded_step import STATE, embedded_parts
 from mbkit.derivation.lanes import Lanes, lanes, width
+from mbkit.derivation.rosenbrock_step import rosenbrock_parts
+from mbkit.derivation.step import Part
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.space import Space
-from mbkit.simulate.embedded_trials import Stretch, first_length
+from mbkit.simulate.embedded_trials import ROUNDS, Stretch, first_length
 from mbkit.simulate.methods import Tolerances
+from mbkit.simulate.rosenbrock_tableau import rodas5p
 from mbkit.simulate.steps import RAN_AWAY, DivergenceError, Field
 from mbkit.simulate.tableau import dormand_prince_853
 from mbkit.simulate.torque import Torque
 
 __all__ = ["LaneTrials"]
 
-#: Tries between two looks at them, at most.
-_ROUNDS: Final = 256
-_STAGES: Final = 12
 #: Larger than any scale or length: no error is seen, and a step is as long as its gap.
 _HUGE: Final = 1e300
 
+
+@dataclass(frozen=True)
+class _Scheme:
+    """A method's tries.
+
+    Attributes
+    ----------
+    name : str
+    coefficients : sequence of list
+        Which are not among the sources that a cached code is told by.
+    parts : callable
+        From the equations to the parts of one try.
+    stages : int
+    rate : str
+        Where ẇ at the start is found after a try of no length.
+    grows : int
+        The power of a step's length with which its estimated error grows.
+    jacobians : int
+        Of each try.
+    """
+
+    name: str
+    coefficients: Sequence[list[float]]
+    parts: Callable[[Equations], tuple[Part, ...]]
+    stages: int
+    rate: str
+    grows: int
+    jacobians: int
+
+
+@cache
+def _scheme(method: str) -> _Scheme:
+    if method == "rodas5":
+        own = rodas5p()
+        tables = own.A, own.C, own.b, own.error
+        return _Scheme(
+            own.name,
+            [[own.gamma], *(x.tolist() for x in tables)],
+            lambda equations: rosenbrock_parts(equations, own.gamma, *tables),
+            stages=own.stages,
+            rate="k",
+            grows=5,
+            jacobians=1,
+        )
+    pair = dormand_prince_853()
+    first, second = pair.errors
+    return _Scheme(
+        pair.name,
+        [x.tolist() for x in (pair.A, pair.b, first, second)],
+        lambda equations: embedded_parts(equations, pair.A, pair.b, (first, second)),
+        stages=pair.stages,
+        rate="k_0",
+        grows=8,
+        jacobians=0,
+    )
+
+
 # Equations are shared by dynamics of one model at different values of its parameters.
-_CODES: Final[WeakKeyDictionary[Equations, Lanes]] = WeakKeyDictionary()
+_CODES: Final[WeakKeyDictionary[Equations, dict[str, Lanes]]] = WeakKeyDictionary()
 
 
-def _code(dyn: LagrangianDynamics) -> Lanes:
-    if dyn.equations not in _CODES:
-        pair = dormand_prince_853()
-        first, second = pair.errors
-        _CODES[dyn.equations] = lanes(
-            # The coefficients are not among the sources that a cached code is told by.
-            (
-                dyn.model.form_digest,
-                pair.name,
-                disk.key_of(repr([x.tolist() for x in (pair.A, pair.b, first, second)])),
-            ),
-            lambda: embedded_parts(dyn.equations, pair.A, pair.b, (first, second)),
+def _code(dyn: LagrangianDynamics, scheme: _Scheme) -> Lanes:
+    made = _CODES.setdefault(dyn.equations, {})
+    if scheme.name not in made:
+        made[scheme.name] = lanes(
+            (dyn.model.form_digest, scheme.name, disk.key_of(repr(scheme.coefficients))),
+            lambda: scheme.parts(dyn.equations),
             STATE,
         )
-    return _CODES[dyn.equations]
+    return made[scheme.name]
 
 
 class _Arena:
@@ -93,32 +146,34 @@ class LaneTrials:
         torque: Torque,
         duration: float,
         batch: int | None,
+        method: str = "rk853",
     ) -> None:
         self._dyn, self._tolerances, self._torque, self._batch = dyn, tolerances, torque, batch
         self._space, self._parameters = space, dyn.parameter_values
-        code = _code(dyn)
+        self._scheme = _scheme(method)
+        code = _code(dyn, self._scheme)
         self._outer = _Arena(code, tolerances, duration * float(np.finfo(float).eps))
         self._code = code
         self._inner: _Arena | None = None
-        self.width = self._outer.width
-        self._log = aligned(_ROUNDS * self._outer.state.size).reshape(_ROUNDS, *self._outer.state.shape)
+        self.width, self.rounds = self._outer.width, ROUNDS
+        self._log = aligned(ROUNDS * self._outer.state.size).reshape(ROUNDS, *self._outer.state.shape)
         self._at = {name: self._outer.within_state(name) for name in STATE}
         self._row = {name: part.start for name, part in self._at.items()}
-        self.evaluations = 0
+        self.evaluations = self.jacobians = 0
 
-    def start(self, which: Sequence[int], q: Array, w: Array) -> None:
+    def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
         """Begin; lanes without a trajectory repeat the last one."""
         self._which = [*which, *[which[-1]] * (self.width - len(which))]
         self._places = len(which)
         pick = np.minimum(np.arange(self.width), self._places - 1)
         state = self._outer.state
         state[:] = 0.0
-        state[self._at["q"]], state[self._at["w"]] = q[pick].T, w[pick].T
-        state[self._row["most"]], state[self._row["last"]] = GROWTH, LAST
+        state[self._at["q"]], state[self._at["w"]], state[self._row["t"]] = q[pick].T, w[pick].T, t
+        state[self._row["most"]], state[self._row["last"]], state[self._row["h"]] = GROWTH, LAST, h
         self._give_parameters(self._outer, self._which)
         self._active = np.zeros(self.width, dtype=bool)
         self._dropped = np.zeros(self.width, dtype=bool)
-        self._begun = False
+        self._begun = h > 0
 
     def _give_parameters(self, arena: _Arena, which: Sequence[int]) -> None:
         if self._parameters.size:
@@ -152,9 +207,9 @@ class LaneTrials:
             at = start.copy()
             at[self._at["q"]], at[self._at["w"]] = q.T, w.T
             arena.run(at, self._log, 1, on=False)
-            return arena["k_0"].T.copy()
+            return arena[self._scheme.rate].T.copy()
 
-        h = first_length(self._space, q, w, probe(q, w), self._tolerances, probe)
+        h = first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self._scheme.grows)
         arena.state[:] = start
         self.evaluations += 2 * self._places
         # Where there is no rate, the step finds that out.
@@ -166,14 +221,15 @@ class LaneTrials:
             return []
         arena, log = self._outer, self._log
         before = arena.state.copy()
-        count = arena.run(arena.state, log, _ROUNDS, on=True)
+        count = arena.run(arena.state, log, self.rounds, on=True)
         out = []
         for place in np.flatnonzero(self._active).tolist():
             going = log[:count, self._row["go"], place] != 0
             tried = count if going[-1] else int(np.argmin(going)) + 1
             self._active[place] = bool(going[-1])
             out.append((place, self._stretch(before[:, place], log[:tried, :, place])))
-            self.evaluations += _STAGES * tried
+            self.evaluations += self._scheme.stages * tried
+            self.jacobians += self._scheme.jacobians * tried
         return out
 
     def _stretch(self, before: Array, tries: Array) -> Stretch:
@@ -204,13 +260,35 @@ class LaneTrials:
             return str(error)
         return RAN_AWAY
 
-    def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:
-        """Return states within steps, several side by side."""
+    def tighten(self, place: int, tolerances: Tolerances) -> None:
+        """Go on with other tolerances."""
+        for name, value in zip(("rtol", "atol"), tolerances, strict=True):
+            self._outer[name][:, place] = value
+
+    def _beside(self, place: int) -> _Arena:
+        """Return room for other tries of a lane's trajectory, in all lanes."""
         if self._inner is None:
             self._inner = _Arena(self._code, Tolerances(0.0, _HUGE), 0.0)
-        arena, count, member = self._inner, len(times), self._which[place]
-        self._give_parameters(arena, [member] * self.width)
-        arena["tau"][:] = self._outer["tau"][:, place, None]
+        self._give_parameters(self._inner, [self._which[place]] * self.width)
+        self._inner["tau"][:] = self._outer["tau"][:, place, None]
+        return self._inner
+
+    def rates(self, place: int, q: Array, w: Array) -> Array:
+        """Return ẇ at states."""
+        arena, found = self._beside(place), []
+        task = np.zeros(arena.state.shape)
+        for start in range(0, len(q), self.width):
+            # Those beyond the last repeat it. A try of no length has the rates in its first stage.
+            pick = np.minimum(np.arange(start, start + self.width), len(q) - 1)
+            task[self._at["q"]], task[self._at["w"]] = q[pick].T, w[pick].T
+            arena.run(task, self._log, 1, on=False)
+            found.append(arena[self._scheme.rate].T.copy())
+        self.evaluations += len(q)
+        return np.concatenate(found)[: len(q)]
+
+    def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:
+        """Return states within steps, several side by side."""
+        arena, count = self._beside(place), len(times)
         rounds = -(-count // self.width)
         pick = np.minimum(np.arange(rounds * self.width), count - 1)
         tasks = np.zeros((len(pick), arena.rows))
@@ -221,7 +299,7 @@ class LaneTrials:
         queue = np.ascontiguousarray(tasks.reshape(rounds, self.width, -1).transpose(0, 2, 1))
         done = np.empty_like(queue)
         arena.run(queue, done, rounds, on=False)
-        self.evaluations += _STAGES * count
+        self.evaluations += self._scheme.stages * count
         ends = done.transpose(0, 2, 1).reshape(len(pick), -1)[:count]
         # One that failed stayed at its start, and is no state at that time.
         ends[~(ends[:, self._row["error"]] < 1)] = np.nan

@@ -34,7 +34,9 @@ class _OneOf(Field):
 class StageTrials:
     """Tries one step at a time, in NumPy; `Trials` says what its methods do."""
 
-    width = 1
+    width = rounds = 1
+    #: The power of a step's length with which its estimated error grows.
+    grows = 8
 
     def __init__(
         self,
@@ -62,13 +64,18 @@ class StageTrials:
         """Of the forward dynamics so far."""
         return self._field.evaluations
 
-    def start(self, which: Sequence[int], q: Array, w: Array) -> None:
+    @property
+    def jacobians(self) -> int:
+        """Evaluated so far."""
+        return 0
+
+    def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
         """Begin at a state."""
         (member,) = which
         if self._batch is not None:
             self._field.one(member)
         self._of_interval = self._torque.of_member(None if self._batch is None else member)
-        self._q, self._w, self._t, self._h = q[0], w[0], 0.0, 0.0
+        self._q, self._w, self._t, self._h = q[0], w[0], t, h
         self._most, self._last, self._error = GROWTH, LAST, 0.0
         self._dropped, self._fresh = False, True
 
@@ -84,7 +91,7 @@ class StageTrials:
 
         q, w = self._q[None], self._w[None]
         try:
-            h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe)[0])
+            h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self.grows)[0])
         except DivergenceError:
             h = math.nan
         # Where there is no rate, the step finds that out. At the least length no step
@@ -111,28 +118,35 @@ class StageTrials:
         return [(0, Stretch(np.array(before[0]), np.array(before[1]), np.array(before[2]), 1))]
 
     def _settle(self, step: float, good: bool) -> None:
-        error = self._error
-        eighth = math.sqrt(math.sqrt(math.sqrt(error))) if error >= 0 else math.nan
-        sixteenth = math.sqrt(eighth)
-        root = math.sqrt(sixteenth)
+        factor, under, root = self._factors(self._error if self._error >= 0 else math.nan)
         if good:
-            over, under = SAFETY * self._last, sixteenth * root
-            factor = GROWTH if GROWTH * under < over else over / under
             grown = step * min(factor, self._most)
             # A step that was short only because the end was near says little.
             self._h = self._h if 2 * step < self._h and grown < self._h else grown
             self._last = max(root, LAST)
         else:
-            self._h = step * (SAFETY / eighth if SHRINK * eighth < SAFETY else SHRINK)
+            self._h = step * (SAFETY / under if SHRINK * under < SAFETY else SHRINK)
         self._most = GROWTH if good else 1.0
+
+    def _factors(self, error: float) -> tuple[float, float, float]:
+        """Return what a step grows by after this error, what it shrinks in proportion to, and the root to remember."""
+        eighth = math.sqrt(math.sqrt(math.sqrt(error)))
+        sixteenth = math.sqrt(eighth)
+        root = math.sqrt(sixteenth)
+        over, under = SAFETY * self._last, sixteenth * root
+        return GROWTH if GROWTH * under < over else over / under, eighth, root
 
     def _try(self, step: float) -> tuple[Array, Array, float]:
         try:
-            q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
+            made = self._tried(step)
         except DivergenceError as error:
             self._why, self._fresh = str(error), True
             return self._q, self._w, math.nan
         self._why, self._fresh = "", False
+        return made
+
+    def _tried(self, step: float) -> tuple[Array, Array, float]:
+        q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
         space, (rtol, atol) = self._space, self._tolerances
         sizes = np.concatenate(
             [np.maximum(space.sizes(self._q, u), space.sizes(q, u)), np.maximum(np.abs(self._w), np.abs(w))]
@@ -166,6 +180,17 @@ class StageTrials:
     def why(self, place: int) -> str:  # noqa: ARG002
         """Return what the engine said."""
         return self._why or RAN_AWAY
+
+    def tighten(self, place: int, tolerances: Tolerances) -> None:  # noqa: ARG002
+        """Go on with other tolerances."""
+        self._tolerances = tolerances
+
+    def rates(self, place: int, q: Array, w: Array) -> Array:  # noqa: ARG002
+        """Return ẇ at states."""
+        try:
+            return np.array([self._field(self._t, *state, self._force) for state in zip(q, w, strict=True)])
+        except DivergenceError:
+            return np.full(w.shape, np.nan)
 
     def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """Return states within steps."""

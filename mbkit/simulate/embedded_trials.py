@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -12,7 +12,10 @@ from mbkit._check import Array
 from mbkit.model.space import Space
 from mbkit.simulate.methods import Tolerances
 
-__all__ = ["Stretch", "Trials", "first_length"]
+__all__ = ["ROUNDS", "Stretch", "Trials", "first_length"]
+
+#: Tries between two looks at them, at most.
+ROUNDS: Final = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +44,23 @@ class Trials(Protocol):
     ----------
     width : int
         How many trajectories at once.
+    rounds : int
+        Tries between two looks at them, at most; 1 where nothing is gained by more.
     """
 
     width: int
+    rounds: int
 
     @property
     def evaluations(self) -> int:
         """Of the forward dynamics so far."""
 
-    def start(self, which: Sequence[int], q: Array, w: Array) -> None:
-        """Begin with these members of the batch, (n, nq) and (n, nv), at t = 0."""
+    @property
+    def jacobians(self) -> int:
+        """Of the forward dynamics so far."""
+
+    def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
+        """Begin with these members of the batch, (n, nq) and (n, nv), and a first step that is given or looked for."""
 
     def hold(self, k: int, stop: float) -> None:
         """Go on to a time, under the force of interval k."""
@@ -71,16 +81,28 @@ class Trials(Protocol):
     def why(self, place: int) -> str:
         """Return why a try was no number."""
 
+    def tighten(self, place: int, tolerances: Tolerances) -> None:
+        """Go on with other tolerances."""
+
+    def rates(self, place: int, q: Array, w: Array) -> Array:
+        """Return ẇ at states, (n, nq) and (n, nv), of a trajectory's parameters under the force that acts now."""
+
     def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:
         """Return (q, w) at times, (m, nq) and (m, nv), each by one step from the state of the same row."""
 
 
 def first_length(
-    space: Space, q: Array, w: Array, k: Array, tolerances: Tolerances, probe: Callable[[Array, Array], Array]
+    space: Space,
+    q: Array,
+    w: Array,
+    k: Array,
+    tolerances: Tolerances,
+    probe: Callable[[Array, Array], Array],
+    grows: int = 8,
 ) -> Array:
     """Return how long a first step may be, one for each state: (n,).
 
-    Hairer, Nørsett, Wanner 1993, II.4, as SciPy does it for order 8.
+    Hairer, Nørsett, Wanner 1993, II.4, as SciPy does it.
 
     Parameters
     ----------
@@ -90,6 +112,8 @@ def first_length(
     tolerances : Tolerances
     probe : callable
         probe(q, w) -> ẇ at other states.
+    grows : int
+        The power of a step's length with which its estimated error grows.
     """
     sizes = np.concatenate([space.sizes(q, w), np.abs(w)], axis=-1)
     scale = tolerances.atol + tolerances.rtol * sizes
@@ -103,5 +127,5 @@ def first_length(
     bent = probe(space.move(q, by * w), w + by * k)
     d2 = norm(np.concatenate([by * k, bent - k], axis=-1)) / h0
     steep = np.maximum(d1, d2)
-    h1 = np.where(steep <= 1e-15, np.maximum(1e-6, h0 * 1e-3), (0.01 / steep) ** (1 / 8))
+    h1 = np.where(steep <= 1e-15, np.maximum(1e-6, h0 * 1e-3), (0.01 / steep) ** (1 / grows))
     return np.asarray(np.minimum(100 * h0, h1))

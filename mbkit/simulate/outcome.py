@@ -31,3 +31,4 @@ class Outcome:
     jacobians: int = 0
     events: tuple[Hit, ...] = ()
     error: FunctionError | None = None
+    chosen: str = ""

@@ -29,7 +29,11 @@ def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[...,
 
 def adaptive_runner(method: Method) -> Callable[..., Outcome]:
     """Return run(dyn, method, q0, v0, duration, tolerances, torque, save, events, bar)."""
-    if method.name == "rk853":
+    if method.name == "auto":
+        from mbkit.simulate.auto import run_auto
+
+        return run_auto
+    if method.name in ("rk853", "rodas5"):
         from mbkit.simulate.embedded import run_embedded
 
         return run_embedded

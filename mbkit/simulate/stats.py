@@ -34,9 +34,13 @@ class Stats:
     rejected : int
         Steps that an adaptive method tried in vain, where it tells.
     jacobians : int
-        Of ``"radau"``, ``"bdf"``, ``"lsoda"`` and ``"cvodes"``: evaluations of the Jacobian of
+        Of ``"rodas5"``, ``"radau"``, ``"bdf"``, ``"lsoda"`` and ``"cvodes"``: evaluations of the Jacobian of
         the forward dynamics, summed over a batch; of ``"implicit_midpoint"``: iterations
         of Newton's method, each with the exact Jacobian of the step's equations.
+    chosen : str
+        Of ``"auto"``: which methods ran, from when to when, and why.
+    doubts : tuple of str
+        What speaks against a run that finished, each with its measured reason and a remedy.
     """
 
     steps: int
@@ -47,6 +51,8 @@ class Stats:
     message: str = ""
     rejected: int = 0
     jacobians: int = 0
+    chosen: str = ""
+    doubts: tuple[str, ...] = ()
 
     @property
     def finished(self) -> bool:
@@ -54,5 +60,6 @@ class Stats:
         return self.ended in ("finished", "event")
 
     def __str__(self) -> str:
-        end = self.message or "finished"
-        return f"{self.steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {end}"
+        end = self.message or ("finished, with doubts" if self.doubts else "finished")
+        chosen = f"; {self.chosen}" if self.chosen else ""
+        return f"{self.steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {end}{chosen}"

@@ -14,7 +14,16 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.errors import InputError
 
-__all__ = ["RK4", "EmbeddedTableau", "ImplicitTableau", "Tableau", "dormand_prince_853", "rooted_trees"]
+__all__ = [
+    "RK4",
+    "EmbeddedTableau",
+    "ImplicitTableau",
+    "Tableau",
+    "Tree",
+    "density",
+    "dormand_prince_853",
+    "rooted_trees",
+]
 
 Tree = tuple[Any, ...]  # a tree is the tuple of its branches, each a tree
 
@@ -41,10 +50,11 @@ def _nodes(tree: Tree) -> int:
     return 1 + sum(_nodes(branch) for branch in tree)
 
 
-def _density(tree: Tree) -> int:
+def density(tree: Tree) -> int:
+    """Return γ(tree): its nodes, times the densities of its branches."""
     out = _nodes(tree)
     for branch in tree:
-        out *= _density(branch)
+        out *= density(branch)
     return out
 
 
@@ -60,11 +70,11 @@ def _require_order(name: str, matrix: Array, weights: Array, order: int) -> None
     for p in range(1, order + 1):
         for tree in rooted_trees(p):
             stages = _stage_weights(matrix, tree)
-            got, wanted = float(weights @ stages), 1 / _density(tree)
+            got, wanted = float(weights @ stages), 1 / density(tree)
             if abs(got - wanted) > slack * float(np.abs(weights) @ np.abs(stages)):
                 raise InputError(
                     f"tableau {name!r}: order {p} condition of tree {tree}: got {got:.17g}, "
-                    f"expected 1/{_density(tree)}; the method has not order {order}"
+                    f"expected 1/{density(tree)}; the method has not order {order}"
                 )
 
 

@@ -1,9 +1,11 @@
 """Questions asked of several engines at once."""
 
+from mbkit.studies import stress
 from mbkit.studies.compare import compare
 from mbkit.studies.precision_result import Curve, InterruptedSweepError, PrecisionPoint, WorkPrecision
 from mbkit.studies.reference import Reference
 from mbkit.studies.result import Comparison, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.stress.result import StressResult
 from mbkit.studies.work_precision import work_precision
 
 __all__ = [
@@ -16,7 +18,9 @@ __all__ = [
     "Refusal",
     "RolloutRow",
     "Row",
+    "StressResult",
     "WorkPrecision",
     "compare",
+    "stress",
     "work_precision",
 ]

@@ -8,16 +8,24 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Protocol
 
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.studies.precision_result import WorkPrecision
 
-__all__ = ["Checkpoint", "Keeper", "Progress"]
+__all__ = ["Checkpoint", "Keeper", "Kept", "Progress"]
+
+
+class Kept(Protocol):
+    """A result that tells itself as JSON."""
+
+    def to_json(self) -> str:
+        """Return it."""
+        ...
+
 
 #: progress(fraction, text)
 Progress = Callable[[float, str], object]
-Checkpoint = str | os.PathLike[str] | Callable[[WorkPrecision], object]
+Checkpoint = str | os.PathLike[str] | Callable[[Any], object]
 
 #: Seconds between two results.
 _BETWEEN: Final = 5.0
@@ -56,13 +64,13 @@ class Keeper:
         if self._progress is not None:
             self._progress(self._told, text)
 
-    def now_and_then(self, make: Callable[[], WorkPrecision]) -> None:
+    def now_and_then(self, make: Callable[[], Kept]) -> None:
         """Keep the result so far, unless that was done a moment ago."""
         if self._checkpoint is not None and time.perf_counter() - self._kept > _BETWEEN:
             self.keep(make())
             self._kept = time.perf_counter()
 
-    def keep(self, result: WorkPrecision) -> None:
+    def keep(self, result: Kept) -> None:
         """Hand a result over; where that fails, the study goes on, and that is told."""
         if callable(self._checkpoint):
             try:

@@ -8,11 +8,12 @@ import io
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mbkit.errors import InputError, OutputError
+from mbkit.errors import InputError
+from mbkit.studies.plain import cell, plain, remade, write
 from mbkit.studies.result import Refusal
 
 if TYPE_CHECKING:
@@ -186,9 +187,9 @@ class WorkPrecision:
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Return the result as JSON with null for NaN, and write it if a path is given."""
-        text = json.dumps(_plain(self.to_dict()), indent=1, allow_nan=False)
+        text = json.dumps(plain(self.to_dict()), indent=1, allow_nan=False)
         if path is not None:
-            _write(path, text + "\n")
+            write(path, text + "\n")
         return text
 
     @classmethod
@@ -212,15 +213,15 @@ class WorkPrecision:
     def _from_plain(cls, data: dict[str, Any]) -> WorkPrecision:
         curves = []
         for told in data["curves"]:
-            points = tuple(_remade(PrecisionPoint, point) for point in told["points"])
-            curves.append(_remade(Curve, told | {"points": points}))
+            points = tuple(remade(PrecisionPoint, point) for point in told["points"])
+            curves.append(remade(Curve, told | {"points": points}))
         told = {
             "curves": tuple(curves),
             "refusals": tuple(Refusal(**r) for r in data["refusals"]),
             "q0": tuple(data["q0"]),
             "v0": tuple(data["v0"]),
         }
-        made: WorkPrecision = _remade(cls, data | told)
+        made: WorkPrecision = remade(cls, data | told)
         return made
 
     def to_csv(self, path: str | Path | None = None) -> str:
@@ -234,10 +235,10 @@ class WorkPrecision:
             numbers = (p.value, p.error, p.energy, p.seconds, p.spread, c.compile + p.seconds)
             on = (id(c), id(p)) in front
             order = (c.order, c.expected)
-            about = (c.engine, c.method, p.setting, *map(_cell, numbers), p.steps, p.evaluations)
-            writer.writerow((*about, *map(_cell, order), int(on), p.note))
+            about = (c.engine, c.method, p.setting, *map(cell, numbers), p.steps, p.evaluations)
+            writer.writerow((*about, *map(cell, order), int(on), p.note))
         if path is not None:
-            _write(path, stream.getvalue())
+            write(path, stream.getvalue())
         return stream.getvalue()
 
     def to_markdown(self) -> str:
@@ -288,40 +289,13 @@ class InterruptedSweepError(KeyboardInterrupt):
 
     Attributes
     ----------
-    result : WorkPrecision
+    result : WorkPrecision or StressResult
         With ``complete=False``.
     """
 
-    def __init__(self, result: WorkPrecision) -> None:
+    def __init__(self, result: Any) -> None:
         super().__init__("interrupted; what was finished is in .result")
         self.result = result
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.result,)
-
-
-def _remade(kind: type[Any], told: dict[str, Any]) -> Any:
-    """Return a dataclass from plain data; null is NaN, and what it does not have is left out."""
-    names = [f.name for f in fields(kind) if f.name in told]
-    return kind(**{n: math.nan if told[n] is None else told[n] for n in names})
-
-
-def _cell(x: float) -> str:
-    return "" if math.isnan(x) else repr(x)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(x) for k, x in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(x) for x in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _write(path: str | Path, text: str) -> None:
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error

@@ -60,12 +60,12 @@ class TooLongError(MbkitError):
     """A run took longer than it is worth."""
 
 
-def patience(seconds: float) -> Callable[[float], None]:
-    """Return a progress function that ends a run after so many seconds."""
-    end = time.perf_counter() + seconds
+def patience(seconds: float, clock: Callable[[], float] = time.perf_counter) -> Callable[[float], None]:
+    """Return a progress function that ends a run after so many seconds, of the wall's or another clock."""
+    end = clock() + seconds
 
     def look(done: float) -> None:
-        if time.perf_counter() > end:
+        if clock() > end:
             raise TooLongError(f"given up after {seconds:g} s, {done:.0%} done: stiff, or very fast motion")
 
     return look

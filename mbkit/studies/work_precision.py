@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import count, finite_array, real
-from mbkit.engines import ENGINES
-from mbkit.engines.oracle import OracleDynamics
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.simulate.applied import TorqueFunction
-from mbkit.simulate.methods import METHODS, method_of
+from mbkit.simulate.methods import METHODS
 from mbkit.studies import stamp
 from mbkit.studies.facts import facts_of
 from mbkit.studies.keeper import Checkpoint, Keeper, Progress
+from mbkit.studies.pairs import pairs
 from mbkit.studies.precision_result import InterruptedSweepError, WorkPrecision
 from mbkit.studies.precision_scene import Exact, scene_of
 from mbkit.studies.reference import Reference
@@ -32,7 +31,6 @@ from mbkit.studies.sweeping import Allowance, Alone, Shared, Sweeping
 
 __all__ = ["work_precision"]
 
-MEASURED: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
 #: Seconds that a study may take when nobody says, and what each velocity adds, up to the most.
 _ALLOWED: Final = 60.0
 _EACH: Final = 10.0
@@ -154,8 +152,8 @@ def work_precision(
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     _check_executor(executor, torque)
     keeper = Keeper(progress, checkpoint)
-    pairs = _pairs(engines, methods)
-    moving = _moving(model, pairs)
+    wanted_pairs = pairs(engines, methods)
+    moving = _moving(model, wanted_pairs)
     asked = real("duration", duration, positive=True)
     grids = _grid("steps", steps), _grid("tolerances", tolerances)
     scene, how = scene_of(
@@ -168,7 +166,7 @@ def work_precision(
         lambda done: keeper.tell(0.1 * done, "reference"),
         _FOR_REFERENCE * allowance.seconds,
     )
-    wanted = plans(pairs, float(scene.times[1]), *grids)
+    wanted = plans(wanted_pairs, float(scene.times[1]), *grids)
     sweeping: Sweeping
     if executor is None:
         sweeping = Alone(scene, wanted, repeats, seed, allowance)
@@ -242,54 +240,6 @@ def _check_executor(executor: Executor | None, torque: object) -> None:
             raise InputError(
                 f"torque: cannot be sent to the executor's processes ({error}); define the function in a module"
             ) from None
-
-
-def _pairs(
-    engines: Sequence[str], methods: Sequence[str] | Mapping[str, Sequence[str]] | None
-) -> dict[str, tuple[str, ...]]:
-    """Return the methods of each engine."""
-    names = _names("engines", engines)
-    for name in names:
-        if name == OracleDynamics.engine:
-            raise InputError("engines: the oracle is what the others are measured by; leave it out")
-        if name not in MEASURED:
-            raise UnknownNameError("engine", name, MEASURED)
-    if isinstance(methods, Mapping):
-        for engine in methods:
-            if engine not in names:
-                raise InputError(f"methods: {engine!r} is not among the engines {list(names)}")
-        asked = {engine: _names(f"methods[{engine!r}]", methods[engine]) for engine in names if engine in methods}
-        if not asked:
-            raise InputError("methods: expected the methods of at least one engine, got none")
-        for engine, own in asked.items():
-            for method in map(method_of, own):
-                if method.engines and engine not in method.engines:
-                    raise InputError(
-                        f"methods[{engine!r}]: {method.name} is not on {engine}; it is on {', '.join(method.engines)}"
-                    )
-    else:
-        given = tuple(METHODS) if methods is None else _names("methods", methods)
-        asked = dict.fromkeys(names, given)
-    out = {e: tuple(m for m in ms if not method_of(m).engines or e in METHODS[m].engines) for e, ms in asked.items()}
-    # A method that none of the engines has was asked for in error.
-    for name in dict.fromkeys(m for ms in asked.values() for m in ms):
-        if methods is not None and not any(name in ms for ms in out.values()):
-            raise InputError(
-                f"methods: {name} is not on {' or '.join(asked)}; it is on {', '.join(METHODS[name].engines)}"
-            )
-    return out
-
-
-def _names(what: str, given: object) -> tuple[str, ...]:
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise InputError(f"{what}: expected several names, got {given!r}; write ({given!r},)")
-    names = tuple(dict.fromkeys(given))
-    if not names:
-        raise InputError(f"{what}: expected at least one name, got none")
-    for name in names:
-        if not isinstance(name, str):
-            raise InputError(f"{what}: expected names, got {name!r}")
-    return names
 
 
 def _check_model(model: Model) -> None:

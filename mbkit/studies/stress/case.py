@@ -103,6 +103,8 @@ class Case:
         The only ones that are asked, where others have no meaning; all where empty.
     theory : callable or None
         From an engine and a method to the value at which linear theory lets it break, or None.
+    patience : float
+        How many times as long as the study allows a run may take here; more than 1 for long motions.
     """
 
     name: str
@@ -118,6 +120,7 @@ class Case:
     why: str = ""
     methods: tuple[str, ...] = ()
     theory: Callable[[str, str], float | None] | None = None
+    patience: float = 1.0
 
     def facts(self) -> dict[str, Any]:
         """Return what a result keeps of it, as plain data."""

@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+import csv
+import html
+import io
+import json
 import math
-from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-__all__ = ["Break", "CaseResult", "Cell", "End", "Outcome", "Row", "StressResult"]
+from mbkit._check import real
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.studies.plain import cell as number
+from mbkit.studies.plain import plain, remade, write
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Break", "Breaking", "CaseResult", "Cell", "End", "Outcome", "Row", "Silent", "StressResult"]
 
 #: How a run or an evaluation ended, before anybody looks at its error.
 End = Literal["finished", "diverged", "nan", "refused", "slow", "died", "not run"]
-#: With its error: held; wrong with a word of warning or without one; or how it ended.
-Outcome = Literal["held", "warned", "silent", "diverged", "nan", "refused", "slow", "died", "not run"]
+#: With its error: held; above the bar, yet within `GROSS`; grossly wrong with a word of warning or
+#: without one; finished, with no truth to judge it by this bar; or how it ended.
+Outcome = Literal[
+    "held", "inaccurate", "warned", "silent", "unjudged", "diverged", "nan", "refused", "slow", "died", "not run"
+]
 
 #: The default bar: a relative error that plots cannot hide and papers accept.
 BAR: Final = 1e-6
+#: Where an answer is no longer inaccurate but wrong: a hundredth of the motion, or of the term. A method of
+#: low order misses the bar with every step that is affordable, and nobody is misled by that.
+GROSS: Final = 1e-2
 
 
 @dataclass(frozen=True)
@@ -30,16 +51,19 @@ class Cell:
         not finite and nothing was said; ``"refused"``, an error of its own; ``"slow"``, stopped at the time
         allowed; ``"died"``, the process ended or took too much memory; ``"not run"``.
     error : float
-        Relative to the problem's scale (motion, terms), or of the energy; NaN where there is none.
+        Relative to the problem's scale (motion, terms), or of the energy where that is the measure; NaN
+        where there is none, or no truth to measure it by.
     energy : float
         Largest relative energy error, NaN where forces do work or nothing was integrated.
     seconds : float
-        Run time without what is compiled once.
+        The processor's time of the run, or of one evaluation of a term, without what is compiled once.
     steps : int
     warnings : tuple of str
         What the library said about it.
     note : str
         Why it ended, what was chosen.
+    floor : float
+        How well the error itself is known: that of the truth, on the same scale.
     """
 
     value: float
@@ -50,13 +74,27 @@ class Cell:
     steps: int = 0
     warnings: tuple[str, ...] = ()
     note: str = ""
+    floor: float = 0.0
+
+    @property
+    def seen(self) -> float:
+        """The error that counts: its own, or that of the energy where there is no truth.
+
+        A wrong energy speaks against a run, but a right one does not speak for it.
+        """
+        return self.energy if math.isnan(self.error) else self.error
 
     def outcome(self, bar: float) -> Outcome:
         """Return how it went, by this bar on the error."""
         if self.end != "finished":
             return self.end
-        if self.error <= bar:
+        seen = self.seen
+        if math.isnan(seen) or abs(seen - bar) <= self.floor or (math.isnan(self.error) and seen <= bar):
+            return "unjudged"
+        if seen <= bar:
             return "held"
+        if seen <= max(bar, GROSS):
+            return "inaccurate"
         return "warned" if self.warnings else "silent"
 
 
@@ -109,12 +147,16 @@ class Row:
         held: float | None = None
         for cell in self.cells:
             how = cell.outcome(bar)
-            if how == "not run":
+            if how in ("not run", "unjudged"):
                 break
             if how != "held":
                 return Break(held, cell.value, how, cell)
             held = cell.value
         return Break(held, None, "", None)
+
+    def reach(self, bar: float) -> int:
+        """Return how many values held before the first that did not."""
+        return next((k for k, cell in enumerate(self.cells) if cell.outcome(bar) != "held"), len(self.cells))
 
 
 @dataclass(frozen=True)
@@ -150,6 +192,46 @@ class CaseResult:
 
 
 @dataclass(frozen=True)
+class Breaking:
+    """Where one engine and method breaks in one case, a line of a table.
+
+    Attributes
+    ----------
+    case, engine, method, setting : str
+    held, failed, how
+        As of `Break`.
+    note : str
+        What was said or seen where it failed.
+    """
+
+    case: str
+    engine: str
+    method: str
+    setting: str
+    held: float | None
+    failed: float | None
+    how: Outcome | Literal[""]
+    note: str
+
+
+@dataclass(frozen=True)
+class Silent:
+    """A wrong answer that nothing warned of.
+
+    Attributes
+    ----------
+    case, engine, method : str
+    cell : Cell
+        With the value and the error.
+    """
+
+    case: str
+    engine: str
+    method: str
+    cell: Cell
+
+
+@dataclass(frozen=True)
 class StressResult:
     """What held to where, of every case.
 
@@ -172,3 +254,165 @@ class StressResult:
     processor: str
     seconds: float
     settings: dict[str, Any] = field(default_factory=dict)
+
+    def case(self, name: str) -> CaseResult:
+        """Return the case of this name.
+
+        Raises
+        ------
+        UnknownNameError
+            There is none in this result.
+        """
+        known = {case.name: case for case in self.cases}
+        if name not in known:
+            raise UnknownNameError("case", name, known)
+        return known[name]
+
+    def rows(self) -> Iterator[tuple[CaseResult, Row]]:
+        """Yield every row with its case."""
+        for case in self.cases:
+            for row in case.rows:
+                yield case, row
+
+    def breaking(self, bar: float | None = None) -> tuple[Breaking, ...]:
+        """Return where each engine and method breaks in each case.
+
+        Parameters
+        ----------
+        bar : float, optional
+            Another one than each case's own.
+        """
+        out = []
+        for case, row in self.rows():
+            broken = row.breaking(_bar(case, bar))
+            note = "" if broken.cell is None else _note(broken.cell)
+            about = (case.name, row.engine, row.method, row.setting)
+            out.append(Breaking(*about, broken.held, broken.failed, broken.how, note))
+        return tuple(out)
+
+    def silent(self, bar: float | None = None) -> tuple[Silent, ...]:
+        """Return all answers that were grossly wrong without a word, by each case's bar or another one."""
+        return tuple(
+            Silent(case.name, row.engine, row.method, cell)
+            for case, row in self.rows()
+            for cell in row.cells
+            if cell.outcome(_bar(case, bar)) == "silent"
+        )
+
+    def best(self, case: str, bar: float | None = None) -> tuple[Row, ...]:
+        """Return the rows that hold furthest in a case; none where none holds at all."""
+        found = self.case(case)
+        reach = {id(row): row.reach(_bar(found, bar)) for row in found.rows}
+        most = max(reach.values(), default=0)
+        return tuple(row for row in found.rows if reach[id(row)] == most > 0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all of it as plain data, with the outcome of each cell and the breaking point of each row."""
+        out = asdict(self)
+        for told, case in zip(out["cases"], self.cases, strict=True):
+            for line, row in zip(told["rows"], case.rows, strict=True):
+                broken = row.breaking(case.bar)
+                line.update(held=broken.held, failed=broken.failed, how=broken.how)
+                for entry, cell in zip(line["cells"], row.cells, strict=True):
+                    entry["outcome"] = cell.outcome(case.bar)
+        return out
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """Return the result as JSON with null for NaN, and write it if a path is given."""
+        text = json.dumps(plain(self.to_dict()), indent=1, allow_nan=False)
+        if path is not None:
+            write(path, text + "\n")
+        return text
+
+    @classmethod
+    def from_json(cls, text: str) -> StressResult:
+        """Return the result that `to_json` told.
+
+        Raises
+        ------
+        InputError
+            The text is no such result.
+        """
+        try:
+            data = json.loads(text)
+            made: StressResult = remade(cls, data | {"cases": tuple(_case(told) for told in data["cases"])})
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            raise InputError(
+                f"text: expected the JSON of a StressResult, such as Path(...).read_text() of a file "
+                f"that to_json wrote; it has no such content ({type(error).__name__}: {error})"
+            ) from None
+        return made
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """Return one line per engine, method and value, and write it if a path is given."""
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        head = ("case", "parameter", "unit", "value", "engine", "method", "setting", "outcome", "end")
+        writer.writerow((*head, "error", "floor", "energy", "seconds", "steps", "warnings", "note"))
+        for case, row in self.rows():
+            for c in row.cells:
+                about = (case.name, case.parameter, case.unit, number(c.value), row.engine, row.method, row.setting)
+                numbers = (c.error, c.floor, c.energy, c.seconds)
+                told = (c.steps, "; ".join(c.warnings), c.note)
+                writer.writerow((*about, c.outcome(case.bar), c.end, *map(number, numbers), *told))
+        if path is not None:
+            write(path, stream.getvalue())
+        return stream.getvalue()
+
+    def to_markdown(self) -> str:
+        """Return a table per case of how far each engine and method held, the furthest first."""
+        lines: list[str] = []
+        for case in self.cases:
+            unit = f" {case.unit}" if case.unit else ""
+            lines += [f"**{case.name}**: {case.about} Held: error ≤ {case.bar:g}.", ""]
+            lines += [f"| engine | method | setting | held to{unit} | then | how |", "|---|---|---|---:|---:|---|"]
+            for row in sorted(case.rows, key=lambda row: -row.reach(case.bar)):
+                broken = row.breaking(case.bar)
+                told = ["none" if broken.held is None else f"{broken.held:g}"]
+                told += ["" if broken.failed is None else f"{broken.failed:g}", broken.how]
+                lines.append(f"| {row.engine} | {row.method} | {row.setting} | {' | '.join(told)} |")
+            lines.append("")
+        lines += [] if self.complete else ["Interrupted: this is what was finished.", ""]
+        return "\n".join(lines)
+
+    def plot(self, case: str | None = None) -> Figure:
+        """Return the map of one case, or how far each engine held in all of them."""
+        from mbkit.studies.stress.figure import figure
+
+        return figure(self, case)
+
+    def __repr__(self) -> str:
+        cells = [(cell, case.bar) for case, row in self.rows() for cell in row.cells]
+        counts = Counter(cell.outcome(bar) for cell, bar in cells)
+        told = ", ".join(f"{n} {how}" for how, n in counts.most_common())
+        plural = "s" * (len(self.cases) != 1)
+        return f"<StressResult of {len(self.cases)} case{plural}: {told or 'nothing run'}>"
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for b in self.breaking():
+            held, failed = ("" if x is None else f"{x:g}" for x in (b.held, b.failed))
+            told = (b.case, b.engine, b.method, b.setting, held or "none", failed, b.how)
+            rows.append("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in told) + "</tr>")
+        head = "".join(f"<th>{x}</th>" for x in ("case", "engine", "method", "setting", "held to", "then", "how"))
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _bar(case: CaseResult, other: float | None) -> float:
+    return case.bar if other is None else real("bar", other, positive=True)
+
+
+def _note(cell: Cell) -> str:
+    error = f"error {cell.seen:.1e}" if math.isfinite(cell.seen) else ""
+    return "; ".join(x for x in (error, *cell.warnings, cell.note) if x)
+
+
+def _case(told: dict[str, Any]) -> CaseResult:
+    rows = []
+    for row in told["rows"]:
+        cells = tuple(remade(Cell, c | {"warnings": tuple(c["warnings"])}) for c in row["cells"])
+        rows.append(Row(row["engine"], row["method"], cells, row["setting"], row["theory"]))
+    facts = tuple({k: math.nan if x is None else x for k, x in f.items()} for f in told["facts"])
+    parts = {"values": tuple(told["values"]), "truths": tuple(told["truths"]), "facts": facts, "rows": tuple(rows)}
+    made: CaseResult = remade(CaseResult, told | parts)
+    return made

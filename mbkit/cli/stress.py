@@ -1,0 +1,130 @@
+"""`mbkit stress`: where each engine and method breaks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say
+from mbkit.cli.options import check_engines, split
+from mbkit.cli.output import File, console, show
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from mbkit.studies.stress.result import StressResult
+
+__all__ = ["stress"]
+
+
+@click.command()
+@click.argument("cases", nargs=-1, metavar="[CASE]...")
+@click.option("--quick", is_flag=True, help="Fewer values and methods: under two minutes instead of thirty.")
+@click.option("--engines", default="lagrangian,pinocchio,mujoco", show_default=True, callback=split, metavar="A,B,...")
+@click.option(
+    "--methods",
+    default="",
+    callback=split,
+    metavar="A,B,...",
+    help="Integrators.  [default: all; quick: one of a kind]",
+)
+@click.option("--bar", type=float, help="Relative error up to which a value is held.  [default: 1e-6]")
+@click.option("--dt", type=float, help="Step of fixed-step methods, s.  [default: 1e-3]")
+@click.option("--rtol", type=float, help="Tolerance of adaptive methods.  [default: 1e-8]")
+@click.option("--seconds", type=float, help="What one run may take, s.  [default: 5; quick: 0.5]")
+@click.option("--budget", type=float, help="What the study may take, s.  [default: 1700; quick: 110]")
+@click.option("--jobs", type=click.IntRange(min=1), help="Processes side by side.  [default: one a processor]")
+@click.option("--list", "listing", is_flag=True, help="List the cases, and end.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@click.option(
+    "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
+)
+def stress(
+    cases: tuple[str, ...],
+    quick: bool,
+    engines: tuple[str, ...],
+    methods: tuple[str, ...],
+    listing: bool,
+    jobs: int | None,
+    as_json: bool,
+    out: Path,
+    **numbers: float | None,
+) -> None:
+    """Sweep each CASE's number over decades: where does each engine and method break, and how.
+
+    All cases where none is named; --list tells them. A page, JSON and CSV are written.
+    Every run is in a process of its own with a bound of time and memory. Ctrl-C ends the
+    study early, and what is finished is written.
+    """
+    if listing:
+        _list(as_json=as_json)
+        leave(DONE)
+    from mbkit.report.folder import check_writable
+    from mbkit.report.progress import Bar
+    from mbkit.simulate.methods import method_of
+    from mbkit.studies.precision_result import InterruptedSweepError
+    from mbkit.studies.stress.study import stress as study
+
+    check_engines(engines, least=1)
+    for name in methods:
+        method_of(name)
+    check_writable(out)
+    given: dict[str, Any] = {name: x for name, x in numbers.items() if x is not None}
+    try:
+        with Bar("stress") as bar:
+            result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **given)
+    except InterruptedSweepError as stopped:
+        result = stopped.result
+    written = _show(result, out, as_json=as_json)
+    finished = sum(cell.end == "finished" for _, row in result.rows() for cell in row.cells)
+    if not result.complete:
+        say("interrupted", f"{finished} runs were finished")
+    elif not finished:
+        say("error", "no run was finished; the reasons are in the data")
+    leave(INTERRUPTED if not result.complete else MISUSE if not written or not finished else DONE)
+
+
+def _show(result: StressResult, out: Path, *, as_json: bool) -> bool:
+    # One case has files of its own; several share theirs.
+    stem = f"{result.cases[0].name}-stress" if len(result.cases) == 1 else "stress"
+
+    def table() -> RenderableType:
+        from mbkit.report import stress_tables
+
+        return stress_tables.summary(result)
+
+    def page() -> str:
+        from mbkit.report.page import stress_page
+
+        return stress_page(result, data=f"{stem}.json", table=f"{stem}.csv")
+
+    data = result.to_json()
+    files = [
+        File("data", f"{stem}.json", lambda: data + "\n"),
+        File("table", f"{stem}.csv", result.to_csv),
+        File("page", f"{stem}.html", page),
+    ]
+    return show(data, table, files, out, as_json=as_json)
+
+
+def _list(*, as_json: bool) -> None:
+    import json
+
+    from rich.text import Text
+
+    from mbkit.report.layout import columns
+    from mbkit.studies.stress.cases import CASES
+
+    if as_json:
+        click.echo(
+            json.dumps([{**case.facts(), "values": case.values, "quick": case.quick} for case in CASES.values()])
+        )
+        return
+    table = columns("case", "family", "swept", "about")
+    for case in CASES.values():
+        unit = f" {case.unit}" if case.unit else ""
+        swept = f"{case.parameter} {case.values[0]:g} to {case.values[-1]:g}{unit}"
+        table.add_row(Text(case.name), Text(case.family), Text(swept), Text(case.about))
+    console().print(table)

@@ -1,0 +1,162 @@
+"""The largest stable step of each method, against linear theory, and the rule that follows for a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from mbkit.report.stress import Overview
+from mbkit.studies.stress.figure import number_text
+from mbkit.studies.stress.reading import Line, place
+from mbkit.studies.stress.result import CaseResult
+
+__all__ = ["Bound", "Rule", "StepCase", "StepLine", "against_theory", "kinds", "rules", "steps"]
+
+#: What a fact's name begins with that a step is to be short against: "fastest frequency", "fastest rate".
+_FASTEST: Final = "fastest"
+#: Ends that say nothing about stability.
+_OTHER: Final = ("slow", "refused", "died")
+
+
+@dataclass(frozen=True)
+class StepLine:
+    """One engine and method on a case whose step is swept, and what was measured against linear theory, in words."""
+
+    line: Line
+    verdict: str
+
+
+@dataclass(frozen=True)
+class StepCase:
+    """A case whose step is swept, where it stands on the page, and its rows, the largest stable step first."""
+
+    case: CaseResult
+    anchor: str
+    lines: tuple[StepLine, ...]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What steps times the fastest frequency or rate ω showed over all cases that tell one.
+
+    Attributes
+    ----------
+    held : float
+        Up to which it held in every case; 0 where it held nowhere.
+    failed : float
+        The least that did not; NaN where all held.
+    theory : float
+        Linear theory's least; infinite where it has no limit, NaN where none is known.
+    """
+
+    held: float
+    failed: float
+    theory: float
+
+    @property
+    def words(self) -> str:
+        """The rule for whoever chooses a step."""
+        if math.isnan(self.failed):
+            return f"no limit found up to {_two(self.held)} / ω"
+        return f"dt ≤ {_two(self.held)} / ω" if self.held else f"none tried held, the least {_two(self.failed)} / ω"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A method's bounds, by what ω is."""
+
+    method: str
+    bounds: dict[str, Bound]
+
+    @property
+    def words(self) -> str:
+        """The rule for whoever chooses a step, told once where it is the same."""
+        told: dict[str, list[str]] = {}
+        for kind, bound in self.bounds.items():
+            told.setdefault(bound.words, []).append(kind)
+        if len(told) == 1:
+            return next(iter(told))
+        return "; ".join(f"{words} ({', '.join(which)})" for words, which in told.items())
+
+
+def _two(x: float) -> str:
+    return number_text(float(f"{x:.2g}"))
+
+
+def steps(cases: Iterable[Overview]) -> list[StepCase]:
+    """Return the cases whose step is swept."""
+    out = []
+    for told in cases:
+        if told.case.family == "step":
+            found = [StepLine(line, against_theory(line, told.case)) for line in told.lines if not line.left_out]
+            out += [StepCase(told.case, told.anchor, tuple(found))] if found else []
+    return out
+
+
+def rules(cases: Iterable[StepCase]) -> list[Rule]:
+    """Return each method's rule over all engines and cases that tell a frequency or rate, the largest step first."""
+    found: dict[str, dict[str, list[Bound]]] = {}
+    for each in cases:
+        for step in each.lines:
+            for kind, bound in _bounds(step.line, each.case):
+                found.setdefault(step.line.row.method, {}).setdefault(kind, []).append(bound)
+    out = [Rule(method, {kind: _least(group) for kind, group in of.items()}) for method, of in found.items()]
+    return sorted(out, key=lambda rule: (-min(b.held for b in rule.bounds.values()), rule.method))
+
+
+def kinds(found: Iterable[Rule]) -> list[str]:
+    """Return what ω is in any rule."""
+    return list(dict.fromkeys(kind for rule in found for kind in rule.bounds))
+
+
+def _bounds(line: Line, case: CaseResult) -> list[tuple[str, Bound]]:
+    held, failed, theory = line.broken.held, line.broken.failed, line.row.theory
+    if line.rest is not None and (failed is None or line.rest in _OTHER):
+        # What stopped it there has nothing to do with the step.
+        return []
+    at = case.facts[0] if case.facts else {}
+    return [
+        (
+            kind.partition(",")[0],
+            Bound(
+                0.0 if held is None else held * rate,
+                math.nan if failed is None else failed * rate,
+                math.nan if theory is None else theory * rate,
+            ),
+        )
+        for kind, rate in at.items()
+        if kind.startswith(_FASTEST) and rate > 0
+    ]
+
+
+def _least(group: list[Bound]) -> Bound:
+    """Return what is safe in all the cases measured."""
+    failed = min((b.failed for b in group if not math.isnan(b.failed)), default=math.nan)
+    theory = min((b.theory for b in group if not math.isnan(b.theory)), default=math.nan)
+    # Steps are tried on a grid, another one in each case: what held in one may be beyond what did not in another.
+    return Bound(min(b.held for b in group if math.isnan(failed) or not math.isnan(b.failed)), failed, theory)
+
+
+def against_theory(line: Line, case: CaseResult) -> str:
+    """Return how the measured breaking point stands to linear theory's; empty where one of them is not known.
+
+    A sweep tells where a method breaks to one of its steps: between the last that held and the first that did not.
+    """
+    limit = math.nan if line.row.theory is None else line.row.theory
+    at = place(case.values, limit)
+    if math.isnan(at):
+        return ""
+    if line.reach and at < line.reach - 1:
+        return f"holds {_times(case.values[line.reach - 1], limit)}further"
+    failed = line.broken.failed
+    if line.rest is not None and (failed is None or line.rest in _OTHER):
+        return ""
+    if failed is not None and at > line.reach:
+        return f"breaks {_times(failed, limit)}earlier" if math.isfinite(limit) else "breaks, theory has no limit"
+    return "as theory says"
+
+
+def _times(x: float, y: float) -> str:
+    return f"{_two(max(abs(x / y), abs(y / x)))} × " if x and y else ""

@@ -1,0 +1,43 @@
+"""The cases of a study of stress, a family a file."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from mbkit.errors import UnknownNameError
+from mbkit.studies.stress.case import Case
+from mbkit.studies.stress.cases import large, length, long, mass_ratio, near_singular, spin, step, stiffness
+
+__all__ = ["CASES", "get", "names"]
+
+#: Name -> case: what is stiff first, what takes longest last.
+CASES: Final[dict[str, Case]] = {
+    case.name: case
+    for family in (stiffness, mass_ratio, length, spin, near_singular, large, step, long)
+    for case in family.CASES
+}
+
+
+def names() -> tuple[str, ...]:
+    """Return the cases' names.
+
+    Examples
+    --------
+    >>> from mbkit.studies.stress import cases
+    >>> cases.names()[:3]
+    ('joint_spring', 'lightly_damped_joint_spring', 'critically_damped_joint_spring')
+    """
+    return tuple(CASES)
+
+
+def get(name: str) -> Case:
+    """Return the case of this name.
+
+    Raises
+    ------
+    UnknownNameError
+        With near names.
+    """
+    if name not in CASES:
+        raise UnknownNameError("case", str(name), CASES)
+    return CASES[name]

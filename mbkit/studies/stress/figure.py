@@ -1,0 +1,250 @@
+"""The figures of a stress result: the map of one case, and how far each engine held in all of them.
+
+A map has a row for each engine and method and a column for each value. Colour is the digits of error:
+blue where it held, orange to red where it did not; what ended otherwise is grey and says how. Marks and
+words say the same, so that it reads in grey.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING, Final
+
+from mbkit.errors import UnknownNameError
+from mbkit.studies.drawing import PLAIN, Palette, engine_mark, one_line, style
+from mbkit.studies.stress.reading import Line, best, engines_of, lines, name_of, place, recommended
+from mbkit.studies.stress.result import CaseResult, Cell, Outcome, StressResult
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["ROOMY", "SHADES", "WORDS", "cell_text", "error_short", "figure", "number_text", "shade"]
+
+#: Where one shade ends and the next begins, in digits of error.
+_DIGITS: Final = (12.0, 9.0, 6.0, 3.0)
+#: The shades on white paper: h held and w did not, by digits from many to few; grossly wrong;
+#: ended otherwise and said so; ended without a word; not run.
+SHADES: Final = {
+    **dict(zip(("h0", "h1", "h2", "h3", "h4"), ("#edf5fb", "#d5e8f5", "#bcdaef", "#a0cae7", "#83b8dd"), strict=True)),
+    **dict(zip(("w0", "w1", "w2", "w3", "w4"), ("#fdf1d8", "#fce4b8", "#fad592", "#f5bd70", "#eda65c"), strict=True)),
+    "gross": "#dd6244",
+    "end": "#d4d8dd",
+    "mute": "#aab1ba",
+    "none": "#ffffff",
+}
+#: How an outcome is called in a cell where there is room, and where there is not.
+WORDS: Final[dict[Outcome, tuple[str, str]]] = {
+    "diverged": ("diverged", "div"),
+    "nan": ("NaN", "NaN"),
+    "refused": ("refused", "ref"),
+    "slow": ("slow", "slow"),
+    "died": ("died", "died"),
+    "not run": ("", ""),
+}
+_MARKS: Final[dict[Outcome, str]] = {"silent": "✗ ", "warned": "! ", "unjudged": "? "}
+#: More columns than these have no room for words.
+ROOMY: Final = 14
+_WIDTH: Final = 10.4
+#: The width of a letter of a row's name, in.
+_LETTER: Final = 0.075
+
+
+def shade(cell: Cell, outcome: Outcome) -> str:
+    """Return the name of a cell's shade, a key of `SHADES`."""
+    if outcome in ("warned", "silent"):
+        return "gross"
+    if outcome in ("diverged", "refused", "slow"):
+        return "end"
+    if outcome in ("nan", "died"):
+        return "mute"
+    if outcome in ("not run", "unjudged"):
+        return "none"
+    digits = math.inf if cell.seen == 0 else -math.log10(cell.seen) if cell.seen > 0 else -math.inf
+    return ("h" if outcome == "held" else "w") + str(sum(digits < d for d in _DIGITS))
+
+
+def cell_text(cell: Cell, outcome: Outcome, short: bool = False) -> str:
+    """Return what a cell says: its error, with a mark where it is grossly wrong, or how it ended."""
+    if outcome in WORDS:
+        return WORDS[outcome][short]
+    if outcome == "unjudged" and math.isnan(cell.error):
+        return "?"
+    return _MARKS.get(outcome, "") + error_short(cell.seen)
+
+
+def error_short(x: float) -> str:
+    """Return an error as short as a cell is: one digit."""
+    if not math.isfinite(x):
+        return "NaN" if math.isnan(x) else "∞"
+    if 0.01 <= x < 999.5 or x == 0:
+        return f"{x:.1g}" if x < 9.5 else f"{x:.0f}"
+    return _exponent(f"{x:.0e}")
+
+
+def number_text(x: float) -> str:
+    """Return a swept number as short as it can be: 256, 0.01, 1e6, 2.5e-9."""
+    if not math.isfinite(x) or x == 0 or 1e-3 <= abs(x) < 1e4:
+        return f"{x:g}".replace("inf", "∞")
+    return _exponent(f"{x:.2e}")
+
+
+def _exponent(text: str) -> str:
+    text = re.sub(r"\.?0+e", "e", text) if "." in text else text
+    return re.sub(r"e([+-])0*(?=\d)", lambda m: "e" + m.group(1).strip("+"), text)
+
+
+def figure(result: StressResult, case: str | None = None, palette: Palette = PLAIN) -> Figure:
+    """Draw a result.
+
+    Parameters
+    ----------
+    result : StressResult
+    case : str, optional
+        Name of the case whose map is drawn; by default, how far each engine held in every case, or the map
+        of the only one.
+    palette : Palette
+        By default for white paper.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Without a window; ``savefig`` writes it, and a notebook shows it.
+
+    Raises
+    ------
+    UnknownNameError
+        The result has no such case.
+    """
+    # Figure without pyplot: no window system, nothing to close.
+    from matplotlib import rc_context
+
+    known = {c.name: c for c in result.cases}
+    if case is not None and case not in known:
+        raise UnknownNameError("case", case, known)
+    if case is None and len(known) == 1:
+        case = next(iter(known))
+    with rc_context(style(palette)):  # type: ignore[arg-type]
+        return _overview(result, palette) if case is None else _map(known[case], palette)
+
+
+def _map(case: CaseResult, palette: Palette) -> Figure:
+    """Draw one case."""
+    from matplotlib.figure import Figure
+
+    ranked, count = lines(case), len(case.values)
+    height = 1.5 + 0.24 * max(len(ranked), 1)
+    fig = Figure(figsize=(_WIDTH, height))
+    names = [one_line(f"{name_of(x.row)}  {x.row.setting}".rstrip(), 44) for x in ranked]
+    left = 0.02 + _LETTER * max(map(len, names), default=0) / _WIDTH
+    margins = {"left": left, "right": 0.995, "top": 1 - 0.55 / height, "bottom": 0.9 / height}
+    ax = fig.subplots(gridspec_kw=margins)
+    for y, line in enumerate(ranked):
+        _strip(ax, y, line, count, palette)
+        _limits(ax, y, line, case, palette)
+    ax.set_xlim(-0.5, max(count, 1) - 0.5)
+    ax.set_ylim(max(len(ranked), 1) - 0.5, -0.5)
+    ax.set_xticks(range(count), [number_text(v) for v in case.values], fontsize=8.5)
+    ax.set_yticks(range(len(ranked)), names, fontsize=8.5)
+    ax.tick_params(length=0)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_visible(False)
+    unit = f", {case.unit}" if case.unit else ""
+    ax.set_xlabel(one_line(f"{case.parameter}{unit}", 90))
+    # From the figure's left edge, for a sentence is longer than the axes.
+    fig.text(0.01, 1 - 0.3 / height, one_line(f"{case.name}: {case.about}", 125), va="center")
+    if not ranked:
+        ax.text(0.5, 0.5, "nothing was run", transform=ax.transAxes, ha="center", color=palette.muted)
+    _legend(fig, case.bar, palette)
+    return fig
+
+
+def _strip(ax: Axes, y: int, line: Line, count: int, palette: Palette) -> None:
+    from matplotlib.patches import Rectangle
+
+    for x, (cell, how) in enumerate(zip(line.row.cells[:count], line.outcomes, strict=False)):
+        face = SHADES[shade(cell, how)]
+        ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=1.0))
+        weight = "bold" if how == "silent" else "normal"
+        told = cell_text(cell, how, short=count > ROOMY)
+        # Cells are light on every paper.
+        ax.text(x, y, told, ha="center", va="center", fontsize=7.5, weight=weight, color=PLAIN.ink)
+    if line.broken.failed is not None:
+        ax.plot([line.reach - 0.5] * 2, [y - 0.5, y + 0.5], color=palette.ink, linewidth=2.2, solid_capstyle="butt")
+
+
+def _limits(ax: Axes, y: int, line: Line, case: CaseResult, palette: Palette) -> None:
+    """Draw a dashed line before the first value beyond what linear theory allows."""
+    at = math.nan if line.row.theory is None else place(case.values, line.row.theory)
+    if at < len(case.values) - 1:
+        dashes = (0, (1.5, 1))
+        ax.plot(
+            [math.floor(at) + 0.5] * 2, [y - 0.5, y + 0.5], color=palette.series[3], linewidth=2.0, linestyle=dashes
+        )
+
+
+def _legend(fig: Figure, bar: float, palette: Palette) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Patch | Line2D] = [
+        Patch(facecolor=SHADES["h2"], label=f"held: error ≤ {number_text(bar)}"),
+        Patch(facecolor=SHADES["w2"], label="inaccurate"),
+        Patch(facecolor=SHADES["gross"], label="wrong: ! with a warning, ✗ in silence"),
+        Patch(facecolor=SHADES["end"], label="ended otherwise"),
+        Line2D([], [], color=palette.ink, linewidth=2.2, label="breaks"),
+        Line2D([], [], color=palette.series[3], linewidth=1.8, linestyle=(0, (1.5, 1)), label="linear theory"),
+    ]
+    fig.legend(handles=handles, loc="lower left", ncols=len(handles), columnspacing=1.2, handlelength=1.4)
+
+
+def _overview(result: StressResult, palette: Palette) -> Figure:
+    """Draw how much of each sweep every engine's furthest method held, and mbkit's own choice."""
+    from matplotlib.figure import Figure
+
+    cases = [c for c in result.cases if c.values]
+    height = 1.3 + 0.26 * max(len(cases), 1)
+    fig = Figure(figsize=(_WIDTH, height))
+    margins = {"left": 0.25, "right": 0.8, "top": 1 - 0.6 / height, "bottom": 0.55 / height}
+    ax = fig.subplots(gridspec_kw=margins)
+    engines = engines_of(cases)
+    for y, case in enumerate(cases):
+        found = best(case)
+        for k, engine in enumerate(engines):
+            if engine in found:
+                shift = (k - (len(engines) - 1) / 2) * 0.2
+                colour, mark = palette.engine(engine), engine_mark(engine)
+                ax.plot([found[engine].reach / len(case.values)], [y + shift], mark, color=colour, markersize=5.5)
+        choice = recommended(case)
+        if choice is not None:
+            ax.plot([choice.reach / len(case.values)], [y], "|", color=palette.ink, markersize=13, markeredgewidth=1.6)
+        ax.text(1.03, y, one_line(_span(case), 44), va="center", fontsize=8.0, color=palette.muted)
+    ax.set_yticks(range(len(cases)), [one_line(c.name, 34) for c in cases])
+    ax.set_ylim(max(len(cases), 1) - 0.5, -0.5)
+    ax.set_xlim(-0.02, 1.02)
+    ax.set_xticks([0, 0.25, 0.5, 0.75, 1], ["nothing", "¼", "½", "¾", "all"])
+    ax.set_xlabel("part of the sweep that held, mild to extreme")
+    ax.tick_params(axis="y", length=0)
+    ax.grid(axis="x")
+    _engines_legend(fig, engines, palette, chosen=any(recommended(c) for c in cases))
+    return fig
+
+
+def _span(case: CaseResult) -> str:
+    unit = f" {case.unit}" if case.unit else ""
+    return f"{case.parameter} {number_text(case.values[0])} … {number_text(case.values[-1])}{unit}"
+
+
+def _engines_legend(fig: Figure, engines: list[str], palette: Palette, *, chosen: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=palette.engine(e), marker=engine_mark(e), linestyle="none", label=f"{e}, its best")
+        for e in engines
+    ]
+    if chosen:
+        told = "method auto"
+        handles.append(Line2D([], [], color=palette.ink, marker="|", linestyle="none", markersize=12, label=told))
+    if handles:
+        fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.02, 1.0), ncols=len(handles))

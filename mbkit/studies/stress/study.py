@@ -1,0 +1,312 @@
+"""`stress`: where each engine and method breaks, with every run in a process of its own."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from multiprocessing import spawn
+from pathlib import Path
+from typing import Any, Final
+
+from mbkit._check import count, real
+from mbkit.errors import InputError
+from mbkit.simulate.methods import METHODS
+from mbkit.studies import stamp
+from mbkit.studies.keeper import Checkpoint, Keeper, Progress
+from mbkit.studies.pairs import pairs
+from mbkit.studies.precision_result import InterruptedSweepError
+from mbkit.studies.stress.case import Case
+from mbkit.studies.stress.messages import Introduce
+from mbkit.studies.stress.result import BAR, StressResult
+from mbkit.studies.stress.schedule import MisuseError, Slots
+from mbkit.studies.stress.server import busy
+from mbkit.studies.stress.sweep import Bounds, CaseSweep
+from mbkit.studies.stress.terms import TERMS
+from mbkit.studies.workers import processors
+
+__all__ = ["QUICK_METHODS", "stress"]
+
+#: One of each kind, mbkit's own choice, and MuJoCo's own: a method that all engines share makes the same
+#: errors on each of them.
+QUICK_METHODS: Final = {
+    "lagrangian": ("auto", "rk4", "implicit_midpoint", "rk853", "cvodes"),
+    "pinocchio": ("auto", "rk4", "semi_implicit_euler", "radau"),
+    "mujoco": ("mujoco_rk4", "mujoco_euler", "mujoco_implicitfast", "mujoco_discrete"),
+}
+#: Seconds that a run may take, and the whole study, quick and not.
+_SECONDS: Final = {True: 0.5, False: 5.0}
+_BUDGET: Final = {True: 110.0, False: 1700.0}
+_MEMORY: Final = 2 * 2**30
+#: Below it no worker starts, bytes.
+_LEAST_MEMORY: Final = 2**29
+_MOST_JOBS: Final = 16
+#: Seconds between two looks at how far it is.
+_TICK: Final = 0.2
+
+
+def stress(
+    cases: Sequence[str | Case] | str | Case | None = None,
+    engines: Sequence[str] = ("lagrangian", "pinocchio", "mujoco"),
+    methods: Sequence[str] | Mapping[str, Sequence[str]] | None = None,
+    *,
+    values: Sequence[float] | Mapping[str, Sequence[float]] | None = None,
+    quick: bool = False,
+    dt: float = 1e-3,
+    rtol: float = 1e-8,
+    bar: float = BAR,
+    seconds: float | None = None,
+    memory: int | None = None,
+    budget: float | None = None,
+    jobs: int | None = None,
+    progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> StressResult:
+    """Sweep each case's number over decades, and see where each engine and method breaks, and how.
+
+    Parameters
+    ----------
+    cases : sequence of str or Case, optional
+        Names of `mbkit.studies.stress.cases`, or cases of your own, whose functions stand
+        in a module or a script; by default all there are.
+    engines : sequence of str
+    methods : sequence of str, or mapping of str to sequence of str, optional
+        Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by
+        default all, in a quick study one of each kind. A case that only some have a meaning for
+        asks these of them. Cases about terms take none.
+    values : sequence of float, or mapping of str to sequence of float, optional
+        From mild to extreme, instead of the cases' own: for all of them, or by name.
+    quick : bool
+        Fewer values, methods and seconds.
+    dt : float
+        Step of fixed-step methods, s, where a case prescribes none; shortened so that a
+        whole number of steps ends on the times at which errors are measured.
+    rtol : float
+        rtol and atol of adaptive methods, raised to the least that one takes.
+    bar : float
+        Up to this error, relative to the size of the motion or term, a value is held,
+        where a case has no bar of its own.
+    seconds : float, optional
+        That a run may take, of the processor's time; 5, in a quick study 0.5. Making the problem, deriving and
+        compiling may take six times as long.
+    memory : int, optional
+        Bytes that a worker process may take, 2 GiB when not given; enforced on Linux.
+    budget : float, optional
+        Seconds that the study may take as a whole, 1700, in a quick study 110. What is
+        not reached by then is "not run".
+    jobs : int, optional
+        Processes side by side; by default as many as there are processors, and not
+        more than 16. They share memory and caches: run times are those of a busy machine.
+    progress : callable, optional
+        Called as ``progress(fraction, text)``. What it raises ends the study, after
+        `checkpoint` has got what was finished.
+    checkpoint : path or callable, optional
+        Where the result so far goes every few seconds and at the end: a JSON file, which is
+        whole at any time, or a function.
+
+    Returns
+    -------
+    StressResult
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        For unusable arguments. What an engine or method cannot do is in the result.
+    UnsupportedError
+        Worker processes do not start.
+    InterruptedSweepError
+        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is what was finished, which
+        `checkpoint` has got before.
+
+    Notes
+    -----
+    Every run takes place in a worker process with a folder of its own, which is ended
+    when a run takes too long, and replaced when it has ended by itself; so a crash, an endless
+    loop and a want of memory are results. Runs of one worker follow each other: what
+    one leaves behind in memory is there for the next.
+
+    The error of a motion is the largest difference of q to its truth over ten times,
+    on the manifold, divided by the problem's scale. The truth is a closed form, or what two
+    independent runs agree on, and `CaseResult.truths` says which and how well it is known;
+    where there is none, a wrong energy speaks against a run, and a right one not for it.
+    The error of a term is normwise per state, against 34 digits. Run times are the
+    processor's, of the whole run after all that is compiled once.
+
+    After a value at which a row is too slow or its process died, more extreme ones are not
+    run: they cost as much, and tell no more. Likewise after two in a row that diverged,
+    were refused or gave NaN. An error above the bar ends no row.
+
+    A case of your own is sent to the workers by name: its functions stand in a module, or in a
+    script whose work is below ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> result = mb.stress("joint_spring", engines=["pinocchio"], methods=["rk4"])  # doctest: +SKIP
+    >>> print(result.to_markdown())  # doctest: +SKIP
+    """
+    if busy():
+        raise InputError(
+            "stress: called by one of its own workers, which imports the script that a case is defined in; "
+            "put what the script does below: if __name__ == '__main__':"
+        )
+    begun = time.perf_counter()
+    quick = _flag("quick", quick)
+    bounds = Bounds(
+        _SECONDS[quick] if seconds is None else real("seconds", seconds, positive=True),
+        real("dt", dt, positive=True),
+        real("rtol", rtol, positive=True),
+    )
+    bar = real("bar", bar, positive=True)
+    room = _MEMORY if memory is None else count("memory", memory, least=_LEAST_MEMORY)
+    allowed = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
+    width = min(processors(), _MOST_JOBS) if jobs is None else count("jobs", jobs, least=1)
+    keeper = Keeper(progress, checkpoint)
+    chosen = _cases(cases)
+    asked = pairs(engines, _quick_methods(engines) if quick and methods is None else methods)
+    introductions, sweeps = {}, []
+    doing = [""]
+
+    def told(text: str) -> None:
+        doing[0] = text
+
+    for k, (case, own) in enumerate(chosen):
+        introductions[str(k)] = _introduction(str(k), case, own)
+        rows = _rows(case, asked)
+        sweeps.append(CaseSweep(str(k), case, _values(case, values, quick), rows, case.bar or bar, bounds, told))
+    _check_values(values, chosen)
+    settings: dict[str, Any] = {
+        "engines": list(asked),
+        "methods": {engine: list(names) for engine, names in asked.items()},
+        "quick": quick,
+        "dt": bounds.dt,
+        "rtol": bounds.rtol,
+        "bar": bar,
+        "seconds": bounds.seconds,
+        "memory": room,
+        "budget": allowed,
+        "jobs": width,
+    }
+
+    def result(*, complete: bool) -> StressResult:
+        return StressResult(
+            cases=tuple(sweep.result() for sweep in sweeps),
+            complete=complete,
+            versions=stamp.versions(),
+            processor=stamp.processor(),
+            seconds=time.perf_counter() - begun,
+            settings=settings,
+        )
+
+    size = sum(sweep.size for sweep in sweeps)
+    width = min(width, max(1, sum(1 + len(sweep.engines) for sweep in sweeps)))
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="mbkit-stress-", ignore_cleanup_errors=True) as home,
+            Slots(sweeps, introductions, Path(home), width, room, begun + allowed) as slots,
+        ):
+            for _ in slots.ticks(_TICK):
+                keeper.tell(sum(sweep.done for sweep in sweeps) / size, doing[0])
+                keeper.now_and_then(lambda: result(complete=False))
+        whole = result(complete=True)
+    except MisuseError as error:
+        raise InputError(
+            f"cases: a case of your own cannot be used in other processes: {error}; define its functions in a module"
+        ) from None
+    except KeyboardInterrupt:
+        part = result(complete=False)
+        keeper.keep(part)
+        raise InterruptedSweepError(part) from None
+    except Exception:
+        # A progress function's, or a fault: what was finished is not lost with it.
+        keeper.keep(result(complete=False))
+        raise
+    keeper.keep(whole)
+    keeper.tell(1.0, "done")
+    return whole
+
+
+def _flag(name: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise InputError(f"{name}: expected True or False, got {value!r}")
+    return value
+
+
+def _quick_methods(engines: object) -> dict[str, tuple[str, ...]] | None:
+    """Return the quick methods of these engines; None for other engines, which are then refused by name."""
+    if isinstance(engines, str) or not isinstance(engines, Iterable) or not set(engines) <= set(QUICK_METHODS):
+        return None
+    return {engine: tuple(m for m in QUICK_METHODS[engine] if m in METHODS) for engine in engines}
+
+
+def _cases(given: object) -> list[tuple[Case, bool]]:
+    """Return the cases, and whether each is the user's own."""
+    if given is None:
+        from mbkit.studies.stress.cases import names
+
+        given = names()
+    if isinstance(given, (str, Case)):
+        given = (given,)
+    if not isinstance(given, Iterable):
+        raise InputError(f"cases: expected names or Case objects, got {given!r}")
+    out: list[tuple[Case, bool]] = []
+    for one in given:
+        if not isinstance(one, (str, Case)):
+            raise InputError(f"cases: expected names or Case objects, got {one!r}")
+        out.append((_named(one), False) if isinstance(one, str) else (one, True))
+    if not out:
+        raise InputError("cases: expected at least one, got none; leave it out for all")
+    called = [case.name for case, _ in out]
+    for name in called:
+        if called.count(name) > 1:
+            raise InputError(f"cases: {name!r} is there twice; a result finds a case by its name")
+    return out
+
+
+def _named(name: str) -> Case:
+    # With the cases come all the models that they are made of.
+    from mbkit.studies.stress.cases import get
+
+    return get(name)
+
+
+def _introduction(key: str, case: Case, own: bool) -> Introduce:
+    if not own:
+        return Introduce(key, case.name)
+    try:
+        pickled = pickle.dumps(case)
+    except Exception as error:  # pickle raises errors of several kinds
+        raise InputError(
+            f"cases: {case.name!r} cannot be sent to other processes ({error}); define its functions in a module"
+        ) from None
+    # As multiprocessing has its children import the script that they were started from.
+    main = spawn.get_preparation_data("stress") if b"__main__" in pickled else {}
+    return Introduce(key, case.name, pickled, {k: x for k, x in main.items() if k.startswith("init_main")} or None)
+
+
+def _rows(case: Case, asked: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
+    if case.measure == "terms":
+        return [(engine, term) for engine in asked for term in TERMS]
+    return [(e, m) for e, names in asked.items() for m in names if not case.methods or m in case.methods]
+
+
+def _values(case: Case, given: object, quick: bool) -> tuple[float, ...]:
+    own = case.quick if quick and case.quick else case.values
+    if isinstance(given, Mapping):
+        given = given.get(case.name)
+    if given is None:
+        given = own
+    if isinstance(given, (str, bytes)) or not isinstance(given, Iterable):
+        raise InputError(f"values: expected several numbers, or a mapping from cases to them, got {given!r}")
+    out = tuple(real(f"values[{i}] of {case.name}", x) for i, x in enumerate(given))
+    if not out or len(set(out)) < len(out):
+        raise InputError(f"values: expected different numbers for {case.name}, at least one, got {list(out)}")
+    return out
+
+
+def _check_values(given: object, chosen: Sequence[tuple[Case, bool]]) -> None:
+    if isinstance(given, Mapping):
+        for name in given:
+            if name not in {case.name for case, _ in chosen}:
+                raise InputError(f"values: {name!r} is not among the cases: {', '.join(c.name for c, _ in chosen)}")

@@ -1,0 +1,119 @@
+"""A run that finishes and is wrong says so, and one that is right does not."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.errors import DoubtfulRunWarning
+from mbkit.simulate.stability import STEPS, growth
+
+
+def hinge(stiffness=0.0, damping=0.0, **kw):
+    b = mb.ModelBuilder("hinge", gravity=(0, 0, 0))
+    b.add_body("a", mass=1.0, com=(0, 0, 0), inertia=np.eye(3), **kw)
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 0, 1), stiffness=stiffness, damping=damping)
+    return b.build()
+
+
+def doubts(model, method, q0, v0=None, duration=1.0, engine=None, **kw):
+    own = engine or ("mujoco" if method.startswith("mujoco") else "lagrangian")
+    dyn = mb.dynamics(model, own, **({"compile": False} if own == "lagrangian" else {}))
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        run = mb.simulate(dyn, q0, np.zeros(model.nv) if v0 is None else v0, duration, method, **kw)
+    told = [str(w.message) for w in heard if issubclass(w.category, DoubtfulRunWarning)]
+    assert len(told) == len(run.stats.doubts)
+    return run, told
+
+
+# The step of 10 ms meets a spring of 80, 500 and 1e6 rad/s: hω = 0.8, 5, 1e4.
+@pytest.mark.parametrize("method", sorted(STEPS))
+@pytest.mark.parametrize("omega", [80.0, 500.0, 1e6])
+def test_no_fixed_step_method_passes_a_spring_in_silence(method, omega):
+    run, told = doubts(hinge(omega**2), method, [0.1], dt=1e-2)
+    exact = 0.1 * np.cos(omega * run.t)
+    if run.stats.ended == "finished" and np.abs(run.q[:, 0] - exact).max() > 0.05:
+        # Gauss's methods lose the phase of what is resolved by few steps a period slowly.
+        assert told or omega == 80.0
+    if omega > 100:
+        assert told or not run.stats.finished
+
+
+@pytest.mark.parametrize(("method", "stable"), [("rk4", 2.785), ("semi_implicit_euler", 2.0), ("mujoco_rk4", 2.785)])
+def test_explicit_methods_meet_a_damper_at_their_limit(method, stable):
+    """Beyond the real end of the stability region, told with the step that would do; within, no word."""
+    h = 1e-2
+    for factor in (0.95, 1.05):
+        run, told = doubts(hinge(damping=factor * stable / h), method, [0.0], [1.0], dt=h, duration=0.3)
+        assert bool(told) == (factor > 1), (factor, told)
+    assert "too long for the fastest mode" in told[0]
+    assert run.stats.finished  # nothing else would have told
+
+
+@pytest.mark.parametrize("method", ["mujoco_implicit", "gauss6", "implicit_midpoint"])
+def test_implicit_methods_may_pass_a_damper(method):
+    assert not doubts(hinge(damping=1e6), method, [0.0], [1.0], dt=1e-2, duration=0.1)[1]
+
+
+def test_energy_that_comes_from_nowhere_is_told():
+    run, told = doubts(mb.catalog.double_pendulum(), "rk4", [3.0, 1.0], [3.0, -9.0], dt=0.1, duration=4.0)
+    assert any("with nothing that drives it" in x for x in told), run.stats
+
+
+@pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "implicit_midpoint", "mujoco_euler"])
+def test_ordinary_runs_are_not_doubted(method):
+    """A double pendulum, high, and a robot in free fall of its joints, at one millisecond."""
+    assert not doubts(mb.catalog.double_pendulum(), method, [1.5, -1.0], [0.5, 0.5], dt=1e-3)[1]
+
+
+def test_forces_and_dampers_may_change_the_energy():
+    pendulum = mb.catalog.pendulum()
+    assert not doubts(pendulum, "rk4", [0.1], dt=1e-3, torque=[5.0])[1]
+    b = mb.ModelBuilder("damped")
+    b.add_body("a", mass=1.0, com=(0, 0, -0.5), inertia=np.eye(3))
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=2.0)
+    assert not doubts(b.build(), "rk4", [2.0], dt=1e-3)[1]
+
+
+def test_a_nearly_singular_mass_matrix_is_told_with_its_digits():
+    b = mb.ModelBuilder("light", gravity=(0, 0, 0))
+    b.add_body("cart", mass=1e-14, com=(0, 0, 0), inertia=1e-14 * np.eye(3))
+    b.add_body("pole", mass=1.0, com=(0, 0, -1.0), inertia=1e-14 * np.eye(3))
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b.add_joint("theta", "revolute", parent="cart", child="pole", axis=(0, 1, 0))
+    told = doubts(b.build(), "rk4", [0.0, 0.0], [0.0, 0.0], dt=1e-3, duration=0.01)[1]
+    assert "singular" in told[0]
+    assert "oracle" in told[0]
+
+
+def test_coordinates_without_digits_are_told():
+    body = mb.catalog.free_body()
+    q = body.neutral()
+    q[0] = 1e11
+    told = doubts(body, "rk4", q, np.ones(6), dt=1e-3, duration=0.01)[1]
+    assert any("nearer origin" in x for x in told)
+    q[0] = 1e7
+    told = doubts(body, "dop853", q, np.ones(6), duration=0.01, rtol=1e-8, atol=1e-12)[1]
+    assert any("rtol" in x for x in told)
+
+
+def test_doubts_can_be_left_out():
+    run, told = doubts(hinge(1e8), "implicit_midpoint", [0.1], dt=1e-2, duration=0.1, doubt=False)
+    assert not told
+    assert run.stats.doubts == ()
+
+
+@pytest.mark.parametrize("method", sorted(STEPS))
+def test_a_step_of_a_linear_system_is_the_method_s(method):
+    """The matrix that doubts rest on is what the method does: one step of a damped spring."""
+    h, k, c = 0.1, 3.0, 0.7
+    dyn = mb.dynamics(hinge(k, c), "mujoco" if "mujoco" in method else "lagrangian")
+    state = np.array([0.3, -0.2])
+    run = mb.simulate(dyn, state[:1], state[1:], h, method, dt=h, doubt=False)
+    A, B = np.array([[-k]]), np.array([[-c]])
+    np.testing.assert_allclose(STEPS[method](h, A, B) @ state, [run.q[-1, 0], run.v[-1, 0]], atol=1e-14)
+    assert growth(method, h, A, B) < 1

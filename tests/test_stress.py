@@ -1,0 +1,416 @@
+"""Where methods break: a crash, an endless loop and a want of memory are results, and nothing finished is lost."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import mbkit as mb
+from mbkit.cli import cli
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.studies import InterruptedSweepError, StressResult
+from mbkit.studies.rollouts import TooLongError
+from mbkit.studies.stress import Case, CaseResult, Cell, Row, stress
+from mbkit.studies.stress.limit import limited
+from mbkit.studies.stress.messages import Condition, Failed, Prepare, Prepared
+from mbkit.studies.stress.process import USED_UP, LostError
+from mbkit.studies.stress.sweep import Bounds, CaseSweep
+from mbkit.studies.stress.terms import condition
+from mbkit.studies.stress.truths import Search
+from tests import stress_cases as own
+
+METHODS = ("rk4", *own.ENDS)
+
+
+@pytest.fixture(scope="module")
+def told() -> list[tuple[float, str]]:
+    """What the progress function was told."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def study(told, tmp_path_factory) -> StressResult:
+    """One study in which everything goes wrong that can."""
+    kept = tmp_path_factory.mktemp("kept") / "result.json"
+    result = stress(
+        [own.ENDING, own.FAULTY, own.MASSES, own.GLIDING],
+        ["pinocchio"],
+        METHODS,
+        seconds=0.3,
+        memory=2**30,
+        budget=300,
+        jobs=2,
+        progress=lambda done, text: told.append((done, text)),
+        checkpoint=kept,
+    )
+    assert kept.read_text() == result.to_json() + "\n"
+    return result
+
+
+def cells(result: StressResult, case: str, method: str) -> tuple[Cell, ...]:
+    (row,) = (row for row in result.case(case).rows if row.method == method)
+    return row.cells
+
+
+def outcomes(result: StressResult, case: str, method: str) -> list[str]:
+    return [cell.outcome(result.case(case).bar) for cell in cells(result, case, method)]
+
+
+# How runs end
+
+
+def test_every_end_is_a_result_and_harms_no_other(study):
+    found = {method: outcomes(study, "ending", method) for method in METHODS}
+    assert found["rk4"] == ["held"] * 3
+    # What kills a process, or its time, ends a row; others are asked twice.
+    assert found["semi_implicit_euler"][1:] == ["died", "not run"]
+    assert found["gauss4"] == ["held", "slow", "not run"]
+    assert found["gauss6"] == ["held", "died", "not run"]
+    assert found["rk853"][1:] == ["nan", "nan"]
+    assert found["dop853"] == ["held", "silent", "silent"]
+    assert found["radau"][1:] == ["warned", "warned"]
+    assert found["bdf"][1:] == found["lsoda"][1:] == ["refused", "refused"]
+
+
+def test_each_end_says_why(study):
+    note = {method: cells(study, "ending", method)[1].note for method in METHODS}
+    assert "SIGABRT" in note["semi_implicit_euler"]
+    assert "stopped after" in note["gauss4"]
+    assert "more memory than allowed" in note["gauss6"]
+    assert "not finite" in note["rk853"]
+    assert note["bdf"] == "pinocchio: not this one"
+    assert note["lsoda"] == "RuntimeError: from C++"
+    assert cells(study, "ending", "radau")[1].warnings == ("this is wrong",)
+    assert cells(study, "ending", "gauss4")[2].note == "not run: slow at 2 before"
+
+
+def test_what_is_held_is_measured(study):
+    (cell, *_) = cells(study, "ending", "rk4")
+    # RK4's own error over 1 s at 1 ms, relative to the swing.
+    assert 1e-14 < cell.error < 1e-10
+    assert cell.seconds > 0
+    assert cell.steps == 1000
+    # The energy of a swing of 1e-9 rad is beyond what doubles can say.
+    assert math.isnan(cell.energy)
+
+
+def test_a_problem_that_cannot_be_made_is_nobody_elses_loss(study):
+    assert outcomes(study, "faulty", "rk4")[:4] == ["held", "died", "refused", "refused"]
+    notes = [cell.note for cell in cells(study, "faulty", "rk4")]
+    assert "SIGABRT, making the problem" in notes[1]
+    assert notes[2] == "ZeroDivisionError: no such problem"
+    assert "expected make to return a Problem, got NoneType" in notes[3]
+    assert study.case("faulty").truths[1] == notes[1]
+
+
+def test_a_truth_that_is_not_good_enough_judges_nobody(study):
+    # Known to half of the motion: no error below it means anything.
+    assert outcomes(study, "faulty", "rk4")[4] == "unjudged"
+    assert cells(study, "faulty", "rk4")[4].floor == pytest.approx(0.5)
+    told = study.case("faulty").truths
+    assert "known to 5.0e-10" in told[4]
+    assert "it is of another motion" in told[5]
+    # A right energy does not speak for a motion, and a wrong one speaks against it.
+    assert outcomes(study, "faulty", "rk4")[5] == "unjudged"
+    assert outcomes(study, "faulty", "dop853")[5] == "unjudged"
+    assert outcomes(study, "faulty", "semi_implicit_euler")[5] == "inaccurate"
+    for cell in (cells(study, "faulty", m)[5] for m in ("rk4", "semi_implicit_euler")):
+        assert math.isnan(cell.error)
+        assert math.isfinite(cell.energy)
+
+
+def test_terms_are_measured_against_34_digits(study):
+    case = study.case("masses")
+    assert [row.method for row in case.rows] == ["mass_matrix", "inverse_dynamics", "forward_dynamics"]
+    assert outcomes(study, "masses", "inverse_dynamics") == ["held", "held"]
+    for row in case.rows:
+        assert row.cells[0].error < 1e-14
+        assert 0 < row.cells[0].seconds < 1e-2
+    # Pinocchio 4.1.0 adds up inertias as if no mass were below eps.
+    assert outcomes(study, "masses", "mass_matrix")[1] == "silent"
+    assert case.facts[1]["cond(M)"] == pytest.approx(1e20, rel=1e-3)
+
+
+def test_a_prescribed_step_is_taken_and_the_energy_is_a_measure(study):
+    case = study.case("gliding")
+    (row,) = case.rows
+    assert (row.method, row.setting, case.bar) == ("rk4", "dt of the case", 1e-11)
+    assert [cell.steps for cell in row.cells] == [100, 100]
+    assert [cell.outcome(case.bar) for cell in row.cells] == ["held", "inaccurate"]
+    assert all(cell.error == cell.energy for cell in row.cells)
+
+
+def test_progress_never_goes_back(study, told):
+    done = [fraction for fraction, _ in told]
+    assert done == sorted(done)
+    assert done[-1] == 1.0
+    assert study.complete
+    assert any(text.startswith("ending: ") for _, text in told)
+
+
+# What is read from a result
+
+
+def test_the_result_tells_what_breaks(study):
+    (broken,) = (b for b in study.breaking() if (b.case, b.method) == ("ending", "dop853"))
+    assert (broken.held, broken.failed, broken.how) == (1, 2, "silent")
+    assert "error 1.0e+09" in broken.note
+    assert {(s.case, s.method) for s in study.silent()} >= {("ending", "dop853"), ("masses", "mass_matrix")}
+    assert [row.method for row in study.best("ending")] == ["rk4"]
+    # By a looser bar the prescribed steps all hold.
+    assert next(b for b in study.breaking(1.0) if b.case == "gliding").failed is None
+    with pytest.raises(UnknownNameError, match="ending"):
+        study.case("endin")
+    with pytest.raises(InputError, match="bar"):
+        study.breaking(-1.0)
+
+
+def test_nothing_is_lost_on_the_way_to_json_and_back(study):
+    again = StressResult.from_json(study.to_json())
+    assert again.to_json() == study.to_json()
+    assert again.breaking() == study.breaking()
+    assert pickle.loads(pickle.dumps(study)).to_json() == study.to_json()
+    rows = list(csv.DictReader(io.StringIO(study.to_csv())))
+    assert len(rows) == sum(len(row.cells) for _, row in study.rows())
+    assert {r["outcome"] for r in rows} >= {"held", "died", "slow", "silent", "nan", "refused", "unjudged"}
+    assert "| pinocchio | rk4 | dt 0.001 s | 3 |  |  |" in study.to_markdown()
+    assert "<td>died</td>" in study._repr_html_()
+    assert "4 cases" in repr(study)
+    for text in ("{}", "no JSON", '{"cases": [1]}'):
+        with pytest.raises(InputError, match="StressResult"):
+            StressResult.from_json(text)
+
+
+def test_outcomes_by_error_floor_and_warning():
+    assert Cell(1.0, "finished", 1e-7).outcome(1e-6) == "held"
+    assert Cell(1.0, "finished", 1e-7, floor=9.5e-7).outcome(1e-6) == "unjudged"
+    assert Cell(1.0, "finished", 0.5, floor=9.5e-7).outcome(1e-6) == "silent"
+    assert Cell(1.0, "finished", 0.5, warnings=("beware",)).outcome(1e-6) == "warned"
+    assert Cell(1.0, "finished").outcome(1e-6) == "unjudged"
+    assert Cell(1.0, "finished", energy=1e-9).outcome(1e-6) == "unjudged"
+    assert Cell(1.0, "finished", energy=0.5).outcome(1e-6) == "silent"
+    row = Row("pinocchio", "rk4", (Cell(1.0, "finished", 0.0), Cell(2.0, "not run"), Cell(3.0, "died")))
+    assert (row.breaking(1e-6).held, row.breaking(1e-6).failed, row.reach(1e-6)) == (1.0, None, 1)
+
+
+# What is asked next
+
+
+def swept(answers, values=(1, 2, 3, 4), methods=("rk4", "rk853")) -> CaseResult:
+    """A case whose worker answers as told, by value and method."""
+    case = Case("fake", "None.", "step", "x", "", values, (), own.swing)
+    sweep = CaseSweep("0", case, values, [("pinocchio", m) for m in methods], 1e-6, Bounds(1.0, 1e-3, 1e-8), str)
+    asked = []
+
+    def ask(request, _patience):
+        if isinstance(request, Prepare):
+            return answers.get(("case", request.value)) or Prepared("known")
+        if isinstance(request, Condition):
+            return 1.0
+        asked.append((request.value, request.method))
+        found = answers.get((request.method, request.value), Cell(request.value, "finished", 0.0))
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    assert sweep.prepare(ask, time.perf_counter() + 10)
+    assert sweep.run("pinocchio", ask, time.perf_counter() + 10)
+    assert sweep.done == sweep.size
+    return sweep.result()
+
+
+def ends(result: CaseResult) -> dict[str, list[str]]:
+    return {row.method: [cell.end for cell in row.cells] for row in result.rows}
+
+
+def test_a_row_ends_where_more_would_only_cost():
+    found = ends(swept({("rk4", 2): LostError("slow", "stopped", "run"), ("rk853", 1): Cell(1, "diverged")}))
+    assert found["rk4"] == ["finished", "slow", "not run", "not run"]
+    assert found["rk853"] == ["diverged", "finished", "finished", "finished"]
+    twice = {("rk4", 1): Cell(1, "refused"), ("rk4", 2): Cell(2, "diverged")}
+    assert ends(swept(twice))["rk4"] == ["refused", "diverged", "not run", "not run"]
+
+
+def test_an_engine_that_cannot_be_made_is_asked_once():
+    found = swept({("rk4", 2): LostError("died", "crash", "engine")})
+    assert ends(found)["rk4"] == ends(found)["rk853"] == ["finished", "died", "not run", "not run"]
+
+
+def test_a_problem_that_takes_for_ever_is_asked_once():
+    found = swept({("case", 2): Failed("slow", "stopped", "case")})
+    assert ends(found)["rk4"] == ends(found)["rk853"] == ["finished", "slow", "finished", "finished"]
+
+
+def test_when_the_time_is_used_up_it_says_so_and_goes_on_with_more():
+    case = Case("fake", "None.", "step", "x", "", (1,), (), own.swing)
+    sweep = CaseSweep("0", case, (1,), [("pinocchio", "rk4")], 1e-6, Bounds(1.0, 1e-3, 1e-8), str)
+    later = time.perf_counter() + 10
+    # Not before the truth is there.
+    assert not sweep.run("pinocchio", lambda *_: None, later)
+    assert sweep.prepare(lambda asked, _: Prepared("known") if isinstance(asked, Prepare) else 1.0, later)
+    assert not sweep.run("pinocchio", lambda *_: None, time.perf_counter())
+    assert sweep.result().rows[0].cells[0].note == USED_UP
+    assert sweep.run("pinocchio", lambda *_: Cell(1, "finished", 0.0), later)
+    assert sweep.result().rows[0].reach(1e-6) == 1
+
+
+def test_a_bound_of_time_ends_what_does_not_ask():
+    with pytest.raises(TooLongError, match=r"given up after 0\.05 s"), limited(0.05):
+        any(False for _ in itertools.count())
+    with pytest.raises(KeyboardInterrupt), limited(10.0):
+        raise KeyboardInterrupt
+    # And nothing is left of it.
+    assert signal.getitimer(signal.ITIMER_PROF) == (0.0, 0.0)
+
+
+# Truths
+
+
+def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none():
+    problem, times = own.sprung(100.0), np.linspace(0, 0.5, 11)
+    truth, told = Search().truth(problem, times, 1e-7, 5.0)
+    assert truth.floor < 1e-10
+    assert "rk853 on lagrangian" in told
+    # At 50 µs its own error is 1e-13.
+    other = mb.simulate(mb.dynamics(problem.model, "mujoco"), problem.q, problem.v, 0.5, "mujoco_rk4", 5e-5, save=times)
+    assert np.abs(truth.q - other.q).max() < 1e-12
+    # 1e5 swings cannot be followed in the time.
+    truth, told = Search().truth(own.sprung(1e12), times, 1e-7, 0.5)
+    assert truth is None
+    assert told.startswith("no truth: ")
+
+
+def test_conditions_beyond_double_are_known():
+    oracle = mb.dynamics(mb.catalog.double_pendulum(mass2=1e-25), "oracle")
+    # Straight: M = [[1 + 4 m, 2 m], [2 m, m]], whose eigenvalues are 1 and m to within m.
+    assert condition(oracle, np.zeros(2)) == pytest.approx(1e25, rel=1e-9)
+    assert condition(mb.dynamics(mb.catalog.pendulum(), "oracle"), np.zeros((3, 1))) == 1.0
+
+
+# How it is asked
+
+
+def test_ctrl_c_keeps_what_was_finished(tmp_path):
+    def interrupt(done, _text):
+        if done > 0.4:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "kept.json"
+    with pytest.raises(InterruptedSweepError) as caught:
+        stress(own.GLIDING, ["pinocchio"], values=(1e-3, 1e-2, 1e1), progress=interrupt, checkpoint=path, jobs=1)
+    result = caught.value.result
+    assert not result.complete
+    assert result.cases[0].facts[0]["cond(M)"] > 1
+    assert json.loads(path.read_text())["complete"] is False
+    assert "Interrupted" in result.to_markdown()
+
+
+def test_a_case_of_a_script_is_found_there(tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text(
+        textwrap.dedent("""
+        import numpy as np, mbkit as mb
+        from mbkit.studies.stress import Case, Problem
+
+        def make(value):
+            return Problem(mb.catalog.pendulum(), np.ones((1, 1)), np.ones((1, 1)) * value)
+
+        case = Case("mine", "My own.", "spin", "speed", "rad/s", (1.0,), (), make, "terms")
+        if __name__ == "__main__":
+            print(mb.stress(case, ["pinocchio"], jobs=1))
+        """)
+    )
+    there = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120, check=False, env=there)
+    assert done.stdout.strip() == "<StressResult of 1 case: 3 held>", done.stderr
+
+
+def bad(match, *args, **more):
+    with pytest.raises((InputError, UnknownNameError), match=match):
+        stress(*args, **more)
+
+
+def test_bad_input_is_named_before_anything_starts():
+    bad("nosuch", ["nosuch"])
+    bad("expected names or Case objects, got 3", [3])
+    bad("there twice", [own.GLIDING, own.GLIDING])
+    bad("at least one", [])
+    bad("engine", own.GLIDING, ["nosuch"])
+    bad("oracle", own.GLIDING, ["oracle"])
+    bad("method", own.GLIDING, methods=["nosuch"])
+    bad("values: expected different numbers", own.GLIDING, values=[1.0, 1.0])
+    bad("values", own.GLIDING, values=[math.nan])
+    bad("not among the cases: gliding", own.GLIDING, values={"other": [1.0]})
+    bad("quick", own.GLIDING, quick=1)
+    bad("memory", own.GLIDING, memory=1000)
+    for name in ("dt", "rtol", "bar", "seconds", "budget"):
+        bad(name, own.GLIDING, **{name: -1.0})
+    bad("jobs", own.GLIDING, jobs=0)
+    bad("cannot be sent to other processes", replace(own.GLIDING, make=lambda _: None))
+
+
+# The command
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A working folder of the test's own."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(*arguments):
+    return CliRunner().invoke(cli, ["stress", *arguments])
+
+
+def test_the_command_prints_and_writes(study, here, monkeypatch):
+    asked = {}
+    monkeypatch.setattr("mbkit.studies.stress.study.stress", lambda *a, **k: asked.update(k, a=a) or study)
+    result = call("joint_spring", "chain", "--quick", "--methods", "rk4", "--bar", "1e-3", "--budget", "50")
+    assert result.exit_code == 0, result.output
+    assert asked.pop("a") == (("joint_spring", "chain"), ("lagrangian", "pinocchio", "mujoco"), ("rk4",))
+    assert (asked["quick"], asked["bar"], asked["budget"]) == (True, 1e-3, 50.0)
+    folder = here / "mbkit-report"
+    assert {p.name for p in folder.iterdir()} == {"stress.html", "stress.json", "stress.csv"}
+    assert StressResult.from_json((folder / "stress.json").read_text()).breaking() == study.breaking()
+    assert 'href="stress.csv"' in (folder / "stress.html").read_text(encoding="utf-8")
+    one = replace(study, cases=study.cases[:1], complete=False)
+
+    def stopped(*_: object, **__: object) -> None:
+        raise InterruptedSweepError(one)
+
+    monkeypatch.setattr("mbkit.studies.stress.study.stress", stopped)
+    result = call("--json", "--out", "out")
+    assert result.exit_code == 130
+    assert json.loads(result.stdout)["complete"] is False
+    assert "interrupted: " in result.stderr
+    assert Path("out/ending-stress.html").exists()
+
+
+@pytest.mark.usefixtures("here")
+def test_the_command_lists_the_cases_and_names_near_ones():
+    listed = call("--list")
+    assert listed.exit_code == 0
+    assert "joint_spring" in listed.stdout
+    assert json.loads(call("--list", "--json").stdout)[0]["name"] == "joint_spring"
+    wrong = call("joint_sprin")
+    assert wrong.exit_code == 2
+    assert "did you mean 'joint_spring'" in wrong.stderr
+    assert call("--engines", "nosuch").exit_code == 2
+    assert not list(Path().iterdir())

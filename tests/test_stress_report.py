@@ -1,0 +1,456 @@
+"""The page, the tables and the figures of where engines and methods break, of results that nothing had to run."""
+
+import io
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import pytest
+from rich.console import Console
+
+from mbkit.errors import UnknownNameError
+from mbkit.report import stress
+from mbkit.report.page import stress_page
+from mbkit.report.stress_figures import stable_steps
+from mbkit.report.stress_map import section
+from mbkit.report.stress_methods import methods
+from mbkit.report.stress_silent import avoid
+from mbkit.report.stress_steps import kinds, rules, steps
+from mbkit.report.stress_tables import summary
+from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
+from mbkit.studies.stress.reading import best, lines, place, recommended
+from mbkit.studies.stress.result import CaseResult, Cell, Row, StressResult
+
+NAN, INF = math.nan, math.inf
+HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'
+
+
+def cells(values: tuple[float, ...], *ends: str | float | tuple[float, str]) -> tuple[Cell, ...]:
+    """One cell a value: an error, an error with a warning, or an end of which there is none."""
+    out = []
+    for value, end in zip(values, ends, strict=False):
+        if isinstance(end, str):
+            out.append(Cell(value, end, seconds=0.5, note=f"{end} at t = 0.1 s"))
+        else:
+            error, warning = end if isinstance(end, tuple) else (end, "")
+            out.append(Cell(value, "finished", error, 1e-9, 0.01, 1000, (warning,) if warning else ()))
+    return tuple(out)
+
+
+STIFF = (1.0, 1e3, 1e6, 1e9)
+SPRING = CaseResult(
+    name="joint_spring",
+    about="A pendulum with a spring of stiffness k.",
+    family="stiffness",
+    parameter="k",
+    unit="N m/rad",
+    measure="motion",
+    bar=1e-6,
+    why="plots cannot hide it",
+    values=STIFF,
+    truths=("closed form", "closed form", "two runs agree", "two runs agree"),
+    facts=({"fastest frequency": 1.0}, {"fastest frequency": 31.6}, {}, {"condition number": 12.0}),
+    rows=(
+        Row("mujoco", "rk4", cells(STIFF, 1e-9, 1e-3, 0.5, 40.0), "dt 1 ms", 1e5),
+        Row("lagrangian", "auto", cells(STIFF, 1e-13, 1e-12, 1e-10, 1e-8), "rtol 1e-10"),
+        Row("pinocchio", "radau", cells(STIFF, 1e-9, 1e-9, 1e-8, "slow"), "rtol 1e-10"),
+        Row("pinocchio", "rk4", cells(STIFF, 1e-9, 1e-5, (0.3, "dt ω is 31"), "diverged"), "dt 1 ms", 1e5),
+        Row("mujoco", "mujoco_euler", cells(STIFF, 1e-3, "nan", "died", "not run"), "dt 1 ms", INF),
+        Row("drake", "rk3", cells(STIFF, "refused", "refused", "refused", "refused")),
+    ),
+)
+STEPS = (1e-3, 2e-3, 4e-3, 8e-3)
+STEP = replace(
+    SPRING,
+    name="step_spring",
+    family="step",
+    parameter="dt",
+    unit="s",
+    bar=1.0,
+    why="below the motion itself it is stable",
+    values=STEPS,
+    truths=("closed form",) * 4,
+    facts=({"fastest frequency, 1/s": 1000.0},) * 4,
+    rows=(
+        Row("lagrangian", "rk4", cells(STEPS, 1e-5, 1e-3, "diverged", "diverged"), theory=2.83e-3),
+        Row("mujoco", "semi_implicit_euler", cells(STEPS, 2.0, 2.0, 2.0, 2.0), theory=2e-3),
+        Row("lagrangian", "gauss4", cells(STEPS, 1e-7, 1e-6, 1e-5, 1e-4), theory=INF),
+    ),
+)
+LINKS = (2.0, 16.0, 128.0)
+TERMS = replace(
+    SPRING,
+    name="chain",
+    family="length",
+    parameter="links",
+    unit="",
+    measure="terms",
+    values=LINKS,
+    truths=("34 digits",) * 3,
+    facts=(),
+    rows=(
+        Row("pinocchio", "M", cells(LINKS, 1e-15, 1e-15, 1e-14)),
+        Row("pinocchio", "forward_dynamics", cells(LINKS, 1e-14, 1e-9, 0.2)),
+        Row("mujoco", "M", cells(LINKS, 1e-15, 1e-5, 1e-3)),
+        Row("mujoco", "C", cells(LINKS, "refused", "refused", "refused")),
+    ),
+)
+RESULT = StressResult(
+    cases=(SPRING, STEP, TERMS),
+    complete=True,
+    versions={"pin": "4.1.0"},
+    processor="a processor",
+    seconds=61.0,
+    settings={"dt": 1e-3, "engines": ["pinocchio", "mujoco"], "memory": None},
+)
+NASTY = replace(
+    RESULT,
+    cases=(
+        replace(
+            SPRING,
+            name=HOSTILE,
+            about=HOSTILE,
+            family=HOSTILE,
+            parameter=HOSTILE,
+            unit=HOSTILE,
+            why=HOSTILE,
+            values=(1.0, NAN, INF),
+            truths=(HOSTILE,),
+            facts=({HOSTILE: NAN},),
+            rows=(
+                Row(HOSTILE, HOSTILE, (Cell(1.0, "finished", NAN, INF, INF, 0, (HOSTILE,), HOSTILE),), HOSTILE, NAN),
+                Row(HOSTILE, "rk4", (Cell(1.0, "finished", INF, INF, NAN, note=HOSTILE),), HOSTILE, 3.0),
+                Row("mujoco", HOSTILE, (Cell(1.0, "refused", note=HOSTILE),)),
+            ),
+        ),
+        replace(STEP, name=HOSTILE, facts=()),
+        replace(SPRING, rows=(), values=(), truths=(), facts=()),
+        replace(SPRING, rows=(Row("pinocchio", "rk4", ()),)),
+        replace(STEP, rows=(), values=()),
+    ),
+    settings={HOSTILE: HOSTILE, "list": [HOSTILE], "map": {HOSTILE: HOSTILE}},
+    processor=HOSTILE,
+)
+NOTHING = replace(RESULT, cases=(), complete=False)
+
+
+class Tags(HTMLParser):
+    """Every tag with its attributes, and the text."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.text = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def printed(what: object, width: int = 100) -> str:
+    console = Console(width=width, force_terminal=False, color_system=None)
+    with console.capture() as capture:
+        console.print(what)
+    return capture.get()
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return stress_page(RESULT, data="stress.json", table="stress.csv")
+
+
+def line(case: CaseResult, engine: str, method: str):
+    return next(x for x in lines(case) if (x.row.engine, x.row.method) == (engine, method))
+
+
+def test_rows_stand_in_the_order_of_how_far_they_held():
+    told = [(x.row.engine, x.row.method, x.reach, x.usable) for x in lines(SPRING)]
+    assert told == [
+        ("lagrangian", "auto", 4, 4),
+        ("pinocchio", "radau", 3, 3),
+        ("pinocchio", "rk4", 1, 2),
+        ("mujoco", "rk4", 1, 2),
+        ("mujoco", "mujoco_euler", 0, 1),
+        ("drake", "rk3", 0, 0),
+    ]
+    assert line(SPRING, "drake", "rk3").left_out
+    assert recommended(SPRING) is not None
+    assert recommended(TERMS) is None
+
+
+def test_an_engine_is_judged_by_its_furthest_method_but_by_the_first_of_its_terms_to_break():
+    assert {e: x.row.method for e, x in best(SPRING).items()} == {
+        "lagrangian": "auto",
+        "pinocchio": "radau",
+        "mujoco": "rk4",
+        "drake": "rk3",
+    }
+    # A term that it does not have is none that breaks.
+    assert {e: x.row.method for e, x in best(TERMS).items()} == {"pinocchio": "forward_dynamics", "mujoco": "M"}
+
+
+@pytest.mark.parametrize(
+    ("values", "x", "where"),
+    [
+        ((1.0, 10.0, 100.0), 10.0, 1.0),
+        ((1.0, 10.0, 100.0), 10**1.5, 1.5),
+        ((1.0, 0.1, 0.01), 10**-1.5, 1.5),
+        ((1.0, 10.0), 0.5, -1.0),
+        ((1.0, 10.0), 0.0, -1.0),
+        ((1.0, 10.0), INF, 2.0),
+        ((1.0, 0.1), INF, -1.0),
+        ((0.0, 1.0), 0.25, 0.25),
+        ((5.0,), 5.0, 0.0),
+    ],
+)
+def test_a_number_has_its_place_among_the_values_by_decades_in_either_direction(values, x, where):
+    assert place(values, x) == pytest.approx(where)
+
+
+def test_what_is_in_no_order_has_no_places():
+    assert all(math.isnan(place(v, 1.0)) for v in ((), (1.0, 5.0, 2.0), (1.0, 1.0), (NAN, 1.0)))
+    assert math.isnan(place((1.0, 2.0), NAN))
+
+
+def test_numbers_are_as_short_as_a_cell():
+    told = [number_text(x) for x in (256.0, 0.01, 1e6, 2.5e-9, 1e-12, 0.0, 12345.0, INF)]
+    assert told == ["256", "0.01", "1e6", "2.5e-9", "1e-12", "0", "1.23e4", "∞"]
+    outcomes = ("held", "silent", "warned", "diverged", "not run")
+    texts = [
+        cell_text(Cell(1.0, "finished", x), o) for x, o in zip((3.2e-10, 0.42, 23.0, NAN, NAN), outcomes, strict=True)
+    ]
+    assert texts == ["3e-10", "✗ 0.4", "! 23", "diverged", ""]
+    assert cell_text(Cell(1.0, "diverged"), "diverged", short=True) == "div"
+
+
+def test_shades_tell_digits_and_whether_it_held():
+    errors = (0.0, 1e-13, 1e-10, 1e-7, 1e-4, 0.01)
+    assert [shade(Cell(1.0, "finished", x), "held") for x in errors] == ["h0", "h0", "h1", "h2", "h3", "h4"]
+    assert shade(Cell(1.0, "finished", 1e-4), "inaccurate") == "w3"
+    assert {shade(Cell(1.0, "finished", x), "silent") for x in (0.5, INF)} == {"gross"}
+    assert shade(Cell(1.0, "finished", NAN), "unjudged") == "none"
+    ends = ("diverged", "refused", "slow", "nan", "died", "not run")
+    assert [shade(Cell(1.0, "nan"), e) for e in ends] == ["end"] * 3 + ["mute"] * 2 + ["none"]
+
+
+def test_dark_text_reads_on_every_shade_of_paper():
+    def luminance(colour: str) -> float:
+        parts = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        linear = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in parts]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    style = re.findall(r"--(\w+): (#[0-9a-f]{6})", stress_page(NOTHING))
+    light, dark = dict(reversed(style)), dict(style)
+    # WCAG 2.1: 4.5 for small text.
+    for paper in (light, dark):
+        for name in set(SHADES) - {"none"}:
+            a, b = sorted((luminance(paper[name]), luminance(paper["ink"])))
+            assert (b + 0.05) / (a + 0.05) >= 4.5, name
+    # A figure on white paper has the page's own shades.
+    assert {name: light[name] for name in set(SHADES) - {"none"}} == {n: c for n, c in SHADES.items() if n != "none"}
+    held, broken = ([luminance(light[f"{kind}{k}"]) for k in range(5)] for kind in "hw")
+    # In grey, fewer digits are darker.
+    assert held == sorted(held, reverse=True)
+    assert [*broken, luminance(light["gross"])] == sorted([*broken, luminance(light["gross"])], reverse=True)
+
+
+def test_the_headline_says_who_held_furthest_and_how_much_was_silent():
+    # Neither terms nor stable steps make a method the best.
+    told = "lagrangian auto held furthest, or as far as any, in 1 of 1 case; 7 silent failures in 3 cases"
+    assert stress.headline(RESULT) == told
+    twice = replace(RESULT, cases=(SPRING, replace(SPRING, rows=SPRING.rows[2:3])))
+    assert stress.headline(twice).startswith(
+        "lagrangian auto and pinocchio radau held furthest, or as far as any, in 1 of 2"
+    )
+    quiet = replace(RESULT, cases=(replace(SPRING, rows=SPRING.rows[1:3]),))
+    assert stress.headline(quiet).endswith("in 1 of 1 case; no silent failures")
+    assert stress.headline(NOTHING) == "interrupted; what was finished: nothing was run"
+    lost = replace(RESULT, cases=(replace(SPRING, rows=SPRING.rows[4:]),))
+    assert stress.headline(lost) == "nothing held in 1 case; no silent failures"
+    # Without a run, terms are told of by engine.
+    assert stress.headline(replace(RESULT, cases=(TERMS,))).startswith("pinocchio held furthest")
+
+
+def test_what_to_avoid_is_told_by_method_with_where_it_begins():
+    found = {a.method: a.places for a in avoid(RESULT)}
+    assert list(found) == ["rk4", "semi_implicit_euler", "pinocchio forward_dynamics"]
+    assert [(p.case.name, p.text, p.engines) for p in found["rk4"]] == [("joint_spring", "1e6 N m/rad", ("mujoco",))]
+    assert found["semi_implicit_euler"][0].engines == ()
+
+
+def test_where_another_holds_further_than_auto_is_told():
+    assert not any(o.behind for o in stress.overview(RESULT))
+    worse = Row("lagrangian", "auto", cells(STIFF, 1e-9, 1e-9, "slow", "slow"))
+    result = replace(RESULT, cases=(replace(SPRING, rows=(worse, *SPRING.rows[2:])),))
+    page = " ".join(Tags(stress_page(result)).text.split())
+    assert "it held as far as any in 0 of 1 case" in page
+    assert "lagrangian auto held to 1000 N m/rad, pinocchio radau held to 1e6 N m/rad; then too slow: slow at" in page
+    assert "behind" in printed(summary(result))
+
+
+def test_methods_are_counted_by_family_with_their_price():
+    first, *_ = found = methods(RESULT)
+    assert (first.name, first.families, first.ahead, first.factor) == ("lagrangian auto", {"stiffness": (1, 1)}, 1, 1.0)
+    assert {m.name: m.silent for m in found}["mujoco rk4"] == 1
+    assert first.held == 1.0
+    # Terms are no methods, a stable step is no merit, and what never ran has no count.
+    assert not {m.name for m in found} & {"pinocchio M", "mujoco semi_implicit_euler", "drake rk3"}
+
+
+def test_steps_are_set_against_linear_theory_and_make_a_rule():
+    found = steps(stress.overview(RESULT))
+    assert [(s.line.row.method, s.verdict) for s in found[0].lines] == [
+        ("gauss4", "as theory says"),
+        ("rk4", "as theory says"),
+        ("semi_implicit_euler", "breaks 2 × earlier"),
+    ]
+    told = {r.method: (*(b.held for b in r.bounds.values()), r.words) for r in rules(found)}
+    assert told == {
+        "gauss4": (8.0, "no limit found up to 8 / ω"),
+        "rk4": (2.0, "dt ≤ 2 / ω"),
+        "semi_implicit_euler": (0.0, "none tried held, the least 1 / ω"),
+    }
+    further = replace(STEP.rows[0], theory=1.2e-3)
+    (case,) = steps(stress.overview(replace(RESULT, cases=(replace(STEP, rows=(further,), facts=()),))))
+    assert case.lines[0].verdict == "holds 1.7 × further"
+    # Without a frequency there is no rule, and a step all the same.
+    assert rules([case]) == []
+    # What was too slow tells nothing of stability.
+    slow = replace(STEP, rows=(replace(STEP.rows[0], cells=cells(STEPS, 1e-5, "slow")),))
+    (case,) = steps(stress.overview(replace(RESULT, cases=(slow,))))
+    assert (case.lines[0].verdict, rules([case])) == ("", [])
+
+
+def test_a_damper_has_a_rule_of_its_own():
+    damped = replace(STEP, name="damped", facts=({"fastest rate": 100.0},) * 4)
+    found = rules(steps(stress.overview(replace(RESULT, cases=(STEP, damped)))))
+    assert kinds(found) == ["fastest frequency", "fastest rate"]
+    told = {r.method: r.words for r in found}
+    assert told["rk4"] == "dt ≤ 2 / ω (fastest frequency); dt ≤ 0.2 / ω (fastest rate)"
+
+
+def test_the_map_marks_where_it_breaks_and_where_theory_lets_it():
+    told = {(r.line.row.engine, r.line.row.method): r for o in stress.overview(RESULT)[:1] for r in section(o).rows}
+    assert [c.style for c in told["pinocchio", "rk4"].cells] == ["h1", "w3 brk", "gross lim", "end"]
+    assert [c.style for c in told["mujoco", "rk4"].cells] == ["h1", "w3 brk", "gross sil lim", "gross sil"]
+    assert [c.text for c in told["mujoco", "mujoco_euler"].cells] == ["1e-3", "NaN", "died", ""]
+    assert "dt ω is 31" in told["pinocchio", "rk4"].cells[2].title
+    assert told["pinocchio", "rk4"].theory == "breaks 100 × earlier"
+    assert ("drake", "rk3") not in told
+
+
+def test_an_interrupted_row_is_filled_with_empty_cells():
+    cut = replace(SPRING, rows=(replace(SPRING.rows[1], cells=SPRING.rows[1].cells[:2]),))
+    told = section(stress.overview(replace(RESULT, cases=(cut,)))[0])
+    assert [c.style for c in told.rows[0].cells] == ["h0", "h0", "none", "none"]
+    page = " ".join(Tags(stress_page(replace(RESULT, cases=(cut,), complete=False))).text.split())
+    assert "auto, then not run" in page
+    assert "interrupted" in page
+
+
+def test_a_page_holds_what_someone_choosing_a_step_asks_for(page):
+    text = " ".join(Tags(page).text.split())
+    for wanted in (
+        "7 silent failures in 3 cases",
+        "rk4: joint_spring at k = 1e6 N m/rad (mujoco)",
+        "it held as far as any in 1 of 1 case",
+        "dt ≤ 2 / ω",
+        "0.00283 s",
+        "breaks 2 × earlier",
+        "A pendulum with a spring of stiffness k.",
+        "Truth for 1 … 1000: closed form. Truth for 1e6 … 1e9: two runs agree.",
+        "fastest frequency",
+        "Left out: drake rk3: refused at t = 0.1 s",
+        "slow at t = 0.1 s",
+        "plots cannot hide it (joint_spring, chain)",
+        "error ≤ 1e-6",
+        "linear theory",
+        "pin 4.1.0",
+        "a processor",
+        "stress.json",
+        "stress.csv",
+    ):
+        assert wanted in text, wanted
+
+
+def test_a_page_needs_nothing_from_elsewhere_and_is_whole(page):
+    for text in (page, stress_page(NASTY, data=HOSTILE, table=HOSTILE)):
+        tags = Tags(text)
+        assert tags.open == []
+        assert not {tag for tag, _ in tags.tags} & {"script", "link", "img", "iframe", "object"}
+        assert not any(name.startswith("on") for _, attributes in tags.tags for name in attributes)
+        # Every link within the page has its place.
+        places = [a["id"] for _, a in tags.tags if "id" in a]
+        assert len(places) == len(set(places))
+        for tag, attributes in tags.tags:
+            target = str(attributes.get("href", "#") or "")
+            if tag == "a" and target.startswith("#"):
+                assert target[1:] in places
+        assert not re.search(r"#0[1-5]0[1-5]0[1-6]", text)
+        assert "default-src 'none'" in text
+        assert "\x1b" not in text
+        assert "\u202e" not in text
+    assert '<script>alert("x")</script>[red]x[/red]' in Tags(stress_page(NASTY)).text
+
+
+def test_a_result_of_nothing_still_has_a_page_a_table_and_a_figure():
+    for empty in (NOTHING, replace(NOTHING, cases=NASTY.cases[2:])):
+        for text in (Tags(stress_page(empty)).text, printed(summary(empty))):
+            assert "interrupted; what was finished: nothing" in text
+        assert figure(empty).axes
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_table_is_a_line_a_case_that_fits_the_terminal(width):
+    many = replace(RESULT, cases=RESULT.cases * 3)
+    text = printed(summary(many), width)
+    assert max(map(len, text.splitlines())) <= width
+    assert sum(x.startswith("joint_spring ") for x in text.splitlines()) == 3
+    for wanted in (
+        "lagrangian auto",
+        "pinocchio (terms)",
+        "1000 nan: mujoco_euler" if width > 80 else "1000 nan",
+        "✗ rk4: joint_spring",
+    ):
+        assert wanted in text, wanted
+    hostile = printed(summary(NASTY), width)
+    assert "\x1b" not in hostile
+    assert "[red]x[/red]" in hostile
+    assert max(map(len, hostile.splitlines())) <= width
+
+
+def test_figures_draw_a_case_or_all_and_refuse_what_there_is_not():
+    drawn = figure(RESULT, "joint_spring").axes[0]
+    assert [t.get_text() for t in drawn.get_xticklabels()] == ["1", "1000", "1e6", "1e9"]
+    assert "✗ 0.5" in [t.get_text() for t in drawn.texts]
+    every = figure(RESULT).axes[0]
+    assert [t.get_text() for t in every.get_yticklabels()] == ["joint_spring", "step_spring", "chain"]
+    # One case alone is drawn as its map.
+    assert figure(replace(RESULT, cases=(TERMS,))).texts[0].get_text().startswith("chain: ")
+    with pytest.raises(UnknownNameError, match="joint_spring"):
+        figure(RESULT, "joint_sprin")
+    for case in NASTY.cases[:4]:
+        figure(replace(NASTY, cases=(case,))).savefig(io.BytesIO(), format="png", dpi=20)
+
+
+def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():
+    for result in (RESULT, NASTY):
+        found = steps(stress.overview(result))
+        drawn = stable_steps(found)
+        assert drawn == stable_steps(found)
+        assert ElementTree.fromstring(drawn).tag.endswith("svg")
+        assert "var(--series2)" in drawn
