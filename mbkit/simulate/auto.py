@@ -18,7 +18,8 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
 from mbkit.model.space import Space
-from mbkit.simulate.auto_course import EXPLICIT, Course, Scene, pause
+from mbkit.simulate.auto_course import Course, pause
+from mbkit.simulate.auto_scene import EXPLICIT, Scene
 from mbkit.simulate.embedded import march, outcome_of, stops_of
 from mbkit.simulate.embedded_trials import Trials
 from mbkit.simulate.events import Event
@@ -70,7 +71,8 @@ def run_auto(
                 break
     tracks = [course.track for course in courses]
     outcome = outcome_of(dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
-    return replace(outcome, chosen=_chosen(courses, batch))
+    doubts = tuple(dict.fromkeys(course.doubt for course in courses if course.doubt))
+    return replace(outcome, chosen=_chosen(courses, batch), doubts=doubts)
 
 
 class _Group:

@@ -1,11 +1,12 @@
 """One trajectory of method auto: what is looked at on the way, and what follows from it.
 
 After some tries, and each time that there are several times as many, it is asked how many more the run will take.
-Where that is a lot, rodas5 makes some tries of its own from the state reached. If it gets further with them than
-rk853, it goes on from there; if not, they are forgotten, and rk853 goes on as if there had been none. The
-linearized system (`mbkit.simulate.stiffness`) tells why: near the edge of rk853's region of stability, h|λ| of about
-5, its steps are short for no other reason. Where rk853 stays, to follow an oscillation, the errors of its many steps
-add up, and their tolerance is tightened to what their number asks for.
+Where that is a lot, the linearized system (`mbkit.simulate.stiffness`) tells what holds the steps: near the edge of
+rk853's region of stability, h|λ| of about 5, they are short for no other reason. There, and where very many are to
+come, rodas5 makes some tries of its own from the state reached. If it gets further with them than rk853, it goes on
+from their end; if not, they are forgotten, and rk853 goes on as if there had been none. Where rk853 stays, to
+follow an oscillation, the errors of its many steps add up, and their tolerance is tightened to what their number asks
+for.
 
 While rodas5 goes on, looks at the linearized system say whether rk853 would be as fast, as where what is stiff has
 come to an end. Where one method's steps fall below rounding the other one may go on; where neither can, as where a
@@ -22,58 +23,21 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines import Dynamics
-from mbkit.errors import NumericalError
-from mbkit.model.space import Space
-from mbkit.simulate.embedded import Track, make_trials, march
+from mbkit.errors import FunctionError, NumericalError
+from mbkit.simulate.auto_scene import EXPLICIT, IMPLICIT, Gauge, Scene
+from mbkit.simulate.embedded import Track, march
 from mbkit.simulate.embedded_trials import ROUNDS, Stretch, Trials
 from mbkit.simulate.events import Event
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.stiffness import Stiffness, linearized, stiffness_of
-from mbkit.simulate.torque import Torque
 
-__all__ = ["EXPLICIT", "IMPLICIT", "Course", "Scene", "pause"]
-
-EXPLICIT, IMPLICIT = "rk853", "rodas5"
-
-
-@dataclass(frozen=True)
-class _Pace:
-    """When to look, by how the tries are made.
-
-    Attributes
-    ----------
-    first, later : int
-        Tries before the first look, and by how much more before each next one.
-    worth : int
-        Tries that a run must still have before it for a look.
-    pilot : int
-        Tries by which rodas5 is judged.
-    dearer : float
-        Time of a try of rodas5 over that of one of rk853.
-    """
-
-    first: int
-    later: int
-    worth: int
-    pilot: int
-    dearer: float
-
-
-# Measured by validation/auto.py, in time of the processor: in machine code a look takes as long as 100 to 150 tries
-# of rk853, in Python as 15 to 20, those of rodas5 among them; a try of rodas5 takes 0.8 to 1.2 times as long as one of
-# rk853 in machine code, where eight stages, a Jacobian and its factors stand against twelve stages, and 1.2 to 1.6
-# times in Python. A look then costs at most a tenth of the run.
-_COMPILED: Final = _Pace(first=64, later=4, worth=1500, pilot=24, dearer=1.2)
-_IN_PYTHON: Final = _Pace(first=8, later=2, worth=100, pilot=10, dearer=1.5)
+__all__ = ["Course", "pause"]
 
 #: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative axis and to 5 on the
 #: imaginary one; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
 _EDGE: Final = 3.0
 #: The h|λ| that rk853 keeps where stability holds its steps.
 _KEPT: Final = 5.0
-#: Steps whose mean is compared with the rates where they end.
-_RECENT: Final = 8
 #: By how much rodas5 must be faster.
 _FASTER: Final = 1.5
 #: First step of rodas5, of what remains: too long is soon found out, while growing from rk853's steps takes a
@@ -84,69 +48,34 @@ _MANY: Final = 1000.0
 #: n steps with errors of the tolerance, in a norm that is a mean over 2 nv numbers, add up to at most n √(2 nv)
 #: of it. They shall not exceed _SUM of it; what was measured is a third to a three-hundredth of that.
 _SUM: Final = 400.0
-#: Steps in all that are believed in, by how many there were.
+#: Steps that are believed to come, for each that there was.
 _BELIEVED: Final = 64
-#: No tolerance below: rounding would be taken for error, and steps shrink without end.
+#: No tolerance below: rounding would be taken for error, and steps shrink without end. Where that comes earlier, it
+#: shows in steps that shrink with this power of the tolerance, and not with the eighth root as rk853's.
 _LEAST: Final = 1e-13
-#: Where steps fall below rounding: by how much the tolerance is loosened, how often in a run, and up to what.
+_COLLAPSE: Final = 1 / 3
+#: Steps of this part of a run are far from rounding.
+_AWAY: Final = 1e-9
+#: Where steps fall below rounding: by how much the tolerance is loosened, up to what, and how often anything is done.
 _LOOSER: Final = 10.0
-_RESCUES: Final = 8
 _LOOSEST: Final = 1e-5
+_RESCUES: Final = 8
 #: Changes of the method that are told one by one.
 _TOLD: Final = 3
 
 
-class Scene:
-    """What all trajectories of a run share.
+@dataclass
+class _Leg:
+    """A part of a run by one method: from when on and why, and what else there is to say."""
 
-    Attributes
-    ----------
-    space : Space
-    tolerances : Tolerances
-    duration : float
-        s.
-    stops : sequence of float
-        As of `mbkit.simulate.embedded.stops_of`.
-    compiled : bool
-        Whether steps run as machine code.
-    """
-
-    def __init__(
-        self,
-        dyn: Dynamics,
-        space: Space,
-        tolerances: Tolerances,
-        torque: Torque,
-        duration: float,
-        batch: int | None,
-        stops: Sequence[float],
-    ) -> None:
-        self._dyn, self._torque, self.batch = dyn, torque, batch
-        self.space, self.tolerances, self.duration, self.stops = space, tolerances, duration, stops
-        self._trials: list[Trials] = []
-        self.compiled = False
-
-    def make(self, method: str, tolerances: Tolerances) -> Trials:
-        """Return what tries a method's steps; its evaluations are counted with all others."""
-        given = self._dyn, self.space, tolerances, self._torque, self.duration, self.batch
-        made = make_trials(method, *given)
-        self._trials.append(made)
-        self.compiled = made.rounds > 1
-        return made
-
-    @property
-    def evaluations(self) -> int:
-        """Of the forward dynamics, by all trials."""
-        return sum(trials.evaluations for trials in self._trials)
-
-    @property
-    def jacobians(self) -> int:
-        """Of the forward dynamics, by all trials."""
-        return sum(trials.jacobians for trials in self._trials)
+    method: str
+    t: float
+    why: str = ""
+    note: str = ""
 
 
 class _Track(Track):
-    """One trajectory that may go on in another way where one method is stuck."""
+    """One trajectory that may go on in another way where a method is stuck."""
 
     rescues = 0
     stalled = False
@@ -158,57 +87,6 @@ class _Track(Track):
             self.stalled = True
             return True
         return super().stuck(trials, place)
-
-
-class _Gauge:
-    """How fast a method goes, judged by the later half of its tries."""
-
-    def __init__(self, t: float, first: int, later: int) -> None:
-        self._next, self._later = first, later
-        # Tries and time.
-        self._marks = [(0, t)]
-        self._ends = [t]
-
-    @property
-    def missing(self) -> int:
-        """Tries until the next look."""
-        return self._next - self._marks[-1][0]
-
-    def saw(self, made: Stretch) -> None:
-        """Count tries."""
-        tries, half = self._marks[-1][0], len(made.t) // 2
-        if made.tried > 1:
-            self._marks.append((tries + made.tried // 2, float(made.t[half])))
-        self._marks.append((tries + made.tried, float(made.t[-1])))
-        self._ends = [*self._ends, *made.t[1:].tolist()][-_RECENT - 1 :]
-
-    def due(self) -> bool:
-        """Return whether it is time to look."""
-        due = self.missing <= 0
-        if due:
-            self._next = self._later * self._marks[-1][0]
-            self._marks = [mark for mark in self._marks if mark[0] >= self._marks[-1][0] // 4]
-        return due
-
-    def pace(self) -> float:
-        """Return the tries for each second of the motion."""
-        tries, t = self._marks[-1]
-        before = next((mark for mark in reversed(self._marks) if mark[0] <= tries / 2), self._marks[0])
-        return (tries - before[0]) / (t - before[1]) if t > before[1] else math.inf
-
-    def step(self) -> float:
-        """Return the mean length of the last steps, s; 0 where there were none."""
-        return (self._ends[-1] - self._ends[0]) / max(1, len(self._ends) - 1)
-
-
-@dataclass
-class _Leg:
-    """A part of a run by one method: from when and why, and what else there is to say."""
-
-    method: str
-    t: float
-    why: str = ""
-    note: str = ""
 
 
 def pause(trials: Trials, courses: Sequence[Course]) -> None:
@@ -233,19 +111,25 @@ class Course:
     ----------
     track : Track
     doubt : str
-        What the user should know; empty where all is well.
+        What the user must know; empty where all is well.
     """
 
     def __init__(self, scene: Scene, index: int, nq: int, save: Array | None, events: tuple[Event, ...]) -> None:
-        self._scene, self._index, self._tolerances = scene, index, scene.tolerances
+        self._scene, self._index = scene, index
         self.track = _Track(scene.space, nq, index, scene.batch, save, events, scene.tolerances)
         self.doubt = ""
+        # As asked for or loosened, and as tightened.
+        self._base = self._tolerances = scene.tolerances
         self._legs = [_Leg(EXPLICIT, 0.0)]
-        self._gauge: _Gauge | None = None
+        self._gauge: Gauge | None = None
         self._at: tuple[float, Array, Array] = 0.0, np.empty(0), np.empty(0)
+        self._tries = 0
+        # At the last look at rk853: the fastest lasting oscillation; the tolerance and the tries for each second.
+        self._turning, self._looser = 0.0, (scene.tolerances.rtol, 0.0)
+        self._returns = 0
+        self._least = _LEAST
         self._next: Trials | None = None
         self._ahead: list[Stretch] = []
-        self._tries = 0
         self._stalled_at = -1.0
 
     # On the way
@@ -253,11 +137,13 @@ class Course:
     @property
     def missing(self) -> int:
         """Tries until the next look."""
-        return self._pace.first if self._gauge is None else max(1, self._gauge.missing)
+        return self._first if self._gauge is None else max(1, self._gauge.missing)
 
     @property
-    def _pace(self) -> _Pace:
-        return _COMPILED if self._scene.compiled else _IN_PYTHON
+    def _first(self) -> int:
+        # Later after each return, lest the methods take turns for ever.
+        returns = self._returns if self._legs[-1].method == EXPLICIT else 0
+        return self._scene.pace.first << 2 * returns
 
     @property
     def _rest(self) -> float:
@@ -269,9 +155,9 @@ class Course:
         return member.ended != "finished" or member.reached >= self._scene.duration
 
     def leaves(self, trials: Trials, place: int, made: Stretch) -> bool:
-        """Look at what was made; return whether other tries go on from its end."""
+        """Look at what was made and taken in; return whether other tries go on from its end."""
         if self._gauge is None:
-            self._gauge = _Gauge(float(made.t[0]), self._pace)
+            self._gauge = self._scene.gauge(float(made.t[0]), self._first)
         self._gauge.saw(made)
         self._tries += made.tried
         self._at = float(made.t[-1]), made.q[-1], made.w[-1]
@@ -284,34 +170,163 @@ class Course:
 
     def alone(self, tell: Callable[[], None]) -> None:
         """Go on to the end, where other tries were to."""
-        stops = self._scene.stops
         while self._next is not None and not self._over:
             trials, self._next, self._gauge = self._next, None, None
-            first = int(np.searchsorted(stops, self._at[0], side="right"))
             ahead, self._ahead = self._ahead, []
-            pause(trials, [self])
-            for made in march(trials, [self.track], stops, first, ahead):
-                if self.leaves(trials, 0, made[0][1]):
-                    trials.drop(0)
+            if all(self._goes_on(trials, made) for made in ahead):
                 pause(trials, [self])
-                tell()
+                for (_, made), *_ in march(trials, [self.track], self._scene.stops, self._interval):
+                    if self.leaves(trials, 0, made):
+                        trials.drop(0)
+                    pause(trials, [self])
+                    tell()
 
-    def _begin(self, method: str, t: float) -> Trials:
-        """Return tries that begin here."""
+    def _goes_on(self, trials: Trials, made: Stretch) -> bool:
+        taken = self.track.take(trials, 0, made)
+        return taken and not self.leaves(trials, 0, made)
+
+    @property
+    def _interval(self) -> int:
+        return int(np.searchsorted(self._scene.stops, self._at[0], side="right"))
+
+    def _begun(self, method: str) -> Trials:
+        """Return tries of a method that begin here."""
         t, q, w = self._at
-        trials = self._scene.make(method, self._tolerances)
+        trials = self._scene.make(method, self._base)
         trials.start([self._index], q[None], w[None], t, _BEGIN * self._rest if method == IMPLICIT else 0.0)
         return trials
 
-    def _go_on(self, method: str, why: str, note: str = "") -> None:
-        self._legs.append(_Leg(method, self._at[0], why, note))
+    def _turn(self, method: str, why: str) -> None:
+        """Go on with a method from here."""
+        self._next, self._tolerances = self._begun(method), self._base
+        self._looser = self._base.rtol, 0.0
+        self._legs.append(_Leg(method, self._at[0], why))
 
     # Looks
 
-    def _look(self, trials: Trials, place: int, gauge: _Gauge) -> None:
+    def _look(self, trials: Trials, place: int, gauge: Gauge) -> None:
         """Decide on rk853."""
-        tries, step = gauge.pace(), gauge.step()
-        if tries * self._rest < self._pace.worth or not step:
+        rate, step, pace = gauge.rate(), gauge.step(), self._scene.pace
+        to_come = rate * self._rest
+        if to_come < pace.worth or not step:
             return
         found = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._scene.duration))
         held = found is not None and step * found.stable >= _EDGE
+        # Not where steps have been short alone, but where they are.
+        if (held or to_come >= pace.guess) and self._faster(min(rate, 1 / step)):
+            told = "" if found is None else f"; {found}"
+            why = "stability held its steps" if held else "rodas5 got further with a try"
+            size = "" if found is None else f" (h|λ| = {step * found.stable:.1f}{told})"
+            self._legs.append(_Leg(IMPLICIT, self._at[0], f"where {why}{size}"))
+        elif found is not None:
+            # What was not there at the last look is a passage, and no oscillation that stays.
+            self._turning, turning = found.lasting(self._rest), self._turning
+            turns = min(turning, self._turning) * self._scene.duration
+            before, slower = self._looser
+            if slower and rate / slower > (before / self._tolerances.rtol) ** _COLLAPSE > 1:
+                self._least = before
+            self._looser = self._tolerances.rtol, rate
+            if turns < _MANY:
+                self._tolerate(trials, place, 0.0, "")
+            else:
+                self._tolerate(trials, place, to_come, f" of {turns:.1g} rad of oscillation")
+
+    def _faster(self, rate: float) -> bool:
+        """Let rodas5 try, and make its tries the next ones if it is faster."""
+        pace, trials = self._scene.pace, self._begun(IMPLICIT)
+        gauge, ahead, tried = self._scene.gauge(self._at[0], pace.pilot), [], 0
+        if trials.rounds > 1:
+            trials.rounds = pace.pilot
+        try:
+            trials.hold(self._interval, self._scene.stops[self._interval])
+            while tried < pace.pilot and (got := trials.advance()):
+                ahead.append(got[0][1])
+                gauge.saw(ahead[-1])
+                tried += ahead[-1].tried
+        except FunctionError:
+            # Of a state where rk853 may never come.
+            return False
+        # With the tolerance that so many steps ask for.
+        tighter = self._factor(gauge.rate() * self._rest) ** (-1 / 5)
+        better = bool(pace.dearer * _FASTER * tighter * gauge.rate() < rate)
+        if better:
+            self._next, self._ahead, self._tolerances = trials, ahead, self._base
+        return better
+
+    def _look_back(self, trials: Trials, place: int, gauge: Gauge) -> None:
+        """Decide on rodas5."""
+        pace, rate = self._scene.pace, gauge.rate()
+        to_come = rate * self._rest
+        if pace.dearer * to_come >= pace.worth and gauge.step() > _AWAY * self._scene.duration:
+            found = self._spectrum(trials, place, 0.0)
+            if found is not None and found.stable / _KEPT < pace.dearer * rate:
+                self._returns += 1
+                self._turn(EXPLICIT, f"where stability no longer held rk853's ({found})")
+                return
+        self._tolerate(trials, place, to_come, "")
+
+    def _spectrum(self, trials: Trials, place: int, enough: float) -> Stiffness | None:
+        """Return how fast the motions here are; None where that is no number."""
+        _, q, w = self._at
+        try:
+            J = linearized(self._scene.space, q, w, lambda q, w: trials.rates(place, q, w))
+            return stiffness_of(J, enough, exact=False)
+        except (NumericalError, FunctionError):
+            return None
+
+    def _factor(self, to_come: float) -> float:
+        """Return what the tolerance is multiplied by, so that the errors of all steps to come are as small together."""
+        steps = min(to_come, _BELIEVED * self._tries)
+        return min(1.0, _SUM / (steps * math.sqrt(2 * self._scene.space.nv))) if to_come else 1.0
+
+    def _tolerate(self, trials: Trials, place: int, to_come: float, of: str) -> None:
+        """Let the tolerance follow the number of steps to come."""
+        factor = max(self._factor(to_come), min(1.0, self._least / self._base.rtol))
+        rtol, atol = (x * factor for x in self._base)
+        # A change that hardly changes a step is none.
+        if not 0.5 < rtol / self._tolerances.rtol < 2.0:
+            self._tolerances = Tolerances(rtol, atol)
+            trials.tighten(place, self._tolerances)
+            self._legs[-1].note = f"at rtol = {rtol:.1g} in the end, as errors{of} add up" if factor < 1 else ""
+
+    def _rescue(self) -> None:
+        """Go on where steps fell below rounding: by the other method, or else with a looser tolerance."""
+        t, other = self._at[0], IMPLICIT if self._legs[-1].method == EXPLICIT else EXPLICIT
+        if t != self._stalled_at:
+            self._stalled_at = t
+            self._turn(other, "where its steps fell below rounding")
+            return
+        looser = [min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base]
+        if looser[0] <= self._base.rtol:
+            # The next time is the last.
+            self.track.rescues = _RESCUES
+        asked, self._base = self._scene.tolerances.rtol, Tolerances(*looser)
+        self._tolerances = self._base
+        self.doubt = (
+            f"at rtol = {asked:g} its steps fell below rounding near t = {t:.6g} s, where accelerations are known to "
+            f"few digits; it went on at {self._base.rtol:.0e}. Leave out what has next to no mass, or compute with 34 "
+            "digits: mbkit.dynamics(model, 'oracle') and method='taylor'"
+        )
+        self._turn(EXPLICIT, "where its steps fell below rounding too")
+        self._legs[-1].note = f"at rtol = {self._base.rtol:.0e}"
+
+    # In words
+
+    def kind(self) -> str:
+        """Return the methods in their order."""
+        methods = [leg.method for leg in self._legs]
+        return f"{methods[0]} throughout" if len(methods) == 1 else ", then ".join(methods)
+
+    def told(self) -> str:
+        """Return what was chosen and why."""
+        legs, parts = self._legs, []
+        skipped = len(legs) - 1 - 2 * _TOLD
+        for i, leg in enumerate(legs):
+            if skipped > 0 and _TOLD < i <= _TOLD + skipped:
+                if i == _TOLD + 1:
+                    parts.append(f"{skipped} more changes")
+                continue
+            where = "" if not i else " from there"
+            until = f" to t = {legs[i + 1].t:.3g} s, {legs[i + 1].why}" if i + 1 < len(legs) else ""
+            parts.append(f"{leg.method}{where}{until}{f', {leg.note}' if leg.note else ''}")
+        return self.kind() if len(legs) == 1 and not legs[0].note else "; ".join(parts)

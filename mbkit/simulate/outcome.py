@@ -32,3 +32,4 @@ class Outcome:
     events: tuple[Hit, ...] = ()
     error: FunctionError | None = None
     chosen: str = ""
+    doubts: tuple[str, ...] = ()

@@ -187,7 +187,7 @@ def simulate(
     found: list[str] = []
     if doubt and outcome.ended in ("finished", "event"):
         found = doubts(dyn, chosen, setting, outcome.t, outcome.q, outcome.v, pushed=torque is not None)
-    return _wrapped(dyn, chosen, applied, outcome, seconds, tuple(found))
+    return _wrapped(dyn, chosen, applied, outcome, seconds, (*outcome.doubts, *found))
 
 
 def _require_engine(dyn: Dynamics, method: Method) -> None:

@@ -36,8 +36,8 @@ QUICK_METHODS: Final = {
     "mujoco": ("mujoco_rk4", "mujoco_euler", "mujoco_implicitfast", "mujoco_discrete"),
 }
 #: Seconds that a run may take, and the whole study, quick and not.
-_SECONDS: Final = {True: 0.5, False: 5.0}
-_BUDGET: Final = {True: 110.0, False: 1700.0}
+_SECONDS: Final = {True: 0.5, False: 2.0}
+_BUDGET: Final = {True: 105.0, False: 1700.0}
 _MEMORY: Final = 2 * 2**30
 #: Below it no worker starts, bytes.
 _LEAST_MEMORY: Final = 2**29
@@ -88,12 +88,12 @@ def stress(
         Up to this error, relative to the size of the motion or term, a value is held,
         where a case has no bar of its own.
     seconds : float, optional
-        That a run may take, of the processor's time; 5, in a quick study 0.5. Making the problem, deriving and
-        compiling may take six times as long.
+        That a run may take, of the processor's time; 2, in a quick study 0.5. Making the
+        problem, deriving and compiling may take fifteen times as long.
     memory : int, optional
         Bytes that a worker process may take, 2 GiB when not given; enforced on Linux.
     budget : float, optional
-        Seconds that the study may take as a whole, 1700, in a quick study 110. What is
+        Seconds that the study may take as a whole, 1700, in a quick study 105. What is
         not reached by then is "not run".
     jobs : int, optional
         Processes side by side; by default as many as there are processors, and not

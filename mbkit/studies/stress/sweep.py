@@ -18,7 +18,7 @@ __all__ = ["Asks", "Bounds", "CaseSweep"]
 
 #: How much longer than a run the making of a problem and an engine, and deriving and compiling, may take, and at
 #: the least, s.
-_MAKING: Final = 6.0
+_MAKING: Final = 15.0
 _MAKING_LEAST: Final = 6.0
 #: A run is not begun with less time than this, s.
 _LEAST: Final = 0.1
@@ -27,6 +27,8 @@ _IN_VAIN: Final = 2
 #: The part of a truth's time that its search gets, and what making engines for it may take besides, s.
 _SEARCH: Final = 0.7
 _TRUTH_LEAST: Final = 2.0
+#: What terms with 34 digits may take at one value, for which there is no substitute, s.
+_TERMS: Final = 60.0
 
 #: Asks a worker, which may be lost.
 Asks = Callable[[Request, Patience], Answer]
@@ -164,7 +166,9 @@ class CaseSweep:
 
     def _prepare(self, i: int, value: float, ask: Asks, share: float) -> None:
         def patience(doing: Doing) -> float:
-            return self._making if doing == "case" else share + _TRUTH_LEAST
+            if doing == "case":
+                return self._making
+            return _TERMS if self.case.measure == "terms" else share + _TRUTH_LEAST
 
         self._facts[i] = {}
         try:
