@@ -139,7 +139,7 @@ def rates(equations: Equations) -> ca.Function:
     a = forward(q, eq.v, eq.tau, *eq.trailing.values())
     given = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.trailing}
     outs = [ca.densify(eq.kin.qdot), ca.densify(a)]
-    return ca.Function("rates", list(given.values()), outs, list(given), ["qdot", "a"], {"cse": True})
+    return ca.Function("rates", list(given.values()), outs, list(given), ["qdot", "a"])
 
 
 class TaylorSystem:
