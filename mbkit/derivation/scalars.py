@@ -1,4 +1,4 @@
-"""Scalar expressions whose arithmetic is quick to write down.
+"""Expressions whose arithmetic is quick to write down, entry by entry.
 
 CasADi's operators first look for what their operands could be converted to, some
 15 µs each; `SX.binary` is told, and takes 2. A tree's kinematics are tens of thousands
