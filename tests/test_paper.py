@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
@@ -165,21 +166,14 @@ def test_dynamicsymbols_and_plain_ones_are_the_same_system():
 
 
 METHODS = ("rk4", "gauss6", "rk853", "taylor", "dop853", "radau", "bdf", "lsoda", "cvodes", "implicit_midpoint")
+SAVE = (0.0, 0.1, 0.3)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("make", ALL)
-def test_every_method_runs_it(make, method):
+@cache
+def solved(make):
+    """Return a system's dynamics, a state, and its motion by SymPy's accelerations and SciPy."""
     lag = make()
     q, v, _ = (s[0] for s in states(lag))
-    dyn, save = lag.dynamics(), [0.0, 0.1, 0.3]
-    if method == "taylor" and make is cart:
-        # Its drag has a kink, where a series would go on as if there were none.
-        return
-    if make in (driven, rheonomic) and method in ("cvodes", "implicit_midpoint"):
-        with pytest.raises(UnsupportedError, match="depends on the time"):
-            mb.simulate(dyn, q, v, 0.3, method, save=save)
-        return
     acceleration = sp.lambdify(
         [*lag.coordinates, *lag.velocities, *([lag.time] if lag.time else [])],
         [e.rhs.subs({**lag.parameters, **dict.fromkeys(lag.inputs.values(), 0)}) for e in lag.equations().explicit()],
@@ -189,10 +183,23 @@ def test_every_method_runs_it(make, method):
         n = len(q)
         return [*y[n:], *acceleration(*y, *([s] if lag.time else []))]
 
-    truth = solve_ivp(rate, (0, 0.3), [*q, *v], "DOP853", save, rtol=1e-13, atol=1e-13).y
+    return lag.dynamics(), q, v, solve_ivp(rate, (0, 0.3), [*q, *v], "DOP853", SAVE, rtol=1e-13, atol=1e-13).y
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("make", ALL)
+def test_every_method_runs_it(make, method):
+    dyn, q, v, truth = solved(make)
+    if method == "taylor" and make is cart:
+        # Its drag has a kink, where a series would go on as if there were none.
+        return
+    if make in (driven, rheonomic) and method in ("cvodes", "implicit_midpoint"):
+        with pytest.raises(UnsupportedError, match="depends on the time"):
+            mb.simulate(dyn, q, v, 0.3, method, save=SAVE)
+        return
     tight = {"bdf": 1e-9, "cvodes": 1e-10, "radau": 1e-9}
     setting = {"dt": 1e-3} if METHODS_OF[method].kind == "fixed" else {"rtol": tight.get(method, 1e-11)}
-    run = mb.simulate(dyn, q, v, 0.3, method, save=save, **setting)
+    run = mb.simulate(dyn, q, v, 0.3, method, save=SAVE, **setting)
     bound = {"implicit_midpoint": 1e-4, "bdf": 1e-6, "cvodes": 1e-6, "radau": 1e-7, "rk4": 1e-7}.get(method, 1e-8)
     assert np.abs(run.q.T - truth[: len(q)]).max() < bound
 

@@ -84,7 +84,9 @@ class Kinematics:
     @cached_property
     def placements(self) -> dict[str, tuple[Any, Vector]]:
         """(R_JC, p_JC_J) of every joint."""
-        return {j.name: j.type.placement(scalars, self.values.joints[j.name], self._q_of[j.name]) for j in self.model.tree}
+        return {
+            j.name: j.type.placement(scalars, self.values.joints[j.name], self._q_of[j.name]) for j in self.model.tree
+        }
 
     @cached_property
     def twists(self) -> dict[str, tuple[Vector, Vector]]:

@@ -8,10 +8,9 @@ of CasADi's own search for common subexpressions.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 import casadi as ca
 import numpy as np
@@ -120,6 +119,10 @@ class Program:
         return sum(o.name not in ("input", "const") for o in self.operations)
 
 
+#: Name, arguments and value of an operation.
+_Entry = tuple[str, tuple[int, ...], float]
+
+
 def program(function: ca.Function) -> Program:
     """Return the operations of an expanded function with dense outputs.
 
@@ -132,7 +135,8 @@ def program(function: ca.Function) -> Program:
     """
     where: dict[int, int] = {}
     operations: list[Operation] = []
-    known: dict[Any, int] = {}
+    made: _Entry
+    known: dict[_Entry, int] = {}
     shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
     outputs = [np.full(rows * columns, -1, dtype=np.intp) for rows, columns in shapes]
     if any(function.nnz_out(i) != out.size for i, out in enumerate(outputs)):
@@ -157,9 +161,8 @@ def program(function: ca.Function) -> Program:
             made = (_BINARY[code], (where[given[0]], where[given[1]]), 0.0)
         else:
             raise UnsupportedError(_unknown(function, code))
-        # Zeros of both signs are equal, and are not the same.
-        key = (*made, math.copysign(1.0, made[2])) if code == ca.OP_CONST else made
-        place = where[out[0]] = known.setdefault(key, len(operations))
+        # CasADi has one zero, so that equal constants are the same.
+        place = where[out[0]] = known.setdefault(made, len(operations))
         if place == len(operations):
             operations.append(Operation(*made))
     return Program(

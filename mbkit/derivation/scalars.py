@@ -15,7 +15,7 @@ import casadi as ca
 __all__ = ["Scalar", "cos", "scalar", "sin"]
 
 
-class Scalar(ca.SX):  # type: ignore[misc]  # casadi has no type information
+class Scalar(ca.SX):
     """A `casadi.SX` whose operators take expressions and floats, and no other operand.
 
     Zeros and ones among the floats vanish, as they do in CasADi.
