@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
+from mbkit.lagrangian.probe import vanishes
 from mbkit.lagrangian.tidy import tidy
 
 if TYPE_CHECKING:
@@ -62,7 +63,8 @@ class ConservedQuantity:
 
 
 def _vanish(parts: Iterable[sp.Expr]) -> bool:
-    return all(x == 0 or tidy(x) == 0 for x in parts)
+    # Decimals that cancel do so in their own digits only.
+    return all(vanishes(x) or (x.has(sp.Float) and tidy(x) == 0) for x in parts)
 
 
 def _in_no_energy(system: Lagrangian, q: sp.Symbol) -> bool:
@@ -80,7 +82,7 @@ def acting(system: Lagrangian) -> list[sp.Expr]:
 
 def _along(system: Lagrangian) -> dict[sp.Symbol, sp.Expr]:
     """Return what acts along each coordinate beside V, the constraints with their λ among it."""
-    multipliers = [(sp.Symbol(f"lambda{k + 1}"), f) for k, f in enumerate(system.constraints)]
+    multipliers = list(zip(system.multiplier_symbols, system.constraints, strict=True))
     return {
         q: tidy(x + sum((sp.diff(f, q) * symbol for symbol, f in multipliers), sp.Integer(0)))
         for q, x in zip(system.coordinates, acting(system), strict=True)
@@ -96,7 +98,7 @@ def cyclic_coordinates(system: Lagrangian) -> tuple[dict[sp.Symbol, sp.Expr], tu
 
 def conserved_momenta(system: Lagrangian) -> dict[sp.Symbol, sp.Expr]:
     """Return ∂L/∂v of each cyclic coordinate along which nothing acts."""
-    _, free = cyclic_coordinates(system)
+    free = system.cyclic_coordinates()
     return {q: p for q, p in zip(system.coordinates, system.momenta, strict=True) if q in free}
 
 

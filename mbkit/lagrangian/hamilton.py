@@ -19,14 +19,15 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, rows
+from mbkit._check import Array, real, rows
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian import cyclic
 from mbkit.lagrangian.cyclic import ConservedQuantity
 from mbkit.lagrangian.numeric import Numeric, values_of
-from mbkit.lagrangian.poisson import bracket, momentum_symbol, shorter
+from mbkit.lagrangian.poisson import bracket, momentum_symbols, shorter
+from mbkit.lagrangian.slopes import slope
 from mbkit.lagrangian.squares import Squares
-from mbkit.lagrangian.symbols import expression, velocity_of
+from mbkit.lagrangian.symbols import in_symbols_of, velocity_of
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
@@ -124,7 +125,7 @@ class Hamiltonian:
             momentum_rates=tuple(velocity_of(p) for p in self.momenta),
             qdot=self.velocities,
             # The squares of H stay together.
-            pdot=sp.ImmutableMatrix([x - sp.diff(self.H, q) for q, x in zip(s.coordinates, forces, strict=True)]),
+            pdot=sp.ImmutableMatrix([x - slope(self.H, q) for q, x in zip(s.coordinates, forces, strict=True)]),
         )
 
     def equations(self) -> CanonicalEquations:
@@ -134,8 +135,14 @@ class Hamiltonian:
     # Brackets
 
     def canonical(self, f: Any) -> sp.Expr:
-        """Return an expression with the velocities in it written in momenta."""
-        out = expression("f", f)
+        """Return an expression with the velocities in it written in momenta.
+
+        Raises
+        ------
+        InputError
+            Symbols that the system does not know.
+        """
+        out = in_symbols_of(self.system, "f", f, self.momenta)
         return sp.sympify(out.subs(dict(zip(self.system.velocities, self.velocities, strict=True)), simultaneous=True))
 
     def poisson(self, f: Any, g: Any) -> sp.Expr:
@@ -184,7 +191,7 @@ class Hamiltonian:
 
     def _behind(self, t: float, values: dict[str, float], what: str) -> Array:
         told = values_of(self.system, values, what)
-        return told if self.system.time is None else np.array([float(t), *told])
+        return told if self.system.time is None else np.array([real("t", t), *told])
 
     def _mass(self, q: ArrayLike, other: ArrayLike, name: str, t: float, values: dict[str, float]) -> Any:
         n = len(self.coordinates)
@@ -226,6 +233,8 @@ class Hamiltonian:
     def field(self, tau: ArrayLike | None = None, **values: float) -> Callable[[float, ArrayLike], Array]:
         """Return f(t, y) = (q̇, ṗ) with y = (q, p), as SciPy's integrators take it.
 
+        Where the mass matrix is singular the answer is not finite, at which an integrator takes a shorter step.
+
         Parameters
         ----------
         tau : (n,) array_like, optional
@@ -243,7 +252,7 @@ class Hamiltonian:
 
         def f(t: float, y: ArrayLike) -> Array:
             y = rows("y", y, 2 * n, s.name, "nq + nv")
-            behind = np.concatenate([acting, [t] if timed else [], told])
+            behind = np.concatenate([acting, [real("t", t)] if timed else [], told])
             return self._rates(y[..., :n], y[..., n:], behind)[..., 0]
 
         return f
@@ -274,8 +283,7 @@ def hamiltonian(system: Lagrangian) -> Hamiltonian:
             f"hamiltonian: {system.name} has constraints, whose forces no H holds; embed them first, or leave them out"
         )
     k = system.kinetic
-    taken = {s.name for s in (*system.parameters, *system.coordinates, *system.velocities)}
-    momenta = tuple(momentum_symbol(q, taken) for q in system.coordinates)
+    momenta = momentum_symbols(system, system.coordinates)
     p = [symbol - x for symbol, x in zip(momenta, k.b, strict=True)]
     squares = Squares(k.M, "T: its mass matrix")
     return Hamiltonian(
