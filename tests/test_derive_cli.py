@@ -154,7 +154,8 @@ def test_symbols_as_they_are_written():
 
 
 def test_expressions_on_one_line():
-    board = Blackboard(systems.kepler().equations())
+    orbit = systems.kepler()
+    board = Blackboard(orbit.coordinates, orbit.velocities)
     m, k, r, g, th = sp.symbols("m k r g theta")
     told = {
         -k / r: "-k/r",
