@@ -135,6 +135,7 @@ class Account:
         rows = [f"{name} &= {board.latex(self._short(x))}" for name, x in (("T", s.T), ("V", s.V))]
         if s.dissipation != 0:
             rows.append(f"R &= {board.latex(self._short(s.dissipation))}")
+        rows += [f"{board.latex(letter)} &= {board.latex(root)}" for letter, root in self._short.roots.items()]
         for name, (given, _) in self._matrices.items():
             A = given.applyfunc(self._short)
             entries = r" \\ ".join(" & ".join(board.latex(x) for x in A[i, :]) for i in range(A.rows))

@@ -37,6 +37,8 @@ class Blackboard:
 
     def __init__(self, *groups: Iterable[sp.Symbol], time: sp.Symbol | None = None) -> None:
         self._moving = {s: k for k, group in enumerate(groups) for s in group}
+        #: Velocities, accelerations and momenta: what holds most of them comes first in a sum.
+        self._fast = {s: k for s, k in self._moving.items() if k}
         self._time = time
 
     # Order
@@ -73,10 +75,11 @@ class Blackboard:
         def key(term: sp.Expr) -> tuple[Any, ...]:
             factors = sp.Mul.make_args(term)
             powers = {b: int(e) if e.is_Integer else 1 for b, e in (f.as_base_exp() for f in factors)}
-            speeds = [-powers.get(s, 0) for s, k in self._moving.items() if k]
+            speeds = [-powers.get(s, 0) for s in self._fast]
+            degree = sum(e for b, e in powers.items() if b.free_symbols & self._fast.keys())
             turned = sorted((*self._place(a.args[0]), str(a)) for a in term.atoms(sp.sin, sp.cos))
             ranks = sorted(self._rank(f) for f in factors if not f.is_Number)
-            return (speeds, len(turned), turned, _signed(term)[0], len(ranks) > 1, ranks, str(term))
+            return (-degree, speeds, len(turned), turned, _signed(term)[0], len(ranks) > 1, ranks, str(term))
 
         out = sorted(terms, key=key)
         # A sum does not begin with a minus where it need not.
@@ -171,7 +174,7 @@ class Blackboard:
         return self._latex(self._terms(parts))
 
     def _latex(self, terms: list[sp.Expr]) -> str:
-        printer = _Latex({"order": "none", "full_prec": False})
+        printer = _Latex({"order": "none", "full_prec": False, "fold_func_brackets": True})
         out = ""
         for term in terms:
             minus, size = _signed(term)

@@ -294,9 +294,8 @@ def _content(poly: _Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, _Poly]:
     """Return the powers and the number that all terms share, and what is left."""
     first, *others = (dict(atoms) for atoms in poly)
     powers = {a: [e, *(o.get(a, 0) for o in others)] for a, e in first.items()}
-    # Above the line the least of all, below it the one that is the nearest to it.
-    shared = {a: min(es) if min(es) > 0 else min(max(es), 0) for a, es in powers.items()}
-    shared = {a: e for a, e in shared.items() if e}
+    # k/r² - p/r³ stays as it is.
+    shared = {a: min(es) for a, es in powers.items() if min(es) > 0 or min(es) == max(es)}
     values = list(poly.values())
     scale = min(map(abs, values))
     if any(v.denominator > 1 or abs(v) > 100 for v in (x / scale for x in values)):
@@ -332,7 +331,12 @@ def _paired(poly: _Poly) -> _Poly:
             if out.get(alone) == -value:
                 other = (sp.cos if isinstance(a, sp.sin) else sp.sin)(*a.args)
                 del out[alone], out[atoms]
-                out[(*alone, (other, 2))] = -value
+                # There may be such a term already, with its atoms in another order.
+                made = {*alone, (other, 2)}
+                place = next((k for k in out if set(k) == made), (*alone, (other, 2)))
+                total = out.pop(place, Fraction(0)) - value
+                if total:
+                    out[place] = total
     return out
 
 

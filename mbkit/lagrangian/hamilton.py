@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real, rows
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian import cyclic
+from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.cyclic import ConservedQuantity
 from mbkit.lagrangian.numeric import Numeric, values_of
 from mbkit.lagrangian.poisson import bracket, momentum_symbols, shorter
@@ -63,7 +64,8 @@ class CanonicalEquations:
 
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block."""
-        rows = (f"{sp.latex(e.lhs)} &= {sp.latex(e.rhs)}" for e in self.equations())
+        board = Blackboard(self.coordinates, self.momenta)
+        rows = (f"{sp.latex(e.lhs)} &= {board.latex(e.rhs)}" for e in self.equations())
         return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
@@ -165,13 +167,14 @@ class Hamiltonian:
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
         """Return the momenta of the cyclic coordinates, and H if it is constant, in coordinates and momenta."""
         symbols = dict(zip(self.coordinates, self.momenta, strict=True))
+        moving = (self.coordinates, self.momenta)
         out = [
-            ConservedQuantity(symbols[q].name, symbols[q], f"momentum of {q.name}, which is cyclic")
+            ConservedQuantity(symbols[q].name, symbols[q], f"momentum of {q.name}, which is cyclic", moving)
             for q in cyclic.conserved_momenta(self.system)
         ]
         if self.is_conserved:
             told = "energy T + V" if self.is_energy else "Jacobi's integral T2 - T0 + V, not the energy T + V"
-            out.append(ConservedQuantity("H", self.H, told))
+            out.append(ConservedQuantity("H", self.H, told, moving))
         return tuple(out)
 
     # Numbers
@@ -261,7 +264,7 @@ class Hamiltonian:
 
     def latex(self) -> str:
         """Return H = ... ."""
-        return f"H = {sp.latex(self.H)}"
+        return f"H = {Blackboard(self.coordinates, self.momenta, time=self.system.time).latex(self.H)}"
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, rows
 from mbkit.errors import InputError
+from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.numeric import Numeric, values_of
 from mbkit.lagrangian.poisson import momentum_symbols
 from mbkit.lagrangian.squares import Squares
@@ -158,10 +159,10 @@ class Routhian:
     def latex(self) -> str:
         """Return R, the momenta and the ignored rates as an aligned LaTeX block."""
         whole, s = self.system, self.lagrangian
-        lines = [f"R &= {sp.latex(s.T)} - \\left({sp.latex(s.V)}\\right)" if s.V != 0 else f"R &= {sp.latex(s.T)}"]
-        lines += [f"{sp.latex(p)} &= {sp.latex(x)}" for p, x in self.momenta.items()]
+        board = Blackboard(whole.coordinates, whole.velocities, tuple(self.momenta), time=whole.time)
         named = dict(zip(whole.coordinates, whole.velocities, strict=True))
-        lines += [f"{sp.latex(named[q])} &= {sp.latex(x)}" for q, x in self.rates.items()]
+        told = [(sp.Symbol("R"), s.L), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
+        lines = (f"{sp.latex(left)} &= {board.latex(right)}" for left, right in told)
         return "\\begin{aligned}" + r" \\ ".join(lines) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:

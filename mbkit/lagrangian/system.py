@@ -10,6 +10,7 @@ import sympy as sp
 
 from mbkit.errors import InputError
 from mbkit.lagrangian import cyclic
+from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.constrained import Constrained
 from mbkit.lagrangian.cyclic import ConservedQuantity
 from mbkit.lagrangian.declaration import declared
@@ -305,4 +306,5 @@ class Lagrangian(Constrained):
         return f"<Lagrangian {self.name!r}: coordinates {', '.join(map(str, self.coordinates))}>"
 
     def _repr_latex_(self) -> str:
-        return f"$T = {sp.latex(self.T)},\\quad V = {sp.latex(self.V)}$"
+        board = Blackboard(self.coordinates, self.velocities, time=self.time)
+        return f"$T = {board.latex(self.T)},\\quad V = {board.latex(self.V)}$"
