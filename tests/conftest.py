@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import tempfile
 from pathlib import Path
@@ -14,3 +15,13 @@ os.environ["MBKIT_CACHE_DIR"] = str(
 )
 # heyoka keeps compiled code of its own.
 os.environ["HEYOKA_CACHE_DIR"] = os.environ["MBKIT_CACHE_DIR"] + "-heyoka"
+# The workers share the cores already: a matrix of 100 rows takes OpenBLAS's threads,
+# which wait for each other, a hundred times as long as one of them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def pytest_collection_finish() -> None:
+    """Leave what stays until the end, modules and tests, out of every search for garbage."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)

@@ -24,10 +24,33 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="module")
-def pendulum(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
-    """A study in its shortest form, and the folder that it wrote to."""
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path, list[object]]:
+    """A study in its shortest form, the folder that it wrote to, and the study itself."""
+    from mbkit.studies import work_precision
+
+    made: list[object] = []
+
+    def keeping(*arguments: object, **more: object) -> object:
+        made.append(work_precision(*arguments, **more))
+        return made[0]
+
     out = tmp_path_factory.mktemp("bench")
-    return call("bench", "pendulum", *SHORT, "--out", str(out)), out
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mbkit.studies.work_precision", keeping)
+        return call("bench", "pendulum", *SHORT, "--out", str(out)), out, made
+
+
+@pytest.fixture
+def pendulum(measured: tuple[Result, Path, list[object]]) -> tuple[Result, Path]:
+    """What the study printed, and the folder that it wrote to."""
+    return measured[:2]
+
+
+@pytest.fixture
+def at_hand(measured: tuple[Result, Path, list[object]], monkeypatch: pytest.MonkeyPatch) -> object:
+    """The same study for every command that asks for one."""
+    monkeypatch.setattr("mbkit.studies.work_precision", lambda *_, **__: measured[2][0])
+    return measured[2][0]
 
 
 def call(*arguments: str) -> Result:
@@ -77,12 +100,9 @@ def test_processes_measure_too(here):
     assert [p.name for p in here.iterdir()] == ["mbkit-report"]
 
 
-def test_what_was_finished_is_written_when_interrupted(here, monkeypatch):
-    from mbkit.studies import work_precision
-
-    def interrupted(*arguments: object, **more: object) -> None:
-        whole = work_precision(*arguments, **more)
-        raise InterruptedSweepError(replace(whole, complete=False, curves=whole.curves[:1]))
+def test_what_was_finished_is_written_when_interrupted(here, monkeypatch, at_hand):
+    def interrupted(*_: object, **__: object) -> None:
+        raise InterruptedSweepError(replace(at_hand, complete=False, curves=at_hand.curves[:1]))
 
     monkeypatch.setattr("mbkit.studies.work_precision", interrupted)
     result = call("bench", "pendulum", *SHORT, "--json")
@@ -107,6 +127,7 @@ def test_interrupted_before_anything_was_finished(here, monkeypatch):
 
 
 @pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("at_hand")
 def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     def full(*_: object) -> Path:
         raise OutputError("cannot write there: No space left on device")

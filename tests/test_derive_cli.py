@@ -77,6 +77,11 @@ def _matrix(A):
     return [[str(x) for x in A[i, :]] for i in range(A.rows)]
 
 
+def test_latex_explains_the_letters_it_makes():
+    text = derive("slider_crank", "--latex").stdout
+    assert r"\rho &= \sqrt{l^{2} - r^{2} \sin^{2} {\theta}}" in text
+
+
 def test_latex_has_what_a_document_needs():
     text = derive("cart_pole", "--latex").stdout
     assert text.count(r"\begin{align*}") == text.count(r"\end{align*}") == 3
@@ -154,7 +159,8 @@ def test_symbols_as_they_are_written():
 
 
 def test_expressions_on_one_line():
-    board = Blackboard(systems.kepler().equations())
+    orbit = systems.kepler()
+    board = Blackboard(orbit.coordinates, orbit.velocities)
     m, k, r, g, th = sp.symbols("m k r g theta")
     told = {
         -k / r: "-k/r",

@@ -6,6 +6,7 @@ import os
 import pickle
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 import numpy as np
 import pytest
@@ -77,16 +78,20 @@ def test_a_feature_acts_in_every_engine_and_can_be_taken_out(engine, feature):
     assert off(without, reference) < CLOSE
 
 
+@cache
+def floating(robot, engine):
+    return mb.dynamics(mb.load(robot, floating_base=True), engine)
+
+
 @pytest.mark.parametrize("engine", list(ENGINES))
 @pytest.mark.parametrize("robot", ["talos", "anymal_b", "solo12"])
 def test_floating_robots_agree_accelerations_included(robot, engine):
-    model = mb.load(robot, floating_base=True)
-    q, v, _, tau = states(model, 4)
-    own = mb.dynamics(model, "lagrangian")
-    a = mb.dynamics(model, engine).forward_dynamics(q, v, tau)
+    own, other = floating(robot, "lagrangian"), floating(robot, engine)
+    q, v, _, tau = states(own.model, 4)
+    a = other.forward_dynamics(q, v, tau)
     condition = np.linalg.cond(own.mass_matrix(q)).max()
     assert off(a, own.forward_dynamics(q, v, tau)) < 1e-15 * condition
-    assert off(mb.dynamics(model, engine).inverse_dynamics(q, v, a), tau) < 1e-15 * condition
+    assert off(other.inverse_dynamics(q, v, a), tau) < 1e-15 * condition
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))

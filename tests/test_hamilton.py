@@ -93,7 +93,7 @@ def test_pendulum_and_top_are_the_textbooks():
     assert H + m * g * ell * sp.cos(theta) == heavy_top().hamiltonian().H
     told = str(pendulum().hamiltonian().equations())
     assert told == "thetadot = p_theta/(l**2*m)\npdot_theta = -g*l*m*sin(theta)"
-    assert r"\dot{p}_{\theta} &= - g l m \sin" in pendulum().hamiltonian().equations().latex()
+    assert r"\dot{p}_{\theta} &= - m g l \sin" in pendulum().hamiltonian().equations().latex()
 
 
 @pytest.mark.parametrize("case", CASES)

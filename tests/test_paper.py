@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
@@ -165,21 +166,14 @@ def test_dynamicsymbols_and_plain_ones_are_the_same_system():
 
 
 METHODS = ("rk4", "gauss6", "rk853", "taylor", "dop853", "radau", "bdf", "lsoda", "cvodes", "implicit_midpoint")
+SAVE = (0.0, 0.1, 0.3)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("make", ALL)
-def test_every_method_runs_it(make, method):
+@cache
+def solved(make):
+    """Return a system's dynamics, a state, and its motion by SymPy's accelerations and SciPy."""
     lag = make()
     q, v, _ = (s[0] for s in states(lag))
-    dyn, save = lag.dynamics(), [0.0, 0.1, 0.3]
-    if method == "taylor" and make is cart:
-        # Its drag has a kink, where a series would go on as if there were none.
-        return
-    if make in (driven, rheonomic) and method in ("cvodes", "implicit_midpoint"):
-        with pytest.raises(UnsupportedError, match="depends on the time"):
-            mb.simulate(dyn, q, v, 0.3, method, save=save)
-        return
     acceleration = sp.lambdify(
         [*lag.coordinates, *lag.velocities, *([lag.time] if lag.time else [])],
         [e.rhs.subs({**lag.parameters, **dict.fromkeys(lag.inputs.values(), 0)}) for e in lag.equations().explicit()],
@@ -189,12 +183,52 @@ def test_every_method_runs_it(make, method):
         n = len(q)
         return [*y[n:], *acceleration(*y, *([s] if lag.time else []))]
 
-    truth = solve_ivp(rate, (0, 0.3), [*q, *v], "DOP853", save, rtol=1e-13, atol=1e-13).y
+    return lag.dynamics(), q, v, solve_ivp(rate, (0, 0.3), [*q, *v], "DOP853", SAVE, rtol=1e-13, atol=1e-13).y
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("make", ALL)
+def test_every_method_runs_it(make, method):
+    dyn, q, v, truth = solved(make)
+    if method == "taylor" and make is cart:
+        # Its drag has a kink, where a series would go on as if there were none.
+        return
     tight = {"bdf": 1e-9, "cvodes": 1e-10, "radau": 1e-9}
     setting = {"dt": 1e-3} if METHODS_OF[method].kind == "fixed" else {"rtol": tight.get(method, 1e-11)}
-    run = mb.simulate(dyn, q, v, 0.3, method, save=save, **setting)
+    run = mb.simulate(dyn, q, v, 0.3, method, save=SAVE, **setting)
     bound = {"implicit_midpoint": 1e-4, "bdf": 1e-6, "cvodes": 1e-6, "radau": 1e-7, "rk4": 1e-7}.get(method, 1e-8)
     assert np.abs(run.q.T - truth[: len(q)]).max() < bound
+
+
+def test_the_midpoint_rule_in_time_is_symplectic():
+    """Area in (q, p) is kept over 20 steps; p = M v + b, so that of (q, v) at the start is M times as large."""
+    lag = driven()
+    dyn, h = lag.dynamics(), 1e-6
+    q, v = np.full((4, 1), 0.4), np.full((4, 1), 0.3)
+    q[:2, 0] += [h, -h]
+    v[2:, 0] += [h, -h]
+    run = mb.simulate(dyn, q, v, 0.2, "implicit_midpoint", dt=0.01, save=[0.2])
+    end = np.stack([run.q[:, 0, 0], run.canonical_momentum()[:, 0, 0]])
+    J = np.stack([end[:, 0] - end[:, 1], end[:, 2] - end[:, 3]], axis=1) / (2 * h)
+    # Differences are good to 1e-9.
+    assert np.linalg.det(J) == pytest.approx(dyn.mass_matrix([0.4])[0, 0], rel=1e-7)
+
+
+def test_the_midpoint_rule_in_time_is_of_second_order_in_machine_code_too():
+    lag = driven()
+    truth = mb.simulate(lag.dynamics(), [0.4], [0.3], 0.3, "rk853", rtol=1e-13, save=[0.3])
+    found = {}
+    for compiled in (False, True):
+        dyn = lag.dynamics(options={"compile": compiled})
+        found[compiled] = [
+            mb.simulate(dyn, [0.4], [0.3], 0.3, "implicit_midpoint", dt=dt, save=[0.3]) for dt in (4e-3, 2e-3)
+        ]
+        for part in ("q", "v"):
+            errors = [np.abs(getattr(run, part) - getattr(truth, part)).max() for run in found[compiled]]
+            assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+    # Newton's iteration of either ends within 1e-12 of the step.
+    for own, other in zip(*found.values(), strict=True):
+        assert np.abs(own.q - other.q).max() < 1e-11
 
 
 def test_a_force_that_is_one_symbol_is_the_torque():

@@ -15,6 +15,7 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.quasi import QuasiLagrangian
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.spatial import rotate
+from validation import motions
 from validation.textbook import WheeledSpacecraft
 
 I1, I2, I3, m, ell, g, c, t, tau = sp.symbols("I1 I2 I3 m l g c t tau")
@@ -218,26 +219,6 @@ def test_body_turns_the_same_way_in_all_forms(pair, compiled):
         assert attitude(ours) == pytest.approx(matrix(theirs[3:]), abs=CLOSE)
 
 
-def test_heavy_top_in_body_rates_is_the_catalogs():
-    mass, across, along, reach = 1.5, 0.02, 0.01, 0.3
-    # About the fixed point, by Steiner.
-    moments = {I1: across + mass * reach**2, I2: across + mass * reach**2, I3: along}
-    top = body(m * g * ell * sp.cos(theta), {**moments, m: mass, g: 9.81, ell: reach})
-    quasi = top.quasi_velocities(D, "w1 w2 w3")
-    q, rates = np.array([0.0, 0.5, 0.0]), np.array([0.3, -0.4, 60.0])
-    times = np.linspace(0.0, 1.0, 6)
-    ours = mb.simulate(quasi.dynamics(options={"compile": False}), q, rates, 1.0, "rk853", rtol=1e-13, save=times)
-    model = mb.catalog.heavy_top(mass=mass, inertia=(across, across, along), com=(0.0, 0.0, reach))
-    half = q[1] / 2
-    dyn = mb.dynamics(model, "lagrangian", compile=False)
-    theirs = mb.simulate(dyn, [np.sin(half), 0, 0, np.cos(half)], rates, 1.0, "rk853", rtol=1e-13, save=times)
-    # At 60 rad/s an error of a step turns the body's axes sixty times as far.
-    assert ours.v == pytest.approx(theirs.v, abs=60 * CLOSE)
-    for a, b in zip(ours.q, theirs.q, strict=True):
-        assert attitude(a) == pytest.approx(matrix(b), abs=10 * CLOSE)
-    assert ours.energy() == pytest.approx(theirs.energy(), rel=1e-12)
-
-
 #: What each method leaves behind after a second at 2 ms, or at 1e-11 a step.
 METHODS = {
     "rk853": 1e-10, "taylor": 1e-10, "dop853": 1e-10, "lsoda": 1e-9, "radau": 1e-8, "bdf": 1e-6, "cvodes": 1e-7,
@@ -399,39 +380,42 @@ def test_a_singular_start_is_refused(pair, method):
         mb.simulate(dyn, [[1.0, 1.0, 1.0], [0.0, 0.0, 0.5]], [0.1, 0.2, 0.3], 0.1, method, save=[0.0, 0.1])
 
 
-def test_a_spacecraft_with_wheels_in_eulers_angles_and_in_body_rates_is_the_catalogs():
-    closed = WheeledSpacecraft()
+def test_a_spacecraft_with_wheels_moves_alike_in_eulers_angles_in_body_rates_and_in_every_engine():
+    """Two slanting wheels with motors; beside them Euler's equation I ω̇ + ω × (I ω + h) = -ḣ, integrated."""
+    slanting = ((1.0, 0.0, 1.0), (-1.0, 0.0, 1.0))
+    closed = WheeledSpacecraft(wheel_axes=slanting)
     n, inertia = len(closed.axes), closed.central_inertia
-    # The pyramid is as good as a plane of symmetry: principal axes.
+    # One mirrors the other, so the body's axes are principal.
     assert np.abs(inertia - np.diag(np.diag(inertia))).max() < 1e-15
     A, B, C, J = sp.symbols("A B C J")
-    phi, th, psi, *turns = sp.symbols(f"phi theta psi s1:{n + 1}")
-    v = sp.symbols(f"phidot thetadot psidot sdot1:{n + 1}")
-    s, c = sp.sin, sp.cos
-    W = sp.Matrix([[s(th) * s(psi), c(psi), 0], [s(th) * c(psi), -s(psi), 0], [c(th), 0, 1]])
-    rates, spins = W * sp.Matrix(v[:3]), sp.Matrix(v[3:])
-    axes = sp.Matrix([[1, 0, 1], [0, 1, 1], [-1, 0, 1], [0, -1, 1]]) / sp.sqrt(2)
+    turns, sdot = sp.symbols(f"s1:{n + 1}"), sp.symbols(f"sdot1:{n + 1}")
+    rates, spins = W * sp.Matrix([u, w, s]), sp.Matrix(sdot)
+    axes = sp.Matrix([[1, 0, 1], [-1, 0, 1]]) / sp.sqrt(2)
     T = (rates.T * sp.diag(A, B, C) * rates)[0] / 2 + J * (spins.T * axes * rates)[0] + J * (spins.T * spins)[0] / 2
     values = dict(zip((A, B, C, J), (*np.diag(inertia), closed.wheel_inertia), strict=True))
-    angles = Lagrangian(T, 0, [phi, th, psi, *turns], v, parameters=values, name="spacecraft")
-    body = angles.quasi_velocities(sp.diag(sp.simplify(W.inv()), sp.eye(n)), [f"w{i}" for i in range(3 + n)])
+    angles = Lagrangian(T, 0, [phi, theta, psi, *turns], [u, w, s, *sdot], parameters=values, name="spacecraft")
+    body = angles.quasi_velocities(sp.diag(D, sp.eye(n)))
     rng = np.random.default_rng(1)
-    q, w = np.array([0.3, 1.0, -0.4, *np.zeros(n)]), np.array([0.2, -0.1, 0.3, *rng.uniform(-40, 40, n)])
-    tau, save = np.array([0.0, 0.0, 0.0, *rng.uniform(-0.2, 0.2, n)]), [0.0, 1.0, 3.0]
-    setting = {"method": "rk853", "rtol": 1e-12, "torque": tau, "save": save}
-    one = mb.simulate(body.dynamics(), q, w, 3.0, **setting)
-    two = mb.simulate(angles.dynamics(), q, body.to_velocity(q, w), 3.0, **setting)
-    assert np.abs(one.q - two.q).max() < 1e-10
-    model = mb.catalog.spacecraft_with_wheels()
-    start = np.zeros(model.nv)
-    start[3:6], start[6:] = w[:3], w[3:]
-    # The centre of mass rests, so the hub's centre does not: what is compared does not depend on it.
-    start[:3] = -np.cross(w[:3], closed.com)
-    three = mb.simulate(
-        mb.dynamics(model, "lagrangian"),
-        model.neutral(),
-        start,
-        3.0,
-        **{**setting, "torque": np.array([0.0] * 6 + [*tau[3:]])},
+    q, rate = np.array([0.3, 1.0, -0.4, *np.zeros(n)]), np.array([0.2, -0.1, 0.3, *rng.uniform(-40, 40, n)])
+    torques, save = rng.uniform(-0.2, 0.2, n), [0.0, 0.5, 1.0]
+    tau = np.array([0.0, 0.0, 0.0, *torques])
+    R, turning, spinning = motions.wheeled(save, closed, attitude(q), rate[:3], rate[3:], torques)
+    told, own = np.hstack([turning, spinning]), {"compile": False}
+    one = mb.simulate(body.dynamics(options=own), q, rate, 1.0, "rk853", rtol=1e-13, torque=tau, save=save)
+    two = mb.simulate(
+        angles.dynamics(options=own), q, body.to_velocity(q, rate), 1.0, "rk853", rtol=1e-13, torque=tau, save=save
     )
-    assert np.abs(three.v[:, 3:] - one.v).max() < 1e-9
+    # Of 40 rad/s.
+    assert np.abs(one.q - two.q).max() < 40 * CLOSE
+    for ours in (one.v, body.to_quasi_velocity(two.q, two.v)):
+        assert np.abs(ours - told).max() < 40 * CLOSE
+    for ours, theirs in zip(one.q, R, strict=True):
+        assert attitude(ours) == pytest.approx(theirs, abs=CLOSE)
+    model = mb.catalog.spacecraft_with_wheels(wheel_axes=slanting)
+    # The centre of mass rests, so the hub's centre does not: what is compared does not depend on it.
+    start = np.array([*-np.cross(rate[:3], closed.com), *rate])
+    tau = np.array([0.0] * 6 + [*torques])
+    for engine in ("lagrangian", "pinocchio", "mujoco"):
+        dyn = mb.dynamics(model, engine)
+        run = mb.simulate(dyn, model.neutral(), start, 1.0, "rk853", rtol=1e-13, torque=tau, save=save)
+        assert np.abs(run.v[:, 3:] - told).max() < 40 * CLOSE

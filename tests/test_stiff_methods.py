@@ -145,13 +145,19 @@ def test_tolerance_rules_the_error(method: str) -> None:
     assert cost == sorted(cost)
 
 
-@pytest.mark.parametrize("method", STIFF)
-def test_every_joint_kind_moves_as_with_dop853(method: str) -> None:
+@pytest.fixture(scope="module")
+def every_kind() -> tuple[Any, ...]:
+    """A tree of every joint kind, how to run it, and its run with dop853."""
     model = random_tree(3, 12)
     q, v = model.random_state(np.random.default_rng(0))
-    dyn, save = dynamics(model, "lagrangian"), [0.0, 0.02, 0.04]
-    truth = simulate(dyn, q, v, 0.04, "dop853", rtol=1e-12, save=save)
-    run = simulate(dyn, q, v, 0.04, method, rtol=ENOUGH[method], save=save)
+    given, save = (dynamics(model, "lagrangian"), q, v, 0.04), [0.0, 0.02, 0.04]
+    return model, given, save, simulate(*given, "dop853", rtol=1e-12, save=save)
+
+
+@pytest.mark.parametrize("method", STIFF)
+def test_every_joint_kind_moves_as_with_dop853(method: str, every_kind: tuple[Any, ...]) -> None:
+    model, given, save, truth = every_kind
+    run = simulate(*given, method, rtol=ENOUGH[method], save=save)
     assert apart(model, run, truth) < 1e-6
     model.check_q(run.q)
     # LSODA stays with Adams where nothing is stiff.

@@ -130,6 +130,26 @@ def test_the_grids_of_our_own_end_where_finer_ones_bring_nothing():
     assert result.seconds < 30
 
 
+def test_coarse_tolerances_that_bind_no_step_do_not_end_a_grid():
+    # Steps end on the saved times, 0.1 s apart: of a gentle motion the first tolerances ask for no shorter ones.
+    gentle = [(0.3 * math.cos(4 * t), -1.2 * math.sin(4 * t)) for t in np.linspace(0, 1, 11)]
+    spring = mb.ModelBuilder("spring", gravity=(0, 0, 0))
+    spring.add_body("mass", mass=1.0)
+    spring.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=16.0)
+    result = work_precision(
+        spring.build(),
+        ["pinocchio"],
+        ["dop853"],
+        reference=lambda t: tuple([x] for x in gentle[round(10 * t)]),
+        repeats=1,
+        seconds=60.0,
+    )
+    (curve,) = result.curves
+    assert curve.points[0].steps <= 1.1 * curve.points[2].steps
+    assert curve.points[2].error < 1e-6
+    assert min(p.error for p in curve.points) < 1e-3 * curve.points[2].error
+
+
 @pytest.mark.parametrize("name", ["pinocchio", "lagrangian", "mujoco"])
 def test_the_same_seed_gives_the_same_errors_to_the_bit(name):
     one, two = (study([name], ["rk4", "rk853"], steps=[0.05, 0.025], seed=3) for _ in range(2))

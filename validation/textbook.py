@@ -3,7 +3,7 @@
 Nothing here imports mbkit, and only NumPy computes. First the terms of catalog systems, each a `System` as in
 ``closed_forms`` (where pendulum, double pendulum, cart-pole, spherical pendulum, chain, heavy top and free body
 are), those with springs a `Sprung`; then the systems of one coordinate, reduced or driven, that no
-description of bodies and joints has. Motions in elliptic functions are in ``elliptic``.
+description of bodies and joints has. Motions along time are in ``elliptic`` and ``motions``.
 
 Each function names its source. "Derived here" means: from positions and velocities, as its docstring or comment
 says. As in ``closed_forms`` energies are written apart from the matrices, so that T = ½ vᵀ M v is a check

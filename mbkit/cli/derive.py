@@ -62,7 +62,9 @@ def derive(
     with Bar(f"derive {target.name}") as bar:
         names = None if isinstance(target, WrittenModel) else letters(target)
         lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.5 * x, text))
-        text, ending = _text(lag, target, form, as_json, bar)
+        # What is prescribed is no coordinate of the equation.
+        told = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
+        text, ending = _text(lag, told, form, as_json, bar)
     if out is None:
         click.echo(text)
         return
@@ -114,7 +116,7 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     click.echo(f"header {paths[0]}\nsource {paths[1]}")
 
 
-def _text(lag: Lagrangian, model: Model, form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
+def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
     if form == "python":
         from mbkit.lagrangian.python_code import python_code
 
@@ -123,7 +125,7 @@ def _text(lag: Lagrangian, model: Model, form: str | None, as_json: bool, bar: A
     from mbkit.lagrangian.account import Account
 
     bar(0.5, "equations")
-    account = Account(lag, names=dict(zip((q.name for q in lag.coordinates), model.coordinate_names, strict=False)))
+    account = Account(lag, names=names)
     if as_json:
         import json
 

@@ -19,6 +19,7 @@ import casadi as ca
 from mbkit.derivation import derivatives, energies
 from mbkit.derivation.factorize import elimination_order, solve
 from mbkit.derivation.kinematics import Kinematics, add, constant_transposed_times
+from mbkit.derivation.scalars import scalar
 from mbkit.derivation.sources import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
 from mbkit.derivation.values import Constants
 from mbkit.errors import UnknownNameError
@@ -123,7 +124,7 @@ class Equations:
         parts: list[Any] = []
         for joint in self.model.independent_joints:
             part = self.model.layout.v[joint.name]
-            p = [self.momentum[i] for i in range(part.start, part.stop)]
+            p = [scalar(self.momentum[i]) for i in range(part.start, part.stop)]
             parts += joint.type.hamel(self.kin.velocities(joint), p)
         return ca.vertcat(ca.SX(0, 1), *parts)
 
@@ -202,7 +203,7 @@ class Equations:
         return derivatives.forward_dynamics(self)
 
     def function(self, name: str) -> ca.Function:
-        """Return a quantity as a function of its arguments."""
+        """Return a quantity as a function of its arguments, with repeated operations as they came."""
         if name not in FUNCTIONS:
             raise UnknownNameError("quantity", name, FUNCTIONS)
         symbols = {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau}
@@ -219,7 +220,7 @@ class Equations:
         """Return M and τ_passive - nle together, for a numerical solution."""
         outs = [ca.densify(self.mass_matrix), ca.densify(self.applied)]
         given = {"q": self.q, "v": self.v, **self.trailing}
-        return ca.Function("mass_and_force", list(given.values()), outs, list(given), ["M", "f"], {"cse": True})
+        return ca.Function("mass_and_force", list(given.values()), outs, list(given), ["M", "f"])
 
     @property
     def trailing(self) -> dict[str, ca.SX]:
@@ -236,7 +237,7 @@ class Equations:
         labels = [f"by_{n}" for n in argument_names[: len(outs)]] if isinstance(out, tuple) else [name]
         dense = [ca.densify(x) for x in outs]
         given = {**dict(zip(argument_names, arguments, strict=True)), **self.trailing}
-        return ca.Function(name, list(given.values()), dense, list(given), labels, {"cse": True})
+        return ca.Function(name, list(given.values()), dense, list(given), labels)
 
     def pose(self, frame: str) -> ca.Function:
         """Return X_WF(q), 4 by 4."""

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 __all__ = ["compile_by_default", "executable", "has_compiler"]
 
 
-#: Operations above which LLVM's time, some 10 s per 100k, is not spent unasked: a
-#: Coriolis matrix of a hundred joints has twice as many, and is interpreted in 0.5 ms.
-_MOST: Final = 150_000
+#: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not
+#: spent unasked: a Coriolis matrix of a hundred joints has twice as many, and is
+#: interpreted in 0.5 ms.
+_MOST: Final = 200_000
 
 
 def compile_by_default() -> bool:

@@ -131,7 +131,10 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     wanted = _checked(quantities)
     for needed, told in (("loops", model.needs.loops), ("prescribed", model.needs.time)):
         if told:
-            raise UnsupportedError(f"{model.name} cannot be exported yet; model.without({needed!r}) can")
+            raise UnsupportedError(
+                f"{model.name} has {needed!r}, which C code of its tree leaves out; mbkit.lagrangian.from_model(model)"
+                f".model can be exported with them, and model.without({needed!r}) without them"
+            )
     if not model.nv:
         raise UnsupportedError(f"{model.name} cannot be exported: no joint of it moves, and C has no empty arrays")
     prefix = c_identifier(model.name) if name is None else name

@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 
+from mbkit.derivation.scalars import scalar
 from mbkit.model import Model
 
 __all__ = ["elimination_order", "elimination_size", "solve"]
@@ -54,8 +55,8 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
     rows: list[dict[int, Any]] = [{} for _ in range(n)]
     for i, j in zip(*M.sparsity().get_triplet(), strict=True):
         if rank[j] <= rank[i]:
-            rows[rank[i]][rank[j]] = M[i, j]
-    x = [f[index, :] for index in order]
+            rows[rank[i]][rank[j]] = scalar(M[i, j])
+    x = [scalar(f[index, :]) for index in order]
     diagonal: list[Any] = [None] * n
     factors: list[dict[int, Any]] = [{} for _ in range(n)]
     for k in reversed(range(n)):
@@ -64,7 +65,7 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
         # infinite, and whoever evaluates finds it.
         diagonal[k] = row.pop(k, 0.0)
         for i in sorted(row, reverse=True):
-            factors[k][i] = row[i] / ca.SX(diagonal[k])
+            factors[k][i] = row[i] / diagonal[k]
             for j, entry in row.items():
                 if j <= i:
                     rows[i][j] = rows[i].get(j, 0.0) - factors[k][i] * entry
@@ -72,7 +73,7 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
         for i, factor in factors[k].items():
             x[i] = x[i] - factor * x[k]
     for k in range(n):
-        x[k] = x[k] / ca.SX(diagonal[k]) - sum((factor * x[i] for i, factor in factors[k].items()), 0.0)
+        x[k] = x[k] / diagonal[k] - sum((factor * x[i] for i, factor in factors[k].items()), 0.0)
     rows_out: list[Any] = [None] * n
     for k, index in enumerate(order):
         rows_out[index] = x[k]

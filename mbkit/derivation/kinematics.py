@@ -1,7 +1,7 @@
 """Kinematics of a model as CasADi expressions: nothing but placements and twists.
 
-Vectors are lists of three scalars, so that every zero and one of the description
-vanishes while the graph is built.
+Vectors are lists of three `Scalar`s or floats, so that every zero and one of the
+description vanishes while the graph is built.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from typing import Any
 
 import casadi as ca
 
+from mbkit.derivation import scalars
+from mbkit.derivation.scalars import scalar
 from mbkit.derivation.values import Constants, Values, is_zero
 from mbkit.model import Joint, Model
 from mbkit.model.kinds import cross3
@@ -61,14 +63,14 @@ class Kinematics:
         self._v_of: dict[str, Vector] = {}
         for joint in model.joints:
             if joint.mimic:
-                leader_q = self.q[layout.q[joint.mimic.joint].start]
-                leader_v = self.v[layout.v[joint.mimic.joint].start]
+                leader_q = scalar(self.q[layout.q[joint.mimic.joint].start])
+                leader_v = scalar(self.v[layout.v[joint.mimic.joint].start])
                 values = self.values.joints[joint.name]
                 self._q_of[joint.name] = [values.ratio * leader_q + values.offset]
                 self._v_of[joint.name] = [values.ratio * leader_v]
             else:
-                self._q_of[joint.name] = [self.q[i] for i in _range(layout.q[joint.name])]
-                self._v_of[joint.name] = [self.v[i] for i in _range(layout.v[joint.name])]
+                self._q_of[joint.name] = [scalar(self.q[i]) for i in _range(layout.q[joint.name])]
+                self._v_of[joint.name] = [scalar(self.v[i]) for i in _range(layout.v[joint.name])]
         self._carrier = {j.child: j for j in model.joints}
 
     def coordinates(self, joint: Joint) -> Vector:
@@ -82,7 +84,9 @@ class Kinematics:
     @cached_property
     def placements(self) -> dict[str, tuple[Any, Vector]]:
         """(R_JC, p_JC_J) of every joint."""
-        return {j.name: j.type.placement(ca, self.values.joints[j.name], self._q_of[j.name]) for j in self.model.tree}
+        return {
+            j.name: j.type.placement(scalars, self.values.joints[j.name], self._q_of[j.name]) for j in self.model.tree
+        }
 
     @cached_property
     def twists(self) -> dict[str, tuple[Vector, Vector]]:
@@ -95,7 +99,7 @@ class Kinematics:
             R, p = self.placements[joint.name]
             angular_J = constant_transposed_times(values.rotation, angular)
             linear_J = add(constant_transposed_times(values.rotation, at_joint), cross3(angular_J, p))
-            own = joint.type.twist(ca, values, self._q_of[joint.name], self._v_of[joint.name])
+            own = joint.type.twist(scalars, values, self._q_of[joint.name], self._v_of[joint.name])
             out[joint.child] = (
                 add(_transposed_times(R, linear_J), own[0]),
                 add(_transposed_times(R, angular_J), own[1]),
@@ -128,7 +132,7 @@ class Kinematics:
         """Return D(q)ᵀ g for a gradient with respect to q."""
         parts: Vector = []
         for j in self.model.independent_joints:
-            g = [gradient[i] for i in _range(self.model.layout.q[j.name])]
+            g = [scalar(gradient[i]) for i in _range(self.model.layout.q[j.name])]
             parts += j.type.pullback(self._q_of[j.name], g)
         return ca.vertcat(ca.SX(0, 1), *parts)
 

@@ -94,18 +94,16 @@ class Machine:
         single = arguments[0].ndim == 1
         n = 1 if single else arguments[0].shape[0]
         if n == 0:
-            f = self.function
-            return [np.empty((0, f.size1_out(i), f.size2_out(i))) for i in range(f.n_out())]
-        for i, x in enumerate(arguments):
-            if x.shape[-1] != self.function.size1_in(i):
-                raise ValueError(f"argument {i}: expected {self.function.size1_in(i)} entries, got shape {x.shape}")
+            return [np.empty((0, *shape)) for shape in self.shapes]
+        for i, (x, size) in enumerate(zip(arguments, self.inputs, strict=True)):
+            if x.shape[-1] != size:
+                raise ValueError(f"argument {i}: expected {size} entries, got shape {x.shape}")
         with self._lock:
             _, run, inputs, outputs = self._prepared(n)
             for held, given in zip(inputs, arguments, strict=True):
                 held[:] = given
             run()
-            results = [np.array(np.swapaxes(x, 1, 2), order="C") for x in outputs]
-        return [x[0] for x in results] if single else results
+            return [x[0].T.copy() if single else x.swapaxes(1, 2).copy() for x in outputs]
 
 
 _MACHINES: Final[WeakSet[Machine]] = WeakSet()

@@ -19,6 +19,9 @@ angle θ = |x|, the functions of x̂ that the derivation leaves behind collapse 
 
 The momentum is carried as π = R p, in the axes of the joint's fixed frame: where no torque
 acts it then stays what it is to the bit. The unknown of a step is w alone.
+
+Where L depends on the time, L_d has it at the middle of the step: every step is still the one of
+an autonomous system, and symplectic.
 """
 
 from __future__ import annotations

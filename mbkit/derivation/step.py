@@ -213,4 +213,4 @@ def _watched(s: dict[str, Any], q1: Any, w1: Any) -> dict[str, Any]:
 def function_of(name: str, given: dict[str, Any], made: dict[str, Any]) -> ca.Function:
     """Return the function of named symbols whose named results are dense."""
     outs = [ca.densify(x) for x in made.values()]
-    return ca.Function(name, list(given.values()), outs, list(given), list(made), {"cse": True})
+    return ca.Function(name, list(given.values()), outs, list(given), list(made))

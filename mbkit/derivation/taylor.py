@@ -139,7 +139,7 @@ def rates(equations: Equations) -> ca.Function:
     a = forward(q, eq.v, eq.tau, *eq.trailing.values())
     given = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.trailing}
     outs = [ca.densify(eq.kin.qdot), ca.densify(a)]
-    return ca.Function("rates", list(given.values()), outs, list(given), ["qdot", "a"], {"cse": True})
+    return ca.Function("rates", list(given.values()), outs, list(given), ["qdot", "a"])
 
 
 class TaylorSystem:
@@ -245,8 +245,9 @@ class TaylorSystem:
             tol=kind.dtype(max(tolerance, kind.eps)),
             fp_type=float if kind.bits == 53 else kind.dtype,
             compact_mode=compact,
-            # In loops more optimization takes half as long again, and gains nothing.
-            opt_level=1 if compact else 3,
+            # In loops more optimization takes half as long again, and gains nothing; where every
+            # operation is a call, any takes three times as long.
+            opt_level=0 if kind.bits == 113 else 1 if compact else 3,
         )
 
     def fill(self, integrator: Any, *arguments: Any) -> None:

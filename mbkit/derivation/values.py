@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.derivation.scalars import scalar
 from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model
 
@@ -76,7 +77,7 @@ class Values:
         self.model = model
         self._symbolic = constants == "symbols"
         self._pool: dict[float, Any] = {}
-        named = self.named = {name: ca.SX.sym(name) for name in model.parameters}
+        named = self.named = {name: scalar(ca.SX.sym(name)) for name in model.parameters}
         if self._symbolic:
             model.require_values("constants='symbols'")
         self.parameters = ca.SX(0, 1) if self._symbolic else ca.vertcat(ca.SX(0, 1), *named.values())
@@ -131,5 +132,5 @@ class Values:
             return value
         size = abs(value)
         if size not in self._pool:
-            self._pool[size] = ca.SX.sym(f"c{len(self._pool)}")
+            self._pool[size] = scalar(ca.SX.sym(f"c{len(self._pool)}"))
         return self._pool[size] if value > 0 else -self._pool[size]

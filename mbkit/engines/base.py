@@ -74,8 +74,9 @@ class Dynamics(ABC):
             if needed:
                 remedy = "loops" if told.startswith("loop") else "prescribed"
                 raise UnsupportedError(
-                    f"{self.engine}: {model.name} has {told}, which no engine here solves yet; "
-                    f"model.without({remedy!r}) is the tree without them"
+                    f"{self.engine}: {model.name} has {told}, and an engine takes the tree alone; "
+                    "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
+                    f"and model.without({remedy!r}) is the tree without them"
                 )
         self.model = model
 
@@ -302,6 +303,9 @@ class Dynamics(ABC):
         if self.model.written is not None:
             q = np.atleast_2d(arguments["q"])[where[0] if arguments["q"].ndim == 2 else 0]
             there = ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, q, strict=True))
+            if self.model.constrained:
+                # Rows that depend on each other everywhere are told by name.
+                self.model.require_independent()  # type: ignore[attr-defined]  # of a written model
             constraints = ", or the constraints depend on each other," if self.model.constrained else ""
             raise NumericalError(
                 f"{self.engine}: {quantity} of {self.model.name} is not finite at {there}{state}; perhaps the mass "

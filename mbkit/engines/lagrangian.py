@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any, Final
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -214,7 +215,10 @@ class LagrangianDynamics(Dynamics):
         return self._machine("jacobian", frame, axes)(q)[0]
 
     def _function(self, name: str) -> Any:
-        return self.equations.function(name)
+        f = self.equations.function(name)
+        given = f.sx_in()
+        # Whoever asks for it inlines and differentiates it: small is worth a search.
+        return ca.Function(name, given, f.call(given), f.name_in(), f.name_out(), {"cse": True})
 
 
 def _remade(

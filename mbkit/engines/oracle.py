@@ -222,7 +222,7 @@ class OracleDynamics(Dynamics):
         if name != "terms":
             return getattr(eq, name)(*extra) if name in ("pose", "jacobian") else eq.function(name)
         outs = [ca.densify(x) for x in (eq.mass_matrix, eq.coriolis_force, eq.gravity, eq.passive, eq.nle)]
-        return ca.Function("terms", [eq.q, eq.v, *eq.trailing.values()], outs, {"cse": True})
+        return ca.Function("terms", [eq.q, eq.v, *eq.trailing.values()], outs)
 
     def _terms(self, q: Array, v: Array | None = None) -> list[Any]:
         """Return M, C v, g, the passive forces and nle; the last answer is kept, M and g for any v."""

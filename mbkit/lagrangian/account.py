@@ -9,7 +9,10 @@ from typing import Any, Final
 import sympy as sp
 
 from mbkit._version import __version__
+from mbkit.lagrangian.abbreviations import Abbreviations
 from mbkit.lagrangian.blackboard import Blackboard, spread, written
+from mbkit.lagrangian.layout import folded, matrix
+from mbkit.lagrangian.lines import lines
 from mbkit.lagrangian.motion import EquationsOfMotion
 from mbkit.lagrangian.system import Lagrangian
 
@@ -19,7 +22,6 @@ __all__ = ["Account"]
 _READABLE: Final = 1500
 #: Letters above which a conserved quantity is only named.
 _LONG: Final = 800
-_LOW: Final = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 class Account:
@@ -43,7 +45,19 @@ class Account:
 
     @cached_property
     def _board(self) -> Blackboard:
-        return Blackboard(self.equations)
+        e = self.equations
+        return Blackboard(e.coordinates, e.velocities, e.accelerations, e.multipliers, time=self.system.time)
+
+    @cached_property
+    def _short(self) -> Abbreviations:
+        """Letters for the roots that stand on the page; where it is long there are none."""
+        s = self.system
+        shown = [] if self.long else [s.T, s.V, *(x for A, _ in self._matrices.values() for x in A)]
+        symbols = (*s.parameters, *s.coordinates, *s.velocities, *s.inputs.values())
+        return Abbreviations(shown, symbols)
+
+    def _equations(self, *, latex: bool = False) -> list[tuple[str, str]]:
+        return [] if self.long else lines(self.equations, self._board, self._short, latex=latex)
 
     @cached_property
     def _matrices(self) -> dict[str, tuple[sp.ImmutableMatrix, str]]:
@@ -69,63 +83,66 @@ class Account:
         """Return the page for a terminal, matrices within a width if they can be."""
         s, board = self.system, self._board
         q = ", ".join(self._named(x) for x in s.coordinates)
-        lines = [f"{s.name}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
+        out = [f"{s.name}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
         if s.parameters:
             given = (written(p.name) + ("" if x is None else f" = {x:g}") for p, x in s.parameters.items())
-            lines.append(f"parameters {', '.join(given)}")
+            out.append(f"parameters {', '.join(given)}")
         if s.time:
-            lines.append(f"time {s.time}")
-        lines += ["", *self._sum("T", s.T, width), *self._sum("V", s.V, width)]
+            out.append(f"time {s.time}")
+        out += ["", *self._sum("T", s.T, width), *self._sum("V", s.V, width)]
         if s.dissipation != 0:
-            lines += self._sum("R", s.dissipation, width)
+            out += self._sum("R", s.dissipation, width)
+        for letter, root in self._short.roots.items():
+            out.append(f"with {board.text(letter)} = {board.text(root)}")
         for name, (A, told) in self._matrices.items():
-            lines += ["", f"{name}, {told}:", *_matrix(name, A, board, width)]
-        lines.append("")
+            out += ["", f"{name}, {told}:", *matrix(name, A.applyfunc(self._short), board.text, width)]
+        out.append("")
         if self.long:
-            lines.append("The equations are too long for a page; --python and --c write them.")
+            out.append("The equations are too long for a page; --python and --c write them.")
         else:
-            lines.append(f"Equation{'s' * (len(s.coordinates) > 1)} of motion:")
-            for left, right in board.rows():
-                lines += ["  " + line for line in _folded(f"{left} = {right}", width - 2)]
-        lines += ["", *self._conserved(width)]
-        return "\n".join(lines)
+            out.append(f"Equation{'s' * (len(s.coordinates) > 1)} of motion:")
+            for left, right in self._equations():
+                out += ["  " + line for line in folded(f"{left} = {right}", width - 2)]
+        out += ["", *self._conserved(width)]
+        return "\n".join(out)
 
     def _named(self, coordinate: sp.Symbol) -> str:
         told, own = written(coordinate.name), self._names.get(coordinate.name, coordinate.name)
         return f"{told}" if own == coordinate.name else f"{told} ({own})"
 
     def _sum(self, name: str, x: sp.Expr, width: int) -> list[str]:
-        return _folded(f"{name} = {self._board.text(x)}", width)
+        return folded(f"{name} = {self._board.text(self._short(x))}", width)
 
     def _conserved(self, width: int) -> list[str]:
         cyclic = [written(q.name) for q in self.system.cyclic_coordinates()]
-        lines = [f"Cyclic: {', '.join(cyclic) or 'no coordinate'}"]
+        out = [f"Cyclic: {', '.join(cyclic) or 'no coordinate'}"]
         if not self._kept:
-            return [*lines, "Conserved: nothing that is told by the coordinates or the time"]
-        energy = sp.expand(self.system.T + self.system.V)
+            return [*out, "Conserved: nothing that is told by the coordinates or the time"]
         for name, x, meaning in self._kept:
             # T and V stand above.
-            told = "T + V" if name == "E" and sp.expand(x - energy) == 0 else self._board.text(x)
+            told = "T + V" if x == self.system.T + self.system.V else self._board.text(self._short(x))
             note = f" ({meaning})" if name == "h" else ""
             if len(told) > _LONG:
                 told, note = "∂T/∂v" if name != "h" else "T2 - T0 + V", ", too long for a page"
-            lines += _folded(f"Conserved: {written(name)} = {told}{note}", width)
-        return lines
+            out += folded(f"Conserved: {written(name)} = {told}{note}", width)
+        return out
 
     # LaTeX
 
     def latex(self) -> str:
         """Return display equations that stand in any document with amsmath."""
         s, board = self.system, self._board
-        rows = [rf"T &= {board.latex(s.T)}", rf"V &= {board.latex(s.V)}"]
+        rows = [f"{name} &= {board.latex(self._short(x))}" for name, x in (("T", s.T), ("V", s.V))]
         if s.dissipation != 0:
-            rows.append(rf"R &= {board.latex(s.dissipation)}")
-        for name, (A, _) in self._matrices.items():
+            rows.append(f"R &= {board.latex(self._short(s.dissipation))}")
+        rows += [f"{board.latex(letter)} &= {board.latex(root)}" for letter, root in self._short.roots.items()]
+        for name, (given, _) in self._matrices.items():
+            A = given.applyfunc(self._short)
             entries = r" \\ ".join(" & ".join(board.latex(x) for x in A[i, :]) for i in range(A.rows))
             rows.append(rf"{name} &= \begin{{bmatrix}} {entries} \end{{bmatrix}}")
         out = [f"% {s.name}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
         if not self.long:
-            out.append(_aligned([f"{left} &= {right}" for left, right in board.rows(latex=True)]))
+            out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(latex=True)]))
         if self._kept:
             out.append(_aligned([f"{sp.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
         return "\n".join(out)
@@ -149,7 +166,9 @@ class Account:
         told["drift"] = [str(x) for x in e.drift]
         told["forces"] = [str(x) for x in e.forces]
         told["constraints"] = [str(x) for x in s.constraints]
-        rows = [] if self.long else self._board.rows(latex=True)
+        # Each by itself: no letter is explained elsewhere.
+        plain = Abbreviations((), ())
+        rows = [] if self.long else lines(self.equations, self._board, plain, latex=True)
         told["equations"] = [] if self.long else [f"{x.lhs} = {x.rhs}" for x in e.equations()]
         told["latex"] = [f"{left} = {right}" for left, right in rows]
         told["cyclic"] = [q.name for q in s.cyclic_coordinates()]
@@ -163,49 +182,3 @@ def _aligned(rows: list[str]) -> str:
 
 def _listed(A: sp.ImmutableMatrix) -> list[list[str]]:
     return [[str(x) for x in A[i, :]] for i in range(A.rows)]
-
-
-def _matrix(name: str, A: sp.ImmutableMatrix, board: Blackboard, width: int) -> list[str]:
-    """Return a matrix in brackets, or its entries one a line where it is too wide."""
-    cells = [[board.text(x) for x in A[i, :]] for i in range(A.rows)]
-    widths = [max(_width(row[j]) for row in cells) for j in range(A.cols)]
-    if sum(widths) + 3 * A.cols + 4 <= width:
-        edges = "[]" if A.rows == 1 else ("⎡⎤", *("⎢⎥",) * (A.rows - 2), "⎣⎦")
-        rows = zip(cells, edges if A.rows > 1 else (edges,), strict=True)
-        return [
-            f"  {edge[0]} {'   '.join(c + ' ' * (w - _width(c)) for c, w in zip(row, widths, strict=True))} {edge[1]}"
-            for row, edge in rows
-        ]
-    out = []
-    symmetric = name == "M"
-    for i in range(A.rows):
-        for j in range(i if symmetric else 0, A.cols):
-            if cells[i][j] != "0":
-                place = str(i + 1) if A.cols == 1 else f"{i + 1}{j + 1}" if A.cols < 10 else f"{i + 1},{j + 1}"
-                equal = f" = {name}{f'{j + 1}{i + 1}'.translate(_LOW)}" if symmetric and i != j and A.cols < 10 else ""
-                out += _folded(f"  {name}{place.translate(_LOW)}{equal} = {cells[i][j]}", width)
-    return out
-
-
-def _width(text: str) -> int:
-    """Return how many columns a text takes: dots above letters take none."""
-    return sum(c not in "\u0307\u0308" for c in text)
-
-
-def _folded(text: str, width: int) -> list[str]:
-    """Return a sum on lines of a width, broken before + and - outside of brackets where there are such."""
-    lines: list[str] = []
-    indent = " " * (len(text) - len(text.lstrip()) + 6)
-    while _width(text) > width:
-        places, depth = [], 0
-        for k, c in enumerate(text[: width + len(text) - _width(text)]):
-            depth += (c in "([") - (c in ")]")
-            if k > len(indent) + 2 and text[k : k + 3] in (" + ", " - ", " = "):
-                places.append((depth, -k))
-        if not places:
-            break
-        # The last place on the line that is within the fewest brackets.
-        cut = -min(places)[1]
-        lines.append(text[:cut])
-        text = indent + text[cut + 1 :]
-    return [*lines, text]

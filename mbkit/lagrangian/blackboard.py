@@ -15,14 +15,13 @@ import sympy as sp
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.pretty.pretty_symbology import pretty_symbol
 
-from mbkit.lagrangian.motion import EquationsOfMotion
-from mbkit.lagrangian.tidy import tidy
-
 __all__ = ["Blackboard", "spread", "written"]
 
 _FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
 _HIGH: Final = str.maketrans("0123456789-/", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ")
 _MASS: Final = re.compile(r"[mM](\d*|_\w+)")
+#: Denominators that are read as such; longer fractions are decimals.
+_READ: Final = 10_000
 _INERTIA: Final = re.compile(r"[A-CIJ](\d*|_\w+)|EI")
 
 
@@ -31,49 +30,61 @@ class Blackboard:
 
     Parameters
     ----------
-    equations : EquationsOfMotion
+    *groups : sequences of sympy.Symbol
+        What moves, in the order in which factors are written: coordinates, velocities, accelerations, momenta.
+    time : sympy.Symbol, optional
     """
 
-    def __init__(self, equations: EquationsOfMotion) -> None:
-        e = self._equations = equations
-        self._moving = {s: k for k, group in enumerate((e.coordinates, e.velocities, e.accelerations)) for s in group}
+    def __init__(self, *groups: Iterable[sp.Symbol], time: sp.Symbol | None = None) -> None:
+        self._moving = {s: k for k, group in enumerate(groups) for s in group}
+        #: Velocities, accelerations and momenta: what holds most of them comes first in a sum.
+        self._fast = {s: k for s, k in self._moving.items() if k}
+        self._time = time
 
     # Order
 
     def _rank(self, x: sp.Expr) -> tuple[Any, ...]:
-        """Return what a factor is ordered by."""
+        """Return what a factor is ordered by: its kind, its place among the coordinates, what is Greek, its name."""
         base = x.base if x.is_Pow and x.exp.is_number else x
         if base.is_Number:
-            return (0, "")
+            return (0, 0, False, "")
         if base.is_Symbol:
-            name = base.name
             if base in self._moving:
-                return (5 + self._moving[base], list(self._moving).index(base))
+                return (5 + self._moving[base], list(self._moving).index(base), False, "")
+            name = base.name
             kinds = (_MASS.fullmatch(name), _INERTIA.fullmatch(name), name == "g")
-            greek = written(name)[0] != name[0]
-            return (next((k for k, hit in enumerate(kinds, start=1) if hit), 4), greek, name)
+            kind = 4.5 if base == self._time else next((k for k, hit in enumerate(kinds, start=1) if hit), 4)
+            return (kind, 0, written(name)[0] != name[0], name)
         if base.is_Add:
-            inside = [self._rank(s) for s in base.free_symbols]
-            least, most = min(inside, default=(4,))[0], max(inside, default=(4,))[0]
-            turns = base.has(sp.sin, sp.cos)
-            return (least if least == most < 4 and not turns else 4.5, str(base))
+            inside = [self._rank(s)[0] for s in base.free_symbols]
+            parameters = max(inside, default=0) <= 4 and not base.has(sp.sin, sp.cos)
+            return (min(inside, default=4) if parameters else 4.7, 0, False, str(base))
         if isinstance(base, sp.Function):
-            return (8, str(base.args[0]), base.func is sp.cos, str(base))
-        return (7.5, str(base))
+            return (12, *self._place(base.args[0]), base.func is sp.cos, str(base))
+        return (11, 0, False, str(base))
+
+    def _place(self, x: sp.Expr) -> tuple[int, str]:
+        """Return what the argument of a function is ordered by: how many coordinates stand in it, and which."""
+        order = list(self._moving)
+        places = sorted(order.index(s) if s in self._moving else -1 for s in x.free_symbols)
+        return len(places), " ".join(f"{k:4d}" for k in places) + str(x)
 
     def _ordered(self, terms: Iterable[sp.Expr]) -> list[sp.Expr]:
         """Return the terms of a sum, positive ones and those that do not turn first."""
 
         def key(term: sp.Expr) -> tuple[Any, ...]:
-            powers = dict(f.as_base_exp() for f in sp.Mul.make_args(term))
-            speeds = [-int(powers.get(s, 0)) for s, k in self._moving.items() if k]
-            turned = sorted((len(a.free_symbols), str(a)) for a in term.atoms(sp.sin, sp.cos))
-            return (speeds, len(turned), turned, _minus(term), str(term))
+            factors = sp.Mul.make_args(term)
+            powers = {b: int(e) if e.is_Integer else 1 for b, e in (f.as_base_exp() for f in factors)}
+            speeds = [-powers.get(s, 0) for s in self._fast]
+            degree = sum(e for b, e in powers.items() if b.free_symbols & self._fast.keys())
+            turned = sorted((*self._place(a.args[0]), str(a)) for a in term.atoms(sp.sin, sp.cos))
+            ranks = sorted(self._rank(f) for f in factors if not f.is_Number)
+            return (-degree, speeds, len(turned), turned, _signed(term)[0], len(ranks) > 1, ranks, str(term))
 
         out = sorted(terms, key=key)
         # A sum does not begin with a minus where it need not.
-        first = next((t for t in out if not _minus(t)), None)
-        if first is not None and _minus(out[0]):
+        first = next((t for t in out if not _signed(t)[0]), None)
+        if first is not None and _signed(out[0])[0]:
             out.remove(first)
             out.insert(0, first)
         return out
@@ -85,14 +96,20 @@ class Blackboard:
 
     def text(self, x: Any) -> str:
         """Return an expression on one line."""
-        x = sp.sympify(x)
-        return self._joined(self._ordered(sp.Add.make_args(x)))
+        return self.text_of([sp.sympify(x)])
+
+    def text_of(self, parts: Iterable[sp.Expr]) -> str:
+        """Return a sum on one line, each part of which is ordered by itself."""
+        return self._joined(self._terms(parts))
+
+    def _terms(self, parts: Iterable[sp.Expr]) -> list[sp.Expr]:
+        return [term for part in parts if part != 0 for term in self._ordered(sp.Add.make_args(part))]
 
     def _joined(self, terms: list[sp.Expr]) -> str:
         out = ""
         for term in terms:
-            minus = _minus(term)
-            told = self._product(-term if minus else term)
+            minus, size = _signed(term)
+            told = self._product(size)
             out += (("-" if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
         return out or "0"
 
@@ -150,14 +167,18 @@ class Blackboard:
 
     def latex(self, x: Any) -> str:
         """Return an expression in LaTeX."""
-        return self._latex(self._ordered(sp.Add.make_args(sp.sympify(x))))
+        return self.latex_of([sp.sympify(x)])
+
+    def latex_of(self, parts: Iterable[sp.Expr]) -> str:
+        """Return a sum in LaTeX, each part of which is ordered by itself."""
+        return self._latex(self._terms(parts))
 
     def _latex(self, terms: list[sp.Expr]) -> str:
-        printer = _Latex({"order": "none", "full_prec": False})
+        printer = _Latex({"order": "none", "full_prec": False, "fold_func_brackets": True})
         out = ""
         for term in terms:
-            minus = _minus(term)
-            told = printer.doprint(self._arranged(-term if minus else term))
+            minus, size = _signed(term)
+            told = printer.doprint(self._arranged(size))
             out += (("- " if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
         return out or "0"
 
@@ -170,31 +191,6 @@ class Blackboard:
         if x.is_Pow:
             return sp.Pow(self._arranged(x.base), x.exp, evaluate=False)
         return x
-
-    # Equations
-
-    def rows(self, *, latex: bool = False) -> list[tuple[str, str]]:
-        """Return the two sides of each equation: accelerations, then velocities, then the potential."""
-        e = self._equations
-        join = self._latex if latex else self._joined
-        right = e.forces
-        if e.multipliers:
-            right = right + e.constraint_jacobian.T * sp.Matrix(e.multipliers)
-        out = []
-        for i, force in enumerate(right):
-            parts = [m * a for m, a in zip(e.mass_matrix[i, :], e.accelerations, strict=True)]
-            parts += [self._by_speeds(e.coriolis_force[i]), e.drift[i], spread(e.potential_gradient[i])]
-            left = [t for part in parts if part != 0 for t in self._ordered(sp.Add.make_args(part))]
-            out.append((join(left), join(self._ordered(sp.Add.make_args(force)) if force != 0 else [])))
-        return out + [(join(self._ordered(sp.Add.make_args(f))), "0") for f in e.constraints]
-
-    def _by_speeds(self, x: sp.Expr) -> sp.Expr:
-        """Return what is quadratic in the velocities term by term, where it would hold cosines in brackets."""
-        if not any(a.has(sp.sin, sp.cos) for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add):
-            return x
-        form = sp.Poly(x, *self._equations.velocities)
-        powers = [sp.Mul(*(v**n for v, n in zip(form.gens, m, strict=True))) for m in form.monoms()]
-        return sp.Add(*(tidy(c) * p for c, p in zip(form.coeffs(), powers, strict=True)))
 
 
 class _Latex(LatexPrinter):  # type: ignore[misc]
@@ -237,11 +233,18 @@ def _below(x: sp.Expr) -> bool:
     return bool(x.is_Pow and x.exp.is_Rational and x.exp.is_negative)
 
 
-def _minus(x: sp.Expr) -> bool:
-    return bool(x.as_coeff_Mul()[0].is_negative)
+def _signed(x: sp.Expr) -> tuple[bool, sp.Expr]:
+    """Return whether a term has a minus in front, and the term without; a sum of negative terms has one."""
+    number, rest = x.as_coeff_Mul()
+    factors = list(sp.Mul.make_args(rest))
+    flipped = bool(number.is_negative)
+    for k, f in enumerate(factors):
+        if f.is_Add and all(t.as_coeff_Mul()[0].is_negative for t in f.args):
+            factors[k], flipped = -f, not flipped
+    return flipped, sp.Mul(abs(number), *factors)
 
 
 def _number(x: sp.Expr) -> str:
-    if x.is_Rational and x.q != 1:
+    if x.is_Rational and 1 < x.q <= _READ:
         return _FRACTIONS.get((int(x.p), int(x.q)), str(x))
-    return f"{float(x):.15g}" if x.is_Float else str(x)
+    return str(x) if x.is_Integer or not x.is_Number else f"{float(x):.15g}"

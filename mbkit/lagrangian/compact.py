@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from fractions import Fraction
 from itertools import combinations
-from math import comb, gcd, lcm
+from math import comb, gcd, lcm, prod
+from random import Random
 from typing import Any, Final
 
 import sympy as sp
 
-from mbkit.lagrangian.harmonic import Harmonic
+from mbkit.lagrangian.harmonic import Harmonic, Key, Space
 
 __all__ = ["cost", "number", "written_out"]
 
@@ -18,8 +19,14 @@ __all__ = ["cost", "number", "written_out"]
 _SMALL: Final = 60
 #: Forms of fewest terms that are made into SymPy's expressions, to count their operations.
 _TRIED: Final = 4
+#: Sums of angles that are taken as one.
+_COMBINED: Final = 2
 #: Terms up to which a sum is tried to be a product of sums.
 _FACTORED: Final = 10
+
+#: Possible terms up to which a product of sums is looked for, and places at which it is ruled out first.
+_DENSE: Final = 50_000
+_PROBES: Final = 4
 
 #: Powers (angle, of cos, of sin) of single angles.
 _Powers = tuple[tuple[int, int, int], ...]
@@ -75,16 +82,49 @@ def written_out(x: Harmonic, *, whole: bool = True, decimals: bool = True) -> sp
     writer = _Writer(x, whole, decimals)
     if len(x.terms) > _SMALL:
         return writer.expression(writer.as_it_is())
-    forms = sorted(writer.forms(), key=len)
-    near = [form for form in forms[:_TRIED] if len(form) <= len(forms[0]) + 2]
-    made = [writer.expression(form) for form in near]
+    forms = [(writer, form) for form in writer.forms()]
+    forms += [(other, form) for other in map(writer.like, _of_one_angle(x)) for form in other.squares()]
+    forms.sort(key=lambda pair: len(pair[1]))
+    near = [(w, form) for w, form in forms[:_TRIED] if len(form) <= len(forms[0][1]) + 2]
+    made = [w.expression(form) for w, form in near]
     return min(made, key=lambda e: (cost(e), made.index(e)))
+
+
+def _of_one_angle(x: Harmonic) -> Iterator[Harmonic]:
+    """Yield a sum with an angle more, such as θ₁ - θ₂, where twice that angle stands in it."""
+    space = x.space
+    found = dict.fromkeys(_direction(key[1]) for key in x.terms if gcd(*key[1]) > 1 and sum(map(bool, key[1])) > 1)
+    for direction in list(found)[:_COMBINED]:
+        angle = sp.Add(*(k * a for k, a in zip(direction, space.angles, strict=True)))
+        # SymPy writes sin(b - a) as -sin(a - b).
+        sign = -1 if sp.sin(angle).is_Mul else 1
+        wider = Space(space.name, [*space.angles, sign * angle], space.generators, space.most)
+        terms = {}
+        for (kind, turns, powers), value in x.terms.items():
+            along = any(turns) and _direction(turns) == direction
+            more = ((0,) * len(turns), gcd(*turns)) if along else (turns, 0)
+            # Of a sine the sign of the angle comes before it.
+            terms[kind, (*more[0], more[1]), powers] = value * (sign if along and kind else 1)
+        yield Harmonic(wider, terms)
+
+
+def _direction(turns: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(k // gcd(*turns) for k in turns) if any(turns) else turns
 
 
 class _Writer:
     def __init__(self, x: Harmonic, whole: bool, decimals: bool) -> None:
         self._x, self._whole, self._decimals = x, whole, decimals
         self._sums: dict[frozenset[Any], sp.Expr] = {}
+
+    def like(self, x: Harmonic) -> _Writer:
+        """Return a writer of another sum."""
+        return _Writer(x, self._whole, self._decimals)
+
+    def squares(self) -> list[_Form]:
+        """Return the sum with its last angle split off."""
+        last = len(self._x.space.angles) - 1
+        return [_split(self._x, (last,), kept) for kept in (0, 1)]
 
     def as_it_is(self) -> _Form:
         return {((), kind, multiples, powers): value for (kind, multiples, powers), value in self._x.terms.items()}
@@ -103,7 +143,21 @@ class _Writer:
                 form = _split(x, subset, kept)
                 if form not in forms:
                     forms.append(form)
-        return forms
+        mixed = self._by_monomial(subsets)
+        return forms if mixed in forms else [*forms, mixed]
+
+    def _by_monomial(self, subsets: list[tuple[int, ...]]) -> _Form:
+        """Return the sum with the shortest form of what multiplies each product of generators."""
+        groups: dict[tuple[int, ...], dict[Key, Fraction]] = {}
+        for key, value in self._x.terms.items():
+            groups.setdefault(key[2], {})[key] = value
+        out: _Form = {}
+        for terms in groups.values():
+            part = Harmonic(self._x.space, terms)
+            tried = [_split(part, subset, kept) for subset in subsets for kept in ((0, 1) if subset else (0,))]
+            best: _Form = min(tried, key=len)
+            out |= best
+        return out
 
     def expression(self, form: _Form) -> sp.Expr:
         poly = _paired(dict(self._term(key, value) for key, value in form.items()))
@@ -192,15 +246,13 @@ class _Writer:
 
 def _product(poly: _Poly, x: sp.Expr) -> list[sp.Expr]:
     """Return a sum as a product of sums, if it is one; its atoms are as good as symbols."""
+    highest: dict[sp.Expr, int] = {}
+    for a, e in (pair for atoms in poly for pair in atoms):
+        highest[a] = max(highest.get(a, 0), e)
+    # SymPy's polynomials are as large as all powers together.
+    large = prod(e + 1 for e in highest.values()) > _DENSE
     # The factors of a sum with decimals would have others.
-    if x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms):
-        return []
-    where: dict[sp.Expr, list[int]] = {}
-    for atoms in poly:
-        for a, e in atoms:
-            where.setdefault(a, []).append(e)
-    # What is linear in an atom that one term holds is a product of nothing: all its terms share no factor.
-    if [1] in where.values():
+    if large or x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms) or _irreducible(poly):
         return []
     symbols = {a: sp.Dummy(f"x{i}") for i, a in enumerate(dict.fromkeys(a for atoms in poly for a, _ in atoms))}
     named = sp.Add(
@@ -213,11 +265,37 @@ def _product(poly: _Poly, x: sp.Expr) -> list[sp.Expr]:
     return [] if product.is_Add else [product.xreplace({symbol: a for a, symbol in symbols.items()})]
 
 
+def _irreducible(poly: _Poly) -> bool:
+    """Return whether a sum is surely no product: what is Q a + R has no factor but those that Q and R share.
+
+    At random whole numbers for the other atoms Q and R share no factor either, most of the time.
+    """
+    atoms = list(dict.fromkeys(a for powers in poly for a, _ in powers))
+    rows = [tuple(dict(powers).get(a, 0) for a in atoms) for powers in poly]
+    # Without what all terms share, which is no factor that is looked for.
+    least = [min(es) for es in zip(*rows, strict=True)]
+    rows = [tuple(e - f for e, f in zip(row, least, strict=True)) for row in rows]
+    scale = lcm(*(v.denominator for v in poly.values()))
+    numbers = [int(v * scale) for v in poly.values()]
+    shared, rng = gcd(*numbers), Random(0)
+    for i, highest in enumerate(max(es) for es in zip(*rows, strict=True)):
+        for _ in range(_PROBES if highest == 1 else 0):
+            at = [rng.randrange(1_000, 1_000_000) for _ in atoms]
+            parts = [0, 0]
+            for row, x in zip(rows, numbers, strict=True):
+                others = (at[j] ** e for j, e in enumerate(row) if j != i)
+                parts[row[i]] += x // shared * prod(others)
+            if gcd(*parts) == 1:
+                return True
+    return False
+
+
 def _content(poly: _Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, _Poly]:
     """Return the powers and the number that all terms share, and what is left."""
     first, *others = (dict(atoms) for atoms in poly)
-    shared = {a: min([e, *(o.get(a, 0) for o in others)]) for a, e in first.items()}
-    shared = {a: e for a, e in shared.items() if e > 0}
+    powers = {a: [e, *(o.get(a, 0) for o in others)] for a, e in first.items()}
+    # k/r² - p/r³ stays as it is.
+    shared = {a: min(es) for a, es in powers.items() if min(es) > 0 or min(es) == max(es)}
     values = list(poly.values())
     scale = min(map(abs, values))
     if any(v.denominator > 1 or abs(v) > 100 for v in (x / scale for x in values)):
@@ -225,6 +303,9 @@ def _content(poly: _Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, _Poly]:
         # Decimals share many numbers by accident; a common factor of a sum is read where it is a small one.
         if scale.numerator > 100 or scale.denominator > 100:
             scale = Fraction(1)
+    # ½ (2 a + b) reads worse than a + ½ b.
+    if _numbers(values) < _numbers([x / scale for x in values]) + (scale != 1):
+        scale = Fraction(1)
     if sum(v > 0 for v in values) == 0:
         scale = -scale
     left = {
@@ -232,6 +313,11 @@ def _content(poly: _Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, _Poly]:
         for atoms, v in poly.items()
     }
     return list(shared.items()), scale, left
+
+
+def _numbers(values: list[Fraction]) -> int:
+    """Return how many numbers are written."""
+    return sum(abs(x) != 1 for x in values)
 
 
 def _paired(poly: _Poly) -> _Poly:
@@ -245,7 +331,12 @@ def _paired(poly: _Poly) -> _Poly:
             if out.get(alone) == -value:
                 other = (sp.cos if isinstance(a, sp.sin) else sp.sin)(*a.args)
                 del out[alone], out[atoms]
-                out[(*alone, (other, 2))] = -value
+                # There may be such a term already, with its atoms in another order.
+                made = {*alone, (other, 2)}
+                place = next((k for k in out if set(k) == made), (*alone, (other, 2)))
+                total = out.pop(place, Fraction(0)) - value
+                if total:
+                    out[place] = total
     return out
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array, real
-from mbkit.errors import UnsupportedError
+from mbkit._check import Array, real
+from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.lagrangian.symbols import name_of
 
 if TYPE_CHECKING:
     from mbkit.engines import Dynamics
@@ -78,14 +79,20 @@ class Constrained:
         """
         q, v = self.model.check_q(q), self.model.check_v(v)
         tau = self.model.check_v(np.zeros_like(v) if tau is None else tau, "tau")
-        return self._manifold(t, values).multipliers(*np.broadcast_arrays(q, v, tau))
+        out = self._manifold(t, values).multipliers(*np.broadcast_arrays(q, v, tau))
+        if not np.isfinite(out).all():
+            raise NumericalError(
+                f"{self.name}: the multipliers are not finite at q = {q.tolist()}; perhaps the constraints depend on "
+                "each other in this pose, or the mass matrix is singular"
+            )
+        return out
 
     def project(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, **values: float) -> tuple[Array, Array]:
         """Return the nearest state that the constraints allow, by the mass matrix's measure.
 
         Parameters
         ----------
-        q, v : (n,) array_like
+        q, v : (n,) or (N, n) array_like
         t : float
             s.
         **values
@@ -93,7 +100,7 @@ class Constrained:
 
         Returns
         -------
-        q, v : (n,) arrays
+        q, v : (n,) or (N, n) arrays
             With f(q, t) = 0 and J v + ∂f/∂t = 0 to rounding.
 
         Raises
@@ -102,7 +109,11 @@ class Constrained:
             Constraints that contradict or follow from each other, or too far a way.
         """
         manifold = self._manifold(t, values)
-        return manifold.project(*(finite_array(n, x, (len(self.coordinates),)) for n, x in (("q", q), ("v", v))))
+        q, v = np.broadcast_arrays(self.model.check_q(q), self.model.check_v(v))
+        if q.ndim == 1:
+            return manifold.project(q, v)
+        found = [manifold.project(*pair) for pair in zip(q, v, strict=True)]
+        return np.array([pair[0] for pair in found]), np.array([pair[1] for pair in found])
 
     def embedded(self, independent: Sequence[Any] | None = None, **values: float) -> Embedded:
         """Return the system on independent coordinates alone, for `mbkit.simulate`.
@@ -120,7 +131,7 @@ class Constrained:
         dyn = self.dynamics().at(**values)
         if isinstance(independent, (str, sp.Basic)):
             independent = [independent]
-        names = None if independent is None else tuple(_name(x) for x in independent)
+        names = None if independent is None else tuple(name_of(x) for x in independent)
         return Embedded(self._consistent(dyn), names)
 
     def _manifold(self, t: float, values: Mapping[str, float]) -> Manifold:
@@ -139,8 +150,3 @@ class Constrained:
     @cached_property
     def _interpreted(self) -> Dynamics:
         return self.dynamics(options={"compile": False})
-
-
-def _name(given: Any) -> str:
-    """Return the name of a coordinate given as a symbol, a dynamicsymbol or a name."""
-    return given if isinstance(given, str) else str(getattr(given, "func", given) if given.args else given)

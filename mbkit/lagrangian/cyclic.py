@@ -10,11 +10,13 @@ the energy T + V where T has neither T1 nor T0 (ch. 2.7).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import sympy as sp
 
+from mbkit.lagrangian.blackboard import Blackboard
+from mbkit.lagrangian.probe import vanishes
 from mbkit.lagrangian.tidy import tidy
 
 if TYPE_CHECKING:
@@ -44,25 +46,29 @@ class ConservedQuantity:
     expression : sympy.Expr
     meaning : str
         In words.
+    moving : tuple of tuples of sympy.Symbol
+        Coordinates and velocities, or momenta, in the order in which they are written.
     """
 
     name: str
     expression: sp.Expr
     meaning: str
+    moving: tuple[tuple[sp.Symbol, ...], ...] = field(default=(), repr=False, compare=False)
 
     def __str__(self) -> str:
         return f"{self.name} = {self.expression} ({self.meaning})"
 
     def latex(self) -> str:
         """Return name = expression."""
-        return f"{sp.latex(sp.Symbol(self.name))} = {sp.latex(self.expression)}"
+        return f"{sp.latex(sp.Symbol(self.name))} = {Blackboard(*self.moving).latex(self.expression)}"
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
 
 
 def _vanish(parts: Iterable[sp.Expr]) -> bool:
-    return all(x == 0 or tidy(x) == 0 for x in parts)
+    # Decimals that cancel do so in their own digits only.
+    return all(vanishes(x) or (x.has(sp.Float) and tidy(x) == 0) for x in parts)
 
 
 def _in_no_energy(system: Lagrangian, q: sp.Symbol) -> bool:
@@ -80,7 +86,7 @@ def acting(system: Lagrangian) -> list[sp.Expr]:
 
 def _along(system: Lagrangian) -> dict[sp.Symbol, sp.Expr]:
     """Return what acts along each coordinate beside V, the constraints with their λ among it."""
-    multipliers = [(sp.Symbol(f"lambda{k + 1}"), f) for k, f in enumerate(system.constraints)]
+    multipliers = list(zip(system.multiplier_symbols, system.constraints, strict=True))
     return {
         q: tidy(x + sum((sp.diff(f, q) * symbol for symbol, f in multipliers), sp.Integer(0)))
         for q, x in zip(system.coordinates, acting(system), strict=True)
@@ -96,7 +102,7 @@ def cyclic_coordinates(system: Lagrangian) -> tuple[dict[sp.Symbol, sp.Expr], tu
 
 def conserved_momenta(system: Lagrangian) -> dict[sp.Symbol, sp.Expr]:
     """Return ∂L/∂v of each cyclic coordinate along which nothing acts."""
-    _, free = cyclic_coordinates(system)
+    free = system.cyclic_coordinates()
     return {q: p for q, p in zip(system.coordinates, system.momenta, strict=True) if q in free}
 
 
@@ -136,14 +142,15 @@ def conserved_quantities(system: Lagrangian, form: Lagrangian | None = None) -> 
         The same in other velocities, to write them in.
     """
     form = form or system
+    moving = (form.coordinates, form.velocities)
     out = [
-        ConservedQuantity(f"p_{q.name}", p, f"momentum of {q.name}, which is cyclic")
+        ConservedQuantity(f"p_{q.name}", p, f"momentum of {q.name}, which is cyclic", moving)
         for q, p in form.conserved_momenta().items()
     ]
     if keeps_energy(system):
         if is_energy(system):
-            out.append(ConservedQuantity("E", form.energy_function, "energy T + V"))
+            out.append(ConservedQuantity("E", form.energy_function, "energy T + V", moving))
         else:
             told = "Jacobi's integral T2 - T0 + V, not the energy T + V"
-            out.append(ConservedQuantity("h", form.energy_function, told))
+            out.append(ConservedQuantity("h", form.energy_function, told, moving))
     return tuple(out)

@@ -19,14 +19,16 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, rows
+from mbkit._check import Array, real, rows
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian import cyclic
+from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.cyclic import ConservedQuantity
 from mbkit.lagrangian.numeric import Numeric, values_of
-from mbkit.lagrangian.poisson import bracket, momentum_symbol, shorter
+from mbkit.lagrangian.poisson import bracket, momentum_symbols, shorter
+from mbkit.lagrangian.slopes import slope
 from mbkit.lagrangian.squares import Squares
-from mbkit.lagrangian.symbols import expression, velocity_of
+from mbkit.lagrangian.symbols import in_symbols_of, velocity_of
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
@@ -62,7 +64,8 @@ class CanonicalEquations:
 
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block."""
-        rows = (f"{sp.latex(e.lhs)} &= {sp.latex(e.rhs)}" for e in self.equations())
+        board = Blackboard(self.coordinates, self.momenta)
+        rows = (f"{sp.latex(e.lhs)} &= {board.latex(e.rhs)}" for e in self.equations())
         return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
@@ -124,7 +127,7 @@ class Hamiltonian:
             momentum_rates=tuple(velocity_of(p) for p in self.momenta),
             qdot=self.velocities,
             # The squares of H stay together.
-            pdot=sp.ImmutableMatrix([x - sp.diff(self.H, q) for q, x in zip(s.coordinates, forces, strict=True)]),
+            pdot=sp.ImmutableMatrix([x - slope(self.H, q) for q, x in zip(s.coordinates, forces, strict=True)]),
         )
 
     def equations(self) -> CanonicalEquations:
@@ -134,8 +137,14 @@ class Hamiltonian:
     # Brackets
 
     def canonical(self, f: Any) -> sp.Expr:
-        """Return an expression with the velocities in it written in momenta."""
-        out = expression("f", f)
+        """Return an expression with the velocities in it written in momenta.
+
+        Raises
+        ------
+        InputError
+            Symbols that the system does not know.
+        """
+        out = in_symbols_of(self.system, "f", f, self.momenta)
         return sp.sympify(out.subs(dict(zip(self.system.velocities, self.velocities, strict=True)), simultaneous=True))
 
     def poisson(self, f: Any, g: Any) -> sp.Expr:
@@ -158,13 +167,14 @@ class Hamiltonian:
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
         """Return the momenta of the cyclic coordinates, and H if it is constant, in coordinates and momenta."""
         symbols = dict(zip(self.coordinates, self.momenta, strict=True))
+        moving = (self.coordinates, self.momenta)
         out = [
-            ConservedQuantity(symbols[q].name, symbols[q], f"momentum of {q.name}, which is cyclic")
+            ConservedQuantity(symbols[q].name, symbols[q], f"momentum of {q.name}, which is cyclic", moving)
             for q in cyclic.conserved_momenta(self.system)
         ]
         if self.is_conserved:
             told = "energy T + V" if self.is_energy else "Jacobi's integral T2 - T0 + V, not the energy T + V"
-            out.append(ConservedQuantity("H", self.H, told))
+            out.append(ConservedQuantity("H", self.H, told, moving))
         return tuple(out)
 
     # Numbers
@@ -184,7 +194,7 @@ class Hamiltonian:
 
     def _behind(self, t: float, values: dict[str, float], what: str) -> Array:
         told = values_of(self.system, values, what)
-        return told if self.system.time is None else np.array([float(t), *told])
+        return told if self.system.time is None else np.array([real("t", t), *told])
 
     def _mass(self, q: ArrayLike, other: ArrayLike, name: str, t: float, values: dict[str, float]) -> Any:
         n = len(self.coordinates)
@@ -226,6 +236,8 @@ class Hamiltonian:
     def field(self, tau: ArrayLike | None = None, **values: float) -> Callable[[float, ArrayLike], Array]:
         """Return f(t, y) = (q̇, ṗ) with y = (q, p), as SciPy's integrators take it.
 
+        Where the mass matrix is singular the answer is not finite, at which an integrator takes a shorter step.
+
         Parameters
         ----------
         tau : (n,) array_like, optional
@@ -243,7 +255,7 @@ class Hamiltonian:
 
         def f(t: float, y: ArrayLike) -> Array:
             y = rows("y", y, 2 * n, s.name, "nq + nv")
-            behind = np.concatenate([acting, [t] if timed else [], told])
+            behind = np.concatenate([acting, [real("t", t)] if timed else [], told])
             return self._rates(y[..., :n], y[..., n:], behind)[..., 0]
 
         return f
@@ -252,7 +264,7 @@ class Hamiltonian:
 
     def latex(self) -> str:
         """Return H = ... ."""
-        return f"H = {sp.latex(self.H)}"
+        return f"H = {Blackboard(self.coordinates, self.momenta, time=self.system.time).latex(self.H)}"
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
@@ -274,8 +286,7 @@ def hamiltonian(system: Lagrangian) -> Hamiltonian:
             f"hamiltonian: {system.name} has constraints, whose forces no H holds; embed them first, or leave them out"
         )
     k = system.kinetic
-    taken = {s.name for s in (*system.parameters, *system.coordinates, *system.velocities)}
-    momenta = tuple(momentum_symbol(q, taken) for q in system.coordinates)
+    momenta = momentum_symbols(system, system.coordinates)
     p = [symbol - x for symbol, x in zip(momenta, k.b, strict=True)]
     squares = Squares(k.M, "T: its mass matrix")
     return Hamiltonian(

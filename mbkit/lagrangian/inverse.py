@@ -7,9 +7,9 @@ from typing import Any, Final
 import sympy as sp
 
 from mbkit.errors import InputError
-from mbkit.lagrangian.quotients import reduced
+from mbkit.lagrangian.tidy import tidy
 
-__all__ = ["inverse"]
+__all__ = ["blocks", "inverse"]
 
 # Above this size cofactors grow faster than elimination does.
 _BY_COFACTORS: Final = 4
@@ -34,9 +34,9 @@ def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
     """
     A = sp.Matrix(A)
     out = sp.zeros(*A.shape)
-    for block in _blocks(A):
+    for block in blocks(A):
         part = A.extract(block, block)
-        det = reduced(part.det(method="berkowitz"))
+        det = tidy(part.det(method="berkowitz"))
         if det == 0:
             raise InputError(f"{what}: {part.tolist()} is singular everywhere")
         if len(block) <= _BY_COFACTORS:
@@ -45,11 +45,11 @@ def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
             turned = part.LUsolve(sp.eye(len(block)))
         for i, row in enumerate(block):
             for j, column in enumerate(block):
-                out[row, column] = reduced(turned[i, j])
+                out[row, column] = tidy(turned[i, j])
     return sp.ImmutableMatrix(out)
 
 
-def _blocks(A: sp.Matrix) -> list[list[int]]:
+def blocks(A: sp.Matrix) -> list[list[int]]:
     """Return the indices that A's entries connect, each set in order."""
     left, out = list(range(A.shape[0])), []
     while left:

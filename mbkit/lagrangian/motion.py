@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import sympy as sp
 
+from mbkit.lagrangian.slopes import gradient, slope
 from mbkit.lagrangian.tidy import tidy, tidy_matrix
 
-__all__ = ["EquationsOfMotion", "christoffel"]
+if TYPE_CHECKING:
+    from mbkit.lagrangian.system import Lagrangian
+
+__all__ = ["EquationsOfMotion", "christoffel", "equations_of_motion"]
 
 
 @dataclass(frozen=True)
@@ -100,9 +104,12 @@ class EquationsOfMotion:
 
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block, in the order of a blackboard."""
-        from mbkit.lagrangian.blackboard import Blackboard
+        from mbkit.lagrangian.lines import board_of, letters_for, lines
 
-        rows = [f"{left} &= {right}" for left, right in Blackboard(self).rows(latex=True)]
+        board, short = board_of(self), letters_for(self)
+        told = lines(self, board, short, latex=True)
+        told += [(board.latex(letter), board.latex(root)) for letter, root in short.roots.items()]
+        rows = (f"{left} &= {right}" for left, right in told)
         return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
@@ -125,13 +132,46 @@ def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
     return out or "0"
 
 
+def equations_of_motion(system: Lagrangian) -> EquationsOfMotion:
+    """Return Lagrange's equations of a system: d/dt ∂L/∂v - ∂L/∂q = Q + Jᵀ λ."""
+    q, v, k, t = system.coordinates, sp.Matrix(system.velocities), system.kinetic, system.time
+    n, m = len(q), len(system.constraints)
+    drift = sp.zeros(n, 1)
+    if any(k.b) or k.T0 != 0:
+        curl = k.b.jacobian(q)
+        drift += (curl - curl.T) * v - sp.Matrix(gradient(k.T0, q))
+    if t is not None:
+        drift += sp.diff(k.M, t) * v + sp.diff(k.b, t)
+    friction = [sp.diff(system.dissipation, w) for w in system.velocities]
+    inputs = [system.inputs.get(x, sp.Integer(0)) for x in q]
+    forces = sp.Matrix(system.forces) + sp.Matrix(inputs) - sp.Matrix(friction)
+    f = sp.Matrix(m, 1, system.constraints)
+    jacobian = f.jacobian(q) if m else sp.zeros(0, n)
+    rate = jacobian * v + (sp.zeros(m, 1) if t is None else sp.diff(f, t))
+    gamma = rate.jacobian(q) * v + (sp.zeros(m, 1) if t is None else sp.diff(rate, t)) if m else rate
+    return EquationsOfMotion(
+        coordinates=q,
+        velocities=system.velocities,
+        accelerations=system.accelerations,
+        mass_matrix=k.M,
+        coriolis_matrix=christoffel(k.M, q, system.velocities),
+        drift=tidy_matrix(drift),
+        potential_gradient=sp.ImmutableMatrix(gradient(system.V, q)),
+        forces=tidy_matrix(forces),
+        constraint_jacobian=sp.ImmutableMatrix(jacobian),
+        constraint_acceleration=tidy_matrix(gamma),
+        constraints=sp.ImmutableMatrix(f),
+        multipliers=system.multiplier_symbols,
+    )
+
+
 def christoffel(M: Any, coordinates: Any, velocities: Any) -> sp.ImmutableMatrix:
     """Return C_ij = ½ Σ_k (∂M_ij/∂q_k + ∂M_ik/∂q_j - ∂M_jk/∂q_i) v_k.
 
     Spong, Hutchinson, Vidyasagar 2006, Robot Modeling and Control, eq. (7.63).
     """
     n = len(coordinates)
-    dM = [sp.diff(M, q) for q in coordinates]
+    dM = [sp.Matrix(M).applyfunc(lambda x, q=q: slope(x, q)) for q in coordinates]
 
     def entry(i: int, j: int) -> sp.Expr:
         return tidy(sum((dM[k][i, j] + dM[j][i, k] - dM[i][j, k]) * velocities[k] for k in range(n)) / 2)

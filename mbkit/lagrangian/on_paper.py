@@ -1,13 +1,16 @@
-"""A model's equations to read: its energies in SymPy."""
+"""A model's equations to read: its energies in SymPy, its loops as constraints, and what is moved in time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, count
 from typing import Any, Final
 
 import sympy as sp
 
 from mbkit.errors import InputError, UnsupportedError
+from mbkit.lagrangian.closures import closure
+from mbkit.lagrangian.prescribed import motion
 from mbkit.lagrangian.symbolic_kinematics import SymbolicKinematics
 from mbkit.lagrangian.symbols import velocity_of
 from mbkit.lagrangian.system import Lagrangian
@@ -26,34 +29,50 @@ def from_model(
     *,
     symbols: bool | None = None,
     coordinates: Sequence[str] | None = None,
+    drives: bool = False,
     progress: Callable[[float, str], None] | None = None,
 ) -> Lagrangian:
-    """Return a model as a `Lagrangian` to read: T, V and Rayleigh's dissipation in its coordinates.
+    """Return a model as a `Lagrangian` to read and to run: T, V and Rayleigh's dissipation in its coordinates.
 
     The joints' own formulas are evaluated on exact sums of cosines and sines, which are
     short without a search: a planar chain has cos(theta2 + theta3) where one would write it.
     Numbers are the decimals of the description. Springs are in V, dampers in the
     dissipation, armature in T; dry friction and limits are left out, as in every engine.
 
+    Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
+    both ends. A point closure has three rows, two where the loop lies in a plane, and its multipliers are
+    the force on body a; a frame closure has three more of the orientation, one where all axes in the
+    loop are parallel (`mbkit.lagrangian.closures`). Coordinates that are prescribed become
+    functions of the time, and T has terms of first and zeroth degree then.
+
     Parameters
     ----------
     model : Model
-        A tree of joints whose velocities are the rates of their coordinates: not ball and free ones.
+        Of joints whose velocities are the rates of their coordinates: not ball and free ones.
     symbols : bool, optional
         Whether a system of the catalog is written in the textbooks' symbols, with the model's
         numbers as values of the parameters: cart_pole in m_c, m_p, l and g. Not given, it is if
         the model has no named parameters of its own.
     coordinates : sequence of str, optional
-        Names instead of the model's, such as ``["q1", "q2"]``.
+        Names instead of the model's, such as ``["q1", "q2"]``, prescribed ones included.
+    drives : bool
+        Whether prescribed coordinates stay, each bound by a constraint behind those of the loops: its
+        multiplier is the force (or torque) of the drive that moves it.
     progress : callable, optional
         Called with a fraction and a text.
 
     Raises
     ------
     UnsupportedError
-        Ball or free joints, loops, prescribed motions, or more terms than anybody reads.
+        Ball or free joints, more terms than anybody reads, or no coordinate that is left to move.
     InputError
-        `symbols` asked for of a model that is no system of the catalog, or names that do not fit.
+        `symbols` asked for of a model that is no system of the catalog, names that do not fit, or
+        a loop whose ends never meet or do not move against each other.
+
+    Notes
+    -----
+    Where a spatial loop has more rows than it takes freedoms (Bricard's, Bennett's), the set is redundant: which
+    rows are enough changes from pose to pose, and running it is refused with the rows by name.
 
     Examples
     --------
@@ -63,6 +82,21 @@ def from_model(
     (l**2*m*thetadot**2/2, -g*l*m*cos(theta))
     >>> {s.name: x for s, x in lag.parameters.items()}
     {'g': 9.81, 'm': 2.0, 'l': 1.0}
+
+    A slider-crank is two rods, a piston, and the pin that closes the loop.
+
+    >>> b = mb.ModelBuilder("slider_crank", gravity=(0, 0, 0))
+    >>> b.add_body("crank", mass=1.0, com=(0.1, 0, 0), inertia=(0, 0.01, 0.01))
+    >>> b.add_body("rod", mass=1.0, com=(0.3, 0, 0), inertia=(0, 0.03, 0.03))
+    >>> b.add_body("piston", mass=2.0)
+    >>> b.add_joint("theta", "revolute", parent="world", child="crank", axis=(0, 0, 1))
+    >>> b.add_joint("phi", "revolute", parent="crank", child="rod", axis=(0, 0, 1), translation=(0.2, 0, 0))
+    >>> b.add_joint("x", "prismatic", parent="world", child="piston", axis=(1, 0, 0))
+    >>> b.add_loop("pin", "point", body_a="rod", translation_a=(0.6, 0, 0), body_b="piston")
+    >>> for row in mb.lagrangian.from_model(b.build()).constraints:
+    ...     print(row)
+    -x + 0.2*cos(theta) + 0.6*cos(phi + theta)
+    0.2*sin(theta) + 0.6*sin(phi + theta)
     """
     if not isinstance(model, Model):
         raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) gives one")
@@ -84,13 +118,25 @@ def from_model(
     v = [velocity_of(s) for s in q]
     kin = SymbolicKinematics(source, q, v, parameters, progress or _silent)
     T, V, R = _kinetic(kin.mass_matrix, v), kin.gravity_energy + kin.spring_energy, kin.dissipation
-    used = T.free_symbols | V.free_symbols | R.free_symbols
+    t = _time({*parameters, *(s.name for s in (*q, *v))})
+    moved = {model.coordinate_names.index(p.joint): motion(kin, p, t) for p in model.prescribed}
+    rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
+    if drives:
+        rows += [(model.coordinate_names[i], q[i] - x) for i, x in moved.items()]
+        moved = {}
+    put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
+    T, V, R, *constraints = (x.xreplace(put) for x in (T, V, R, *(row for _, row in rows)))
+    kept = [i for i in range(len(q)) if i not in moved]
+    _check_kept(model, {q[i] for i in kept}, zip((name for name, _ in rows), constraints, strict=True))
+    used = set().union(*(x.free_symbols for x in (T, V, R, *constraints)))
     return Lagrangian(
         T,
         V,
-        q,
-        v,
+        [q[i] for i in kept],
+        [v[i] for i in kept],
+        time=t,
         dissipation=R,
+        constraints=constraints,
         # What only a frame needs is no part of the equation; a name of the user's own is kept all the same.
         parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used},
         name=model.name,
@@ -108,9 +154,6 @@ def _check(model: Model) -> None:
             f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate; write it in Euler "
             "angles (mbkit.lagrangian.systems.heavy_top, or spherical_zyx joints), or use Lagrangian.quasi_velocities"
         )
-    for feature, told in (("loops", model.loops), ("prescribed", model.prescribed)):
-        if told:
-            raise UnsupportedError(f"{model.name}: cannot be written with {feature}; model.without({feature!r}) can")
     if not model.nv:
         raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
     if model.nv > _MOST:
@@ -118,6 +161,26 @@ def _check(model: Model) -> None:
             f"{model.name}: {model.nv} coordinates are more than the {_MOST} that are written out; "
             'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
         )
+
+
+def _time(taken: set[str]) -> sp.Symbol:
+    names = chain(("t", "time"), (f"t_{k}" for k in count()))
+    return sp.Symbol(next(name for name in names if name not in taken))
+
+
+def _check_kept(model: Model, kept: set[sp.Symbol], rows: Iterable[tuple[str, sp.Expr]]) -> None:
+    """Refuse what the prescribed motions leave nothing of."""
+    if not kept:
+        raise UnsupportedError(
+            f"{model.name}: every coordinate is prescribed, so there is no equation; drives=True keeps them, with the "
+            "forces that move them as multipliers"
+        )
+    for name, row in rows:
+        if not row.free_symbols & kept:
+            raise InputError(
+                f"{model.name}: loop {name!r}: the prescribed motions alone move it, so that it is open or "
+                f"says nothing: {row} = 0; leave out one of them"
+            )
 
 
 def _coordinates(model: Model, names: Sequence[str] | None) -> list[sp.Symbol]:

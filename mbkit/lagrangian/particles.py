@@ -11,7 +11,7 @@ from mbkit.errors import InputError
 from mbkit.lagrangian.symbols import Plain
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.tidy import tidy
-from mbkit.lagrangian.virtual_work import generalized_force, vectors
+from mbkit.lagrangian.virtual_work import check_places, generalized_force, vectors
 
 __all__ = ["from_particles"]
 
@@ -71,6 +71,7 @@ def from_particles(
     """
     into = Plain(coordinates, velocities, time)
     R = vectors("positions", positions, into)
+    check_places("positions", R, into)
     # A single vector stands for one particle, of which the mass may stand alone.
     m = [into("masses", x) for x in ([masses] if isinstance(masses, (sp.Basic, int, float)) else masses)]
     if len(m) != len(R):

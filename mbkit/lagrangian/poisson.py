@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import sympy as sp
 
+from mbkit.lagrangian.probe import vanishes
+from mbkit.lagrangian.symbols import free_name
 from mbkit.lagrangian.tidy import tidy
 
-__all__ = ["bracket", "momentum_symbol", "shorter"]
+if TYPE_CHECKING:
+    from mbkit.lagrangian.system import Lagrangian
+
+__all__ = ["bracket", "momentum_symbols", "shorter"]
 
 # Operations up to which a bracket is tidied.
-_SHORT: Final = 50
+_SHORT: Final = 200
 
 
-def momentum_symbol(coordinate: sp.Symbol, taken: Collection[str]) -> sp.Symbol:
-    """Return the symbol of a coordinate's momentum: theta -> p_theta, or P_theta where that is taken already."""
-    name = f"p_{coordinate.name}"
-    while name in taken:
-        name = name.capitalize() if name[0] == "p" else f"{name}_"
-    return sp.Symbol(name)
+def momentum_symbols(system: Lagrangian, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
+    """Return a symbol for each coordinate's momentum: theta -> p_theta, or P_theta where that is taken already."""
+    own = (*system.parameters, *system.coordinates, *system.velocities, *system.inputs.values())
+    taken = {s.name for s in (*own, *([system.time] if system.time is not None else []))}
+    out = []
+    for q in coordinates:
+        out.append(sp.Symbol(free_name(f"p_{q.name}", taken)))
+        taken.add(out[-1].name)
+    return tuple(out)
 
 
 def bracket(f: Any, g: Any, coordinates: Sequence[sp.Symbol], momenta: Sequence[sp.Symbol]) -> sp.Expr:
@@ -35,5 +43,7 @@ def bracket(f: Any, g: Any, coordinates: Sequence[sp.Symbol], momenta: Sequence[
 
 
 def shorter(x: sp.Expr) -> sp.Expr:
-    """Return a short bracket tidied, and a long one as it is: nested ones grow fast."""
+    """Return a short bracket tidied, and a long one as it is unless it is zero: nested ones grow fast."""
+    if vanishes(x):
+        return sp.Integer(0)
     return tidy(x) if x.count_ops() <= _SHORT else x

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
-from sympy.core.function import AppliedUndef
 
 from mbkit._check import Array, rows
 from mbkit.errors import InputError, UnsupportedError
@@ -33,9 +32,9 @@ from mbkit.lagrangian.degree import KineticSplit
 from mbkit.lagrangian.inverse import inverse
 from mbkit.lagrangian.motion import EquationsOfMotion
 from mbkit.lagrangian.numeric import Numeric, values_of
-from mbkit.lagrangian.quotients import reduced, reduced_matrix
-from mbkit.lagrangian.symbols import plain
+from mbkit.lagrangian.symbols import fits, in_symbols_of, plain
 from mbkit.lagrangian.system import Lagrangian
+from mbkit.lagrangian.tidy import tidy, tidy_matrix
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.hamilton import Hamiltonian
@@ -94,25 +93,25 @@ class QuasiLagrangian(Lagrangian):
                 "embed them first"
             )
         self.system = system
-        self.D = reduced_matrix(_checked(system, D))
+        self.D = tidy_matrix(_checked(system, D))
         self.W = inverse(self.D, "D")
         w = _named(system, names)
         k = system.kinetic
-        M, b = reduced_matrix(self.D.T * k.M * self.D), reduced_matrix(self.D.T * k.b)
+        M, b = tidy_matrix(self.D.T * k.M * self.D), tidy_matrix(self.D.T * k.b)
         v = sp.Matrix(w)
         T2, T1 = (v.T * M * v)[0] / 2, (b.T * v)[0]
         # Known, and need not be told apart again.
-        self.__dict__["kinetic"] = KineticSplit(T2=reduced(T2), T1=T1, T0=k.T0, M=M, b=b)
+        self.__dict__["kinetic"] = KineticSplit(T2=tidy(T2), T1=T1, T0=k.T0, M=M, b=b)
         put = dict(zip(system.velocities, self.D * v, strict=True))
-        forces = reduced_matrix(self.D.T * system.forces.subs(put, simultaneous=True))
+        forces = tidy_matrix(self.D.T * system.forces.subs(put, simultaneous=True))
         super().__init__(
-            T=reduced(T2) + T1 + k.T0,
+            T=tidy(T2) + T1 + k.T0,
             V=system.V,
             coordinates=system.coordinates,
             velocities=w,
             time=system.time,
             forces=dict(zip(system.coordinates, forces, strict=True)),
-            dissipation=reduced(system.dissipation.subs(put, simultaneous=True)),
+            dissipation=tidy(system.dissipation.subs(put, simultaneous=True)),
             parameters=system.parameters,
             name=system.name,
         )
@@ -128,7 +127,7 @@ class QuasiLagrangian(Lagrangian):
                 # [D_i, D_j] in the frame that D's columns are.
                 bracket = self.W * (slopes[j] * D[:, i] - slopes[i] * D[:, j])
                 for k, x in enumerate(bracket):
-                    out[k, i, j] = reduced(x)
+                    out[k, i, j] = tidy(x)
                     out[k, j, i] = -out[k, i, j]
         return sp.ImmutableDenseNDimArray(out)
 
@@ -136,7 +135,7 @@ class QuasiLagrangian(Lagrangian):
     def input_forces(self) -> sp.ImmutableMatrix:
         """Dᵀ u of the coordinates' inputs u, (n, 1)."""
         inputs = [self.system.inputs.get(q, sp.Integer(0)) for q in self.coordinates]
-        return reduced_matrix(self.D.T * sp.Matrix(inputs))
+        return tidy_matrix(self.D.T * sp.Matrix(inputs))
 
     def _along(self, x: Any) -> list[Any]:
         """Return the derivative of x along each column of D."""
@@ -162,9 +161,9 @@ class QuasiLagrangian(Lagrangian):
             accelerations=self.accelerations,
             mass_matrix=k.M,
             coriolis_matrix=self._coriolis_matrix(),
-            drift=reduced_matrix(drift),
-            potential_gradient=reduced_matrix(self._along(self.V)),
-            forces=reduced_matrix(sp.Matrix(self.forces) + self.input_forces - friction),
+            drift=tidy_matrix(drift),
+            potential_gradient=tidy_matrix(self._along(self.V)),
+            forces=tidy_matrix(sp.Matrix(self.forces) + self.input_forces - friction),
             D=self.D,
             rates=self.system.velocities,
             hamel_coefficients=gamma,
@@ -186,7 +185,7 @@ class QuasiLagrangian(Lagrangian):
                 * self.velocities[k]
                 for k in range(n)
             )
-            return reduced(sum(terms, sp.Integer(0)) / 2)
+            return tidy(sum(terms, sp.Integer(0)) / 2)
 
         return sp.ImmutableMatrix(n, n, entry)
 
@@ -224,7 +223,7 @@ class QuasiLagrangian(Lagrangian):
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return the momentum Wᵀ p of each cyclic coordinate, in quasi-velocities."""
         p, kept = self.W.T * self.momenta, self.system.cyclic_coordinates()
-        return {q: reduced(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
+        return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
 
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
         """Return what is constant along every motion, in quasi-velocities."""
@@ -298,19 +297,14 @@ def _checked(system: Lagrangian, given: Any) -> sp.ImmutableMatrix:
             f"D: expected shape ({n}, {n}), one row for each of {', '.join(map(str, system.coordinates))}, "
             f"got {D.shape}"
         )
-    # Dynamic symbols are known by their names here.
-    by_name = {q.name: q for q in system.coordinates}
-    D = D.subs({f: by_name[f.func.__name__] for f in D.atoms(AppliedUndef) if f.func.__name__ in by_name})
-    if D.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
-        raise InputError(f"D: expected finite entries, got {D.tolist()}")
+    D = D.applyfunc(lambda x: in_symbols_of(system, "D", x))
     if system.time is not None and system.time in D.free_symbols:
         raise InputError(f"D: expected coordinates and parameters only, got the time {system.time}")
-    unknown = D.free_symbols - set(system.coordinates) - set(system.parameters)
-    if unknown or D.atoms(AppliedUndef):
-        told = plain(unknown) or str(next(iter(D.atoms(AppliedUndef))))
+    others = D.free_symbols - set(system.coordinates) - set(system.parameters)
+    if others:
         raise InputError(
-            f"D: expected the coordinates {', '.join(by_name)} and parameters only, got {told}"
-            + ("; q̇ = D w with D of q alone" if unknown & set(system.velocities) else "")
+            f"D: expected the coordinates {', '.join(map(str, system.coordinates))} and parameters only, "
+            f"got {plain(others)}; q̇ = D w with D of q alone"
         )
     return D
 
@@ -329,6 +323,7 @@ def _named(system: Lagrangian, names: Any) -> list[sp.Symbol]:
         if not isinstance(x, (str, sp.Symbol)) or not str(x):
             raise InputError(f"names: expected names or symbols, got {x!r}")
         out.append(sp.Symbol(x) if isinstance(x, str) else x)
+        fits("velocities", out[-1])
     known = (*system.coordinates, *system.velocities, *system.parameters, *system.inputs.values())
     taken = {s.name for s in (*known, *([system.time] if system.time else []))}
     for s in out:

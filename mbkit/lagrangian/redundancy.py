@@ -21,7 +21,13 @@ _POSES: Final = 3
 _STARTS: Final = 12
 #: Of a row's size at the start: what is left of a row that follows from the others.
 _DEPENDENT: Final = 1e-7
+#: Of it, what is left of a slope where a square is nearly zero.
+_FLAT: Final = 1e-4
+#: A slope that is rounding alone.
+_ROUNDED: Final = 1e-14
 _MOST: Final = 100
+#: Characters of a constraint that is named: of a loop in space it has thousands.
+_TOLD: Final = 100
 
 _JUDGED: Final[WeakKeyDictionary[object, set[tuple[float, ...]]]] = WeakKeyDictionary()
 
@@ -63,7 +69,7 @@ def _judge(manifold: Manifold, written: list[str]) -> None:
         start = rng.choice([1.0, 3.0]) * Model.random_state(model, rng)[0]
         sizes = np.linalg.norm(manifold.jacobian(start), axis=1)
         rows = np.maximum(rows, sizes)
-        q, f = _nearest(manifold, start, np.where(sizes > 0, sizes, 1.0))
+        q, f = _nearest(manifold, start, np.where(sizes > _ROUNDED, sizes, 1.0))
         if np.linalg.norm(f) < 1e-10:
             found.append(q)
         elif np.linalg.norm(f) < best[0]:
@@ -77,8 +83,15 @@ def _judge(manifold: Manifold, written: list[str]) -> None:
             f"constraints: no configuration satisfies them all; {_named(against, written)} {told}: "
             f"the least that is left of them is {best[0]:.3g}"
         )
-    scale = np.where(rows > 0, rows, 1.0)
-    ranks = [_dependent(manifold.jacobian(q) / scale[:, None]) for q in found]
+    scale = np.where(rows > _ROUNDED, rows, 1.0)
+    slopes = [manifold.jacobian(q) / scale[:, None] for q in found]
+    flat = np.flatnonzero((np.max([np.linalg.norm(J, axis=1) for J in slopes], axis=0) < _FLAT) & (rows > _ROUNDED))
+    if len(flat):
+        raise InputError(
+            f"constraints: {_named(flat, written)} has no slope where it holds, so that no force can hold it; "
+            "write it without the square, as f = 0 instead of f**2 = 0"
+        )
+    ranks = [_dependent(J) for J in slopes]
     if all(len(needless) for needless, _ in ranks):
         needless, others = min(ranks, key=lambda pair: len(pair[0]))
         why = f"follows from {_named(others, written)}" if len(others) else "holds by itself"
@@ -123,4 +136,5 @@ def _dependent(J: Array) -> tuple[Array, Array]:
 
 
 def _named(which: Iterable[int], written: list[str]) -> str:
-    return ", ".join(f"constraints[{k}] ({written[k]})" for k in which)
+    told = {k: written[k] if len(written[k]) <= _TOLD else f"{written[k][:_TOLD]} ..." for k in which}
+    return ", ".join(f"constraints[{k}] ({text})" for k, text in told.items())

@@ -22,13 +22,13 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, rows
+from mbkit._check import Array, real, rows
 from mbkit.errors import InputError
-from mbkit.lagrangian.cyclic import cyclic_coordinates
+from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.numeric import Numeric, values_of
-from mbkit.lagrangian.poisson import momentum_symbol
+from mbkit.lagrangian.poisson import momentum_symbols
 from mbkit.lagrangian.squares import Squares
-from mbkit.lagrangian.symbols import plain
+from mbkit.lagrangian.symbols import listed, name_of, plain
 from mbkit.lagrangian.tidy import tidy
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Routhian:
         s, n = self.system, len(self.system.coordinates)
         q, v = rows("q", q, n, s.name, "nq"), rows("v", v, n, s.name, "nv")
         told = values_of(s, values, "reduce")
-        behind = told if s.time is None else np.array([float(t), *told])
+        behind = told if s.time is None else np.array([real("t", t), *told])
         p = self._momenta(q, v, behind)[..., 0]
         kept, _ = self._places
         found = {x.name: p[..., k] if p.ndim > 1 else float(p[k]) for k, x in enumerate(self.momenta)}
@@ -159,10 +159,10 @@ class Routhian:
     def latex(self) -> str:
         """Return R, the momenta and the ignored rates as an aligned LaTeX block."""
         whole, s = self.system, self.lagrangian
-        lines = [f"R &= {sp.latex(s.T)} - \\left({sp.latex(s.V)}\\right)" if s.V != 0 else f"R &= {sp.latex(s.T)}"]
-        lines += [f"{sp.latex(p)} &= {sp.latex(x)}" for p, x in self.momenta.items()]
+        board = Blackboard(whole.coordinates, whole.velocities, tuple(self.momenta), time=whole.time)
         named = dict(zip(whole.coordinates, whole.velocities, strict=True))
-        lines += [f"{sp.latex(named[q])} &= {sp.latex(x)}" for q, x in self.rates.items()]
+        told = [(sp.Symbol("R"), s.L), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
+        lines = (f"{sp.latex(left)} &= {board.latex(right)}" for left, right in told)
         return "\\begin{aligned}" + r" \\ ".join(lines) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
@@ -193,8 +193,7 @@ def routhian(system: Lagrangian, cyclic: Any = None) -> Routhian:
     kept = [q for q in system.coordinates if q not in ignored]
     r, c = ([system.coordinates.index(q) for q in part] for part in (kept, ignored))
     k = system.kinetic
-    taken = {s.name for s in (*system.parameters, *system.coordinates, *system.velocities)}
-    symbols = [momentum_symbol(q, taken) for q in ignored]
+    symbols = momentum_symbols(system, ignored)
     excess = [symbol - k.b[i] for symbol, i in zip(symbols, c, strict=True)]
     squares = Squares(k.M.extract(c, c), "T: the ignored coordinates' mass matrix")
     columns = [list(k.M.extract(c, [j])) for j in r]
@@ -228,16 +227,16 @@ def _quadratic(M: Any, v: list[sp.Symbol]) -> sp.Expr:
 
 
 def _chosen(system: Lagrangian, cyclic: Any) -> list[sp.Symbol]:
-    found, free = cyclic_coordinates(system)
+    free = system.cyclic_coordinates()
+    found = system.forced_cyclic_coordinates() | dict.fromkeys(free, sp.Integer(0))
     if cyclic is None:
         wanted: Iterable[Any] = free
     else:
-        wanted = [cyclic] if isinstance(cyclic, (sp.Symbol, str)) else list(cyclic)
+        wanted = listed("cyclic", cyclic)
     by_name = {q.name: q for q in system.coordinates}
     out: list[sp.Symbol] = []
     for given in wanted:
-        name = given if isinstance(given, str) else getattr(given, "name", str(given))
-        q = by_name.get(name)
+        q = by_name.get(name_of(given))
         if q is None:
             raise InputError(f"cyclic: {given} is no coordinate; the coordinates are {', '.join(by_name)}")
         if q not in found:
@@ -247,7 +246,7 @@ def _chosen(system: Lagrangian, cyclic: Any) -> list[sp.Symbol]:
         if q not in out:
             out.append(q)
     if not out:
-        forced = "; ".join(f"{q} is in no energy, but {force} acts along it" for q, force in found.items())
+        forced = "; ".join(f"{q} is in no energy, but {x} acts along it" for q, x in found.items() if x != 0)
         raise InputError(f"cyclic: no coordinate of {system.name} can be ignored" + (f": {forced}" if forced else ""))
     if len(out) == len(system.coordinates):
         raise InputError(

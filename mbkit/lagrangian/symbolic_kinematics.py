@@ -15,7 +15,7 @@ from typing import Any, Final
 import sympy as sp
 
 from mbkit.lagrangian.compact import number, written_out
-from mbkit.lagrangian.harmonic import Harmonic, Space
+from mbkit.lagrangian.harmonic import Harmonic, Key, Space
 from mbkit.model import Joint, Model
 from mbkit.model.kinds import cross3
 
@@ -29,6 +29,7 @@ _FIELDS: Final = {
     "bodies": ("mass", "com", "inertia"),
     "joints": ("rotation", "translation", "axes", "pitch", "armature"),
     "springs": ("point_a", "point_b"),
+    "loops": ("rotation_a", "translation_a", "rotation_b", "translation_b"),
 }
 #: What rounded rotations leave of a term that is zero.
 _DUST: Final = Fraction(1, 10**15)
@@ -40,7 +41,7 @@ class SymbolicKinematics:
     Parameters
     ----------
     model : Model
-        A tree without ball and free joints, loops and prescribed motions.
+        Without ball and free joints. Loops stay open here, and what is prescribed is a coordinate.
     coordinates, velocities : list of sympy.Symbol
     parameters : dict of str to sympy.Symbol
     progress : callable
@@ -73,15 +74,16 @@ class SymbolicKinematics:
             s for j in model.joints for i, x in enumerate(self._q[j.name]) if _advances(j, i) for s in x.free_symbols
         }
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
-        self._coordinates = coordinates
+        self.coordinates = coordinates
         self.space = Space(model.name, angles, generators)
-        self._values = {
+        self.values = {
             (where, part.name): self._read(where, part, fields)
             for where, fields in _FIELDS.items()
             for part in getattr(model, where)
         }
         self._placements = {j.name: self._placement(j) for j in model.tree}
         self._carrier = {j.child: j for j in model.joints}
+        self._lengths = [i for i, g in enumerate(generators) if g in lengths]
 
     # Numbers
 
@@ -117,13 +119,13 @@ class SymbolicKinematics:
 
     def _placement(self, joint: Joint) -> tuple[Any, Vector]:
         q = self._arguments(joint)
-        return joint.type.placement(self.space, self._values["joints", joint.name], q)  # type: ignore[arg-type]
+        return joint.type.placement(self.space, self.values["joints", joint.name], q)  # type: ignore[arg-type]
 
     def _columns(self) -> dict[str, dict[int, Column]]:
         """Return each body's velocity in its own axes per unit of each velocity that moves it."""
         out: dict[str, dict[int, Column]] = {"world": {}}
         for joint in self.model.tree:
-            values = self._values["joints", joint.name]
+            values = self.values["joints", joint.name]
             R, p = self._placements[joint.name]
             moved = {}
             for i, (linear, angular) in out[joint.parent].items():
@@ -140,7 +142,7 @@ class SymbolicKinematics:
         q = self._arguments(joint)
         for k in range(joint.type.nv):
             unit = [self.space.number(int(i == k)) for i in range(joint.type.nv)]
-            values = self._values["joints", joint.name]
+            values = self.values["joints", joint.name]
             linear, angular = joint.type.twist(self.space, values, q, unit)  # type: ignore[arg-type]
             i, ratio = self._velocity(joint, k)
             yield i, ([ratio * x for x in linear], [ratio * x for x in angular])
@@ -151,14 +153,22 @@ class SymbolicKinematics:
         return at, self.space.of(self._v[joint.name][k] / self.velocities[at])
 
     def _to_world(self, body: str, x: Vector) -> Vector:
-        while body != "world":
-            joint = self._carrier[body]
-            x, body = self._to_parent(joint, x, 1), joint.parent
+        for joint in self.way(body):
+            x = self.to_parent(joint, x, 1)
         return x
 
-    def _to_parent(self, joint: Joint, x: Vector, weight: Any) -> Vector:
+    def way(self, body: str) -> list[Joint]:
+        """Return the joints from a body down to the ground."""
+        out: list[Joint] = []
+        while body != "world":
+            out.append(self._carrier[body])
+            body = out[-1].parent
+        return out
+
+    def to_parent(self, joint: Joint, x: Vector, weight: Any) -> Vector:
+        """Return a point (weight 1) or a direction (0) of a joint's child in the parent's axes, or a moment of mass."""
         R, p = self._placements[joint.name]
-        values = self._values["joints", joint.name]
+        values = self.values["joints", joint.name]
         in_J = _add(_times(R, x), [weight * c for c in p])
         return _add(_times(values.rotation, in_J), [weight * c for c in values.translation])
 
@@ -172,7 +182,7 @@ class SymbolicKinematics:
         columns = self._columns()
         for done, body in enumerate(self.model.bodies):
             self._progress(0.5 * done / len(self.model.bodies), f"kinetic energy of {body.name}")
-            values = self._values["bodies", body.name]
+            values = self.values["bodies", body.name]
             own = columns.get(body.name, {})
             at_com = {i: _add(linear, cross3(angular, values.com)) for i, (linear, angular) in own.items()}
             spun = {i: _times(values.inertia, angular) for i, (_, angular) in own.items()}
@@ -181,14 +191,14 @@ class SymbolicKinematics:
                     if i <= j:
                         M[i][j] = M[i][j] + values.mass * _dot(at_com[i], at_com[j]) + _dot(own[i][1], spun[j])
         for joint in self.model.joints:
-            for k, rotor in enumerate(self._values["joints", joint.name].armature):
+            for k, rotor in enumerate(self.values["joints", joint.name].armature):
                 i, ratio = self._velocity(joint, k)
                 M[i][i] = M[i][i] + rotor * ratio * ratio
-        self._dust([x for row in M for x in row])
+        self.drop_dust([x for row in M for x in row])
         made: dict[tuple[int, int], sp.Expr] = {}
         for i in range(n):
             self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
-            made.update({(i, j): self._shown(M[i][j]) for j in range(i, n)})
+            made.update({(i, j): self.shown(M[i][j]) for j in range(i, n)})
         return [[made[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
 
     @cached_property
@@ -198,16 +208,16 @@ class SymbolicKinematics:
         masses: dict[str, Any] = {"world": self.space.number(0)}
         moments: dict[str, Vector] = {"world": [self.space.number(0)] * 3}
         for body in model.bodies:
-            values = self._values["bodies", body.name]
+            values = self.values["bodies", body.name]
             masses[body.name] = values.mass
             moments[body.name] = [values.mass * c for c in values.com]
         for joint in reversed(model.tree):
-            up = self._to_parent(joint, moments[joint.child], masses[joint.child])
+            up = self.to_parent(joint, moments[joint.child], masses[joint.child])
             moments[joint.parent] = _add(moments[joint.parent], up)
             masses[joint.parent] = masses[joint.parent] + masses[joint.child]
         gravity = [self.space.of(self.value("gravity", "", "gravity", model, i)) for i in range(3)]
         total = -_dot(gravity, moments["world"])
-        self._dust([total])
+        self.drop_dust([total])
         # Height by height rather than with g before them all, so that forces read term by term.
         return self._back(written_out(total, whole=False))
 
@@ -217,10 +227,10 @@ class SymbolicKinematics:
         total = sp.Integer(0)
         for joint in self.model.joints:
             for k, q in enumerate(self._q[joint.name]):
-                stiffness, rest = (self._float("joints", joint, f, k) for f in ("stiffness", "rest"))
+                stiffness, rest = (self.written("joints", joint, f, k) for f in ("stiffness", "rest"))
                 total += stiffness * (self._back(q) - rest) ** 2 / 2
         for spring, square in self._squares():
-            stiffness, rest = (self._float("springs", spring, f) for f in ("stiffness", "rest_length"))
+            stiffness, rest = (self.written("springs", spring, f) for f in ("stiffness", "rest_length"))
             total += stiffness * (square if rest == 0 else (sp.sqrt(square) - rest) ** 2) / 2
         return total
 
@@ -230,11 +240,11 @@ class SymbolicKinematics:
         total = sp.Integer(0)
         for joint in self.model.joints:
             for k, v in enumerate(self._v[joint.name]):
-                total += self._float("joints", joint, "damping", k) * self._back(v) ** 2 / 2
+                total += self.written("joints", joint, "damping", k) * self._back(v) ** 2 / 2
         for spring, square in self._squares():
-            damping = self._float("springs", spring, "damping")
+            damping = self.written("springs", spring, "damping")
             if damping != 0:
-                pairs = zip(self._coordinates, self.velocities, strict=True)
+                pairs = zip(self.coordinates, self.velocities, strict=True)
                 rate = sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / 2
                 total += damping * rate**2 / square / 2
         return total
@@ -242,23 +252,33 @@ class SymbolicKinematics:
     def _squares(self) -> Iterator[tuple[Any, sp.Expr]]:
         """Yield each spring between points with the square of its length."""
         for spring in self.model.springs:
-            values = self._values["springs", spring.name]
+            values = self.values["springs", spring.name]
             ends = self._to_world(spring.body_a, values.point_a), self._to_world(spring.body_b, values.point_b)
             gap = [y - x for x, y in zip(*ends, strict=True)]
-            yield spring, self._shown(_dot(gap, gap))
+            yield spring, self.shown(_dot(gap, gap))
 
-    def _float(self, where: str, part: Any, field: str, *index: int) -> sp.Expr:
+    def coordinates_of(self, joint: Joint) -> list[sp.Expr]:
+        """Return a joint's coordinates, those of a mimic joint by its leader's."""
+        return [self._back(x) for x in self._q[joint.name]]
+
+    def written(self, where: str, part: Any, field: str, *index: int) -> sp.Expr:
         """Return a number as it is shown, for what is written down as it stands."""
         x = self.value(where, part.name, field, part, *index)
         return number(Fraction(int(x.p), int(x.q))) if x.is_Rational else self._back(x)
 
-    def _shown(self, x: Any) -> sp.Expr:
+    def shown(self, x: Any) -> sp.Expr:
+        """Return a sum as it is shown."""
         return self._back(written_out(x))
+
+    def moves(self, key: Key) -> bool:
+        """Return whether a term of a sum depends on a coordinate."""
+        _, multiples, powers = key
+        return any(multiples) or any(powers[i] for i in self._lengths)
 
     def _back(self, x: sp.Expr) -> sp.Expr:
         return x.subs({dummy: e for e, dummy in self._opaque.items()}) if self._opaque else x
 
-    def _dust(self, sums: list[Any]) -> None:
+    def drop_dust(self, sums: list[Any]) -> None:
         """Drop the terms that only rounding of the model's rotations has left, of those with the same unit."""
         largest: dict[Any, Fraction] = {}
         for x in sums:

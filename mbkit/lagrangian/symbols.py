@@ -8,15 +8,31 @@ by such symbols when they come in.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import sympy as sp
 from sympy.core.function import AppliedUndef
 
 from mbkit.errors import InputError
 
-__all__ = ["Plain", "acceleration_of", "expression", "plain", "velocity_of"]
+if TYPE_CHECKING:
+    from mbkit.lagrangian.system import Lagrangian
+
+__all__ = [
+    "Plain",
+    "acceleration_of",
+    "by_name",
+    "expression",
+    "fits",
+    "free_name",
+    "in_symbols_of",
+    "listed",
+    "name_of",
+    "plain",
+    "velocity_of",
+]
 
 
 def velocity_of(coordinate: sp.Symbol) -> sp.Symbol:
@@ -32,7 +48,15 @@ def acceleration_of(coordinate: sp.Symbol) -> sp.Symbol:
 def _dotted(symbol: sp.Symbol, dots: str) -> sp.Symbol:
     # SymPy's printers read the modifier from the name, before its digits and indices.
     stem, rest = re.fullmatch(r"(.*?)(_.*|\d*)", symbol.name, flags=re.S).groups()  # type: ignore[union-attr]
-    return sp.Symbol(f"{stem}{dots}{rest}", **symbol.assumptions0) if stem else sp.Symbol(f"{dots}{rest}")
+    # What is positive changes with a velocity of any sign.
+    return sp.Symbol(f"{stem}{dots}{rest}", **({"real": True} if symbol.is_real else {}))
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """Return a name, with a capital or a mark behind it where it is taken: p_x, P_x, P_x_."""
+    while name in taken:
+        name = name[0].upper() + name[1:] if name[0].islower() else f"{name}_"
+    return name
 
 
 class Plain:
@@ -49,10 +73,24 @@ class Plain:
         As `Lagrangian` takes them.
     among : iterable of sympy.Symbol
         Where velocities that are not given may stand already, by their names.
+    named : iterable of sympy.Symbol
+        Others that are known by their names.
+
+    Notes
+    -----
+    A name stands for one thing, whatever is assumed of it: ``Symbol("m", positive=True)`` in an expression is the
+    parameter ``Symbol("m")``, as engines know parameters by their names.
     """
 
-    def __init__(self, coordinates: Any, velocities: Any, time: Any, among: Iterable[sp.Symbol] = ()) -> None:
-        given = _several("coordinates", coordinates)
+    def __init__(
+        self,
+        coordinates: Any,
+        velocities: Any,
+        time: Any,
+        among: Iterable[sp.Symbol] = (),
+        named: Iterable[sp.Symbol] = (),
+    ) -> None:
+        given = listed("coordinates", coordinates)
         functions = [c for c in given if isinstance(c, AppliedUndef)]
         times = {c.args for c in functions}
         if len(times) > 1 or any(len(c.args) != 1 for c in functions):
@@ -60,7 +98,7 @@ class Plain:
         own = next(iter(times))[0] if times else None
         if time is not None and not isinstance(time, sp.Symbol):
             raise InputError(f"time: expected a SymPy symbol, got {time!r}")
-        if time is not None and own is not None and own != time:
+        if time is not None and own is not None and own.name != time.name:
             raise InputError(f"time: {time} is given, but the coordinates are functions of {own}")
         self.time = time if own is None else own
         self._map: dict[Any, sp.Symbol] = {}
@@ -75,7 +113,12 @@ class Plain:
                 raise InputError(f"coordinates: expected SymPy symbols or dynamicsymbols, got {c!r}")
         self.coordinates = tuple(made)
         self.velocities = self._velocities(given, velocities, among)
-        _differ((*self.coordinates, *self.velocities, *([self.time] if self.time else [])))
+        own_time = [self.time] if self.time else []
+        _differ((*self.coordinates, *self.velocities, *own_time))
+        for what, symbols in (("coordinates", self.coordinates), ("velocities", self.velocities), ("time", own_time)):
+            for s in symbols:
+                fits(what, s)
+        self._named = {s.name: s for s in (*named, *own_time, *self.velocities, *self.coordinates)}
 
     def _velocities(self, given: Sequence[Any], velocities: Any, among: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
         if velocities is None:
@@ -83,7 +126,7 @@ class Plain:
             named = {s.name: s for s in among}
             own = [named.get(velocity_of(c).name, velocity_of(c)) for c in self.coordinates]
         else:
-            told = _several("velocities", velocities)
+            told = listed("velocities", velocities)
             if len(told) != len(given):
                 what = f"{len(told)} velocities for {len(given)} coordinates"
                 raise InputError(f"velocities: {what}; give each coordinate one, in the same order")
@@ -105,10 +148,10 @@ class Plain:
 
     def __call__(self, what: str, given: Any) -> sp.Expr:
         """Return an expression in plain symbols."""
-        out = expression(what, given)
+        out = expression(what, given, self._named)
         # A derivative before the function in it.
         order = sorted(self._map, key=lambda x: not isinstance(x, sp.Derivative))
-        out = out.subs([(x, self._map[x]) for x in order])
+        out = by_name(out.subs([(x, self._map[x]) for x in order]), self._named)
         left = [*out.atoms(sp.Derivative), *out.atoms(AppliedUndef)]
         if left:
             raise InputError(
@@ -123,20 +166,68 @@ def plain(names: Iterable[sp.Symbol]) -> str:
     return ", ".join(sorted(s.name for s in names))
 
 
-def expression(what: str, given: Any) -> sp.Expr:
-    """Return a scalar SymPy expression, or say what came instead."""
+def name_of(given: Any) -> str:
+    """Return the name of a coordinate given as a symbol, a dynamicsymbol or a name."""
+    return (
+        given if isinstance(given, str) else str(getattr(given, "func", given) if getattr(given, "args", ()) else given)
+    )
+
+
+def by_name(x: Any, named: Mapping[str, sp.Symbol]) -> Any:
+    """Return an expression or a matrix with the symbols that are known by these names."""
+    put = {}
+    for s in x.free_symbols:
+        known = named.get(s.name) if isinstance(s, sp.Symbol) and not isinstance(s, sp.Dummy) else None
+        if known is not None and known != s:
+            put[s] = known
+    return x.xreplace(put) if put else x
+
+
+def in_symbols_of(system: Lagrangian, what: str, given: Any, also: Iterable[sp.Symbol] = ()) -> sp.Expr:
+    """Return an expression in a system's own symbols, whatever variants of them or dynamicsymbols it is written in.
+
+    Raises
+    ------
+    InputError
+        It holds others; they are named.
+    """
+    own = [*system.parameters, *system.inputs.values(), *([system.time] if system.time is not None else [])]
+    own += [*system.velocities, *system.coordinates, *also]
+    known = {s.name: s for s in own}
+    rates = {q.name: v for q, v in zip(system.coordinates, system.velocities, strict=True)}
+    out = expression(what, given, known)
+    for d in out.atoms(sp.Derivative):
+        name = name_of(d.expr)
+        if name in rates and d.derivative_count == 1:
+            out = out.subs(d, rates[name])
+    out = out.subs({f: known[name_of(f)] for f in out.atoms(AppliedUndef) if name_of(f) in rates})
+    out = by_name(out, known)
+    unknown = [str(x) for x in (*out.atoms(sp.Derivative), *out.atoms(AppliedUndef), *(out.free_symbols - set(own)))]
+    if unknown:
+        raise InputError(f"{what}: {', '.join(sorted(unknown))} is no symbol of {system.name}: {', '.join(known)}")
+    return out
+
+
+def expression(what: str, given: Any, named: Mapping[str, sp.Symbol] = MappingProxyType({})) -> sp.Expr:
+    """Return a scalar SymPy expression, or say what came instead; text is read with the symbols of these names."""
     try:
-        out = sp.sympify(given)
-    except (sp.SympifyError, TypeError) as error:
+        out = sp.sympify(given, locals=dict(named))
+    except (sp.SympifyError, TypeError, AttributeError) as error:
         raise InputError(f"{what}: expected a SymPy expression, got {given!r}") from error
     if not isinstance(out, sp.Expr) or out.is_Matrix:
         raise InputError(f"{what}: expected a scalar SymPy expression, got {type(given).__name__}")
     if out.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
         raise InputError(f"{what}: {out} is not finite")
+    if out.has(sp.I):
+        raise InputError(f"{what}: {out} holds the imaginary unit; a symbol of that name is sympy.Symbol('I')")
+    other = [s for s in out.free_symbols if not isinstance(s, sp.Symbol)]
+    if other:
+        raise InputError(f"{what}: {min(map(str, other))} is no plain symbol; take sympy.Symbol instead")
     return out
 
 
-def _several(what: str, given: Any) -> list[Any]:
+def listed(what: str, given: Any) -> list[Any]:
+    """Return one or several symbols as a list."""
     if isinstance(given, (sp.Basic, str)) and not isinstance(given, sp.Tuple):
         given = [given]
     try:
@@ -145,6 +236,8 @@ def _several(what: str, given: Any) -> list[Any]:
         raise InputError(f"{what}: expected a list of symbols, got {given!r}") from None
     if not out:
         raise InputError(f"{what}: expected at least one symbol, got none")
+    if isinstance(given, (set, frozenset)) and len(out) > 1:
+        raise InputError(f"{what}: expected a list of symbols, got a set, which has no order")
     return out
 
 
@@ -154,3 +247,16 @@ def _differ(symbols: Sequence[sp.Symbol]) -> None:
         if s.name in seen:
             raise InputError(f"coordinates: {s.name!r} stands twice among coordinates, velocities and time")
         seen[s.name] = s
+
+
+def fits(what: str, s: sp.Symbol) -> None:
+    """Refuse what is assumed of a symbol that moves, where that cannot be."""
+    if not s.name.strip():
+        raise InputError(f"{what}: expected symbols with names, got {s!r}")
+    wrong = ["commutative"] if not s.is_commutative else []
+    wrong += [told for told in ("integer", "imaginary", "zero") if getattr(s, f"is_{told}")]
+    if what == "velocities":
+        wrong += [told for told in ("nonnegative", "nonpositive") if getattr(s, f"is_{told}")]
+    if wrong:
+        told = "not commutative" if wrong[0] == "commutative" else wrong[0]
+        raise InputError(f"{what}: {s} is assumed to be {told}; what moves takes every real value on its way")

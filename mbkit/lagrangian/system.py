@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import sympy as sp
 
-from mbkit._check import real
 from mbkit.errors import InputError
 from mbkit.lagrangian import cyclic
+from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.constrained import Constrained
 from mbkit.lagrangian.cyclic import ConservedQuantity
+from mbkit.lagrangian.declaration import declared
 from mbkit.lagrangian.degree import KineticSplit, split
-from mbkit.lagrangian.motion import EquationsOfMotion, christoffel
-from mbkit.lagrangian.symbols import Plain, acceleration_of, plain, velocity_of
+from mbkit.lagrangian.inertia import require_inertia
+from mbkit.lagrangian.motion import EquationsOfMotion, equations_of_motion
+from mbkit.lagrangian.symbols import plain
 from mbkit.lagrangian.tidy import tidy_matrix
 
 if TYPE_CHECKING:
@@ -53,9 +54,13 @@ class Lagrangian(Constrained):
         Rayleigh's function R of the velocities; the force is -∂R/∂v.
     parameters : mapping of sympy.Symbol to float or None, or sequence of symbols, optional
         Every other symbol, with its value where it has one.
-    constraints : sequence of sympy.Expr, optional
+    constraints : sequence of sympy.Expr or sympy.Eq, optional
         Holonomic: f(q, t) = 0 each.
     name : str
+
+    Notes
+    -----
+    A name stands for one thing: ``Symbol("m", positive=True)`` and ``Symbol("m")`` are the same parameter.
 
     Attributes
     ----------
@@ -70,12 +75,15 @@ class Lagrangian(Constrained):
         The symbols that stand for ``tau``.
     parameters : mapping of sympy.Symbol to float or None
     constraints : tuple of sympy.Expr
+    multiplier_symbols : tuple of sympy.Symbol
+        λ of each constraint.
 
     Raises
     ------
     InputError
         T of another degree (the term is named), a velocity without its coordinate, symbols
-        that are not declared (they are named), a mass matrix that is singular everywhere.
+        that are not declared (they are named), names that stand for two things, a mass matrix
+        that is singular everywhere (the velocities are named).
 
     Examples
     --------
@@ -102,76 +110,16 @@ class Lagrangian(Constrained):
         constraints: Sequence[Any] = (),
         name: str = "system on paper",
     ) -> None:
-        into = Plain(coordinates, velocities, time, among=getattr(T, "free_symbols", ()))
+        d = declared(T, V, coordinates, velocities, time, forces, dissipation, parameters, constraints)
+        if not isinstance(name, str) or not name.strip():
+            raise InputError(f"name: expected a text, got {name!r}")
         self.name = name
-        self.coordinates, self.velocities, self.time = into.coordinates, into.velocities, into.time
-        # A velocity of a name of its own, such as omega, has its derivative named after it.
-        self.accelerations = tuple(
-            acceleration_of(q) if w.name == velocity_of(q).name else velocity_of(w)
-            for q, w in zip(self.coordinates, self.velocities, strict=True)
-        )
-        self.parameters = _parameters(parameters)
-        self.T, self.V = into("T", T), into("V", V)
-        self.dissipation = into("dissipation", dissipation)
-        given = _forces(into, forces or {}, self.coordinates)
-        self.constraints = tuple(into(f"constraints[{k}]", c) for k, c in enumerate(constraints))
-        # Dynamicsymbols bring a time that need not enter by itself.
-        held = (self.T, self.V, self.dissipation, *given.values(), *self.constraints)
-        if not any(self.time in x.free_symbols for x in held):
-            self.time = None
-        self.inputs = self._inputs(given)
-        self.forces = sp.ImmutableMatrix([x if q not in self.inputs else 0 for q, x in given.items()])
-        self._check()
-
-    def _inputs(self, given: Mapping[sp.Symbol, sp.Expr]) -> Mapping[sp.Symbol, sp.Symbol]:
-        known = {*self.coordinates, *self.velocities, *self.parameters, *([self.time] if self.time else [])}
-        elsewhere: set[Any] = set().union(
-            *(x.free_symbols for x in (self.T, self.V, self.dissipation, *self.constraints))
-        )
-        counts: dict[Any, int] = {}
-        for x in given.values():
-            for s in x.free_symbols:
-                counts[s] = counts.get(s, 0) + 1
-        return MappingProxyType(
-            {
-                q: x
-                for q, x in given.items()
-                if isinstance(x, sp.Symbol) and x not in known and x not in elsewhere and counts[x] == 1
-            }
-        )
-
-    def _check(self) -> None:
-        q, w = set(self.coordinates), set(self.velocities)
-        t = {self.time} if self.time else set()
-        known = q | w | t | set(self.parameters)
-        parts = {"T": self.T, "V": self.V, "dissipation": self.dissipation}
-        parts |= {f"forces[{c}]": x for c, x in zip(self.coordinates, self.forces, strict=True)}
-        parts |= {f"constraints[{k}]": x for k, x in enumerate(self.constraints)}
-        unknown = {s for x in parts.values() for s in x.free_symbols} - known
-        if unknown:
-            where = ", ".join(n for n, x in parts.items() if x.free_symbols & unknown)
-            first = min(unknown, key=lambda s: s.name)
-            raise InputError(
-                f"parameters: {plain(unknown)} stands in {where} and is not declared; "
-                f"add {first}=... to it as parameters={{{first}: 1.0}}, or with None for no value yet"
-            )
-        clash = set(self.parameters) & (q | w | t)
-        if clash:
-            raise InputError(f"parameters: {plain(clash)} is a coordinate, a velocity or the time already")
-        for part in ("V", *(f"constraints[{k}]" for k in range(len(self.constraints)))):
-            moving = parts[part].free_symbols & w
-            if moving:
-                raise InputError(
-                    f"{part}: expected coordinates, time and parameters only, got the velocity {plain(moving)}"
-                )
-        # Coordinates that move no mass can still be bound to some that do.
-        idle = [w for i, w in enumerate(self.velocities) if not any(self.kinetic.M[i, :])]
-        if idle and not self.constraints:
-            raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {plain(idle)}")
-        if not self.constraints and self.kinetic.M.shape[0] <= 4 and self.kinetic.M.det(method="berkowitz") == 0:
-            raise InputError(
-                f"T: its mass matrix {self.kinetic.M.tolist()} is singular everywhere; a velocity is missing"
-            )
+        self.coordinates, self.velocities, self.time = d.coordinates, d.velocities, d.time
+        self.accelerations, self.multiplier_symbols = d.accelerations, d.multipliers
+        self.parameters, self.inputs = d.parameters, d.inputs
+        self.T, self.V, self.dissipation, self.constraints = d.T, d.V, d.dissipation, d.constraints
+        self.forces = sp.ImmutableMatrix([x if q not in self.inputs else 0 for q, x in d.given.items()])
+        require_inertia(self.kinetic.M, self.coordinates, self.velocities, self.constraints)
 
     # The parts
 
@@ -197,37 +145,7 @@ class Lagrangian(Constrained):
 
     @cached_property
     def _equations(self) -> EquationsOfMotion:
-        q, v, k = self.coordinates, sp.Matrix(self.velocities), self.kinetic
-        t = self.time
-        drift = sp.zeros(len(q), 1)
-        if any(k.b) or k.T0 != 0:
-            curl = k.b.jacobian(q)
-            drift += (curl - curl.T) * v - sp.Matrix([sp.diff(k.T0, x) for x in q])
-        if t is not None:
-            drift += sp.diff(k.M, t) * v + sp.diff(k.b, t)
-        friction = [sp.diff(self.dissipation, w) for w in self.velocities]
-        inputs = [self.inputs.get(x, sp.Integer(0)) for x in q]
-        forces = sp.Matrix(self.forces) + sp.Matrix(inputs) - sp.Matrix(friction)
-        m = len(self.constraints)
-        f = sp.Matrix(m, 1, self.constraints)
-        jacobian = f.jacobian(q) if m else sp.zeros(0, len(q))
-        by_time = sp.zeros(m, 1) if t is None else sp.diff(f, t)
-        rate = jacobian * v + by_time
-        gamma = rate.jacobian(q) * v + (sp.zeros(m, 1) if t is None else sp.diff(rate, t)) if m else rate
-        return EquationsOfMotion(
-            coordinates=q,
-            velocities=self.velocities,
-            accelerations=self.accelerations,
-            mass_matrix=k.M,
-            coriolis_matrix=christoffel(k.M, q, self.velocities),
-            drift=tidy_matrix(drift),
-            potential_gradient=tidy_matrix([sp.diff(self.V, x) for x in q]),
-            forces=tidy_matrix(forces),
-            constraint_jacobian=sp.ImmutableMatrix(jacobian),
-            constraint_acceleration=tidy_matrix(gamma),
-            constraints=sp.ImmutableMatrix(f),
-            multipliers=tuple(sp.Symbol(f"lambda{i + 1}") for i in range(m)),
-        )
+        return equations_of_motion(self)
 
     def equations(self) -> EquationsOfMotion:
         """Return the equation of motion, frozen: its matrices, and `latex()` and `explicit()`."""
@@ -237,11 +155,15 @@ class Lagrangian(Constrained):
 
     def cyclic_coordinates(self) -> tuple[sp.Symbol, ...]:
         """Return the coordinates that L does not hold and along which nothing acts: their momenta are constant."""
-        return cyclic.cyclic_coordinates(self)[1]
+        return self._cyclic[1]
+
+    @cached_property
+    def _cyclic(self) -> tuple[dict[sp.Symbol, sp.Expr], tuple[sp.Symbol, ...]]:
+        return cyclic.cyclic_coordinates(self)
 
     def forced_cyclic_coordinates(self) -> dict[sp.Symbol, sp.Expr]:
         """Return the other coordinates that L does not hold, each with the force that acts along it."""
-        return {q: force for q, force in cyclic.cyclic_coordinates(self)[0].items() if force != 0}
+        return {q: force for q, force in self._cyclic[0].items() if force != 0}
 
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return p = ∂L/∂v of each cyclic coordinate, by coordinate."""
@@ -329,10 +251,13 @@ class Lagrangian(Constrained):
 
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> Lagrangian:
         """Return the same system with numbers for some parameters."""
-        for s in values:
-            if s not in self.parameters:
-                raise InputError(f"values: {s} is no parameter; they are {plain(self.parameters) or 'none'}")
-        put = {s: sp.sympify(x) for s, x in values.items()}
+        own = {s.name: s for s in self.parameters}
+        put = {}
+        for given, x in values.items():
+            symbol = own.get(str(given))
+            if symbol is None:
+                raise InputError(f"values: {given} is no parameter; they are {plain(self.parameters) or 'none'}")
+            put[symbol] = sp.sympify(x)
         forces = {q: self.inputs.get(q, x.subs(put)) for q, x in zip(self.coordinates, self.forces, strict=True)}
         return self._like(
             T=self.T.subs(put),
@@ -381,26 +306,5 @@ class Lagrangian(Constrained):
         return f"<Lagrangian {self.name!r}: coordinates {', '.join(map(str, self.coordinates))}>"
 
     def _repr_latex_(self) -> str:
-        return f"$T = {sp.latex(self.T)},\\quad V = {sp.latex(self.V)}$"
-
-
-def _parameters(given: Any) -> Mapping[sp.Symbol, float | None]:
-    pairs = given.items() if isinstance(given, Mapping) else ((s, None) for s in given or ())
-    out: dict[sp.Symbol, float | None] = {}
-    for symbol, value in pairs:
-        if not isinstance(symbol, sp.Symbol):
-            raise InputError(f"parameters: expected SymPy symbols, got {symbol!r}")
-        if any(s.name == symbol.name for s in out):
-            raise InputError(f"parameters: {symbol.name!r} stands twice")
-        out[symbol] = None if value is None else real(f"parameter {symbol}", value)
-    return MappingProxyType(out)
-
-
-def _forces(into: Plain, given: Mapping[Any, Any], coordinates: Sequence[sp.Symbol]) -> dict[sp.Symbol, sp.Expr]:
-    out: dict[sp.Symbol, sp.Expr] = dict.fromkeys(coordinates, sp.Integer(0))
-    for key, value in given.items():
-        coordinate = into("forces", key)
-        if coordinate not in out:
-            raise InputError(f"forces: {key} is no coordinate; the coordinates are {', '.join(map(str, coordinates))}")
-        out[coordinate] = into(f"forces[{key}]", value)
-    return out
+        board = Blackboard(self.coordinates, self.velocities, time=self.time)
+        return f"$T = {board.latex(self.T)},\\quad V = {board.latex(self.V)}$"

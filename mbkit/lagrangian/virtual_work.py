@@ -8,10 +8,10 @@ from typing import Any
 import sympy as sp
 
 from mbkit.errors import InputError
-from mbkit.lagrangian.symbols import Plain, expression
+from mbkit.lagrangian.symbols import Plain, expression, listed, plain
 from mbkit.lagrangian.tidy import tidy
 
-__all__ = ["generalized_force", "vectors"]
+__all__ = ["check_places", "generalized_force", "vectors"]
 
 
 def generalized_force(
@@ -52,7 +52,8 @@ def generalized_force(
     Raises
     ------
     InputError
-        Other numbers of forces than of points, or vectors of other lengths.
+        Other numbers of forces than of points, vectors of other lengths, points that depend on a
+        velocity, or an angular velocity that depends on none.
 
     Examples
     --------
@@ -68,15 +69,27 @@ def generalized_force(
     n, w = vectors("torques", torques, into), vectors("angular_velocities", angular_velocities, into)
     _pairs("forces", f, "points", R)
     _pairs("torques", n, "angular_velocities", w)
-    given = (
-        [coordinates] if isinstance(coordinates, sp.Basic) and not isinstance(coordinates, sp.Tuple) else coordinates
-    )
+    check_places("points", R, into)
+    for k, turn in enumerate(w):
+        if any(turn) and not any(x.free_symbols & set(into.velocities) for x in turn):
+            raise InputError(
+                f"angular_velocities[{k}]: {list(turn)} holds none of the velocities {plain(into.velocities)}; "
+                "velocities=... gives them other names"
+            )
     out = {}
-    for key, q, v in zip(given, into.coordinates, into.velocities, strict=True):
+    for key, q, v in zip(listed("coordinates", coordinates), into.coordinates, into.velocities, strict=True):
         work = [a * sp.diff(b, q) for fi, Ri in zip(f, R, strict=True) for a, b in zip(fi, Ri, strict=True)]
         work += [a * sp.diff(b, v) for nk, wk in zip(n, w, strict=True) for a, b in zip(nk, wk, strict=True)]
         out[key] = tidy(sp.Add(*work))
     return out
+
+
+def check_places(what: str, places: list[tuple[sp.Expr, ...]], into: Plain) -> None:
+    """Refuse places that depend on a velocity, where nothing can be."""
+    for k, place in enumerate(places):
+        moving = {s for x in place for s in x.free_symbols} & set(into.velocities)
+        if moving:
+            raise InputError(f"{what}[{k}]: expected coordinates and time only, got the velocity {plain(moving)}")
 
 
 def vectors(what: str, given: Any, into: Plain) -> list[tuple[sp.Expr, ...]]:

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, partial
+from html import escape
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.constraints import ConstraintTerms, Manifold, manifold_of
 from mbkit.lagrangian.conversion import Conversion
 from mbkit.lagrangian.multipliers import constrained, derivatives
+from mbkit.lagrangian.redundancy import require_independent
 from mbkit.model import Model
 from mbkit.model.needs import Needs
 from mbkit.model.parts import Body, Frame, Joint
@@ -150,7 +152,16 @@ class WrittenModel(Model):
             # From some places there is no way to the constraints.
             with suppress(InputError):
                 return self._states.project(*super().random_state(rng))
+        self.require_independent()
         return self._states.project(*super().random_state(rng))
+
+    def require_independent(self) -> None:
+        """Refuse constraints that follow from each other or contradict each other, with the rows.
+
+        Not while a parameter has no value, of which it may depend.
+        """
+        if self.constrained and None not in self.parameters.values():
+            require_independent(LagrangianDynamics(self, compile=False))
 
     @cached_property
     def _states(self) -> Manifold:
@@ -164,11 +175,13 @@ class WrittenModel(Model):
         return f"<WrittenModel {self.name!r}: coordinates {', '.join(self.coordinate_names)}>"
 
     def _repr_html_(self) -> str:
-        return f"<p><b>{self.name}</b>: {self.system._repr_latex_()}</p>"
+        return f"<p><b>{escape(self.name)}</b>: {self.system._repr_latex_()}</p>"
 
 
 class WrittenEquations(Equations):
     """The equations of a `WrittenModel`, derived from its T and V as those of a robot are."""
+
+    model: WrittenModel
 
     def __init__(self, model: WrittenModel, constants: Constants = "literal") -> None:
         values = Values(model, constants)
@@ -262,7 +275,10 @@ class WrittenEquations(Equations):
     @cached_property
     def forward_dynamics(self) -> Any:
         """M⁻¹ (τ + τ_passive - nle + Jᵀ λ); every other term of the equation is the one without constraints."""
-        return self._constrained[0] if self.model.constrained else super().forward_dynamics
+        if not self.model.constrained:
+            return super().forward_dynamics
+        self.model.require_independent()
+        return self._constrained[0]
 
     @cached_property
     def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:

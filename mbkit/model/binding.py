@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mbkit.model.parameter import Expression, Number, nominal
+from mbkit.model.parts import Joint
 
 __all__ = ["Binding", "split", "with_numbers"]
 
@@ -20,9 +21,9 @@ class Binding:
     Attributes
     ----------
     where : str
-        ``"bodies"``, ``"joints"``, ``"frames"``, ``"springs"``, or ``"gravity"``.
+        ``"bodies"``, ``"joints"``, ``"frames"``, ``"springs"``, ``"loops"``, ``"prescribed"``, or ``"gravity"``.
     part : str
-        The part's name; empty for gravity.
+        The part's name, of a prescribed motion its joint's; empty for gravity.
     field : str
         Name of its attribute; of a mimic joint also ``"ratio"`` and ``"offset"``.
     index : tuple of int
@@ -56,7 +57,7 @@ def with_numbers(part: Any, numbers: Iterable[tuple[str, tuple[int, ...], Number
     """Return a part with numbers of some fields replaced by nominal ones."""
     changes: dict[str, Any] = {}
     for field, index, value in numbers:
-        if field in ("ratio", "offset"):
+        if isinstance(part, Joint) and field in ("ratio", "offset"):
             if part.mimic:
                 changes["mimic"] = replace(changes.get("mimic", part.mimic), **{field: nominal(value)})
         elif index:

@@ -29,7 +29,7 @@ class ModelBuilder:
     A faulty call is remembered and not raised: `build` reports all faults in one
     `ModelError`. Parts may be declared in any order; coordinates follow the
     order in which the joints are declared. Masses, lengths, inertias, constants of
-    springs and dampers, and gravity may be a `Parameter` or an expression of some.
+    springs and dampers, of prescribed motions, and gravity may be a `Parameter` or an expression of some.
 
     Parameters
     ----------
@@ -252,25 +252,45 @@ class ModelBuilder:
         *,
         body_a: str,
         body_b: str,
-        translation_a: ArrayLike = (0.0, 0.0, 0.0),
+        translation_a: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
         rotation_a: ArrayLike | None = None,
-        translation_b: ArrayLike = (0.0, 0.0, 0.0),
+        translation_b: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
         rotation_b: ArrayLike | None = None,
     ) -> None:
-        """Close a loop: two points, or two frames, of two bodies stay together."""
+        """Close a loop: two points, or two frames, of two bodies stay together.
+
+        `mbkit.lagrangian.from_model` makes constraints of it; the engines by themselves refuse it.
+
+        Parameters
+        ----------
+        name : str
+        kind : {"point", "frame"}
+            Points that coincide, as in a ball joint (in a plane: a hinge), or frames that do, as if welded.
+        body_a, body_b : str
+            Names of bodies; one of them may be ``"world"``.
+        translation_a, translation_b : (3,) array_like
+            The points, or the frames' origins, in the axes of the two bodies, m.
+        rotation_a, rotation_b : (3, 3) array_like, optional
+            The frames' orientations in their bodies.
+        """
         who = f"loop {name!r}"
         if kind not in ("point", "frame"):
             self._read.faults.append(f"{who}: unknown kind {kind!r}; use 'point' or 'frame'")
+        numbers = self._numbers(
+            "loops",
+            str(name),
+            translation_a=self._read.quantities(f"{who}: translation_a", translation_a, 3),
+            translation_b=self._read.quantities(f"{who}: translation_b", translation_b, 3),
+        )
         self._loops.append(
             Loop(
-                str(name),
-                kind,
-                str(body_a),
-                self._read.rotation(who, rotation_a, None),
-                self._read.vector(f"{who}: translation_a", translation_a, 3),
-                str(body_b),
-                self._read.rotation(who, rotation_b, None),
-                self._read.vector(f"{who}: translation_b", translation_b, 3),
+                name=str(name),
+                kind=kind,
+                body_a=str(body_a),
+                rotation_a=self._read.rotation(who, rotation_a, None),
+                body_b=str(body_b),
+                rotation_b=self._read.rotation(who, rotation_b, None),
+                **numbers,
             )
         )
 
@@ -278,17 +298,19 @@ class ModelBuilder:
         self,
         joint: str,
         *,
-        offset: float = 0.0,
-        rate: float = 0.0,
-        amplitude: float = 0.0,
-        frequency: float = 0.0,
-        phase: float = 0.0,
+        offset: Number = 0.0,
+        rate: Number = 0.0,
+        amplitude: Number = 0.0,
+        frequency: Number = 0.0,
+        phase: Number = 0.0,
     ) -> None:
-        """Move a one-velocity joint in time: offset + rate t + amplitude sin(frequency t + phase)."""
-        names = ("offset", "rate", "amplitude", "frequency", "phase")
-        values = (offset, rate, amplitude, frequency, phase)
-        numbers = [self._read.real(f"prescribed {joint!r}: {n}", x) for n, x in zip(names, values, strict=True)]
-        self._prescribed.append(Prescribed(str(joint), *numbers))
+        """Move a one-velocity joint in time: offset + rate t + amplitude sin(frequency t + phase).
+
+        `mbkit.lagrangian.from_model` puts it into the energies; the engines by themselves refuse it.
+        """
+        given = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
+        read = {n: self._read.quantity(f"prescribed {joint!r}: {n}", x) for n, x in given.items()}
+        self._prescribed.append(Prescribed(str(joint), **self._numbers("prescribed", str(joint), **read)))
 
     def note(self, text: str) -> None:
         """Keep a sentence for whoever reads the model."""

@@ -391,9 +391,9 @@ class Model:
         if feature == "gravity":
             return replace(self, gravity=np.zeros(3), bindings=self._bindings_without("gravity"))
         if feature == "loops":
-            return replace(self, loops=())
+            return replace(self, loops=(), bindings=tuple(b for b in self.bindings if b.where != "loops"))
         if feature == "prescribed":
-            return replace(self, prescribed=())
+            return replace(self, prescribed=(), bindings=tuple(b for b in self.bindings if b.where != "prescribed"))
         if feature == "limits":
             return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
         name = _PER_VELOCITY[feature]

@@ -93,7 +93,7 @@ class Parameter(Expression):
 
     It may stand wherever the builder or the catalog takes a mass, a centre of mass,
     an inertia, a length, a spring's or damper's constant, armature, a mimic joint's
-    ratio and offset, or gravity. Not for orientations, axes and limits.
+    ratio and offset, a number of a prescribed motion, or gravity. Not for orientations, axes and limits.
 
     Parameters
     ----------

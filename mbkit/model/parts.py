@@ -186,3 +186,8 @@ class Prescribed(_Frozen):
     amplitude: float = 0.0
     frequency: float = 0.0
     phase: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """The joint's, which has one motion."""
+        return self.joint

@@ -54,6 +54,8 @@ def structure_faults(
             faults.append(f"spring {spring.name!r}: both ends on {spring.body_a!r}; it would never act")
     for loop in loops:
         faults += _unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b), known)
+        if loop.body_a == loop.body_b:
+            faults.append(f"loop {loop.name!r}: both ends on {loop.body_a!r}; it would close nothing")
     faults += _tree_faults(bodies, joints)
     faults += _mimic_faults(joints)
     one = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
@@ -63,6 +65,8 @@ def structure_faults(
         for p in prescribed
         if p.joint not in one
     ]
+    moved = Counter(p.joint for p in prescribed)
+    faults += [f"prescribed {n!r}: moved {k} times; give one motion" for n, k in moved.items() if k > 1]
     return faults
 
 

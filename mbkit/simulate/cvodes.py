@@ -19,6 +19,7 @@ from mbkit.derivation.equations import Equations
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnsupportedError
+from mbkit.model import Model
 from mbkit.simulate.events import Event
 from mbkit.simulate.members import Member, check_save, gathered, reporter
 from mbkit.simulate.methods import Tolerances
@@ -71,8 +72,6 @@ def run_cvodes(
         )
     if torque.callable or events:
         raise UnsupportedError(f"{method}: takes neither torque functions nor events; use method='bdf' or 'lsoda'")
-    if dyn.model.clock:
-        raise UnsupportedError(f"{method}: {dyn.model.name} depends on the time; use method='bdf' or 'radau'")
     batch = None if q0.ndim == 1 else len(q0)
     if save is None:
         raise InputError(
@@ -157,6 +156,8 @@ class _Solve:
 
     def __init__(self, dyn: LagrangianDynamics, tolerances: Tolerances) -> None:
         self._graph = _graph(dyn)
+        clock = _clock(dyn.model)
+        self._clock = None if clock is None else dyn.model.nv + clock
         self._options = {
             "reltol": tolerances.rtol,
             "abstol": tolerances.atol,
@@ -181,8 +182,11 @@ class _Solve:
         if len(self._made) > _REMEMBERED:
             self._made.clear()
         self._made[grid] = integrator
+        given = np.append(given, length)
+        if self._clock is not None:
+            given[self._clock] = times[0]
         try:
-            out = integrator(x0=y, p=np.append(given, length))
+            out = integrator(x0=y, p=given)
         except RuntimeError as error:
             return _read(str(error), self._rtol)
         finally:
@@ -207,7 +211,10 @@ def _read(told: str, rtol: float) -> _Failure:
 
 
 def _graph(dyn: LagrangianDynamics) -> ca.Function:
-    """Return x, p -> dx/ds with t = length s and p = (τ, parameters, length), made once."""
+    """Return s, x, p -> dx/ds with p = (τ, parameters, length), made once.
+
+    t is length s beyond the parameter that is the time, where the equation depends on it.
+    """
     if _GRAPH not in vars(dyn):
         vars(dyn)[_GRAPH] = _derived(dyn.equations)
     graph: ca.Function = vars(dyn)[_GRAPH]
@@ -224,10 +231,18 @@ def _derived(eq: Equations) -> ca.Function:
         unit[part] = q[part] / lengths[part]
     rate = ca.vertcat(eq.kin.qdot, eq.forward_dynamics)
     rate = ca.substitute(rate, eq.q, unit)
+    s, clock = ca.SX.sym("s"), _clock(model)
+    if clock is not None:
+        rate = ca.substitute(rate, eq.parameters[clock], eq.parameters[clock] + length * s)
     # D is linear in the quaternion: with its length put back, the drift of that length never bends the rotation.
     rate[: model.nq] *= lengths
     given = ca.vertcat(eq.tau, eq.parameters, length)
-    named = {"x": ca.vertcat(q, v), "p": given, "ode": length * ca.densify(rate)}
+    named = {"t": s, "x": ca.vertcat(q, v), "p": given, "ode": length * ca.densify(rate)}
     names_in, names_out = ca.dyn_in(), ca.dyn_out()
     ins, outs = ([named.get(name, ca.SX(0, 1)) for name in names] for names in (names_in, names_out))
     return ca.Function("rates", ins, outs, names_in, names_out, {"cse": True})
+
+
+def _clock(model: Model) -> int | None:
+    """Return which of the parameters is the time."""
+    return None if model.clock is None else list(model.parameters).index(model.clock)

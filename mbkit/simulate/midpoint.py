@@ -58,11 +58,6 @@ def run_midpoint(
             f"{method}: {dyn.engine} gives neither momenta nor ∂T/∂q, which the midpoint rule in (q, p) is made of; "
             "mbkit.dynamics(model, 'lagrangian') has them; 'gauss4' and 'gauss6' run on any engine"
         )
-    if dyn.model.clock:
-        raise UnsupportedError(
-            f"{method}: {dyn.model.name} depends on the time, where (q, p) alone has no symplectic flow; "
-            "'gauss4' and 'gauss6' are the implicit methods for it"
-        )
     refuse_constraints(dyn, method, "which its step in (q, p) does not know")
     single = q0.ndim == 1
     q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
@@ -93,7 +88,7 @@ class _Run:
         self._midpoint = Midpoint(dyn.equations)
         self._q0, self._v0, self._w0 = q0, v0, Space(dyn.model).enter(q0, v0)
         n, rows = len(q0), len(kept)
-        (self._pi0,) = called(self._dyn, self._midpoint.momentum, slice(None), q0, v0)
+        (self._pi0,) = called(self._dyn, self._midpoint.momentum, slice(None), 0.0, q0, v0)
         self._q, self._v = np.full((n, rows, q0.shape[1]), np.nan), np.full((n, rows, v0.shape[1]), np.nan)
         self._steps = np.zeros(n, dtype=np.intp)
         self._last = np.zeros(n)
@@ -157,7 +152,7 @@ class _Run:
             n = min(chunk.block, whole - k)
             if held or not torques.size:
                 torques = self._torque.columns(members, k, k + n)
-            good = chunk.advance(n, grid.step(k), torques)
+            good = chunk.advance(n, grid.time(k), grid.step(k), torques)
             if (rows := self._rows(k + 1, k + n)).start < rows.stop:
                 at = self._kept[rows] - k
                 self._q[members, rows], self._v[members, rows] = chunk.states("q", at), chunk.states("pi", at)
@@ -184,7 +179,7 @@ class _Run:
             for k in range(grid.steps):
                 w, tau, good = solver.velocity(members, k, grid.time(k), grid.step(k), q, pi, guess)
                 ws = [w, *ws[:-1]]
-                q1, pi1, guess = solver.end(members, grid.step(k), q, pi, ws, tau)
+                q1, pi1, guess = solver.end(members, grid.time(k), grid.step(k), q, pi, ws, tau)
                 good &= (np.abs(q1) < RUNAWAY).all(axis=1) & (np.abs(pi1) < RUNAWAY).all(axis=1)
                 if not good.all():
                     self._last[members[~good]] = np.maximum(np.abs(q).max(axis=1), np.abs(pi).max(axis=1))[~good]
@@ -231,18 +226,19 @@ class _Run:
 
     def _to_velocities(self) -> None:
         n, rows, nv = self._v.shape
+        times = np.array([self._grid.time(int(k)) for k in self._kept])
         size = max(_SLICE // max(n * (nv or 1), 1), 1)
         for start in range(0, rows, size):
             q, v = (x[:, start : start + size] for x in (self._q, self._v))
             good = np.isfinite(v).all(axis=2)
             who, at = np.nonzero(good)
             if len(who):
-                v[who, at] = self._velocities(who, q[who, at], v[who, at])
+                v[who, at] = self._velocities(who, times[start + at], q[who, at], v[who, at])
 
-    def _velocities(self, members: Indices, q: Array, pi: Array) -> Array:
+    def _velocities(self, members: Indices, t: Array, q: Array, pi: Array) -> Array:
         if self._dyn.written_out:
-            return called(self._dyn, self._midpoint.velocity, members, q, pi)[0]
-        M, p = called(self._dyn, self._midpoint.velocity_system, members, q, pi)
+            return called(self._dyn, self._midpoint.velocity, members, t, q, pi)[0]
+        M, p = called(self._dyn, self._midpoint.velocity_system, members, t, q, pi)
         return np.asarray(np.linalg.solve(M, p[..., None])[..., 0])
 
     def _message(self, single: bool) -> str:

@@ -69,7 +69,10 @@ class MidpointChunk:
         rooms = [("q", n + 1, nq), ("pi", n + 1, nv), ("misses", n + 1, 1), ("tau", n if torques else 1, nv)]
         # The velocity of each step behind those of the last ones before the block.
         rooms += [("w", n + back, nv), ("guess", 2, nv), ("trial", 2, nv), ("miss", 1, 1), ("dt", 1, 1)]
-        rooms += [("parameters", 1, len(dyn.model.parameters))]
+        # The time is one of them, and another in each step.
+        names, clock = list(dyn.model.parameters), dyn.model.clock
+        self._clock = None if clock is None else names.index(clock)
+        rooms += [("parameters", 1 if clock is None else n, len(names))]
         self._rooms = {name: _room(places, rows, width) for name, places, rows in rooms}
         self._back = back
         self._sequences: dict[tuple[int, int], CallSequence] = {}
@@ -85,8 +88,8 @@ class MidpointChunk:
         self._fill("guess", 0, w.T)
         for place in range(self._back):
             self._fill("w", place, w.T)
-        if parameters.size:
-            self._fill("parameters", 0, np.atleast_2d(parameters).T)
+        for place in range(len(self._rooms["parameters"]) if parameters.size else 0):
+            self._fill("parameters", place, np.atleast_2d(parameters).T)
 
     def _fill(self, name: str, place: int, columns: Array) -> None:
         # Columns beyond the states repeat the last one.
@@ -106,8 +109,8 @@ class MidpointChunk:
             room = self._rooms[name]
             return np.asarray(room[place % len(room)].T)
 
-        held = {name: at(name, j) for name in ("q", "pi", "tau", "misses")}
-        held |= {name: at(name, 0) for name in ("dt", "miss", "parameters")}
+        held = {name: at(name, j) for name in ("q", "pi", "tau", "misses", "parameters")}
+        held |= {name: at(name, 0) for name in ("dt", "miss")}
         new = {"q1": at("q", j + 1), "pi1": at("pi", j + 1), "misses1": at("misses", j + 1), "guess": at("guess", 1)}
         # The block's first guess stays where it is, so that the block can be made again.
         tries = [at("guess", min(j, 1)), *(at("trial", i) for i in range(iterations - 1)), at("w", j + self._back)]
@@ -122,13 +125,14 @@ class MidpointChunk:
     def _call(self, name: str, reads: tuple[str, ...], given: dict[str, Array], outs: list[Array]) -> Call:
         return Call(self._codes[name], [given[n] for n in reads], outs)
 
-    def advance(self, steps: int, dt: float, torques: Array) -> NDArray[np.intp]:
+    def advance(self, steps: int, start: float, dt: float, torques: Array) -> NDArray[np.intp]:
         """Take some steps, at most `block`, from where the last ones ended.
 
         Parameters
         ----------
         steps : int
-        dt : float
+        start, dt : float
+            Time at which the first begins, and length of each; s.
         torques : (steps or 1, nv, n or 1) array
 
         Returns
@@ -139,6 +143,9 @@ class MidpointChunk:
         self._rooms["dt"][:] = dt
         for j in range(min(steps, len(self._rooms["tau"]))):
             self._fill("tau", j, torques[j])
+        if self._clock is not None:
+            middles = start + (np.arange(steps) + 0.5) * dt
+            self._rooms["parameters"][:steps, self._clock] = middles[:, None]
         self._rooms["misses"][0] = 0.0
         if self._smooth >= _PATIENCE and self._iterations > 1:
             self._iterations, self._smooth = self._iterations - 1, 0

@@ -22,13 +22,22 @@ _WITH_FUNCTION: Final = 60
 _EPS: Final = float(np.finfo(float).eps)
 
 
-def called(dyn: LagrangianDynamics, part: Part, members: slice | Indices, *arguments: Array) -> list[Array]:
-    """Return a part's results for members of a batch: vectors as (n, rows), matrices as (n, rows, columns)."""
+def called(
+    dyn: LagrangianDynamics, part: Part, members: slice | Indices, t: Array | float, *arguments: Array
+) -> list[Array]:
+    """Return a part's results for members of a batch: vectors as (n, rows), matrices as (n, rows, columns).
+
+    `t`, one for all or (n,), is the time of evaluation, where the dynamics depends on it.
+    """
     n = len(arguments[0])
     given = [np.broadcast_to(x, (n, x.shape[-1])) for x in arguments]
     if dyn.model.parameters:
         values = dyn.parameter_values
-        given.append(values[members] if values.ndim == 2 else np.broadcast_to(values, (n, len(values))))
+        own = values[members] if values.ndim == 2 else np.broadcast_to(values, (n, len(values)))
+        if dyn.model.clock is not None:
+            own = own.copy()
+            own[:, list(dyn.model.parameters).index(dyn.model.clock)] = t
+        given.append(own)
     results = dyn.code(part.name, make=part.make)(*given, threads=dyn.threads)
     return [
         x[..., 0] if x.shape[-1] == 1 and name not in ("M", "jacobian") else x
@@ -76,7 +85,7 @@ class MidpointSolver:
                 break
             if self._torque.callable:
                 tau[todo] = self._function(members[todo], k, t, h, q[todo], w[todo])
-            w1, solved = self._newton(members[todo], q[todo], pi[todo], w[todo], tau[todo], h)
+            w1, solved = self._newton(members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
             change = np.abs(w1 - w[todo]).max(axis=1, initial=0.0)
             if self._torque.callable:
                 solved &= (change <= 4 * _EPS * np.abs(w1).max(axis=1, initial=0.0)) | (change >= last[todo] / 2)
@@ -93,25 +102,25 @@ class MidpointSolver:
         return force(t + h / 2, *state)
 
     def _newton(
-        self, members: Indices, q: Array, pi: Array, w: Array, tau: Array, h: float
+        self, members: Indices, t: float, q: Array, pi: Array, w: Array, tau: Array, h: float
     ) -> tuple[Array, NDArray[np.bool_]]:
         self.iterations += len(q)
         given = (q, pi, w, tau, np.array([[h]]))
         if self._dyn.written_out:
-            w1, miss = called(self._dyn, self._midpoint.newton, members, *given)
+            w1, miss = called(self._dyn, self._midpoint.newton, members, t, *given)
             return w1, miss[:, 0] == 0
-        residual, jacobian = called(self._dyn, self._midpoint.system, members, *given)
+        residual, jacobian = called(self._dyn, self._midpoint.system, members, t, *given)
         change = _solved(jacobian, residual)
         w1 = w - change
         limit = SMALL**2 * np.sum(w1**2, axis=1) + (LEAST / h) ** 2 * (1 + np.sum(q**2, axis=1))
         return w1, np.sum(change**2, axis=1) < limit
 
     def end(
-        self, members: Indices, h: float, q: Array, pi: Array, ws: list[Array], tau: Array
+        self, members: Indices, t: float, h: float, q: Array, pi: Array, ws: list[Array], tau: Array
     ) -> tuple[Array, Array, Array]:
         """Return q and π after the step, and the first guess of the next velocity, from those of the last steps."""
         zero = np.zeros((1, 1))
-        outs = called(self._dyn, self._midpoint.end, members, q, pi, *ws, tau, np.array([[h]]), zero, zero)
+        outs = called(self._dyn, self._midpoint.end, members, t + h / 2, q, pi, *ws, tau, np.array([[h]]), zero, zero)
         return outs[0], outs[1], outs[2]
 
 

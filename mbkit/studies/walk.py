@@ -29,6 +29,8 @@ _SHORT: Final = 2e-3
 _MOST_IN_A_ROUND: Final = 100
 #: Settings in a row that bring nothing, after which a sweep of our own grid ends.
 _IN_VAIN: Final = 2
+#: Times as many steps as before, from which a setting is finer: a decade of a tolerance is 1.33 at order 8.
+_FINER: Final = 1.2
 #: Errors above this may still fall again, as those of steps that are too large do.
 _SMALL: Final = 1e-6
 
@@ -228,7 +230,13 @@ class Walk:
 
     def _in_vain(self) -> bool:
         """Whether the last settings brought nothing: the reference's floor, or rounding."""
-        errors = [p.error for p in self._points]
+        # Steps that end on the saved times can be shorter than a coarse tolerance asks for: of settings that hardly
+        # add a step, only the first says whether finer ones bring anything.
+        told = self._points[:1]
+        for p in self._points[1:]:
+            if not p.error > self.scene.floor or p.steps >= _FINER * told[-1].steps:
+                told.append(p)
+        errors = [p.error for p in told]
         before, last = errors[:-_IN_VAIN], errors[-_IN_VAIN:]
         finite = [e for e in before if math.isfinite(e)]
         if not finite or min(finite) > _SMALL:

@@ -1,0 +1,86 @@
+"""What is told of expressions by their values at random places, in a time that is bounded.
+
+An expression that is zero by some identity need not look so, and `sympy.simplify` may search for the identity for
+ever. Its values say it: computed in more digits what is zero gets smaller, and what is not stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
+
+import mpmath
+import sympy as sp
+from mpmath.libmp import NoConvergence
+from numpy.random import default_rng
+
+__all__ = ["DIGITS", "Probe", "vanishes"]
+
+#: That values have, and that they have where it is asked whether they are zero.
+DIGITS: Final = 30
+_MORE: Final = 60
+#: What is left of zero with the second number of digits, relative to what the first left.
+_LESS: Final = 1e-15
+#: Beside terms of the order of 1 it is nothing at all.
+_NOTHING: Final = 1e-50
+#: Places that must agree; more of them where signs decide.
+_PLACES: Final = 2
+_SIGNED: Final = 8
+
+
+class Probe:
+    """Expressions as numbers at random places.
+
+    Parameters
+    ----------
+    expressions : sequence of sympy.Expr
+    symbols : iterable of sympy.Symbol, optional
+        Where places have values of their own besides those that the expressions hold.
+    """
+
+    def __init__(self, expressions: Sequence[sp.Expr], symbols: Iterable[sp.Symbol] = ()) -> None:
+        held: set[Any] = set(symbols).union(*(x.free_symbols for x in expressions))
+        self.symbols = sorted(held, key=lambda s: (s.name, str(s)))
+        dummies = {s: sp.Dummy() for s in self.symbols}
+        named = [x.xreplace(dummies) for x in expressions]
+        self._call = sp.lambdify([list(dummies.values())], named, modules="mpmath", cse=True)
+
+    def place(self, seed: int) -> dict[sp.Symbol, Any]:
+        """Return a random value for each symbol, of size ½ to 3/2; positive ones only where the seed is even."""
+        rng = default_rng(seed)
+        out = {}
+        for s in self.symbols:
+            size, sign = rng.uniform(0.5, 1.5), rng.choice([-1.0, 1.0])
+            out[s] = mpmath.mpf(size if seed % 2 == 0 or s.is_nonnegative else sign * size)
+        return out
+
+    def __call__(self, place: dict[sp.Symbol, Any], digits: int = DIGITS) -> list[Any] | None:
+        """Return the values at a place, complex where a root is negative; None where one is not defined."""
+        with mpmath.workdps(digits):
+            try:
+                out = [mpmath.mpmathify(x) for x in self._call([place[s] for s in self.symbols])]
+            except (ArithmeticError, ValueError, TypeError, NameError, NoConvergence):
+                return None
+        return out if all(mpmath.isfinite(x) for x in out) else None
+
+
+def vanishes(x: sp.Expr) -> bool:
+    """Return whether an expression is zero everywhere, whatever it looks like.
+
+    What is put together of pieces may be zero in some of them: it is zero only where it says so itself.
+    """
+    if not x.free_symbols or x.is_zero is not None or x.has(sp.Piecewise, sp.Max, sp.Min):
+        return bool(x == 0 or x.is_zero)
+    broken = x.has(sp.Abs, sp.sign) or any(not p.exp.is_Integer for p in x.atoms(sp.Pow))
+    probe, needed = Probe([x]), _SIGNED if broken else _PLACES
+    for seed in range(2 * needed):
+        place = probe.place(seed)
+        rough, fine = (probe(place, digits) for digits in (DIGITS, _MORE))
+        if rough is None or fine is None:
+            continue
+        if abs(fine[0]) > max(_LESS * abs(rough[0]), _NOTHING):
+            return False
+        needed -= 1
+        if not needed:
+            return True
+    return False

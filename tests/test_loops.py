@@ -1,0 +1,426 @@
+"""Models with loops and prescribed motions: by Pinocchio's trees, the textbook's systems and published values."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.spatial.transform import Rotation
+
+import mbkit as mb
+from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.lagrangian import from_model, systems
+from mbkit.model.parts import Prescribed
+from tests.random_trees import off, random_tree
+from validation.closed_forms import published
+
+OWN = {"compile": False}
+# Sums of some hundred rounded terms, in another order than the tree's.
+CLOSE = 1e-13
+P = mb.Parameter
+ABOUT_Z = {"axis": (0, 0, 1)}
+
+
+def bar(b: mb.ModelBuilder, name: str, length, mass=1.0, part=1.0, thick=1e-3) -> None:
+    """Add a uniform rod along x, or the first part of one."""
+    J = mass * length**2 * (part**3 / 12)
+    b.add_body(name, mass=mass * part, com=(length * part / 2, 0, 0), inertia=(thick * part, J, J))
+
+
+# The slider-crank
+
+
+def slider_crank(*changes) -> mb.Model:
+    """Crank, rod and piston of `systems.rigid_slider_crank`, and a pin."""
+    L1, L2, m1, m2 = P("L1", 0.1), P("L2", 0.3), P("m1", 0.2), P("m2", 0.2)
+    b = mb.ModelBuilder("slider_crank", gravity=(0, 0, 0))
+    bar(b, "crank", L1, m1, thick=0.0)
+    bar(b, "rod", L2, m2, thick=0.0)
+    b.add_body("piston", mass=P("m3", 0.4))
+    b.add_joint("theta", "continuous", parent="world", child="crank", **ABOUT_Z)
+    b.add_joint("phi", "continuous", parent="crank", child="rod", translation=(L1, 0, 0), **ABOUT_Z)
+    b.add_joint("x", "prismatic", parent="world", child="piston", axis=(1, 0, 0))
+    b.add_loop("pin", "point", body_a="rod", translation_a=(L2, 0, 0), body_b="piston")
+    for change in changes:
+        change(b)
+    return b.build()
+
+
+def at_angle(th: float) -> np.ndarray:
+    phi = -th - math.asin(math.sin(th) / 3)
+    return np.array([th, phi, 0.1 * math.cos(th) + 0.3 * math.cos(th + phi)])
+
+
+@pytest.fixture(scope="module")
+def crank():
+    return from_model(slider_crank())
+
+
+def test_a_slider_crank_closes_as_in_the_textbook(crank):
+    L1, L2, th, phi, x = sp.symbols("L1 L2 theta phi x")
+    row = L1 * sp.cos(th) + L2 * sp.cos(th + phi) - x, L1 * sp.sin(th) + L2 * sp.sin(th + phi)
+    assert [sp.expand(a - b) for a, b in zip(crank.constraints, row, strict=True)] == [0, 0]
+    told, one = published()["rigid_slider_crank"], systems.rigid_slider_crank().dynamics(options=OWN)
+    embedded = crank.embedded(["theta"])
+    for angle, J in ((0.0, told["J0"]), (0.7, None), (math.pi / 2, told["J_half_pi"]), (2.5, None)):
+        q = at_angle(angle)
+        own = embedded.on(embedded.chart(q, 0.0), q, 0.0)
+        assert off(own.mass_matrix([angle]), one.mass_matrix([angle])) < 1e-14
+        assert J is None or own.mass_matrix([angle])[0, 0] == pytest.approx(J, rel=1e-14)
+        pushed, alone = (x.forward_dynamics([angle], [3.0], [tau]) for x, tau in ((own, 0.1), (one, 0.0)))
+        assert pushed == pytest.approx(alone, rel=1e-12)
+
+
+def test_a_slider_crank_reaches_the_published_digits(crank):
+    exact = np.array([float(s) for s in published()["rigid_slider_crank"]["exact_t3_theta_thetadot"]])
+    run = mb.simulate(
+        crank.dynamics(options=OWN),
+        at_angle(0.0),
+        np.zeros(3),
+        3.0,
+        "rk853",
+        rtol=1e-9,
+        torque=[0.1, 0, 0],
+        save=[3.0],
+    )
+    # 19 turns at 100 rad/s; the tolerance is that of each of 1200 steps.
+    assert np.abs(np.array([run.q[0, 0], run.v[0, 0]]) / exact - 1).max() < 1e-7
+    # Of angles of 122 rad, rounded.
+    assert np.abs(crank.constraint(run.q)).max() < 1e-14
+
+
+# Andrews' squeezing mechanism: seven bodies, three loops
+
+
+def squeezing_mechanism() -> mb.Model:
+    told = published()["andrews_squeezing_mechanism"]
+    g, spring = told["geometry"], told["spring"]
+    A, B, C = ((g[f"x{k}"], g[f"y{k}"], 0) for k in "abc")
+    com = [
+        (g["ra"], 0),
+        (-g["da"], 0),
+        (g["sb"], -g["sa"]),
+        (0, g["ea"] - g["e"]),
+        (g["ta"], g["tb"]),
+        (g["zf"] - g["fa"], 0),
+        (-g["ub"], -g["ua"]),
+    ]
+    carriers = [("world", (0, 0, 0)), ("K1", (g["rr"], 0, 0)), ("world", B), ("K5", (g["zt"], 0, 0)), ("world", A)]
+    carriers += [("K7", (0, -g["u"], 0)), ("world", A)]
+    b = mb.ModelBuilder("squeezing_mechanism", gravity=(0, 0, 0))
+    for k, (place, mass, J) in enumerate(zip(com, told["m"], told["I_com"], strict=True), 1):
+        b.add_body(f"K{k}", mass=mass, com=(*place, 0), inertia=(0, J, J))
+    for k, (name, (parent, at)) in enumerate(zip(told["coords"], carriers, strict=True), 1):
+        b.add_joint(name, "continuous", parent=parent, child=f"K{k}", translation=at, **ABOUT_Z)
+    for body, end in (("K3", (0, -g["ss"], 0)), ("K4", (0, -g["e"], 0)), ("K6", (g["zf"], 0, 0))):
+        ends = {"body_a": "K2", "translation_a": (-g["d"], 0, 0), "body_b": body, "translation_b": end}
+        b.add_loop(f"E{body}", "point", **ends)
+    ends = {"body_a": "K3", "point_a": (g["sd"], -g["sc"], 0), "body_b": "world", "point_b": C}
+    b.add_spring("spring", **ends, stiffness=spring["c0"], rest_length=spring["l0"])
+    return b.build()
+
+
+def test_andrews_squeezing_mechanism_is_the_published_one():
+    told = published()["andrews_squeezing_mechanism"]
+    lag = from_model(squeezing_mechanism())
+    dyn = lag.dynamics(options=OWN)
+    q, v = np.array([float(x) for x in told["q0"]]), np.zeros(7)
+    tau = np.array([told["drive_torque_on_beta"], *np.zeros(6)])
+    assert np.abs(lag.constraint(q)).max() < 1e-16
+    a, lam = (np.array([float(x) for x in told[n]]) for n in ("qdd0", "lambda0"))
+    assert off(dyn.forward_dynamics(q, v, tau), a) < CLOSE
+    # The test set's multipliers stand on the other side of the equation.
+    assert off(lag.multipliers(q, v, tau), -lam) < CLOSE
+    run = mb.simulate(dyn, q, v, 0.03, "rk853", rtol=1e-11, torque=tau, save=np.linspace(0, 0.03, 4))
+    end = told["reference_t_0p03"]
+    # The printed digits are good to 3e-10 and 5e-8.
+    assert np.abs(run.q[-1] / end["q"] - 1).max() < 1e-9
+    assert np.abs(run.v[-1] / end["v"] - 1).max() < 1e-7
+    energy = run.energy() - tau[0] * run.q[:, 0]
+    assert np.ptp(energy) < 1e-10 * run.kinetic_energy().max()
+    assert np.abs(lag.constraint(run.q)).max() < 1e-16
+
+
+# Four bars: point and frame, in any plane
+
+
+def four_bar(kind: str, R: np.ndarray | None = None) -> mb.Model:
+    R = np.eye(3) if R is None else R
+    b = mb.ModelBuilder("four_bar", gravity=R @ [0, -9.81, 0])
+    bar(b, "a", 1.0)
+    bar(b, "b", 2.0)
+    b.add_joint("q1", "continuous", parent="world", child="a", rotation=R, **ABOUT_Z)
+    b.add_joint("q2", "continuous", parent="a", child="b", translation=(1, 0, 0), **ABOUT_Z)
+    half = 1.0 if kind == "point" else 0.5
+    bar(b, "c", 1.5, part=half)
+    # An axis that points the other way.
+    b.add_joint("q3", "continuous", parent="world", child="c", axis=(0, 0, -1), rotation=R, translation=R @ [2, 0, 0])
+    if kind == "point":
+        b.add_loop("pin", "point", body_a="b", translation_a=(2, 0, 0), body_b="c", translation_b=(1.5, 0, 0))
+    else:
+        # The other half hangs on the coupler, and is welded to the first.
+        bar(b, "d", 1.5, part=half)
+        b.add_joint("q4", "continuous", parent="b", child="d", translation=(2, 0, 0), **ABOUT_Z)
+        ends = {"body_a": "d", "translation_a": (0.75, 0, 0), "body_b": "c", "translation_b": (0.75, 0, 0)}
+        b.add_loop("weld", "frame", **ends, rotation_b=np.diag([-1.0, -1, 1]))
+    return b.build()
+
+
+def test_a_four_bar_however_it_is_closed():
+    save = np.linspace(0, 1.0, 3)
+    lag = from_model(four_bar("point"))
+    q, v = lag.project([1.2, -0.7, -1.6], [1.0, 0, 0])
+    run = mb.simulate(lag.dynamics(options=OWN), q, v, 1.0, "rk853", rtol=1e-13, save=save)
+    assert np.ptp(run.energy()) < 1e-12
+    assert np.abs(lag.constraint(run.q)).max() < 1e-14
+    embedded = mb.simulate(lag.embedded(), q, v, 0.5, "rk853", rtol=1e-11, save=[0.5])
+    assert np.abs(embedded.q[0] - run.q[1]).max() < 1e-9
+    tilted = Rotation.from_euler("xyz", [0.4, 0.3, -0.8]).as_matrix()
+    # The welded half turns with the rod that it is a half of, and may have turned around before.
+    turn = -(q[2] + q[0] + q[1]) + math.pi
+    for k, (R, turns) in enumerate(((None, 0.0), (tilted, 2 * math.pi))):
+        weld = from_model(four_bar("frame", R))
+        assert len(weld.constraints) == 3
+        assert str(weld.constraints[2]) == "2*cos(q1/2 + q2/2 + q3/2 + q4/2)"
+        start = [*q, turn + turns], [*v, -v.sum()]
+        dyn = weld.dynamics(options=OWN)
+        assert off(
+            dyn.forward_dynamics(*start, np.zeros(4))[:3], lag.dynamics(options=OWN).forward_dynamics(q, v, v * 0)
+        ) < (1e-12)
+        if k == 0:
+            other = mb.simulate(dyn, *start, 1.0, "rk853", rtol=1e-12, save=save)
+            assert np.abs(other.q[:, :3] - run.q).max() < 1e-11
+    assert np.abs(from_model(four_bar("point", tilted)).constraint(q)).max() < 1e-15
+
+
+def ball_linkage(kind: str) -> mb.Model:
+    """A crank, a ball joint, a coupler, a universal joint and a rocker whose axis is square to the crank's."""
+    b = mb.ModelBuilder("linkage")
+    bar(b, "crank", 0.4, thick=0.01)
+    bar(b, "rocker", 0.8, thick=0.01)
+    b.add_joint("q1", "continuous", parent="world", child="crank", **ABOUT_Z)
+    b.add_joint("q3", "continuous", parent="world", child="rocker", axis=(0, 1, 0), translation=(1, 0.2, 0))
+    bar(b, "coupler", 1.0, part=1.0 if kind == "point" else 0.5, thick=0.01)
+    axes = {"axis": (0, 1, 0), "axis2": (0, 0, 1), "translation": (0.8, 0, 0)}
+    b.add_joint("u", "universal", parent="rocker", child="coupler", **axes)
+    if kind == "point":
+        ends = {"translation_a": (1, 0, 0), "translation_b": (0.4, 0, 0)}
+        b.add_loop("ball", "point", body_a="coupler", body_b="crank", **ends)
+    else:
+        bar(b, "half", 1.0, part=0.5, thick=0.01)
+        b.add_joint("s", "spherical_zyx", parent="crank", child="half", translation=(0.4, 0, 0))
+        ends = {"translation_a": (0.5, 0, 0), "translation_b": (0.5, 0, 0), "rotation_b": np.diag([-1.0, -1, 1])}
+        b.add_loop("weld", "frame", body_a="coupler", body_b="half", **ends)
+    for side in "ab":
+        name = {"a": "coupler", "b": "crank" if kind == "point" else "half"}[side]
+        b.add_frame(f"end_{side}", body=name, translation=ends[f"translation_{side}"])
+    return b.build()
+
+
+def pinocchios_jacobian(tree, q):
+    """Return that of end a less end b's, linear then angular, in the world's axes."""
+    return tree.jacobian(q, "end_a") - tree.jacobian(q, "end_b")
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    lag, model = from_model(ball_linkage("point")), ball_linkage("point").without("loops")
+    return lag, model, *lag.project([0.3, -1.5, 3.76, -0.1], [1.0, 0, 0, 0])
+
+
+def test_a_loop_in_space_has_the_tree_s_terms(linkage):
+    lag, model, q, v = linkage
+    dyn, pin, tau = lag.dynamics(options=OWN), mb.dynamics(model), np.array([0.3, -0.2, 0.5, 0.1])
+    for other in (pin, mb.dynamics(model, "mujoco")):
+        assert off(dyn.mass_matrix(q), other.mass_matrix(q)) < CLOSE
+        assert off(dyn.nle(q, v), other.nle(q, v)) < CLOSE
+    J = pinocchios_jacobian(pin, q)[:3]
+    assert off(lag.constraint_jacobian(q), J) < CLOSE
+    # What the tree's own equation leaves is Jᵀ λ.
+    a, lam = dyn.forward_dynamics(q, v, tau), lag.multipliers(q, v, tau)
+    assert off(pin.inverse_dynamics(q, v, a) - tau, J.T @ lam) < CLOSE
+
+
+def test_a_frame_closed_in_space_moves_as_the_point_does(linkage):
+    lag, model, q, v = linkage
+    weld, open_weld = from_model(ball_linkage("frame")), mb.dynamics(ball_linkage("frame").without("loops"))
+    tree = mb.dynamics(model)
+    turned = tree.pose(q, "crank")[:3, :3].T @ tree.pose(q, "coupler")[:3, :3] @ np.diag([-1.0, -1, 1])
+    q_w = np.array([*q, *Rotation.from_matrix(turned).as_euler("ZYX")])
+    assert np.abs(weld.constraint(q_w)).max() < 1e-14
+    J = weld.constraint_jacobian(q_w)
+    assert off(J, pinocchios_jacobian(open_weld, q_w)) < CLOSE
+    # One freedom: the velocity is the null vector of J.
+    null = np.linalg.svd(J)[2][-1]
+    v_w = null / null[0] * v[0]
+    assert np.abs(v_w[:4] - v).max() < 1e-14
+    one, two = (
+        mb.simulate(x.dynamics(options=OWN), *state, 0.3, "rk853", rtol=1e-10, save=[0.3])
+        for x, state in ((lag, (q, v)), (weld, (q_w, v_w)))
+    )
+    assert np.abs(one.q - two.q[:, :4]).max() < 1e-10
+
+
+def test_a_plane_that_is_carried_along_stays_one():
+    """A governor's two rods and sleeve on a shaft that turns."""
+    b = mb.ModelBuilder("governor")
+    b.add_body("shaft", mass=1.0, inertia=(0.1, 0.1, 0.1))
+    b.add_joint("turn", "continuous", parent="world", child="shaft", **ABOUT_Z)
+    bar(b, "upper", 0.5)
+    bar(b, "lower", 0.5)
+    b.add_joint("alpha", "continuous", parent="shaft", child="upper", axis=(0, 1, 0), translation=(0, 0, 1))
+    b.add_joint("beta", "continuous", parent="upper", child="lower", axis=(0, 1, 0), translation=(0.5, 0, 0))
+    b.add_body("sleeve", mass=1.0)
+    b.add_joint("s", "prismatic", parent="shaft", child="sleeve", axis=(0, 0, 1))
+    b.add_loop("pin", "point", body_a="lower", translation_a=(0.5, 0, 0), body_b="sleeve")
+    lag = from_model(b.build())
+    assert len(lag.constraints) == 2
+    assert not any(lag.coordinates[0] in row.free_symbols for row in lag.constraints)
+    assert lag.embedded().degrees == 2
+
+
+# Motions in time
+
+
+def driven_pendulum() -> mb.Model:
+    b = mb.ModelBuilder("driven_pendulum")
+    b.add_body("pivot")
+    b.add_body("bob", mass=P("m", 1.0), com=(0, 0, -P("l", 1.0)))
+    b.add_joint("z", "prismatic", parent="world", child="pivot", axis=(0, 0, 1))
+    b.add_joint("theta", "continuous", parent="pivot", child="bob", axis=(0, -1, 0))
+    b.prescribe("z", amplitude=P("a", 0.1), frequency=P("Omega", 100.0), phase=math.pi / 2)
+    return b.build()
+
+
+def test_a_pendulum_on_a_moved_pivot_is_the_textbook_s():
+    lag, ref = from_model(driven_pendulum()), systems.driven_pendulum()
+    assert [s.name for s in lag.coordinates] == ["theta"]
+    assert {s.name: x for s, x in lag.parameters.items()} == {"m": 1.0, "l": 1.0, "a": 0.1, "Omega": 100.0}
+    assert sp.expand(lag.T - ref.T) == 0
+    assert sp.expand(lag.V - ref.V.subs(sp.Symbol("g"), 9.81)) == 0
+    own, textbook = (x.dynamics(options=OWN, Omega=40.0) for x in (lag, ref))
+    runs = [mb.simulate(dyn, [1.0], [0.3], 0.3, "rk853", save=[0.3]) for dyn in (own, textbook)]
+    assert np.abs(runs[0].q - runs[1].q).max() < 1e-12
+
+
+def test_the_multiplier_of_a_drive_is_its_force():
+    lag = from_model(driven_pendulum(), drives=True)
+    q, v = np.array([0.1, 0.7]), np.array([0.0, 0.4])
+    a = lag.dynamics(options=OWN).forward_dynamics(q, v, [0, 0])
+    assert a[0] == pytest.approx(-0.1 * 100.0**2, rel=1e-14)
+    rise = a[0] + math.cos(0.7) * 0.4**2 + math.sin(0.7) * a[1]
+    assert lag.multipliers(q, v)[0] == pytest.approx(9.81 + rise, rel=1e-13)
+    # A slider-crank at constant speed has no freedom left, and its torque is the textbook's.
+    driven = from_model(slider_crank(lambda b: b.prescribe("theta", rate=10.0)), drives=True)
+    q, v = driven.project(at_angle(0.3), [10.0, 0, 0], t=0.03)
+    expected = systems.rigid_slider_crank().dynamics(options=OWN).inverse_dynamics([0.3], [10.0], [0.0])
+    assert driven.multipliers(q, v, t=0.03)[-1] == pytest.approx(expected[0] + 0.1, rel=1e-12)
+
+
+@pytest.mark.parametrize(("seed", "n", "which"), [(6, 2, 1), (7, 3, 0)])
+def test_a_tree_with_a_prescribed_joint_is_the_tree_along_its_motion(seed, n, which):
+    # The last joint; and one that another mimics, with a damper to the ground.
+    tree = random_tree(seed, n, ("revolute", "prismatic", "helical"), mimic=n == 3, springs=n == 2, nearest=1)
+    moved = tree.joint_names[which]
+    given = {moved: (0.2, 0.7, 0.3, 2.0, 0.4)}
+    lag = from_model(replace(tree, prescribed=tuple(Prescribed(n, *x) for n, x in given.items())))
+    free = [i for i, n in enumerate(tree.coordinate_names) if n != moved]
+    assert [s.name for s in lag.coordinates] == [tree.coordinate_names[i] for i in free]
+    q, v, a = np.random.default_rng(0).standard_normal((3, tree.nv))
+    t = 0.6
+    for name, (offset, rate, size, frequency, phase) in given.items():
+        i, turn = tree.coordinate_names.index(name), frequency * t + phase
+        q[i], v[i] = offset + rate * t + size * math.sin(turn), rate + size * frequency * math.cos(turn)
+        a[i] = -size * frequency**2 * math.sin(turn)
+    own = lag.dynamics(options=OWN).at(t=t)
+    ref = mb.dynamics(tree)
+    assert off(own.inverse_dynamics(q[free], v[free], a[free]), ref.inverse_dynamics(q, v, a)[free]) < CLOSE
+    assert off(own.mass_matrix(q[free]), ref.mass_matrix(q)[np.ix_(free, free)]) < CLOSE
+    assert own.kinetic_energy(q[free], v[free]) == pytest.approx(v @ ref.mass_matrix(q) @ v / 2, rel=CLOSE)
+
+
+def test_a_loop_of_which_one_joint_is_moved():
+    lag = from_model(slider_crank(lambda b: b.prescribe("theta", offset=0.2, rate=3.0)))
+    assert lag.time == sp.Symbol("t")
+    q, v = lag.project(at_angle(0.2)[1:], [0.0, 0.0])
+    for method, how in (("rk4", {"dt": 0.01}), ("cvodes", {"rtol": 1e-9})):
+        run = mb.simulate(lag.dynamics(options=OWN), q, v, 1.0, method, save=[0.5, 1.0], **how)
+        # Its constraints say all of it, whatever the method.
+        assert np.abs(run.q - [at_angle(0.2 + 3 * t)[1:] for t in run.t]).max() < 1e-14
+
+
+def test_a_catalog_system_keeps_its_symbols_while_it_is_moved():
+    cart_pole = mb.catalog.cart_pole()
+    lag = from_model(replace(cart_pole, prescribed=(Prescribed("x", rate=2.0),)))
+    m_c, m_p, l, th, w = sp.symbols("m_c m_p l theta thetadot")
+    assert sp.expand(lag.T - m_p * (l * w) ** 2 / 2 - 2 * m_p * l * w * sp.cos(th) - 2 * (m_c + m_p)) == 0
+    assert lag.time is None
+
+
+# What cannot be
+
+
+def another(kind, **more):
+    return lambda b: b.add_loop(
+        "other", kind, body_a=more.pop("body_a", "rod"), body_b=more.pop("body_b", "world"), **more
+    )
+
+
+FLIP = np.diag([1.0, -1, -1])
+REFUSED = {
+    "across the plane": ([another("point", translation_a=(0.3, 0, 0.1))], "'other': its points never meet.*: 0.1 is"),
+    "by a parameter": ([another("point", translation_a=(0.3, 0, P("d")))], "never meet.*: d is left"),
+    "another plane": ([another("frame", rotation_b=FLIP)], "its frames are never parallel.*rotation_a"),
+    "turned": ([another("frame", body_a="piston", rotation_b=np.diag([-1.0, -1, 1]))], "never parallel"),
+    "rigid": (
+        [
+            lambda b: b.add_body("plate"),
+            lambda b: b.add_joint("fixed", "fixed", parent="piston", child="plate"),
+            another("frame", body_a="piston", body_b="plate"),
+        ],
+        "'other' closes nothing",
+    ),
+    "moved open": (
+        [lambda b: b.prescribe("x", rate=1.0), another("point", body_a="piston")],
+        "'other': the prescribed motions alone move it.*t = 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_loop_that_cannot_close_is_told(case):
+    changes, told = REFUSED[case]
+    with pytest.raises(InputError, match=f"slider_crank: loop {told}" if told[0] == "'" else told):
+        from_model(slider_crank(*changes))
+
+
+def test_faults_of_loops_and_motions_are_told_when_built():
+    with pytest.raises(ModelError, match="both ends on 'rod'"):
+        slider_crank(another("point", body_b="rod"))
+    with pytest.raises(ModelError, match="prescribed 'theta': moved 2 times"):
+        slider_crank(*[lambda b: b.prescribe("theta", rate=1.0)] * 2)
+
+
+def test_what_nothing_is_left_of_is_refused():
+    moves = [lambda b, n=n: b.prescribe(n, rate=1.0) for n in ("theta", "phi", "x")]
+    with pytest.raises(UnsupportedError, match="drives=True"):
+        from_model(slider_crank(*moves).without("loops"))
+    twice = from_model(slider_crank(another("point", translation_a=(P("L2", 0.3), 0, 0), body_b="piston")))
+    with pytest.raises(InputError, match="4 of them for 3 coordinates"):
+        twice.embedded()
+
+
+@pytest.mark.parametrize("feature", ["loops", "prescribed"])
+def test_engines_tell_the_way(feature):
+    model = slider_crank(lambda b: b.prescribe("theta", rate=P("speed", 1.0)))
+    other = {"loops": "prescribed", "prescribed": "loops"}[feature]
+    with pytest.raises(UnsupportedError, match=rf"from_model\(model\)\.dynamics.*without\('{feature}'\)"):
+        mb.dynamics(model.without(other), "lagrangian")
+    bare = model.without("loops", "prescribed")
+    assert "speed" in model.parameters
+    assert "speed" not in bare.parameters
+    assert model.with_parameters(speed=2.0).prescribed[0].rate == 2.0
+    assert model.with_parameters(L2=0.4).loops[0].translation_a[0] == 0.4
