@@ -14,7 +14,7 @@ from typing import Final
 
 from mbkit.errors import KnownDefectWarning
 
-__all__ = ["CORIOLIS", "KINETIC_ENERGY", "Defect", "announce"]
+__all__ = ["CORIOLIS", "KINETIC_ENERGY", "TINY_MASS", "Defect", "announce"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,14 @@ KINETIC_ENERGY: Final = Defect(
     "4.1.0",
     "computeKineticEnergy leaves out the armature of revolute joints whose axis is not exactly +x, +y or +z",
     "half vᵀ M v is right",
+)
+TINY_MASS: Final = Defect(
+    "pinocchio",
+    "mass_matrix",
+    "4.1.0",
+    "the sum of two inertias has a wrong centre of mass where they weigh less than 2.2e-16 kg together, and with it M, "
+    "nle and accelerations",
+    "the lagrangian engine is right; or take a larger unit of mass",
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from typing import Any, Final
 
 import mujoco
@@ -13,7 +14,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel
-from mbkit.errors import UnknownNameError, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 
 __all__ = ["INTEGRATORS", "Rollout"]
@@ -31,6 +32,7 @@ INTEGRATORS: Final = {
     "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_SINGULAR: Final = int(mujoco.mjtWarning.mjWARN_INERTIA)
 _FORCE: Final = mujoco.mjtState.mjSTATE_QFRC_APPLIED
 
 
@@ -66,6 +68,9 @@ class Rollout:
             states, _ = mujoco.rollout.rollout(
                 self._m, data, start, control, control_spec=int(_FORCE), nstep=steps, skip_checks=False
             )
+        if any(d.warning.number[_SINGULAR] for d in data):
+            told = "MuJoCo met a mass matrix that is too close to singular, and went on with another one"
+            warnings.warn(f"{self._description.name}: {told}; compare with rk853", DoubtfulRunWarning, stacklevel=6)
         states = np.concatenate([start[:, None], states], axis=1)
         states[np.logical_not(self._alive(states, dt))] = np.nan
         q, v = self._read(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + self._m.nv])

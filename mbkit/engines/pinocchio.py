@@ -55,6 +55,8 @@ class PinocchioDynamics(Dynamics):
         self._G = layout.G[self._pin.v_order]
         self._Gt = np.ascontiguousarray(self._G.T)
         self._take_short_way()
+        if tiny := self._tiny_bodies():
+            defects.announce(defects.TINY_MASS, f"the mass of body {tiny}")
 
     def _take_short_way(self) -> None:
         m, d = self._m, self._d
@@ -224,6 +226,15 @@ class PinocchioDynamics(Dynamics):
         return per_sample(one, q)
 
     # Known defects, measured on this very model.
+
+    def _tiny_bodies(self) -> str:
+        """Return the names of bodies so light that Pinocchio's sum of inertias, which M is made of, is wrong."""
+        out = []
+        for body in self.model.bodies:
+            if 0 < body.mass < np.finfo(float).eps:
+                one = pin.Inertia(body.mass, np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)))
+                out += [repr(body.name)] if abs((one + one).lever[0] - 1) > 1e-9 else []
+        return ", ".join(out[:3]) + (f" and {len(out) - 3} more" if len(out) > 3 else "")
 
     @cached_property
     def _suspect_joints(self) -> tuple[Any, ...]:

@@ -19,7 +19,7 @@ from mbkit.model.space import Space
 from mbkit.simulate.along import along
 from mbkit.simulate.balance import is_damped, kinetic_energy, potential_energy
 from mbkit.simulate.methods import Method, Tolerances
-from mbkit.simulate.stability import STEPS, growth
+from mbkit.simulate.stability import STEPS, growth, lost
 from mbkit.simulate.stiffness import linearized
 
 __all__ = ["doubts"]
@@ -29,11 +29,13 @@ _EPS: Final = float(np.finfo(float).eps)
 _TIMES: Final = 7
 _MEMBERS: Final = 4
 #: Where a quantity is no longer inaccurate but wrong. A first-order method at a common step
-#: oscillates in energy by a percent or so, and means no harm.
-_ENERGY: Final = 0.05
+#: oscillates in energy by some parts of a thousand, and means no harm.
+_ENERGY: Final = 0.01
 _DIGITS: Final = 1e-3
-#: h|λ| up to which any method follows a mode.
-_RESOLVED: Final = 1.0
+#: h|λ| below which every method follows every mode for as long as runs are.
+_FOLLOWED: Final = 1e-3
+#: Of a mode's phase or amplitude, over a run.
+_LOST: Final = 0.05
 #: m or rad: what engineers still call a position.
 _POSITION: Final = 1e-6
 
@@ -59,6 +61,9 @@ def doubts(
     # The oracle's digits are not in doubt, and its terms take long.
     if len(t) < 2 or not nv or dyn.engine == "oracle":
         return []
+    # The first trajectory's fastest state is where a step is longest for it.
+    fastest = int(np.nan_to_num(np.abs(v.reshape(-1, *v.shape[-2:])[0]).max(axis=-1), posinf=0.0).argmax())
+    ends = [_first(q, v, k) for k in sorted({0, fastest, len(t) - 1})]
     times = np.unique(np.linspace(0, len(t) - 1, _TIMES).astype(int))
     q, v = q[..., times, :], v[..., times, :]
     if q.ndim == 3:
@@ -78,7 +83,7 @@ def doubts(
     ]
     if not isinstance(setting, Tolerances) and method.name in STEPS:
         # The cause is told before what came of it.
-        looks.insert(0, _step(dyn, method.name, setting, float(t[-1]), q, v))
+        looks.insert(0, _step(dyn, method.name, setting, float(t[-1]), ends))
     found: list[str] = []
     for look in looks:
         try:
@@ -87,6 +92,11 @@ def doubts(
             # An engine that lacks a term, or has none there, has no opinion on it.
             continue
     return found
+
+
+def _first(q: Array, v: Array, k: int) -> tuple[Array, Array]:
+    """Return the k-th state of the first trajectory."""
+    return q.reshape(-1, *q.shape[-2:])[0, k], v.reshape(-1, *v.shape[-2:])[0, k]
 
 
 def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool) -> Iterator[str]:
@@ -137,44 +147,48 @@ def _condition(M: Array) -> Iterator[str]:
         )
 
 
-def _step(dyn: Dynamics, method: str, h: float, duration: float, q: Array, v: Array) -> Iterator[str]:
-    """Hold the step against the fastest mode of the motion's linearization, at its first and last state."""
+def _step(dyn: Dynamics, method: str, h: float, duration: float, states: list[tuple[Array, Array]]) -> Iterator[str]:
+    """Hold the step against the modes of the motion's linearization, at its first, last and fastest state."""
     model = dyn.model
     if dyn.samples is not None or model.clock is not None or model.constrained:
         return
-    states = [(q[..., k, :].reshape(-1, model.nq)[0], v[..., k, :].reshape(-1, model.nv)[0]) for k in (0, -1)]
-    space, worst, told = Space(model), 0.0, ""
+    space = Space(model)
 
     def accelerations(q: Array, w: Array) -> Array:
         v = space.leave(q, w)
         return np.asarray(space.acceleration(q, v, dyn.forward_dynamics(q, v, np.zeros_like(v))))
 
-    for at in states:
-        if not all(np.isfinite(x).all() for x in at):
+    found: list[tuple[float, str]] = []
+    for q, v in states:
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
             continue
         # By differences on any engine: deriving would take longer than most runs.
-        J = linearized(space, at[0], space.enter(*at), accelerations)
+        J = linearized(space, q, space.enter(q, v), accelerations)
         A, B = J[model.nv :, : model.nv], J[model.nv :, model.nv :]
         rates = np.linalg.eigvals(J)
-        fastest, swing = float(np.abs(rates).max()), float(np.abs(rates.imag).max())
-        if h * fastest <= max(_RESOLVED, worst):
+        fastest = float(np.abs(rates).max())
+        if h * fastest < _FOLLOWED:
             continue
-        worst = h * fastest
         # What the motion itself does, a pendulum upside down or a chaotic one, is not the method's doing.
-        grows = np.log(max(growth(method, h, A, B), 1e-300)) - h * max(0.0, float(rates.real.max()))
-        if grows * duration / h > 1:
+        grows = float(np.log(max(growth(method, h, A, B), 1e-300))) - h * max(0.0, float(rates.real.max()))
+        if grows * duration / h > 1 and h * fastest > 1:
             told = (
                 f"a step of {h:g} s is too long for the fastest mode, {fastest:.2g} 1/s (h|λ| = {h * fastest:.2g}): "
                 f"{method} makes it grow by {np.expm1(min(grows, 700.0)):.1g} a step; take a step below "
-                f"{_RESOLVED / fastest:.1g} s, or method='auto'"
+                f"{1 / fastest:.1g} s, or method='auto'"
             )
-        elif h * swing > _RESOLVED:
+            found.append((np.inf, told))
+            continue
+        part, rate = lost(method, h, A, B, duration)
+        if part > _LOST:
+            kind = f"an oscillation of {abs(rate.imag):.2g} rad/s" if abs(rate.imag) > abs(rate.real) else "a motion"
             told = (
-                f"a step of {h:g} s is too long to follow an oscillation of {swing:.2g} rad/s (hω = {h * swing:.2g}): "
-                f"where that is excited, its phase is lost; take a step below {0.1 / swing:.1g} s, or method='auto'"
+                f"a step of {h:g} s is too long to follow {kind} with h|λ| = {h * abs(rate):.2g}: where it is "
+                f"excited, {min(1.0, part):.0%} of it is lost over the run; take a smaller step, or method='auto'"
             )
-    if told:
-        yield told
+            found.append((part, told))
+    if found:
+        yield max(found)[1]
 
 
 def _far(q: Array, tolerances: Tolerances | None) -> Iterator[str]:

@@ -37,6 +37,10 @@ _SHORT: Final = 5e-3
 _REPEATS: Final = 3
 #: What asks nobody whether to go on is stopped so much later than what does.
 _LATER: Final = 1.1
+#: What a method may turn to under way, and is compiled before.
+_TURNS_TO: Final = {"auto": ("rk853", "rodas5")}
+#: What a run may take that compiles on its way, beside one that does not.
+_FIRST: Final = 2.0
 #: Steps of an engine's own integrator after which it is known how long all of them will take.
 _TRIAL: Final = 2000
 _EPS: Final = float(np.finfo(float).eps)
@@ -81,6 +85,10 @@ def integrated(
     try:
         with limited(asked.making):
             _begin(asked, problem, dyn, times, setting)
+        if asked.method in _TURNS_TO:
+            # What it looks at on its way is compiled where it first looks.
+            with limited(_FIRST * asked.seconds):
+                quiet_simulate(*start, duration, asked.method, save=times, **setting)
         tell("run")
         if told := _too_many(asked, problem, dyn, times, setting):
             return Cell(asked.value, "slow", note=told)
@@ -97,8 +105,7 @@ def integrated(
         quiet_simulate(*start, duration, asked.method, save=times, **setting)
         seconds.append(_clock() - begun)
     stats = run.stats
-    chosen = getattr(stats, "chosen", "")
-    note = "; ".join(x for x in (stats.message, chosen) if x)
+    note = "; ".join(x for x in (stats.message, stats.chosen) if x)
     out = Cell(asked.value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
     if not stats.finished or len(run.t) != len(times):
         return replace(out, end="diverged", note=stats.message or f"ended at t = {run.t[-1]:g} s")
@@ -175,8 +182,8 @@ def _setting(asked: Run, problem: Problem, times: Array) -> dict[str, Any]:
 def _begin(asked: Run, problem: Problem, dyn: Dynamics, times: Array, setting: dict[str, Any]) -> None:
     """Integrate a step, or the thousandth part of an interval, for all that is compiled."""
     short = setting.get("dt", 1e-3 * float(times[1]))
-    given = {"save": [short], **setting}
-    quiet_simulate(dyn, problem.q, problem.v, short, asked.method, **given)
+    for method in (*_TURNS_TO.get(asked.method, ()), asked.method):
+        quiet_simulate(dyn, problem.q, problem.v, short, method, save=[short], **setting)
 
 
 def _too_many(asked: Run, problem: Problem, dyn: Dynamics, times: Array, setting: dict[str, Any]) -> str:
