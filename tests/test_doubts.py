@@ -76,6 +76,17 @@ def test_ordinary_runs_are_not_doubted(method):
     assert not doubts(mb.catalog.double_pendulum(), method, [1.5, -1.0], [0.5, 0.5], dt=1e-3)[1]
 
 
+def test_a_method_of_first_order_is_held_against_twice_the_step():
+    """Three seconds of a double pendulum: what it is said to be off by is what it is off by."""
+    model, q0 = mb.catalog.double_pendulum(), np.array([1.5, 1.0])
+    run, told = doubts(model, "semi_implicit_euler", q0, dt=5e-3, duration=3.0)
+    truth, none = doubts(model, "rk853", q0, duration=3.0, rtol=1e-11, save=[3.0])
+    assert not none
+    off = np.abs(run.q[-1] - truth.q[-1]).max() / np.abs(run.q - q0).max()
+    said = float(told[-1].split("off by ")[1].split(" of")[0])
+    assert 0.5 < said / off < 2
+
+
 def test_forces_and_dampers_may_change_the_energy():
     pendulum = mb.catalog.pendulum()
     assert not doubts(pendulum, "rk4", [0.1], dt=1e-3, torque=[5.0])[1]

@@ -4,9 +4,9 @@ After some tries, and each time that there are several times as many, it is aske
 Where that is a lot, the linearized system (`mbkit.simulate.stiffness`) tells what holds the steps: near the edge of
 rk853's region of stability, h|λ| of about 5, they are short for no other reason. There, and where very many are to
 come, rodas5 makes some tries of its own from the state reached. If it gets further with them than rk853, it goes on
-from their end; if not, they are forgotten, and rk853 goes on as if there had been none. Where rk853 stays, to
-follow an oscillation, the errors of its many steps add up, and their tolerance is tightened to what their number asks
-for.
+from their end; if not, they are forgotten, and rk853 goes on as if there had been none. Where there are motions far
+faster than the run is long, the errors of many steps add up, and the tolerance is tightened to what their number asks
+for; the same holds of rodas5.
 
 While rodas5 goes on, looks at the linearized system say whether rk853 would be as fast, as where what is stiff has
 come to an end. Where one method's steps fall below rounding the other one may go on; where neither can, as where a
@@ -36,14 +36,14 @@ __all__ = ["Course", "pause"]
 #: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative axis and to 5 on the
 #: imaginary one; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
 _EDGE: Final = 3.0
-#: The h|λ| that rk853 keeps where stability holds its steps.
+#: The h|λ| that rk853 keeps at most.
 _KEPT: Final = 5.0
 #: By how much rodas5 must be faster.
 _FASTER: Final = 1.5
 #: First step of rodas5, of what remains: too long is soon found out, while growing from rk853's steps takes a
 #: try for each factor of ten.
 _BEGIN: Final = 1e-3
-#: Turns of an oscillation, rad, from which on the tolerance follows the number of steps.
+#: Fastest rate times duration from which on the tolerance follows the number of steps.
 _MANY: Final = 1000.0
 #: n steps with errors of the tolerance, in a norm that is a mean over 2 nv numbers, add up to at most n √(2 nv)
 #: of it. They shall not exceed _SUM of it; what was measured is a third to a three-hundredth of that.
@@ -124,8 +124,11 @@ class Course:
         self._gauge: Gauge | None = None
         self._at: tuple[float, Array, Array] = 0.0, np.empty(0), np.empty(0)
         self._tries = 0
-        # At the last look at rk853: the fastest lasting oscillation; the tolerance and the tries for each second.
-        self._turning, self._looser = 0.0, (scene.tolerances.rtol, 0.0)
+        # At the last look at rk853: its tolerance and the tries for each second.
+        self._looser = scene.tolerances.rtol, 0.0
+        self._fastest, self._tightest = 0.0, math.inf
+        # h|λ| of rk853 when it was left.
+        self._kept = _KEPT
         self._returns = 0
         self._least = _LEAST
         self._next: Trials | None = None
@@ -218,18 +221,17 @@ class Course:
             why = "stability held its steps" if held else "rodas5 got further with a try"
             size = "" if found is None else f" (h|λ| = {step * found.stable:.1f}{told})"
             self._legs.append(_Leg(IMPLICIT, self._at[0], f"where {why}{size}"))
+            if found is not None:
+                self._kept = min(_KEPT, step * found.stable)
         elif found is not None:
-            # What was not there at the last look is a passage, and no oscillation that stays.
-            self._turning, turning = found.lasting(self._rest), self._turning
-            turns = min(turning, self._turning) * self._scene.duration
             before, slower = self._looser
             if slower and rate / slower > (before / self._tolerances.rtol) ** _COLLAPSE > 1:
                 self._least = before
             self._looser = self._tolerances.rtol, rate
-            if turns < _MANY:
-                self._tolerate(trials, place, 0.0, "")
-            else:
-                self._tolerate(trials, place, to_come, f" of {turns:.1g} rad of oscillation")
+            self._fastest = max(self._fastest, found.rate)
+            if self._fastest * self._scene.duration >= _MANY:
+                # By the pace of the whole leg: what comes and goes is no sign of what is to come.
+                self._tolerate(trials, place, gauge.overall() * self._rest)
 
     def _faster(self, rate: float) -> bool:
         """Let rodas5 try, and make its tries the next ones if it is faster."""
@@ -259,11 +261,11 @@ class Course:
         to_come = rate * self._rest
         if pace.dearer * to_come >= pace.worth and gauge.step() > _AWAY * self._scene.duration:
             found = self._spectrum(trials, place, 0.0)
-            if found is not None and found.stable / _KEPT < pace.dearer * rate:
+            if found is not None and found.stable / self._kept < pace.dearer * rate:
                 self._returns += 1
                 self._turn(EXPLICIT, f"where stability no longer held rk853's ({found})")
                 return
-        self._tolerate(trials, place, to_come, "")
+        self._tolerate(trials, place, to_come)
 
     def _spectrum(self, trials: Trials, place: int, enough: float) -> Stiffness | None:
         """Return how fast the motions here are; None where that is no number."""
@@ -277,9 +279,9 @@ class Course:
     def _factor(self, to_come: float) -> float:
         """Return what the tolerance is multiplied by, so that the errors of all steps to come are as small together."""
         steps = min(to_come, _BELIEVED * self._tries)
-        return min(1.0, _SUM / (steps * math.sqrt(2 * self._scene.space.nv))) if to_come else 1.0
+        return min(1.0, _SUM / (steps * math.sqrt(2 * self._scene.space.nv))) if steps else 1.0
 
-    def _tolerate(self, trials: Trials, place: int, to_come: float, of: str) -> None:
+    def _tolerate(self, trials: Trials, place: int, to_come: float) -> None:
         """Let the tolerance follow the number of steps to come."""
         factor = max(self._factor(to_come), min(1.0, self._least / self._base.rtol))
         rtol, atol = (x * factor for x in self._base)
@@ -287,13 +289,18 @@ class Course:
         if not 0.5 < rtol / self._tolerances.rtol < 2.0:
             self._tolerances = Tolerances(rtol, atol)
             trials.tighten(place, self._tolerances)
-            self._legs[-1].note = f"at rtol = {rtol:.1g} in the end, as errors{of} add up" if factor < 1 else ""
+            if not self._legs[-1].note or rtol < self._tightest:
+                self._tightest = rtol
+                self._legs[-1].note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
 
     def _rescue(self) -> None:
         """Go on where steps fell below rounding: by the other method, or else with a looser tolerance."""
         t, other = self._at[0], IMPLICIT if self._legs[-1].method == EXPLICIT else EXPLICIT
-        if t != self._stalled_at:
+        if t != self._stalled_at or self._tolerances.rtol < self._base.rtol:
             self._stalled_at = t
+            if self._tolerances.rtol < self._base.rtol:
+                # It was only too much to ask for.
+                other, self._least = self._legs[-1].method, math.inf
             self._turn(other, "where its steps fell below rounding")
             return
         looser = [min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base]

@@ -111,7 +111,7 @@ class Gauge:
     """How fast a method goes, judged by the later half of its tries."""
 
     def __init__(self, t: float, first: int, later: int) -> None:
-        self._next, self._later = first, later
+        self._next, self._later, self._begin = first, later, t
         # Tries and time.
         self._marks = [(0, t)]
         self._ends = [t]
@@ -143,6 +143,11 @@ class Gauge:
         tries, t = self._marks[-1]
         before = next((mark for mark in reversed(self._marks) if mark[0] <= tries / 2), self._marks[0])
         return (tries - before[0]) / (t - before[1]) if t > before[1] else math.inf
+
+    def overall(self) -> float:
+        """Return the tries for each second of the motion from the beginning."""
+        tries, t = self._marks[-1]
+        return tries / (t - self._begin) if t > self._begin else math.inf
 
     def step(self) -> float:
         """Return the mean length of the last steps, s; 0 where there were none."""

@@ -6,7 +6,7 @@ somebody looks; this looks at a few of its states, at a cost that does not grow 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,7 @@ from mbkit.simulate.methods import Method, Tolerances
 from mbkit.simulate.stability import STEPS, growth, lost
 from mbkit.simulate.stiffness import linearized
 
-__all__ = ["doubts"]
+__all__ = ["doubts", "halved"]
 
 _EPS: Final = float(np.finfo(float).eps)
 #: States and trajectories of a batch that are looked at.
@@ -34,6 +34,9 @@ _ENERGY: Final = 0.01
 _DIGITS: Final = 1e-3
 #: h|λ| below which every method follows every mode for as long as runs are.
 _FOLLOWED: Final = 1e-3
+#: Of the motion.
+_OFF: Final = 0.01
+_BEYOND: Final = 3.0
 #: Of a mode's phase or amplitude, over a run.
 _LOST: Final = 0.05
 #: m or rad: what engineers still call a position.
@@ -92,6 +95,38 @@ def doubts(
             # An engine that lacks a term, or has none there, has no opinion on it.
             continue
     return found
+
+
+def halved(
+    method: str, h: float, states: tuple[Array, Array, Array], coarser: Callable[[], tuple[Array, Array] | None]
+) -> Iterator[str]:
+    """Hold the end of a run by a method of first order against that of twice the step: the gap is the error.
+
+    Parameters
+    ----------
+    method : str
+    h : float
+        s.
+    states : arrays
+        t, q and v that were kept, with the start.
+    coarser : callable
+        Returns q and v at the end with twice the step; None where that failed.
+    """
+    q, v = (x.reshape(-1, *x.shape[-2:])[0] for x in states[1:])
+    # Quaternions' entries serve as well: nothing here is needed to a digit.
+    motion = float(np.abs(q - q[0]).max(initial=0.0))
+    end = coarser()
+    if end is None or not motion or not np.isfinite(q[-1]).all():
+        return
+    if np.abs(end[1]).max() > _BEYOND * np.abs(v).max():
+        # Unstable at twice the step: that says nothing of the step that was taken.
+        return
+    off = float(np.abs(end[0] - q[-1]).max()) / motion
+    if off > _OFF:
+        yield (
+            f"by a run with a step of {2 * h:g} s the end is off by {off:.2g} of the motion, since {method} is of "
+            "first order; take a smaller step, or method='auto'"
+        )
 
 
 def _first(q: Array, v: Array, k: int) -> tuple[Array, Array]:

@@ -83,11 +83,6 @@ class Stiffness:
         """Fastest |Im λ|, rad/s."""
         return self._fastest(self.eigenvalues.imag)
 
-    def lasting(self, duration: float) -> float:
-        """Return the fastest |Im λ| of what has not died out after some seconds, rad/s."""
-        lasts = -self.eigenvalues.real * duration < _DEAD
-        return self._fastest(self.eigenvalues.imag[lasts])
-
     @staticmethod
     def _fastest(rates: Array) -> float:
         return max(0.0, float(rates.max(initial=0.0)))
@@ -111,8 +106,6 @@ _GROWS: Final = 0.1
 _SHARE: Final = 1e-3
 #: Rows up to which a norm is not worth its time.
 _SMALL: Final = 20
-#: What is e^-3 of itself is as good as gone.
-_DEAD: Final = 3.0
 
 
 def stiffness(

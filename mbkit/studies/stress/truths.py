@@ -78,11 +78,11 @@ class Search:
         """
         if problem.exact is not None:
             return _closed(problem, times)
-        end = time.process_time() + seconds
+        end = time.thread_time() + seconds
         best: _Found | None = None
         reasons: list[str] = []
         for road, part in zip(list(self._roads), _PARTS, strict=True):
-            left = end - time.process_time()
+            left = end - time.thread_time()
             if left < (_SERIES if road is _extended else _LEAST):
                 reasons.append("the time was up")
                 break
@@ -132,11 +132,11 @@ def _double(
     NumericalError
         There are no two that came to the end.
     """
-    end = time.process_time() + seconds
+    end = time.thread_time() + seconds
     done: list[tuple[Array, str]] = []
     best = np.inf
     for engine, method, setting in runs:
-        left = end - time.process_time()
+        left = end - time.thread_time()
         if left < _LEAST:
             break
         fixed = METHODS[method].kind == "fixed"
