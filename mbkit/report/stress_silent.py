@@ -42,7 +42,7 @@ class SilentLine:
     @property
     def worst(self) -> Cell:
         """The cell of the largest error."""
-        return max(self.cells, key=lambda c: math.inf if math.isnan(c.error) else c.error)
+        return max(self.cells, key=lambda c: math.inf if math.isnan(c.seen) else c.seen)
 
 
 def silences(result: StressResult) -> list[SilentLine]:

@@ -258,12 +258,13 @@ class Course:
     def _look_back(self, trials: Trials, place: int, gauge: Gauge) -> None:
         """Decide on rodas5."""
         pace, rate = self._scene.pace, gauge.rate()
-        to_come = rate * self._rest
+        # Steps may be growing still.
+        to_come = min(rate, 1 / gauge.step() if gauge.step() else math.inf) * self._rest
         if pace.dearer * to_come >= pace.worth and gauge.step() > _AWAY * self._scene.duration:
             found = self._spectrum(trials, place, 0.0)
             if found is not None and found.stable / self._kept < pace.dearer * rate:
                 self._returns += 1
-                self._turn(EXPLICIT, f"where stability no longer held rk853's ({found})")
+                self._turn(EXPLICIT, f"where stability no longer held rk853's steps ({found})")
                 return
         self._tolerate(trials, place, to_come)
 
@@ -333,7 +334,7 @@ class Course:
                 if i == _TOLD + 1:
                     parts.append(f"{skipped} more changes")
                 continue
-            where = "" if not i else " from there"
+            where = f"{'' if not i else ' from there'}{f', {leg.note},' if leg.note else ''}"
             until = f" to t = {legs[i + 1].t:.3g} s, {legs[i + 1].why}" if i + 1 < len(legs) else ""
-            parts.append(f"{leg.method}{where}{until}{f', {leg.note}' if leg.note else ''}")
+            parts.append(f"{leg.method}{where}{until}".rstrip(","))
         return self.kind() if len(legs) == 1 and not legs[0].note else "; ".join(parts)

@@ -27,7 +27,7 @@ from mbkit.studies.stress.result import Cell
 from mbkit.studies.stress.terms import TERMS, Terms, error_of
 from mbkit.studies.timing import interleaved
 
-__all__ = ["evaluated", "integrated"]
+__all__ = ["evaluated", "heard_warnings", "integrated"]
 
 #: Seconds of the processor: those of the wall are other processes' too. A run has one thread, and Linux tells
 #: those of the whole process to some milliseconds only while there is a timer on them.
@@ -93,7 +93,7 @@ def integrated(
         tell("run")
         if told := _too_many(asked, problem, dyn, times, setting):
             return Cell(asked.value, "slow", note=told)
-        with _heard() as heard:
+        with heard_warnings() as heard:
             begun = _clock()
             look = patience(asked.seconds, _clock)
             with limited(_LATER * asked.seconds):
@@ -202,7 +202,7 @@ def _too_many(asked: Run, problem: Problem, dyn: Dynamics, times: Array, setting
 
 
 @contextmanager
-def _heard() -> Iterator[list[str]]:
+def heard_warnings() -> Iterator[list[str]]:
     """Collect what the library warns of."""
     out: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
@@ -226,7 +226,7 @@ def evaluated(asked: Run, dyn: Dynamics, truth: Terms, tell: Callable[[Doing], N
     tell("method")
     arguments = [getattr(truth.at, name) for name in TERMS[asked.method]]
     term: Callable[..., Any] = getattr(dyn, asked.method)
-    with _heard() as heard:
+    with heard_warnings() as heard:
         value = np.asarray(term(*arguments))
     tell("run")
     # Writeable ones, as users have: engines have a short way for them.

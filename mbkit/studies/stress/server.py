@@ -9,6 +9,7 @@ import pickle
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing import spawn
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -183,12 +184,24 @@ class Server:
         return self._once("truth", lambda: pickle.loads(path.read_bytes()) if path.exists() else None)
 
     def _run(self, request: m.Run) -> Cell:
-        from mbkit.studies.stress.runs import evaluated, integrated
+        from mbkit.studies.stress.runs import heard_warnings
 
         case, problem = self._cases[request.case], self._problem(request)
         truth = self._truth(request)
         self._tell("engine")
-        dyn: Dynamics = self._once(request.engine, lambda: dynamics(problem.model, request.engine))
+
+        def made() -> tuple[Dynamics, list[str]]:
+            with heard_warnings() as heard:
+                return dynamics(problem.model, request.engine), heard
+
+        dyn, told = self._once(request.engine, made)
+        cell = self._measured(request, case, problem, truth, dyn)
+        # What an engine says when it is made holds for all that it does.
+        return replace(cell, warnings=(*told, *cell.warnings)) if told and cell.end == "finished" else cell
+
+    def _measured(self, request: m.Run, case: Case, problem: Problem, truth: Any, dyn: Dynamics) -> Cell:
+        from mbkit.studies.stress.runs import evaluated, integrated
+
         if case.measure == "terms":
             if truth is None:
                 return Cell(request.value, "not run", note="not run: no truth")
