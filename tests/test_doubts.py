@@ -118,6 +118,15 @@ def test_coordinates_without_digits_are_told():
     assert any("rtol" in x for x in told)
 
 
+def test_a_step_over_gimbal_lock_is_told():
+    b = mb.ModelBuilder("ball", gravity=(0, 0, 0))
+    b.add_body("a", mass=1.0, com=(0, 0, 0), inertia=np.eye(3))
+    b.add_joint("j", "spherical_zyx", parent="world", child="a")
+    told = doubts(b.build(), "rk4", [0.0, 1.5, 0.0], [0.0, 1.0, 0.0], dt=1e-2, duration=0.2)[1]
+    assert any("gimbal lock" in x for x in told)
+    assert not doubts(b.build(), "rk4", [0.0, 1.5, 0.0], [0.0, -1.0, 0.0], dt=1e-2, duration=0.2)[1]
+
+
 def test_doubts_can_be_left_out():
     run, told = doubts(hinge(1e8), "implicit_midpoint", [0.1], dt=1e-2, duration=0.1, doubt=False)
     assert not told

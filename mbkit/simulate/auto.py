@@ -71,7 +71,8 @@ def run_auto(
                 break
     tracks = [course.track for course in courses]
     outcome = outcome_of(dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
-    doubts = tuple(dict.fromkeys(course.doubt for course in courses if course.doubt))
+    told = outcome.ended in ("finished", "event")
+    doubts = tuple(dict.fromkeys(course.doubt for course in courses if course.doubt and told))
     return replace(outcome, chosen=_chosen(courses, batch), doubts=doubts)
 
 

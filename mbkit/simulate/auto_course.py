@@ -284,6 +284,8 @@ class Course:
 
     def _tolerate(self, trials: Trials, place: int, to_come: float) -> None:
         """Let the tolerance follow the number of steps to come."""
+        if not math.isfinite(to_come):
+            return
         factor = max(self._factor(to_come), min(1.0, self._least / self._base.rtol))
         rtol, atol = (x * factor for x in self._base)
         # A change that hardly changes a step is none.
@@ -334,7 +336,8 @@ class Course:
                 if i == _TOLD + 1:
                     parts.append(f"{skipped} more changes")
                 continue
-            where = f"{'' if not i else ' from there'}{f', {leg.note},' if leg.note else ''}"
+            part = leg.method + (" from there" if i else "")
+            # What a method was given on the way to being left is of no interest.
             until = f" to t = {legs[i + 1].t:.3g} s, {legs[i + 1].why}" if i + 1 < len(legs) else ""
-            parts.append(f"{leg.method}{where}{until}".rstrip(","))
+            parts.append(part + (until or (leg.note and f", {leg.note}")))
         return self.kind() if len(legs) == 1 and not legs[0].note else "; ".join(parts)

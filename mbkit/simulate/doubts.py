@@ -67,6 +67,7 @@ def doubts(
     # The first trajectory's fastest state is where a step is longest for it.
     fastest = int(np.nan_to_num(np.abs(v.reshape(-1, *v.shape[-2:])[0]).max(axis=-1), posinf=0.0).argmax())
     ends = [_first(q, v, k) for k in sorted({0, fastest, len(t) - 1})]
+    crossed = q
     times = np.unique(np.linspace(0, len(t) - 1, _TIMES).astype(int))
     q, v = q[..., times, :], v[..., times, :]
     if q.ndim == 3:
@@ -80,6 +81,7 @@ def doubts(
     except MbkitError:
         return []
     looks = [
+        _pole(dyn, crossed),
         _energy(here, M, q, v, pushed),
         _condition(M),
         _far(q, setting if isinstance(setting, Tolerances) else None),
@@ -98,9 +100,12 @@ def doubts(
 
 
 def halved(
-    method: str, h: float, states: tuple[Array, Array, Array], coarser: Callable[[], tuple[Array, Array] | None]
+    method: str,
+    h: float,
+    states: tuple[Array, Array, Array],
+    coarser: Callable[[Array], tuple[Array, Array] | None],
 ) -> Iterator[str]:
-    """Hold the end of a run by a method of first order against that of twice the step: the gap is the error.
+    """Hold a run by a method of first order against that of twice the step: the gap is about the error.
 
     Parameters
     ----------
@@ -110,21 +115,26 @@ def halved(
     states : arrays
         t, q and v that were kept, with the start.
     coarser : callable
-        Returns q and v at the end with twice the step; None where that failed.
+        Returns q and v at some times with twice the step; None where that failed.
     """
-    q, v = (x.reshape(-1, *x.shape[-2:])[0] for x in states[1:])
+    t, q, v = states[0], *(x.reshape(-1, *x.shape[-2:])[0] for x in states[1:])
+    # A longer last step would be another run's.
+    both = np.flatnonzero(np.abs(t / (2 * h) - np.rint(t / (2 * h))) < 1e-6)[1:]
+    if not len(both):
+        return
+    both = both[np.unique(np.linspace(0, len(both) - 1, _TIMES).astype(int))]
     # Quaternions' entries serve as well: nothing here is needed to a digit.
     motion = float(np.abs(q - q[0]).max(initial=0.0))
-    end = coarser()
-    if end is None or not motion or not np.isfinite(q[-1]).all():
+    found = coarser(t[both])
+    if found is None or not motion or not np.isfinite(q).all():
         return
-    if np.abs(end[1]).max() > _BEYOND * np.abs(v).max():
+    if np.abs(found[1]).max() > _BEYOND * np.abs(v).max():
         # Unstable at twice the step: that says nothing of the step that was taken.
         return
-    off = float(np.abs(end[0] - q[-1]).max()) / motion
+    off = float(np.abs(found[0] - q[both]).max()) / motion
     if off > _OFF:
         yield (
-            f"by a run with a step of {2 * h:g} s the end is off by {off:.2g} of the motion, since {method} is of "
+            f"by a run with a step of {2 * h:g} s it is off by {off:.2g} of the motion, since {method} is of "
             "first order; take a smaller step, or method='auto'"
         )
 
@@ -161,6 +171,20 @@ def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool) -> Iterat
             f"{gained} {share[worst]:.2g} of its energy ({wrong[worst]:.2g} J) with nothing that drives it; "
             "take a smaller step, or method='auto'"
         )
+
+
+def _pole(dyn: Dynamics, q: Array) -> Iterator[str]:
+    """Look for steps over gimbal lock, after which three angles are those of another sheet."""
+    if dyn.model.written is not None:
+        return
+    for joint in dyn.model.independent_joints:
+        if joint.kind == "spherical_zyx":
+            side = np.sign(np.cos(q[..., dyn.model.layout.q[joint.name].start + 1]))
+            if (side != side[..., :1])[np.isfinite(side)].any():
+                yield (
+                    f"joint {joint.name!r} was stepped over gimbal lock: its pose holds, and its first and last angle "
+                    "may be off by π each; take a ball joint, whose quaternion has no pole"
+                )
 
 
 def _condition(M: Array) -> Iterator[str]:

@@ -200,7 +200,7 @@ class Track:
         lost = not (credible(made.q[-1]) and credible(made.w[-1]))
         if lost:
             good = credible(made.q[1:]) & credible(made.w[1:])
-            steps = int(np.argmin(good))
+            steps = int(np.argmin(good)) if len(good) else 0
         hit = self._look(trials, place, made, steps)
         if hit is not None:
             steps = int(np.searchsorted(made.t, hit.t))

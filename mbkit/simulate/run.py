@@ -196,7 +196,7 @@ def simulate(
         steps = round(duration / dt)
         if chosen.order == 1 and torque is None and _FEWEST <= steps <= _MOST and not model.clock:
             one = (dyn, q, v) if batch is None else (dyn.of_samples([0]), q[:1], v[:1])
-            found += halved(chosen.name, dt, states, lambda: _coarser(one, duration, chosen.name, dt))
+            found += halved(chosen.name, dt, states, lambda times: _coarser(one, chosen.name, dt, times))
     return _wrapped(dyn, chosen, applied, outcome, seconds, (*outcome.doubts, *found))
 
 
@@ -208,15 +208,16 @@ def _from_start(outcome: Outcome, q0: Array, v0: Array) -> tuple[Array, Array, A
     return np.append(0.0, outcome.t), q, v
 
 
-def _coarser(one: tuple[Dynamics, Array, Array], duration: float, method: str, dt: float) -> tuple[Array, Array] | None:
-    """Return where a step twice as long ends; None where that is nowhere."""
+def _coarser(one: tuple[Dynamics, Array, Array], method: str, dt: float, times: Array) -> tuple[Array, Array] | None:
+    """Return q and v at some times with a step twice as long; None where it does not get there."""
     dyn, q, v = one
     if dyn.samples is None:
         q, v = np.atleast_2d(q)[0], np.atleast_2d(v)[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
-        run = simulate(dyn, q, v, duration, method, 2 * dt, save=[duration], doubt=False)
-    return (run.q.reshape(-1, dyn.model.nq)[-1], run.v.reshape(-1, dyn.model.nv)[-1]) if run.stats.finished else None
+        run = simulate(dyn, q, v, float(times[-1]), method, 2 * dt, save=times, doubt=False)
+    count = len(times)
+    return (run.q.reshape(count, -1), run.v.reshape(count, -1)) if run.stats.finished else None
 
 
 def _require_engine(dyn: Dynamics, method: Method) -> None:
