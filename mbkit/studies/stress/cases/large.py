@@ -56,6 +56,7 @@ def _far_on_rail(place: float) -> Problem:
         exact=lambda t: motion(t) + np.array([place, 0.0]),
         floor=EPS * place + 1e-12,
         source="energy and momentum with a quadrature",
+        scale=2 * theta,
         facts={"spacing of doubles there": math.ulp(place)},
     )
 

@@ -59,6 +59,8 @@ def tumbling(place: Array, velocity: Array, duration: float) -> Problem:
         # Each turn is known to some eps; the place to its own rounding.
         floor=16 * EPS * (1 + float(np.linalg.norm(_BOX_SPIN)) * duration) + EPS * float(np.abs(place).max()),
         source="free rotation by elliptic functions, Landau, Lifshitz 1976, §37",
+        # No attitude is farther from another.
+        scale=np.pi,
         facts={"flips": 2 * duration / period},
     )
 

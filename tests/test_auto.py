@@ -1,0 +1,340 @@
+# Torques have the signature they are called with.
+# ruff: noqa: ARG001, ARG005
+"""Method auto: what it chooses, that nothing is lost on the way, and what it says; and the stiffness it goes by."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit import catalog
+from mbkit.engines import Dynamics, dynamics
+from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, TorqueError
+from mbkit.model import Model, ModelBuilder
+from mbkit.simulate import Trajectory, at_section, simulate, stiffness
+from mbkit.simulate.auto_scene import Gauge
+from mbkit.simulate.embedded_trials import Stretch
+from tests.random_trees import SOUND, random_tree
+
+START: Any = ([1.0, 0.0], [0.0, 0.0], 1.0)
+SAVE = np.linspace(0, 1, 9)
+
+
+def bent_pendulum(stiffness: Any, damping: Any) -> Model:
+    """Two rods whose hinge a spring and a damper hold straight."""
+    b = ModelBuilder("bent pendulum")
+    for name, parent, place in (("a", "world", 0.0), ("b", "a", -1.0)):
+        b.add_body(name, mass=1.0, com=(0, 0, -1.0))
+        held = {"stiffness": stiffness, "damping": damping} if name == "b" else {}
+        b.add_joint(name, "continuous", parent=parent, child=name, axis=(0, -1, 0), translation=(0, 0, place), **held)
+    return b.build()
+
+
+def slider(stiffness: float, damping: float) -> Model:
+    b = ModelBuilder("slider", gravity=(0, 0, 0))
+    b.add_body("mass", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=stiffness, damping=damping)
+    return b.build()
+
+
+# One form of the equations for all constants, so that the steps are compiled once.
+FORM = bent_pendulum(mb.Parameter("k", 1e8), mb.Parameter("c", 1e5))
+COMPILED = dynamics(FORM, "lagrangian", compile=True)
+INTERPRETED = dynamics(FORM, "lagrangian", compile=False)
+WAYS = {"machine code": COMPILED, "interpreted": INTERPRETED, "pinocchio": dynamics(FORM, "pinocchio")}
+
+
+def tight(dyn: Dynamics = COMPILED, **given: Any) -> Trajectory:
+    return simulate(dyn, *START, "rodas5", rtol=1e-12, **given)
+
+
+def same(a: Trajectory, b: Trajectory) -> bool:
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("t", "q", "v"))
+
+
+# What it chooses
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_where_nothing_is_stiff_it_is_rk853_to_the_bit(way: str) -> None:
+    dyn = WAYS[way].at(k=10.0, c=0.1)
+    auto, plain = (simulate(dyn, *START, method, rtol=1e-9) for method in ("auto", "rk853"))
+    assert same(auto, plain)
+    assert auto.stats.chosen == "rk853 throughout"
+    assert plain.stats.chosen == ""
+    assert auto.stats.evaluations <= 1.1 * plain.stats.evaluations
+    assert (auto.stats.steps, auto.stats.rejected) == (plain.stats.steps, plain.stats.rejected)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_where_stability_holds_the_steps_it_goes_on_with_rodas5(way: str) -> None:
+    run, truth = simulate(WAYS[way], *START, "auto", rtol=1e-8, save=SAVE), tight(save=SAVE)
+    assert np.abs(run.q - truth.q).max() < 1e-7
+    assert np.abs(run.v - truth.v).max() < 1e-6
+    assert run.stats.steps < 150
+    # Explicitly it takes 80,000 steps.
+    assert 0 < run.stats.jacobians < 100
+    assert run.stats.chosen.startswith("rk853 to t = ")
+    assert "fastest decay 5e+05 1/s); rodas5 from there" in run.stats.chosen
+    assert run.stats.chosen in str(run.stats)
+    assert run.stats.chosen in repr(run)
+
+
+@pytest.mark.parametrize(("k", "c"), [(1e6, 1e3), (1e12, 1e9), (0.0, 1e10)])
+def test_it_holds_however_stiff(k: float, c: float) -> None:
+    dyn = COMPILED.at(k=k, c=c)
+    run, truth = simulate(dyn, *START, "auto", rtol=1e-8, save=SAVE), tight(dyn, save=SAVE)
+    assert np.abs(run.q - truth.q).max() < 1e-7
+    assert run.stats.steps < 800
+
+
+def test_a_stiffness_without_damping_is_passed_over_where_it_does_not_ring() -> None:
+    k, angle = 1e10, 1.0
+    b = ModelBuilder("elastic pendulum")
+    b.add_body("rod")
+    b.add_body("bob", mass=1.0, com=(0, 0, -1.0))
+    b.add_joint("theta", "continuous", parent="world", child="rod", axis=(0, -1, 0))
+    b.add_joint("stretch", "prismatic", parent="rod", child="bob", axis=(0, 0, -1), stiffness=k)
+    dyn = dynamics(b.build(), "pinocchio")
+    start = [angle, 9.81 * np.cos(angle) / k], [0.0, 0.0], 1.0
+    run = simulate(dyn, *start, "auto", rtol=1e-8, save=SAVE)
+    rigid, _ = mb_pendulum(SAVE, angle)
+    # The rod is longer by 1e-9.
+    assert run.q[:, 0] == pytest.approx(rigid, abs=1e-7)
+    assert "rodas5 from there" in run.stats.chosen
+    assert run.stats.evaluations < 1500
+
+
+def mb_pendulum(t: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    from validation.closed_forms import pendulum_solution
+
+    return pendulum_solution(t, angle)
+
+
+def test_an_oscillation_is_followed_and_its_errors_do_not_add_up() -> None:
+    k, times = 1e8, np.linspace(0, 1, 5)
+    dyn = dynamics(slider(k, 0.0), "lagrangian", compile=True)
+    run = simulate(dyn, [1.0], [0.0], 1.0, "auto", rtol=1e-8, save=times)
+    assert run.q[:, 0] == pytest.approx(np.cos(1e4 * times), abs=1e-7)
+    assert run.stats.chosen.startswith("rk853, at rtol = ")
+    plain = simulate(dyn, [1.0], [0.0], 1.0, "rk853", rtol=1e-8, save=times)
+    assert np.abs(plain.q[:, 0] - np.cos(1e4 * times)).max() > 2e-7
+    assert plain.stats.steps < run.stats.steps < 3 * plain.stats.steps
+
+
+def test_where_a_stiff_part_comes_to_its_end_rk853_comes_back() -> None:
+    dyn = WAYS["pinocchio"]
+
+    def brake(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        # Stiff for a tenth of the run, afterwards a pendulum that is shaken.
+        return np.array([0.0, -1e7 * v[1] if t < 0.1 else 40 * np.sin(300 * t)])
+
+    soft = dyn.at(k=1.0, c=0.0)
+    run = simulate(soft, *START, "auto", rtol=1e-8, torque=brake, save=SAVE)
+    assert "rodas5 from there to t = 0." in run.stats.chosen
+    assert run.stats.chosen.endswith("rk853 from there")
+    other = simulate(soft, *START, "radau", rtol=1e-9, torque=brake, save=SAVE)
+    assert np.abs(run.q - other.q).max() < 1e-6
+
+
+# Nothing is lost on the way
+
+
+@pytest.mark.parametrize("way", ["machine code", "interpreted"])
+def test_events_and_own_steps_survive_the_change(way: str) -> None:
+    events = [at_section(FORM, "a", 0.5), at_section(FORM, "a", -0.2, terminal=True)]
+    run, truth = (simulate(dyn, *START, m, rtol=r, events=events) for dyn, m, r in (
+        (WAYS[way], "auto", 1e-8), (COMPILED, "rodas5", 1e-12)))  # fmt: skip
+    assert [hit.name for hit in run.events] == ["a = 0.5", "a = -0.2"]
+    for hit, exact in zip(run.events, truth.events, strict=True):
+        assert hit.t == pytest.approx(exact.t, abs=1e-8)
+    assert run.stats.ended == "event"
+    assert run.t[-1] == run.events[-1].t
+    assert (np.diff(run.t) > 0).all()
+    assert len(run.t) == run.stats.steps + 1
+
+
+@pytest.mark.parametrize("way", ["machine code", "interpreted"])
+def test_torques_held_or_of_a_function_act_on_both_sides_of_the_change(way: str) -> None:
+    tau = np.random.default_rng(0).standard_normal((8, 2)) * [5.0, 50.0]
+    run, truth = simulate(WAYS[way], *START, "auto", rtol=1e-8, torque=tau, save=SAVE), tight(torque=tau, save=SAVE)
+    assert "rodas5" in run.stats.chosen
+    assert np.abs(run.q - truth.q).max() < 1e-7
+    assert np.array_equal(run.tau()[:-1], tau)
+
+    def steer(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.array([3 * np.sin(4 * t) - 0.2 * v[0], 0.0])
+
+    steered = simulate(WAYS[way], *START, "auto", rtol=1e-8, torque=steer, save=SAVE)
+    other = simulate(INTERPRETED, *START, "radau", rtol=1e-8, torque=steer, save=SAVE)
+    assert "rodas5" in steered.stats.chosen
+    assert np.abs(steered.q - other.q).max() < 1e-7
+
+
+def test_each_of_a_batch_is_decided_on_by_itself() -> None:
+    k, c = [1e2, 1e8, 1e10, 1e4, 1e9], [1.0, 1e5, 1e7, 10.0, 1e6]
+    both = simulate(COMPILED.at(k=k, c=c), *START, "auto", rtol=1e-8, save=SAVE)
+    alone = [simulate(COMPILED.at(k=x, c=y), *START, "auto", rtol=1e-8, save=SAVE) for x, y in zip(k, c, strict=True)]
+    for i, one in enumerate(alone):
+        assert np.array_equal(both.q[i], one.q)
+    for figure in ("steps", "evaluations", "rejected", "jacobians"):
+        assert getattr(both.stats, figure) == sum(getattr(one.stats, figure) for one in alone)
+    assert "3 of 5, such as trajectory 1: rk853 to t" in both.stats.chosen
+    assert "2 of 5: rk853 throughout" in both.stats.chosen
+    with pytest.raises(InputError, match="save: expected a grid of times for a batch"):
+        simulate(COMPILED, np.zeros((2, 2)), [0.0, 0.0], 1.0, "auto")
+
+
+def test_every_joint_kind_moves_as_with_rk853() -> None:
+    model = random_tree(5, 8, SOUND)
+    q, v = model.random_state(np.random.default_rng(1))
+    stiff = np.full(model.nv, 1e5)
+    dyn = dynamics(model, "pinocchio")
+    torque = lambda t, q, v: -stiff * v  # noqa: E731
+    run, other = (simulate(dyn, q, v, 0.05, m, rtol=1e-8, torque=torque, save=[0.05]) for m in ("auto", "rodas5"))
+    assert np.abs(model.difference(run.q[-1], other.q[-1])).max() < 1e-7
+    model.check_q(run.q)
+
+
+# Twice, and elsewhere
+
+
+def test_a_run_repeats_to_the_bit_and_travels() -> None:
+    runs = [simulate(COMPILED, *START, "auto", rtol=1e-8) for _ in range(2)]
+    assert same(*runs)
+    assert runs[0].stats.chosen == runs[1].stats.chosen
+    sent = pickle.loads(pickle.dumps(runs[0]))
+    assert same(sent, runs[0])
+    assert sent.stats == runs[0].stats
+
+
+# What goes wrong
+
+
+def test_rounding_is_told_and_what_is_singular_ends_the_run() -> None:
+    """Accelerations with six digits: rk853 at 1e-10 finds no step, and a looser tolerance does."""
+    rough = _Rough(catalog.pendulum())
+    with pytest.warns(DoubtfulRunWarning, match="its steps fell below rounding near t = ") as heard:
+        run = simulate(rough, [1.0], [0.0], 0.3, "auto", rtol=1e-10, save=[0.0, 0.3], doubt=False)
+    assert len(heard) == 1
+    assert run.stats.finished
+    assert "rodas5" in run.stats.chosen
+    exact, _ = mb_pendulum(np.array([0.3]), 1.0)
+    assert run.q[-1] == pytest.approx(exact, abs=1e-5)
+
+
+class _Rough(Dynamics):
+    """A pendulum whose engine rounds."""
+
+    engine = "rough"
+
+    def _forward_dynamics(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        noise = np.sin(1e13 * q) + np.sin(1.1e13 * v)
+        return tau - 9.81 * np.sin(q) * (1 + 3e-2 * noise)
+
+    def _other(self, *_: Any) -> np.ndarray:
+        raise NotImplementedError
+
+    _mass_matrix = _potential_energy = _kinetic_energy = _gravity = _nle = _passive = _inverse_dynamics = _other
+    _pose = _jacobian = _other
+
+
+def test_what_cannot_go_on_says_so_once() -> None:
+    box = catalog.free_body()
+    with pytest.warns(MbkitWarning, match="auto diverged: the state grew beyond all bounds after t = 0 s") as heard:
+        run = simulate(dynamics(box), box.neutral(), [0, 0, 0, 0, 0, 1e155], 1.0, "auto")
+    assert len(heard) == 1
+    assert np.array_equal(run.q, [box.neutral()])
+
+    def fails(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        if t > 0.3:
+            raise ValueError("no more")
+        return np.zeros(2)
+
+    with pytest.raises(TorqueError, match="no more") as told:
+        simulate(WAYS["pinocchio"], *START, "auto", rtol=1e-8, torque=fails)
+    assert 0.2 < told.value.trajectory.t[-1] <= 0.3
+
+
+def test_bad_input_is_named() -> None:
+    with pytest.raises(InputError, match="rtol: expected at least"):
+        simulate(INTERPRETED, *START, "auto", rtol=1e-17)
+    with pytest.raises(InputError, match="save: expected a grid of times for an adaptive method"):
+        simulate(INTERPRETED, *START, "auto", save=3)
+    still = simulate(INTERPRETED, [1.0, 0.0], [0.0, 0.0], 0.0, "auto")
+    assert still.q.shape == (1, 2)
+    none = simulate(INTERPRETED, np.empty((0, 2)), [0.0, 0.0], 1.0, "auto", save=SAVE, doubt=False)
+    assert none.q.shape == (0, 9, 2)
+
+
+def test_the_pace_is_that_of_the_later_half() -> None:
+    gauge = Gauge(0.0, 4, 2)
+    for k in range(8):
+        t = np.array([k, k + 1.0]) if k < 4 else np.array([4 + (k - 4) / 10, 4 + (k - 3) / 10])
+        gauge.saw(Stretch(t, np.zeros((2, 1)), np.zeros((2, 1)), 1))
+        assert gauge.due() == (k in (3, 7))
+    assert gauge.rate() == pytest.approx(10.0)
+    assert gauge.overall() == pytest.approx(8 / 4.4)
+    assert gauge.step() == pytest.approx(4.4 / 8)
+
+
+# The stiffness
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
+def test_the_stiffness_of_a_slider_is_that_of_its_roots(engine: str) -> None:
+    for k, c in ((1e12, 0.0), (1e12, 1e3), (1e6, 1e4), (1.0, 1e10)):
+        found = stiffness(dynamics(slider(k, c), engine), [0.3], [-0.2])
+        roots = np.roots([1.0, c, k])
+        assert found.rate == pytest.approx(np.abs(roots).max(), rel=1e-6)
+        assert found.decay == pytest.approx(max(0.0, -roots.real.min()), rel=1e-6, abs=1e-3)
+        assert found.oscillation == pytest.approx(np.abs(roots.imag).max(), rel=1e-6, abs=1e-3)
+        assert found.exact == (engine == "lagrangian")
+
+
+def test_the_stiffness_is_that_of_what_follows_from_a_state() -> None:
+    """Of all joint kinds, differences and derivatives agree; so do those of a torque function."""
+    model = random_tree(3, 9, SOUND)
+    q, v = model.random_state(np.random.default_rng(0))
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return -1e4 * v
+
+    exact, near = (stiffness(dynamics(model, e), q, v, torque) for e in ("lagrangian", "pinocchio"))
+    assert near.rate == pytest.approx(exact.rate, rel=1e-5)
+    assert near.decay == pytest.approx(exact.decay, rel=1e-5)
+    both = stiffness(dynamics(model), np.stack([q, q]), np.stack([0 * v, v]))
+    assert both.member in (0, 1)
+    assert repr(both).startswith("<Stiffness of trajectory")
+
+
+def test_the_bound_comes_first_and_bad_input_is_named() -> None:
+    beam = catalog.clamped_beam(segments=12)
+    dyn, q = dynamics(beam), np.zeros(12)
+    exact = stiffness(dyn, q, q)
+    bound = stiffness(dyn, q, q, enough=10 * exact.rate)
+    assert not len(bound.eigenvalues)
+    assert exact.rate <= bound.rate <= 10 * exact.rate
+    assert str(bound) == f"no rate above {bound.bound:.2g} 1/s"
+    grows = stiffness(dynamics(catalog.pendulum()), [np.pi], [0.0])
+    assert grows.growth == pytest.approx(9.81**0.5, rel=1e-6)
+    assert "fastest growth 3.1 1/s" in str(grows)
+    with pytest.raises(InputError, match="v: expected shape"):
+        stiffness(dyn, q, [0.0])
+    with pytest.raises(InputError, match="q"):
+        stiffness(dyn, q * np.nan, q)
+    with pytest.raises(InputError, match="dyn: expected a Dynamics"):
+        stiffness("beam", q, q)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="empty batch"):
+        stiffness(dyn, np.empty((0, 12)), q)
+
+
+def test_nothing_is_said_where_all_is_well() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulate(COMPILED, *START, "auto", rtol=1e-8)
