@@ -15,6 +15,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_times
 from mbkit.errors import MbkitError
+from mbkit.model import Model
 from mbkit.model.space import Space
 from mbkit.simulate.along import along
 from mbkit.simulate.balance import is_damped, kinetic_energy, potential_energy
@@ -100,6 +101,7 @@ def doubts(
 
 
 def halved(
+    model: Model,
     method: str,
     h: float,
     states: tuple[Array, Array, Array],
@@ -109,6 +111,7 @@ def halved(
 
     Parameters
     ----------
+    model : Model
     method : str
     h : float
         s.
@@ -119,19 +122,20 @@ def halved(
     """
     t, q, v = states[0], *(x.reshape(-1, *x.shape[-2:])[0] for x in states[1:])
     # A longer last step would be another run's.
+    if not np.isfinite(q).all():
+        return
     both = np.flatnonzero(np.abs(t / (2 * h) - np.rint(t / (2 * h))) < 1e-6)[1:]
     if not len(both):
         return
     both = both[np.unique(np.linspace(0, len(both) - 1, _TIMES).astype(int))]
-    # Quaternions' entries serve as well: nothing here is needed to a digit.
-    motion = float(np.abs(q - q[0]).max(initial=0.0))
+    motion = float(np.abs(model.difference(np.broadcast_to(q[0], q.shape), q)).max(initial=0.0))
     found = coarser(t[both])
-    if found is None or not motion or not np.isfinite(q).all():
+    if found is None or not motion:
         return
     if np.abs(found[1]).max() > _BEYOND * np.abs(v).max():
         # Unstable at twice the step: that says nothing of the step that was taken.
         return
-    off = float(np.abs(found[0] - q[both]).max()) / motion
+    off = float(np.abs(model.difference(q[both], found[0])).max()) / motion
     if off > _OFF:
         yield (
             f"by a run with a step of {2 * h:g} s it is off by {off:.2g} of the motion, since {method} is of "

@@ -196,7 +196,7 @@ def simulate(
         steps = round(duration / dt)
         if chosen.order == 1 and torque is None and _FEWEST <= steps <= _MOST and not model.clock:
             one = (dyn, q, v) if batch is None else (dyn.of_samples([0]), q[:1], v[:1])
-            found += halved(chosen.name, dt, states, lambda times: _coarser(one, chosen.name, dt, times))
+            found += halved(model, chosen.name, dt, states, lambda times: _coarser(one, chosen.name, dt, times))
     return _wrapped(dyn, chosen, applied, outcome, seconds, (*outcome.doubts, *found))
 
 
