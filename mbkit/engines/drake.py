@@ -35,6 +35,8 @@ class DrakeDynamics(Dynamics):
     ----------
     plant : pydrake.multibody.plant.MultibodyPlant
         What was built; free to read.
+    made : DrakeModel
+        The plant with the maps between its coordinates and the description's.
     """
 
     engine = "drake"
@@ -45,8 +47,8 @@ class DrakeDynamics(Dynamics):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self._made = build(model)
-        self.plant = self._made.plant
+        self.made = build(model)
+        self.plant = self.made.plant
         self._context = self.plant.CreateDefaultContext()
         self._applied = self.plant.get_applied_generalized_force_input_port()
         self._acceleration = self.plant.get_generalized_acceleration_output_port()
@@ -66,9 +68,9 @@ class DrakeDynamics(Dynamics):
 
     # Between the description's numbers and Drake's.
 
-    def _set(self, q: Array, v: Array | None = None) -> Array:
-        """Put a state into Drake; return b of a_drake = T a + b."""
-        made, layout = self._made, self.model.layout
+    def to_drake(self, q: Array, v: Array | None = None) -> tuple[Array, Array, Array]:
+        """Return Drake's positions and velocities, and b of a_drake = T a + b."""
+        made, layout = self.made, self.model.layout
         full_q = layout.expand_q(q)
         full_v = np.zeros(layout.sizes[3]) if v is None else layout.expand_v(v)
         x, u = full_q[made.q_index], full_v[made.v_index]
@@ -86,16 +88,21 @@ class DrakeDynamics(Dynamics):
             self._rotations.append((R, iv, iv + 3))
             u[iv : iv + 3], u[iv + 3 : iv + 6] = R @ own_v[3:], R @ own_v[:3]
             b[iv + 3 : iv + 6] = R @ np.cross(own_v[3:], own_v[:3])
+        return x, u, b
+
+    def _set(self, q: Array, v: Array | None = None) -> Array:
+        """Put a state into Drake; return b of a_drake = T a + b."""
+        x, u, b = self.to_drake(q, v)
         self.plant.SetPositions(self._context, x)
         self.plant.SetVelocities(self._context, u)
         return b
 
-    def _to_drake(self, x: Array) -> Array:
+    def _vector_to_drake(self, x: Array) -> Array:
         """Return T x for full velocities, accelerations or, since T is orthogonal, forces, after `_set`."""
         layout = self.model.layout
         full = layout.expand_v(x)
-        out = full[self._made.v_index]
-        for (joint, _, _), (R, angular, linear) in zip(self._made.turning, self._rotations, strict=True):
+        out = full[self.made.v_index]
+        for (joint, _, _), (R, angular, linear) in zip(self.made.turning, self._rotations, strict=True):
             own = full[layout.full_v[joint.name]]
             out[angular : angular + 3] = R @ own[-3:]
             if linear is not None:
@@ -106,9 +113,9 @@ class DrakeDynamics(Dynamics):
         """Return J T, in the description's order and reduced."""
         layout = self.model.layout
         full = np.zeros((len(J), layout.sizes[3]))
-        plain = self._made.v_index >= 0
-        full[:, self._made.v_index[plain]] = J[:, plain]
-        for (joint, _, _), (R, angular, linear) in zip(self._made.turning, self._rotations, strict=True):
+        plain = self.made.v_index >= 0
+        full[:, self.made.v_index[plain]] = J[:, plain]
+        for (joint, _, _), (R, angular, linear) in zip(self.made.turning, self._rotations, strict=True):
             own = layout.full_v[joint.name]
             full[:, own.stop - 3 : own.stop] = J[:, angular : angular + 3] @ R
             if linear is not None:
@@ -146,7 +153,7 @@ class DrakeDynamics(Dynamics):
     def _bias(self, b: Array) -> Array:
         """Return C v, and M b of the change of velocities."""
         out = self.plant.CalcBiasTerm(self._context)
-        return out + self.plant.CalcMassMatrix(self._context) @ b if b.any() else out
+        return np.asarray(out + self.plant.CalcMassMatrix(self._context) @ b if b.any() else out)
 
     def _nle(self, q: Array, v: Array) -> Array:
         def one(q: Array, v: Array) -> Array:
@@ -172,7 +179,7 @@ class DrakeDynamics(Dynamics):
             b = self._set(q, v)
             forces = MultibodyForces(self.plant)
             self.plant.CalcForceElementsContribution(self._context, forces)
-            return self._force(self.plant.CalcInverseDynamics(self._context, self._to_drake(a) + b, forces))
+            return self._force(self.plant.CalcInverseDynamics(self._context, self._vector_to_drake(a) + b, forces))
 
         return per_sample(one, q, v, a)
 
@@ -181,7 +188,7 @@ class DrakeDynamics(Dynamics):
 
     def _forward_tree(self, q: Array, v: Array, tau: Array) -> Array:
         b = self._set(q, v)
-        self._applied.FixValue(self._context, self._to_drake(tau))
+        self._applied.FixValue(self._context, self._vector_to_drake(tau))
         return self._force(self._acceleration.Eval(self._context) - b)
 
     def _forward_reduced(self, q: Array, v: Array, tau: Array) -> Array:
@@ -199,7 +206,7 @@ class DrakeDynamics(Dynamics):
         def one(q: Array) -> Any:
             self._set(q)
             total = 0.0
-            for stiffness, A, p_AP, B, p_BQ in self._made.bushings:
+            for stiffness, A, p_AP, B, p_BQ in self.made.bushings:
                 P, Q = (self.plant.EvalBodyPoseInWorld(self._context, x).multiply(p) for x, p in ((A, p_AP), (B, p_BQ)))
                 total += 0.5 * stiffness * float((Q - P) @ (Q - P))
             return total + float(self._energy())
@@ -208,7 +215,7 @@ class DrakeDynamics(Dynamics):
 
     def _energy(self) -> float:
         """Return Drake's own potential energy; of a plant without bushings where Drake cannot tell theirs."""
-        if not self._made.bushings:
+        if not self.made.bushings:
             return float(self.plant.CalcPotentialEnergy(self._context))
         plant, context = self._without_bushings
         plant.SetPositions(context, self.plant.GetPositions(self._context))
@@ -224,7 +231,7 @@ class DrakeDynamics(Dynamics):
 
         def one(q: Array) -> Array:
             self._set(q)
-            X_WB = self.plant.EvalBodyPoseInWorld(self._context, self._made.bodies[f.body])
+            X_WB = self.plant.EvalBodyPoseInWorld(self._context, self.made.bodies[f.body])
             X = np.eye(4)
             X[:3, :3] = X_WB.rotation().matrix() @ f.rotation
             X[:3, 3] = X_WB.multiply(np.array(f.translation))
@@ -234,7 +241,7 @@ class DrakeDynamics(Dynamics):
 
     def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
         f = self.model.frame(frame)
-        body, world = self._made.bodies[f.body], self.plant.world_frame()
+        body, world = self.made.bodies[f.body], self.plant.world_frame()
 
         def one(q: Array) -> Array:
             self._set(q)
