@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mbkit import catalog as catalog
     from mbkit import errors as errors
     from mbkit import lagrangian as lagrangian
+    from mbkit import testing as testing
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
     from mbkit.errors import MbkitError as MbkitError
@@ -31,7 +32,11 @@ if TYPE_CHECKING:
     from mbkit.model import Parameter as Parameter
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import simulate as simulate
+    from mbkit.studies import baseline as baseline
+    from mbkit.studies.causes import explain as explain
     from mbkit.studies.compare import compare as compare
+    from mbkit.studies.convert import convert as convert
+    from mbkit.studies.parsers import compare_parsers as compare_parsers
     from mbkit.studies.stress.study import stress as stress
     from mbkit.studies.work_precision import work_precision as work_precision
 
@@ -45,15 +50,25 @@ _HOME = {
     "Parameter": "mbkit.model",
     "Trajectory": "mbkit.simulate",
     "compare": "mbkit.studies",
+    "compare_parsers": "mbkit.studies.parsers",
+    "convert": "mbkit.studies.convert",
     "dynamics": "mbkit.engines",
     "equilibrium": "mbkit.lagrangian.equilibrium",
+    "explain": "mbkit.studies.causes",
     "load": "mbkit.load",
     "robots": "mbkit.load",
     "stress": "mbkit.studies",
     "work_precision": "mbkit.studies",
 }
 # `simulate` is called too, and its methods and events are in it.
-_MODULES = ("catalog", "errors", "lagrangian", "simulate")
+_MODULES = {
+    "baseline": "mbkit.studies.baseline",
+    "catalog": "mbkit.catalog",
+    "errors": "mbkit.errors",
+    "lagrangian": "mbkit.lagrangian",
+    "simulate": "mbkit.simulate",
+    "testing": "mbkit.testing",
+}
 
 __all__ = sorted([*_HOME, *_MODULES, "__version__"])
 
@@ -62,7 +77,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     if name in _MODULES:
-        return importlib.import_module(f"mbkit.{name}")
+        return importlib.import_module(_MODULES[name])
     raise AttributeError(f"module 'mbkit' has no attribute {name!r}; it has: {', '.join(__all__)}")
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 __all__ = [
+    "BaselineError",
     "DoubtfulRunWarning",
     "EventError",
     "FunctionError",
@@ -125,6 +126,10 @@ class ModelError(MbkitError, ValueError):
 
 class LoadError(MbkitError, ValueError):
     """A file cannot be read as a robot."""
+
+
+class BaselineError(MbkitError, ValueError):
+    """A file is no baseline that can be read, or not the one of this model."""
 
 
 class OutputError(MbkitError, OSError):

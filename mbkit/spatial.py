@@ -24,6 +24,7 @@ __all__ = [
     "normalized",
     "quaternion_from_matrix",
     "rotate",
+    "rpy_from_matrix",
     "skew",
 ]
 
@@ -104,6 +105,17 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def rpy_from_matrix(R: Array) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll), pitch within ±π/2.
+
+    Yaw is found first and taken out of R, so that roll makes up for what yaw lost near a pitch of ±π/2.
+    """
+    yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = float(np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0]))
+    return float(np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])), pitch, yaw
 
 
 def exp_quaternion(w: Array) -> Array:

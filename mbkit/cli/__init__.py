@@ -1,7 +1,7 @@
 """The command `mbkit`: checks arguments, calls the library, prints, and says how it ended.
 
-Exit status: 0 done, and the engines agree, 1 they differ, 2 misuse or bad input, 70 a fault of
-mbkit's own, 130 interrupted. A command is a file.
+Exit status: 0 done, and the engines agree (or are as a baseline has them), 1 they differ, 2 misuse or
+bad input, 70 a fault of mbkit's own, 130 interrupted. A command is a file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 import click
 
 from mbkit._version import __version__
-from mbkit.cli import bench, check, derive, export, robots, stress
+from mbkit.cli import baseline, bench, check, convert, derive, diff, export, robots, stress
 from mbkit.cli.door import Door
 
 __all__ = ["cli", "main"]
@@ -23,7 +23,17 @@ def cli() -> None:
     """Equations of motion that can be trusted: Pinocchio, MuJoCo and an own derivation, compared."""
 
 
-for _command in (check.check, derive.derive, bench.bench, stress.stress, export.export, robots.robots):
+for _command in (
+    check.check,
+    diff.diff,
+    baseline.baseline,
+    derive.derive,
+    bench.bench,
+    stress.stress,
+    convert.convert,
+    export.export,
+    robots.robots,
+):
     cli.add_command(_command)
 
 

@@ -27,6 +27,7 @@ __all__ = ["check"]
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @model_options
 @click.option("--no-rollouts", is_flag=True, help="Terms only: no trajectories, run times or omissions.")
+@click.option("--own-parsers", is_flag=True, help="Compare what each engine's own importer makes of the file.")
 @click.option("--jobs", type=click.IntRange(min=1), help="With --all: processes.  [default: one per processor]")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
 @click.option(
@@ -42,6 +43,7 @@ def check(
     mimic: Literal["reduce", "free"] | None,
     nonphysical: Literal["error", "warn"] | None,
     no_rollouts: bool,
+    own_parsers: bool,
     jobs: int | None,
     as_json: bool,
     out: Path,
@@ -49,14 +51,21 @@ def check(
     """Compare engines on TARGET, and write a page and JSON.
 
     TARGET is a robot (mbkit robots lists them), a catalog system, a path to a URDF or
-    MJCF file, or package.module:function for a function that returns a Model.
+    MJCF file, or package.module:function for a function that returns a Model. With --own-parsers
+    it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves.
     """
+    if own_parsers and (everything or target is None or floating_base or mimic or nonphysical or no_rollouts):
+        raise click.UsageError("--own-parsers takes one TARGET as it is written, and --seed, --json and --out")
     if everything and (target is not None or nonphysical is not None):
         raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")
     if not everything and jobs is not None:
         raise click.UsageError("--jobs goes with --all")
     from mbkit.report.folder import check_writable
 
+    if own_parsers:
+        check_writable(out)
+        _check_parsers(str(target), seed, as_json, out)
+        return
     check_engines(engines, least=2)
     check_writable(out)
     if everything:
@@ -106,6 +115,27 @@ def _check_one(
     if not result.rows:
         say("error", f"{result.verdict}; two engines that hold the model are needed")
     leave(MISUSE if not written or not result.rows else AGREE if result.passed else DIFFER)
+
+
+def _check_parsers(target: str, seed: int, as_json: bool, out: Path) -> None:
+    from mbkit.load.names import find
+    from mbkit.report.folder import file_stem
+    from mbkit.studies.parsers import compare_parsers
+
+    result = compare_parsers(target, seed=seed)
+
+    def table() -> RenderableType:
+        from mbkit.report import cause_tables
+
+        return cause_tables.importers(result)
+
+    stem = file_stem(target if find(target) else Path(target).stem)
+    data = result.to_json()
+    written = show(data, table, (File("data", f"{stem}.importers.json", lambda: data + "\n"),), out, as_json=as_json)
+    read = any(p.stages for p in result.importers)
+    if not read:
+        say("error", f"no importer reads {target}")
+    leave(MISUSE if not written or not read else AGREE if result.agree else DIFFER)
 
 
 def _check_all(

@@ -17,6 +17,7 @@ ENGINES: Final = {
     "pinocchio": ("mbkit.engines.pinocchio", "PinocchioDynamics", "pin"),
     "lagrangian": ("mbkit.engines.lagrangian", "LagrangianDynamics", "casadi"),
     "mujoco": ("mbkit.engines.mujoco", "MujocoDynamics", "mujoco"),
+    "drake": ("mbkit.engines.drake", "DrakeDynamics", "mbkit[drake]"),
     "oracle": ("mbkit.engines.oracle", "OracleDynamics", "mpmath"),
 }
 

@@ -22,7 +22,7 @@ from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
 
-__all__ = ["MujocoModel", "build"]
+__all__ = ["MujocoModel", "Placed", "build", "mapped", "specified"]
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
@@ -77,6 +77,52 @@ def build(description: Model, *, spheres: bool = False) -> MujocoModel:
         For a helical joint, an unevenly damped free joint, or a body that
         MuJoCo's compiler refuses; the message names it.
     """
+    spec, placed, disabled = specified(description)
+    if spheres:
+        for name, body in placed.bodies.items():
+            if name != "world":
+                body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], pos=body.ipos, mass=0.0)
+    # A singular M at the zero configuration is told when somebody solves with it.
+    with heard_warnings(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise UnsupportedError(f"mujoco: {_refusal(description, str(error))}") from None
+        _set_constants(model, description, placed)
+    _verify(model, description, placed)
+    return mapped(model, description, placed, disabled)
+
+
+@dataclass
+class Placed:
+    """What of a description went where in a specification.
+
+    Attributes
+    ----------
+    bodies : dict
+        Body name -> MuJoCo's body.
+    degenerate : dict
+        Bodies that stand in with a placeholder -> their own principal moments.
+    joints : dict
+        Joint name -> names of MuJoCo's joints.
+    absorbed : set of str
+    """
+
+    bodies: dict[str, Any]
+    degenerate: dict[str, Array]
+    joints: dict[str, list[str]]
+    absorbed: set[str]
+
+
+def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
+    """Return the specification, not compiled yet, what went where in it, and what was switched off.
+
+    Raises
+    ------
+    UnsupportedError
+        For a helical joint or an unevenly damped free joint.
+    """
     for joint in description.joints:
         if joint.kind == "helical":
             raise UnsupportedError(f"mujoco: joint {joint.name!r} is helical, and MuJoCo has no helical joint")
@@ -95,28 +141,7 @@ def build(description: Model, *, spheres: bool = False) -> MujocoModel:
     disabled = _switch_off(spec, description)
     placed = _add_tree(spec, description)
     _add_springs(spec, description, placed)
-    if spheres:
-        for name, body in placed.bodies.items():
-            if name != "world":
-                body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], pos=body.ipos, mass=0.0)
-    # A singular M at the zero configuration is told when somebody solves with it.
-    with heard_warnings(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        try:
-            model = spec.compile()
-        except ValueError as error:
-            raise UnsupportedError(f"mujoco: {_refusal(description, str(error))}") from None
-        _set_constants(model, description, placed)
-    _verify(model, description, placed)
-    return _mapped(model, description, placed, disabled)
-
-
-@dataclass
-class _Placed:
-    bodies: dict[str, Any]
-    degenerate: dict[str, Array]
-    joints: dict[str, list[str]]
-    absorbed: set[str]
+    return spec, placed, disabled
 
 
 def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
@@ -150,8 +175,8 @@ def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
     return tuple(bits)
 
 
-def _add_tree(spec: Any, description: Model) -> _Placed:
-    placed = _Placed({"world": spec.worldbody}, {}, {}, set())
+def _add_tree(spec: Any, description: Model) -> Placed:
+    placed = Placed({"world": spec.worldbody}, {}, {}, set())
     children: dict[str, list[Joint]] = {}
     for joint in description.joints:
         children.setdefault(joint.parent, []).append(joint)
@@ -194,7 +219,7 @@ def _add_tree(spec: Any, description: Model) -> _Placed:
     return placed
 
 
-def _give_inertia(made: Any, body: Body, description: Model, placed: _Placed) -> None:
+def _give_inertia(made: Any, body: Body, description: Model, placed: Placed) -> None:
     inertia = np.array(body.inertia)
     if np.array_equal(inertia, np.diag(np.diag(inertia))):
         moments, axes = np.diag(inertia).copy(), np.eye(3)
@@ -214,7 +239,7 @@ def _give_inertia(made: Any, body: Body, description: Model, placed: _Placed) ->
         made.inertia = np.ones(3)
 
 
-def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: _Placed, *, at_origin: bool) -> None:
+def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, at_origin: bool) -> None:
     """Add the joint, whose fixed frame at q = 0 is (R, p) in the body."""
     names: list[str] = []
 
@@ -259,7 +284,7 @@ def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: _Placed, *, 
     placed.joints[joint.name] = names
 
 
-def _add_springs(spec: Any, description: Model, placed: _Placed) -> None:
+def _add_springs(spec: Any, description: Model, placed: Placed) -> None:
     for k, spring in enumerate(description.springs):
         tendon = spec.add_tendon(name=spring.name)
         for end, body, point in (("a", spring.body_a, spring.point_a), ("b", spring.body_b, spring.point_b)):
@@ -285,7 +310,7 @@ def _refusal(description: Model, error: str) -> str:
     return f"the compiler refuses {description.name}: {told}"
 
 
-def _set_constants(model: Any, description: Model, placed: _Placed) -> None:
+def _set_constants(model: Any, description: Model, placed: Placed) -> None:
     for name, moments in placed.degenerate.items():
         model.body_inertia[model.body(name).id] = moments
     for joint in description.joints:
@@ -295,7 +320,7 @@ def _set_constants(model: Any, description: Model, placed: _Placed) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _verify(model: Any, description: Model, placed: _Placed) -> None:
+def _verify(model: Any, description: Model, placed: Placed) -> None:
     """Raise unless every body arrived with its mass, centre of mass and inertia."""
     for body in description.bodies:
         if body.name in placed.absorbed:
@@ -327,7 +352,8 @@ def _addresses(model: Any, names: list[str]) -> tuple[list[int], list[int]]:
     return q, v
 
 
-def _mapped(model: Any, description: Model, placed: _Placed, disabled: tuple[str, ...]) -> MujocoModel:
+def mapped(model: Any, description: Model, placed: Placed, disabled: tuple[str, ...]) -> MujocoModel:
+    """Return a compiled model with the maps between its coordinates and the description's, by name."""
     layout = description.layout
     q_index, v_index = np.zeros(model.nq, int), np.zeros(model.nv, int)
     free = []

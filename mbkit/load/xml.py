@@ -24,12 +24,13 @@ _MOST_LEVELS: Final = 250
 
 @dataclass
 class Element:
-    """An element as it was written: tag, attributes, line, children. Text is not kept."""
+    """An element as it was written: tag, attributes, line, children, and what text is in it, joined."""
 
     tag: str
     attributes: dict[str, str]
     line: int
     children: list[Element] = field(default_factory=list)
+    text: str = ""
 
     def all(self, tag: str) -> list[Element]:
         """Return the children of this tag."""
@@ -91,6 +92,10 @@ def parse(content: bytes, name: str) -> Element:
     def end(_: str) -> None:
         stack.pop()
 
+    def data(text: str) -> None:
+        if stack and not text.isspace():
+            stack[-1].text += text
+
     def doctype(*_: object) -> NoReturn:
         raise LoadError(
             f"{name}: line {parser.CurrentLineNumber}: a document type declaration (<!DOCTYPE ...>), which can hide "
@@ -99,6 +104,7 @@ def parse(content: bytes, name: str) -> Element:
 
     parser.StartElementHandler = start
     parser.EndElementHandler = end
+    parser.CharacterDataHandler = data
     parser.StartDoctypeDeclHandler = doctype
     try:
         parser.Parse(content, True)

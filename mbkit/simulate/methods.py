@@ -67,6 +67,10 @@ def _mujoco(name: str, order: int, stages: int, about: str) -> Method:
     return Method(f"mujoco_{name}", "native", order, stages, about, engines=("mujoco",), callables=False)
 
 
+def _drake(name: str, order: int | None, about: str) -> Method:
+    return Method(f"drake_{name}", "adaptive", order, 0, about, engines=("drake",), least=1e-15, callables=False)
+
+
 METHODS: Final[dict[str, Method]] = {
     m.name: m
     for m in (
@@ -142,6 +146,11 @@ METHODS: Final[dict[str, Method]] = {
         _mujoco("implicit", 1, 1, "MuJoCo's own Euler, implicit in dampers and all velocity terms"),
         _mujoco("implicitfast", 1, 1, "as mujoco_implicit, with the Coriolis derivatives of free bodies alone"),
         _mujoco("discrete", 1, 1, "MuJoCo's own Euler, implicit in dampers and springs"),
+        _drake("runge_kutta3", 3, "Drake's own third-order Runge-Kutta with error control"),
+        _drake("runge_kutta5", 5, "Drake's own Dormand-Prince 5(4)"),
+        _drake("bogacki_shampine3", 3, "Drake's own Bogacki-Shampine 3(2)"),
+        _drake("radau3", 3, "Drake's own Radau IIA of two stages, implicit"),
+        _drake("implicit_euler", 1, "Drake's own implicit Euler with error control"),
     )
 }
 

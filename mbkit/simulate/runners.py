@@ -45,6 +45,10 @@ def adaptive_runner(method: Method) -> Callable[..., Outcome]:
         from mbkit.simulate.cvodes import run_cvodes
 
         return run_cvodes
+    if method.name.startswith("drake_"):
+        from mbkit.simulate.drakes import run_drake
+
+        return run_drake
     from mbkit.simulate.adaptive import run_scipy
 
     return run_scipy

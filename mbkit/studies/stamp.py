@@ -11,7 +11,7 @@ from mbkit._version import __version__
 
 __all__ = ["processor", "versions"]
 
-_PACKAGES = ("pin", "mujoco", "casadi", "numpy", "scipy", "llvmlite", "heyoka", "mpmath", "example-robot-data")
+_PACKAGES = ("pin", "mujoco", "drake", "casadi", "numpy", "scipy", "llvmlite", "heyoka", "mpmath", "example-robot-data")
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,49 @@
+"""`mbkit convert`: a description in another format, checked by reading it back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from mbkit.cli.door import say
+from mbkit.cli.options import load_options, model_options
+from mbkit.errors import OutputError
+
+__all__ = ["convert"]
+
+
+@click.command()
+@click.argument("target")
+@click.option("--to", "to", required=True, type=click.Choice(["mjcf", "urdf"]), help="The format.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="File to write.  [default: print]")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
+@model_options
+def convert(
+    target: str,
+    to: str,
+    output: Path | None,
+    force: bool,
+    floating_base: bool,
+    mimic: str | None,
+    nonphysical: str | None,
+) -> None:
+    """Write TARGET as MJCF or URDF: its motion alone, without geometry.
+
+    TARGET is what `mbkit check` takes. The text is read back with MuJoCo's or Pinocchio's own parser before
+    it is written, and what the format cannot say is an error that names it.
+    """
+    from mbkit.studies.convert import convert as converted
+    from mbkit.studies.target import model_of
+
+    if output is not None and output.exists() and not force:
+        raise OutputError(f"{output} is there already; choose another with -o, or replace it with --force")
+    made = converted(model_of(target, load_options(floating_base, mimic, nonphysical)), to)
+    if output is None:
+        click.echo(made.text, nl=False)
+    else:
+        made.write(output)
+    for note in made.notes:
+        say("note", note)
+    where = "printed" if output is None else f"written to {output}"
+    say("checked", f"{made.model} as {to}, {where}: read back, every term agrees to {made.worst:.1e}")

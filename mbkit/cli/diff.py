@@ -1,0 +1,98 @@
+"""`mbkit diff`: why two descriptions, or two engines on one, differ."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from mbkit.cli.door import AGREE, DIFFER, leave
+from mbkit.cli.options import check_engines, load_options, model_options, split
+from mbkit.cli.output import console
+from mbkit.errors import MbkitError
+
+if TYPE_CHECKING:
+    from mbkit.model import Model
+
+__all__ = ["diff"]
+
+
+@click.command()
+@click.argument("first")
+@click.argument("second", required=False)
+@click.option(
+    "--engines", callback=split, default="", metavar="A,B", help="Two engines, to be compared on FIRST (and SECOND)."
+)
+@click.option("--samples", default=3, show_default=True, type=click.IntRange(min=1), help="Random states.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
+@click.option(
+    "--tolerance", default=1e-9, show_default=True, type=click.FloatRange(min=0, min_open=True), help="What counts."
+)
+@model_options
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+def diff(
+    first: str,
+    second: str | None,
+    engines: tuple[str, ...],
+    samples: int,
+    seed: int,
+    tolerance: float,
+    floating_base: bool,
+    mimic: Literal["reduce", "free"] | None,
+    nonphysical: Literal["error", "warn"] | None,
+    as_json: bool,
+) -> None:
+    """Say why SECOND moves otherwise than FIRST, and name the causes.
+
+    Both are what `mbkit check` takes. A file is read link by link, as it is written, so that links which are
+    fused wrongly are named. With two engines they are compared on one description, or each on its own.
+    """
+    if engines:
+        check_engines(engines, least=2)
+        if len(engines) > 2:
+            raise click.UsageError("--engines takes two")
+    elif second is None:
+        raise click.UsageError("give two descriptions, or one and --engines A,B")
+    from mbkit.engines import dynamics
+    from mbkit.studies.causes import explain
+
+    options = load_options(floating_base, mimic, nonphysical)
+    models = [_model(target, options) for target in ([first] if second is None else [first, second])]
+    sides: list[Any] = list(models)
+    if engines:
+        sides = [dynamics(models[k % len(models)], engine) for k, engine in enumerate(engines)]
+    names = None if engines else (_short(first), _short(second or ""))
+    if names is not None and names[0] == names[1]:
+        names = first, second or ""
+    result = explain(*sides, samples=samples, seed=seed, tolerance=tolerance, names=names)
+    if as_json:
+        click.echo(result.to_json())
+    else:
+        from mbkit.report.cause_tables import explanation
+
+        console().print(explanation(result))
+    leave(AGREE if result.agree else DIFFER)
+
+
+def _short(target: str) -> str:
+    return os.path.basename(target) or target
+
+
+def _model(target: str, options: Mapping[str, Any]) -> Model:
+    """Return a file as it is written where nothing else is asked for, and any other target as it loads."""
+    from mbkit import catalog
+    from mbkit.load.names import find
+    from mbkit.studies.parsers.compare import written
+    from mbkit.studies.target import model_of
+
+    # A robot that is also a catalog system is told about where targets are told apart.
+    plain = not options and (os.path.isfile(target) or (find(target) is not None and target not in catalog.systems()))
+    if plain:
+        try:
+            return written(target)
+        except MbkitError:
+            # What is wrong with it is told better by the loader, which may also read it.
+            pass
+    return model_of(target, options)

@@ -1,0 +1,205 @@
+"""MuJoCo's own importer of URDF and MJCF, and what it made of a file.
+
+The only place that knows how a compiled `mjModel` holds a tree: joints stand in a body's own axes
+and may be several, `qpos0` is where they are drawn, inertias are principal moments in axes of
+their own, and quaternions are w, x, y, z.
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.engines.base import Dynamics
+from mbkit.engines.imported import Imported, checked, unused
+from mbkit.engines.mujoco import MujocoDynamics
+from mbkit.engines.mujoco_api import heard_warnings
+from mbkit.engines.mujoco_model import MujocoModel
+from mbkit.errors import UnsupportedError
+from mbkit.model import Body, Joint, Model
+from mbkit.model.kinds import kind_of
+
+__all__ = ["ImportedMujoco", "read"]
+
+_KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
+
+
+def read(text: str, format_: str) -> Imported:  # noqa: ARG001  # MuJoCo tells the formats apart by itself
+    """Return what MuJoCo's parser and compiler make of a text."""
+    # A singular M at the zero configuration is a warning, and no refusal.
+    with heard_warnings() as heard, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            made = mujoco.MjModel.from_xml_string(text)
+        except Exception as error:
+            lines = " ".join(str(error).split())
+            raise UnsupportedError(f"mujoco: {lines.removeprefix('XML Error: ').removeprefix('Error: ')}") from None
+    described = _Description(made)
+    dyn = ImportedMujoco(checked("mujoco", described.model), described.made)
+    return Imported(described.model, dyn.terms, (*_beside(made), *(" ".join(w.split()) for w in heard)))
+
+
+class ImportedMujoco(MujocoDynamics):
+    """MuJoCo on its own model."""
+
+    def __init__(self, model: Model, made: MujocoModel) -> None:
+        Dynamics.__init__(self, model)
+        self._made = made
+        self.mj_model = self._m = made.model
+        self.disabled = ()
+        self._d = mujoco.MjData(self._m)
+        self._reduced = model.layout.reduced
+        self._lock = threading.RLock()
+
+    def terms(self, q: Array, v: Array) -> dict[str, Array]:
+        """Return M, g and nle at a batch of states."""
+        return {"M": self.mass_matrix(q), "g": self.gravity(q), "nle": self.nle(q, v)}
+
+
+def _beside(m: Any) -> list[str]:
+    """Say what acts in the model beside its bodies and joints."""
+    out = []
+    kinds = [mujoco.mjtEq(int(t)).name.removeprefix("mjEQ_").lower() for t in m.eq_type]
+    for kind in dict.fromkeys(kinds):
+        what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
+        out.append(f"{what} ({kinds.count(kind)}), outside M and nle")
+    for count, what in ((m.ntendon, "tendons"), (m.nu, "actuators")):
+        if count:
+            out.append(f"{count} {what}, outside M and nle")
+    if np.any(m.body_gravcomp):
+        out.append(f"gravity compensation on {int(np.count_nonzero(m.body_gravcomp))} bodies, outside nle")
+    return out
+
+
+class _Description:
+    """Reads a compiled model body by body."""
+
+    def __init__(self, m: Any) -> None:
+        self.m = m
+        self.names = ["world"]
+        self.taken = {"joint": set[str](), "body": {"world"}}
+        for i in range(1, m.nbody):
+            self.names.append(self._new("body", m.body(i).name or f"body{i}"))
+        self.anchors: list[Array] = [np.zeros(3)]
+        self.bodies: list[Body] = []
+        self.joints: list[Joint] = []
+        self.numbers: list[int] = []
+        for i in range(1, m.nbody):
+            self._body(i)
+        self.model = Model(
+            name="mujoco", gravity=np.array(m.opt.gravity), bodies=tuple(self.bodies), joints=tuple(self.joints)
+        )
+        self.made = self._mapped()
+
+    def _new(self, what: str, name: str) -> str:
+        made = unused(name, self.taken[what])
+        self.taken[what].add(made)
+        return made
+
+    def _body(self, i: int) -> None:
+        m = self.m
+        first, count = int(m.body_jntadr[i]), int(m.body_jntnum[i])
+        mine = range(first, first + count) if count else range(0)
+        kinds = [_KINDS[int(m.jnt_type[j])] for j in mine]
+        # A body's frame is its last joint's, so it stands where that is anchored.
+        last = np.array(m.jnt_pos[mine[-1]]) if count and kinds[-1] != "free" else np.zeros(3)
+        self.anchors.append(last)
+        parent_index = int(m.body_parentid[i])
+        R = _matrix(m.body_quat[i])
+        p = np.array(m.body_pos[i]) - self.anchors[parent_index]
+        parent, before = self.names[parent_index], np.zeros(3)
+        if not count:
+            self._joint(self._new("joint", f"{self.names[i]}_fixed"), "fixed", parent, self.names[i], R, p, -1)
+        for k, j in enumerate(mine):
+            name = self._new("joint", m.joint(j).name or f"{self.names[i]}_joint{k or ''}")
+            child = self.names[i] if k == count - 1 else self._new("body", f"{self.names[i]}_{name}")
+            if kinds[k] == "free":
+                # Its coordinates are the pose in the world, wherever it is drawn.
+                R, p = np.eye(3), np.zeros(3)
+            else:
+                anchor = np.array(m.jnt_pos[j])
+                p = p + R @ (anchor - before)
+                before = anchor
+            self._joint(name, kinds[k], parent, child, R, p, j)
+            if k < count - 1:
+                self.bodies.append(Body(child, 0.0, np.zeros(3), np.zeros((3, 3))))
+            R, p, parent = np.eye(3), np.zeros(3), child
+        axes = _matrix(m.body_iquat[i])
+        inertia = axes @ np.diag(m.body_inertia[i]) @ axes.T
+        com = np.array(m.body_ipos[i]) - last
+        self.bodies.append(Body(self.names[i], float(m.body_mass[i]), com, 0.5 * (inertia + inertia.T)))
+
+    def _joint(self, name: str, kind: str, parent: str, child: str, R: Array, p: Array, j: int) -> None:
+        m, type_ = self.m, kind_of(kind)
+        v = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + type_.nv) if j >= 0 else slice(0, 0)
+        lower, upper = np.full(type_.nq, -np.inf), np.full(type_.nq, np.inf)
+        stiffness, rest, effort = np.zeros(type_.nv), np.zeros(type_.nv), np.full(type_.nv, np.inf)
+        axes = np.empty((0, 3))
+        if type_.nv == 1:
+            axis, ref = np.array(m.jnt_axis[j]), float(m.qpos0[m.jnt_qposadr[j]])
+            axes = axis[None, :]
+            # At q = ref the body is where it is drawn.
+            if ref and kind == "revolute":
+                R = R @ spatial.matrix_from_quaternion(spatial.exp_quaternion(-ref * axis))
+            elif ref:
+                p = p - R @ (ref * axis)
+            if m.jnt_limited[j]:
+                lower, upper = np.split(np.array(m.jnt_range[j]), 2)
+            elif kind == "revolute":
+                kind = "continuous"
+            if m.jnt_actfrclimited[j]:
+                effort = np.array([np.abs(m.jnt_actfrcrange[j]).max()])
+            stiffness = np.array([float(np.ravel(m.jnt_stiffness[j])[0])])
+            rest = np.array([m.qpos_spring[m.jnt_qposadr[j]]]) if stiffness.any() else rest
+        self.numbers.append(j)
+        self.joints.append(
+            Joint(
+                name=name,
+                kind=kind,
+                parent=parent,
+                child=child,
+                rotation=R,
+                translation=p,
+                axes=axes,
+                pitch=0.0,
+                lower=lower,
+                upper=upper,
+                velocity_limit=np.full(type_.nv, np.inf),
+                effort_limit=effort,
+                armature=np.array(m.dof_armature[v]),
+                damping=np.array(m.dof_damping[v]),
+                friction=np.array(m.dof_frictionloss[v]),
+                stiffness=stiffness,
+                rest=rest,
+            )
+        )
+
+    def _mapped(self) -> MujocoModel:
+        m, layout = self.m, self.model.layout
+        q_index, v_index = np.zeros(m.nq, int), np.zeros(m.nv, int)
+        free = []
+        for joint, j in zip(self.joints, self.numbers, strict=True):
+            if j < 0:
+                continue
+            q, v = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j])
+            ours_q, ours_v = layout.q[joint.name], layout.v[joint.name]
+            order = list(range(ours_q.start, ours_q.stop))
+            if joint.type.quaternion is not None:
+                k = joint.type.quaternion
+                order[k:] = [order[-1], *order[k:-1]]
+            q_index[q : q + joint.type.nq], v_index[v : v + joint.type.nv] = order, range(ours_v.start, ours_v.stop)
+            if joint.kind == "free":
+                free.append((q, v))
+        bodies = {name: i for i, name in enumerate(self.names)}
+        return MujocoModel(m, q_index, v_index, tuple(free), bodies, frozenset(), ())
+
+
+def _matrix(wxyz: Array) -> Array:
+    w, x, y, z = (float(c) for c in wxyz)
+    return spatial.matrix_from_quaternion(np.array([x, y, z, w]))

@@ -1,0 +1,96 @@
+"""What an engine's own importer makes of a file, in words that can be compared."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Container
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.errors import UnsupportedError
+from mbkit.model import Model
+
+__all__ = ["IMPORTERS", "Imported", "checked", "importer", "unused"]
+
+#: Engine -> (module, package that has its version, package to install).
+IMPORTERS = {
+    "pinocchio": ("mbkit.engines.import_pinocchio", "pin", "pin"),
+    "mujoco": ("mbkit.engines.import_mujoco", "mujoco", "mujoco"),
+    "drake": ("mbkit.engines.import_drake", "drake", "mbkit[drake]"),
+}
+# What mbkit's own loaders take.
+_LARGEST: Final = 1e30
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A file as one engine's importer holds it.
+
+    Attributes
+    ----------
+    model : Model
+        What the importer made, described: its bodies, joints and numbers, as they are.
+    terms : callable
+        (q, v) -> M, g and nle of the imported model by the engine itself, at (N, nq) and (N, nv) in
+        the coordinates of `model`, as a dict.
+    notes : tuple of str
+        What the importer said, and what it holds that `model` does not.
+    """
+
+    model: Model
+    terms: Callable[[Array, Array], dict[str, Array]]
+    notes: tuple[str, ...]
+
+
+def unused(name: str, taken: Container[str]) -> str:
+    """Return a name that nothing has yet; an importer may take what mbkit's loader refuses."""
+    while name in taken:
+        name += "_"
+    return name
+
+
+def checked(engine: str, model: Model) -> Model:
+    """Return what an importer made, if something moves in it and all its numbers are numbers.
+
+    Raises
+    ------
+    UnsupportedError
+        With the culprit.
+    """
+    if not model.nv:
+        raise UnsupportedError(f"{engine}: nothing moves in what it made of the file (nv = 0)")
+    for what, parts, names in (
+        ("body", model.bodies, ("mass", "com", "inertia")),
+        ("joint", model.joints, ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness")),
+    ):
+        for part in parts:
+            for name in names:
+                # Not a number, or memory that nobody wrote to.
+                if not (np.abs(getattr(part, name)) <= _LARGEST).all():
+                    raise UnsupportedError(
+                        f"{engine}: made {what} {part.name!r} with a {name} that nothing has: {getattr(part, name)}"
+                    )
+    if not (np.abs(model.gravity) <= _LARGEST).all():
+        raise UnsupportedError(f"{engine}: made a gravity that nothing has: {model.gravity}")
+    return model
+
+
+def importer(engine: str) -> Callable[[str, str], Imported]:
+    """Return the function (text, format) -> Imported of an engine.
+
+    Raises
+    ------
+    UnsupportedError
+        The engine is not installed. The function itself raises it where the importer refuses a text.
+    """
+    module, _, package = IMPORTERS[engine]
+    try:
+        made: Callable[[str, str], Imported] = importlib.import_module(module).read
+    except ModuleNotFoundError as error:
+        if error.name and error.name.startswith("mbkit"):
+            raise
+        raise UnsupportedError(f"{engine} is not installed ({error}); pip install {package}") from error
+    return made

@@ -1,0 +1,307 @@
+"""A pytest plugin: robots and engines as parameters of tests, and baselines that tests hold them to.
+
+It is found by itself where mbkit is installed. Nothing of mbkit is loaded before a test asks for it,
+because every run of pytest loads this file.
+
+    @pytest.mark.mbkit(robots=["panda", "robots/arm.urdf"], engines=["pinocchio", "mujoco"])
+    def test_my_robots(mbkit_model, mbkit_engine): ...
+
+    @pytest.mark.mbkit(robots=["panda"])
+    def test_as_recorded(mbkit_model, mbkit_baseline):
+        mbkit_baseline(mbkit_model)
+
+The asserts of `mbkit.testing` need no fixture.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import pytest
+
+if TYPE_CHECKING:
+    from mbkit.engines import Dynamics
+    from mbkit.model import Model
+
+__all__ = ["MbkitBaseline", "mbkit_baseline", "mbkit_dynamics", "mbkit_engine", "mbkit_model"]
+
+_MARK = (
+    "mbkit(robots=[...], engines=[...], **load): run a test for each robot (mbkit_model) and engine (mbkit_engine); "
+    "a robot is a name, a file beside the test, package.module:function, or a Model; load are options of mbkit.load"
+)
+_ENGINES = ("pinocchio", "lagrangian", "mujoco")
+#: What a report brings from the process of the test to the one that prints.
+_TOLD = "mbkit"
+_CACHE = pytest.StashKey[dict[Any, Any]]()
+Made = TypeVar("Made")
+# `mbkit.testing.STRICT`, which is not imported for one word.
+_STRICT = "MBKIT_TEST_STRICT"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options."""
+    group = parser.getgroup("mbkit", "robots and their engines (mbkit)")
+    group.addoption("--mbkit-regen", action="store_true", help="record the baselines of the tests anew")
+    group.addoption("--mbkit-strict", action="store_true", help="fail, and do not skip, where an engine is missing")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the marker known, and strictness."""
+    config.addinivalue_line("markers", _MARK)
+    config.stash[_CACHE] = {}
+    if config.getoption("--mbkit-strict"):
+        before = os.environ.get(_STRICT)
+        os.environ[_STRICT] = "1"
+        config.add_cleanup(lambda: _restore(before))
+
+
+def _restore(before: str | None) -> None:
+    if before is None:
+        os.environ.pop(_STRICT, None)
+    else:
+        os.environ[_STRICT] = before
+
+
+# Robots and engines as parameters.
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test for each of its marker's robots and engines."""
+    wants_model = "mbkit_model" in metafunc.fixturenames
+    wants_engine = "mbkit_engine" in metafunc.fixturenames
+    if not wants_model and not wants_engine:
+        return
+    asked = _asked(metafunc)
+    if wants_model:
+        robots = _several(asked.get("robots"), "robots")
+        if not robots:
+            pytest.fail(
+                f"{metafunc.function.__name__}: mbkit_model wants @pytest.mark.mbkit(robots=[...])", pytrace=False
+            )
+        metafunc.parametrize("mbkit_model", robots, indirect=True, ids=[_id(r) for r in robots])
+    if wants_engine:
+        engines = _several(asked.get("engines", _ENGINES), "engines")
+        metafunc.parametrize("mbkit_engine", engines, indirect=True, ids=[str(e) for e in engines])
+
+
+def _asked(node: Any) -> dict[str, Any]:
+    """Return what the markers of a test say, the nearest first."""
+    out: dict[str, Any] = {}
+    for mark in getattr(node, "definition", node).iter_markers("mbkit"):
+        if mark.args:
+            pytest.fail(f"{_MARK.partition(':')[0]} takes names: robots=[...], engines=[...]", pytrace=False)
+        out = {**mark.kwargs, **out}
+    return out
+
+
+def _several(given: Any, name: str) -> list[Any]:
+    if given is None:
+        return []
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        pytest.fail(f"mark mbkit: {name}: expected a list, got {given!r}", pytrace=False)
+    return list(given)
+
+
+def _id(robot: Any) -> str:
+    """Return what a robot is called in a test's name, the same in every process."""
+    if isinstance(robot, (str, os.PathLike)):
+        text = os.fspath(robot)
+        return Path(text).stem if text.lower().endswith((".urdf", ".xml", ".mjcf")) else text
+    return str(getattr(robot, "name", None) or getattr(robot, "__name__", None) or type(robot).__name__)
+
+
+@pytest.fixture
+def mbkit_model(request: pytest.FixtureRequest) -> Model:
+    """One of the robots of the test's marker."""
+    __tracebackhide__ = True
+    robot = request.param
+    options = {k: x for k, x in _asked(request.node).items() if k not in ("robots", "engines")}
+    if not isinstance(robot, (str, os.PathLike)):
+        return robot() if callable(robot) else robot  # type: ignore[no-any-return]
+    target = _target(os.fspath(robot), request)
+    return _once(request.config, ("model", target, repr(options)), lambda: _load(target, options))
+
+
+def _target(text: str, request: pytest.FixtureRequest) -> str:
+    """Return a robot's name, or the path of a file, which is looked for beside the test first."""
+    beside = request.path.parent / text
+    return str(beside) if beside.is_file() else text
+
+
+def _load(target: str, options: Mapping[str, Any]) -> Model:
+    __tracebackhide__ = True
+    from mbkit.studies.target import model_of
+
+    return _told(lambda: model_of(target, options))
+
+
+@pytest.fixture
+def mbkit_engine(request: pytest.FixtureRequest) -> str:
+    """One of the engines of the test's marker; the test is skipped where it is not installed."""
+    __tracebackhide__ = True
+    from mbkit.studies.installed import not_installed
+
+    name = str(request.param)
+    for why in not_installed([name]).values():
+        (pytest.fail if request.config.getoption("--mbkit-strict") else pytest.skip)(f"{name}: {why}")
+    return name
+
+
+@pytest.fixture
+def mbkit_dynamics(request: pytest.FixtureRequest, mbkit_model: Model, mbkit_engine: str) -> Dynamics:
+    """Evaluate the robot by the engine."""
+    __tracebackhide__ = True
+    from mbkit.engines import dynamics
+
+    key = "dynamics", mbkit_model.digest, mbkit_engine
+    return _once(request.config, key, lambda: _told(lambda: dynamics(mbkit_model, mbkit_engine)))
+
+
+def _told(call: Callable[[], Made], write: Callable[[Exception], str] = str) -> Made:
+    """Return what a call gives; what mbkit raises is one message, without the lines that led to it."""
+    __tracebackhide__ = True
+    from mbkit.errors import MbkitError
+
+    try:
+        return call()
+    except (AssertionError, MbkitError) as error:
+        told = write(error)
+    pytest.fail(told, pytrace=False)
+
+
+def _once(config: pytest.Config, key: Any, make: Callable[[], Made]) -> Made:
+    """Return what is made once in a process."""
+    cache = config.stash[_CACHE]
+    if key not in cache:
+        cache[key] = make()
+    made: Made = cache[key]
+    return made
+
+
+# Baselines.
+
+
+class MbkitBaseline:
+    """Holds a model against its baseline, or records it with ``--mbkit-regen``; a test calls it.
+
+    The file is ``baselines/<test file>/<test>.toml`` beside the test, unless a name is given:
+    then it is ``baselines/<name>.toml``.
+    """
+
+    def __init__(self, request: pytest.FixtureRequest) -> None:
+        self._request = request
+        self._used: dict[Path, str] = {}
+
+    def path(self, name: str | None = None) -> Path:
+        """Return the file."""
+        folder = self._request.path.parent / "baselines"
+        if name is not None:
+            return folder / f"{_plain(name)}.toml"
+        return folder / self._request.path.stem / f"{_plain(self._request.node.name)}.toml"
+
+    def __call__(self, model: Model, name: str | None = None, **record: Any) -> Any:
+        """Hold a model against its baseline.
+
+        Parameters
+        ----------
+        model : Model
+        name : str, optional
+            Of the file; a test that asks twice gives one.
+        **record
+            Arguments of `mbkit.baseline.record`, such as ``engines``, for when it is recorded.
+
+        Returns
+        -------
+        BaselineResult or Baseline
+            What was found, or recorded.
+        """
+        __tracebackhide__ = True
+        path = self.path(name)
+        if self._used.setdefault(path, model.digest) != model.digest:
+            pytest.fail(f"{path}: asked for two models in one test; give each a name", pytrace=False)
+        if self._request.config.getoption("--mbkit-regen"):
+            return self._record(model, path, record)
+        return self._check(model, path)
+
+    def _record(self, model: Model, path: Path, given: Mapping[str, Any]) -> Any:
+        __tracebackhide__ = True
+        from mbkit.studies import baseline as baselines
+
+        target, options = self._target(model, path)
+        # A test that was given another robot means it.
+        arguments = {"target": target, "options": options, "force": True, **given}
+        made = _told(lambda: baselines.record(model, path, **arguments))
+        self._tell(f"recorded {self._shown(path)} ({', '.join(made.engines)})")
+        for told in made.disagreements:
+            self._tell(f"{self._shown(path)}: {told}")
+        return made
+
+    def _check(self, model: Model, path: Path) -> Any:
+        __tracebackhide__ = True
+        from mbkit.errors import BaselineError
+        from mbkit.testing import assert_baseline
+
+        again = f"pytest --mbkit-regen {shlex.quote(self._request.node.nodeid)}"
+        target = self._target(model, path)[0] or None
+
+        def write(error: Exception) -> str:
+            told = f"{error}\n  To record it: {again}" if isinstance(error, BaselineError) else str(error)
+            return told.replace(str(path), self._shown(path))
+
+        result = _told(lambda: assert_baseline(model, path, target=target, remedy=again), write)
+        if result.status == "versions":
+            self._tell(f"{self._shown(path)}: {result.verdict} pytest --mbkit-regen")
+        for refusal in result.skipped:
+            self._tell(f"{self._shown(path)}: {refusal.engine} skipped: {refusal.reason}")
+        return result
+
+    def _target(self, model: Model, path: Path) -> tuple[str, dict[str, Any]]:
+        """Return where the test's own robot came from, so that its links can be named; nothing for another model."""
+        robot = getattr(self._request.node, "callspec", None) and self._request.node.callspec.params.get("mbkit_model")
+        if not isinstance(robot, (str, os.PathLike)) or self._request.getfixturevalue("mbkit_model") is not model:
+            return "", {}
+        from mbkit.studies.baseline.target import kept
+
+        options = {k: x for k, x in _asked(self._request.node).items() if k not in ("robots", "engines")}
+        return kept(_target(os.fspath(robot), self._request), path), options
+
+    def _shown(self, path: Path) -> str:
+        try:
+            return str(path.relative_to(self._request.config.rootpath))
+        except ValueError:
+            return str(path)
+
+    def _tell(self, text: str) -> None:
+        # Reports carry it to the process that prints, whoever ran the test.
+        self._request.node.user_properties.append((_TOLD, text))
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^\w.+-]+", "_", name).strip("._")[:120] or "model"
+
+
+@pytest.fixture
+def mbkit_baseline(request: pytest.FixtureRequest) -> MbkitBaseline:
+    """Call it with a model: hold it against its baseline, or record that with ``--mbkit-regen``."""
+    return MbkitBaseline(request)
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say what was recorded, what was skipped, and where it is time to record anew."""
+    told = {
+        text: None
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if getattr(report, "when", "") == "call"
+        for key, text in getattr(report, "user_properties", ())
+        if key == _TOLD
+    }
+    if told:
+        terminalreporter.section("mbkit")
+        for text in told:
+            terminalreporter.write_line(text)

@@ -1,0 +1,195 @@
+"""What `check` and `diff` return: a status, what led to it, and ways to read them."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from mbkit.errors import OutputError
+from mbkit.studies.baseline.changes import Change
+from mbkit.studies.baseline.versions import VersionChange
+from mbkit.studies.baseline.yardstick import Moved
+from mbkit.studies.result import Refusal
+
+__all__ = ["BaselineResult", "Status"]
+
+Status = Literal["same", "versions", "numbers", "description", "skipped"]
+# A person acts on the first few; the rest is in the data.
+_MOST: Final = 5
+_MOST_CHANGES: Final = 20
+
+
+@dataclass(frozen=True)
+class BaselineResult:
+    """A model held against a baseline, or one baseline against another.
+
+    Attributes
+    ----------
+    question : {"check", "diff"}
+    model, path : str
+    against : str
+        The second file of a `diff`.
+    status : {"same", "versions", "numbers", "description", "skipped"}
+        The gravest thing found; ``"skipped"`` where no engine was there to be asked.
+    engines : tuple of str
+        Those that were asked.
+    changes : tuple of Change
+        Parameters of the description, causes before effects.
+    moved : tuple of Moved
+        Numbers that are not as recorded, by more than rounding.
+    versions : tuple of VersionChange
+    processors : (str, str)
+        Then and now.
+    skipped : tuple of Refusal
+        Engines that are not there, with the reason.
+    strict : bool
+        Whether these fail.
+    notes : tuple of str
+    effect : str
+        What a changed description does to the terms.
+    worst : float
+        The largest error of what is as recorded.
+    """
+
+    question: Literal["check", "diff"]
+    model: str
+    path: str
+    status: Status
+    engines: tuple[str, ...] = ()
+    against: str = ""
+    changes: tuple[Change, ...] = ()
+    moved: tuple[Moved, ...] = ()
+    versions: tuple[VersionChange, ...] = ()
+    processors: tuple[str, str] = ("", "")
+    skipped: tuple[Refusal, ...] = ()
+    strict: bool = False
+    notes: tuple[str, ...] = ()
+    effect: str = ""
+    worst: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether the robot and all engines that were asked are as recorded."""
+        return self.status in ("same", "versions") and not (self.strict and self.skipped)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        how = "missing, which fails (strict)" if self.strict else "skipped"
+        missing = f"; {', '.join(r.engine for r in self.skipped)} {how}" if self.skipped else ""
+        if self.question == "diff":
+            parameters = f"{_count(self.changes, 'parameter')} of the description"
+            told = {
+                "same": "the same robot, with the same numbers",
+                "versions": f"the same numbers, of other versions: {self._told_versions()}",
+                "numbers": "the same description, with other numbers",
+                "description": f"{parameters} differ{'s' if _one(self.changes) else ''}",
+            }
+            return told[self.status]
+        if self.status == "skipped":
+            return f"nothing was checked: {', '.join(f'{r.engine} ({r.reason})' for r in self.skipped)}"
+        if self.status == "description":
+            return f"the description changed in {_count(self.changes, 'parameter')}"
+        if self.status == "numbers":
+            names = ", ".join(dict.fromkeys(r.engine for r in self.moved))
+            return f"{_count(self.moved, 'number')} moved: {names}{missing}"
+        told_worst = f"{', '.join(self.engines)}; largest error {self.worst:.1e}"
+        if self.status == "versions":
+            return f"as recorded ({told_worst}), by other versions: {self._told_versions()}; rebaseline?{missing}"
+        return f"as recorded ({told_worst}){missing}"
+
+    def _told_versions(self) -> str:
+        return ", ".join(map(str, self.versions))
+
+    def lines(self, everything: bool = False) -> Iterator[tuple[str, str]]:
+        """Iterate over what was found, gravest first: (what it is about, what is to be said).
+
+        Unless `everything` is asked for, the first 20 parameters and of each engine the 5 numbers that
+        are off most.
+        """
+        most = len(self.moved) if everything else _MOST
+        shown = self.changes if everything else self.changes[:_MOST_CHANGES]
+        for change in shown:
+            yield "description", change.text
+        if len(shown) < len(self.changes):
+            yield "description", f"and {len(self.changes) - len(shown)} more"
+        if self.effect:
+            yield "effect", self.effect
+        for engine in dict.fromkeys(r.engine for r in self.moved):
+            rows = sorted((r for r in self.moved if r.engine == engine), key=lambda r: -r.error)
+            cause = f" ({rows[0].cause})" if rows[0].cause else ""
+            for row in rows[:most]:
+                yield f"{engine}{cause}", str(row)
+            if len(rows) > most:
+                rest = ", ".join(dict.fromkeys(r.term for r in rows[most:]))
+                yield f"{engine}{cause}", f"and {len(rows) - most} more: {rest}"
+        if self.moved or self.changes:
+            for version in self.versions:
+                yield "version", str(version)
+            if self.processors[0] != self.processors[1]:
+                yield "processor", " → ".join(self.processors)
+        for refusal in self.skipped:
+            yield refusal.engine, refusal.reason if self.strict else f"skipped: {refusal.reason}"
+        for note in self.notes:
+            yield "note", note
+
+    def text(self, remedy: str = "") -> str:
+        """Return everything for a terminal without colours; `remedy` is how the caller records anew."""
+        head = f"{self.model}, {self.path}: {self.verdict}"
+        if self.question == "diff":
+            head = f"{self.path} → {self.against}: {self.verdict}"
+        out = [head, *(f"  {what}: {told}" for what, told in self.lines())]
+        if self.status in ("description", "numbers") and self.question == "check" and remedy:
+            out.append(f"  If this is meant: {remedy}")
+        return "\n".join(out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return asdict(self) | {"passed": self.passed, "verdict": self.verdict}
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """Return the result as JSON, and write it to `path` if given. What is not finite becomes null."""
+        text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False, ensure_ascii=False)
+        if path is not None:
+            try:
+                Path(path).write_text(text, encoding="utf-8")
+            except OSError as error:
+                raise OutputError(f"cannot write {path}: {error.strerror}; the result itself is kept") from error
+        return text
+
+    def to_markdown(self) -> str:
+        """Return it as a list in Markdown."""
+        found = [f"- {what}: {told}" for what, told in self.lines(everything=True)]
+        return "\n".join([f"**{self.model}**: {self.verdict}", "", *found]).rstrip() + "\n"
+
+    def _repr_html_(self) -> str:
+        found = "".join(
+            f"<li>{html.escape(what)}: {html.escape(told)}</li>" for what, told in self.lines(everything=True)
+        )
+        return f"<p><b>{html.escape(self.model)}</b>: {html.escape(self.verdict)}</p>" + (
+            f"<ul>{found}</ul>" if found else ""
+        )
+
+    def __repr__(self) -> str:
+        return f"<BaselineResult of {self.model!r}: {self.verdict}>"
+
+
+def _one(found: Sequence[object]) -> bool:
+    return len(found) == 1
+
+
+def _count(found: Sequence[object], noun: str) -> str:
+    return f"{len(found)} {noun}{'' if _one(found) else 's'}"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

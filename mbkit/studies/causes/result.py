@@ -1,0 +1,218 @@
+"""What an explanation is: frozen data, and ways to read it."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit.errors import OutputError
+from mbkit.studies.causes.matching import Match
+from mbkit.studies.causes.terms import Gap
+
+__all__ = ["Cause", "Explanation", "effect", "grouped", "plain", "saved"]
+
+#: More causes of one kind than this are told in one line.
+_FEW: Final = 3
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One thing that makes the second side differ from the first.
+
+    Attributes
+    ----------
+    kind : str
+        The usual mistake's name, such as ``"armature"`` or ``"inertia about the wrong point"``.
+    subject : str
+        The body, the joint or the whole.
+    says : str
+        What the second side did, as a sentence.
+    a, b : float, list or None
+        The numbers of the two sides, where they are numbers.
+    effects : dict
+        Term -> relative difference that this cause alone makes, all others being set right;
+        infinite where the two sides have other coordinates because of it, and NaN where there
+        are too many causes to look at each.
+    acts : bool
+        Whether any of that is above the tolerance; else it is data that moves nothing.
+    """
+
+    kind: str
+    subject: str
+    says: str
+    a: Any
+    b: Any
+    effects: dict[str, float]
+    acts: bool
+
+    def __str__(self) -> str:
+        return self.says
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why two descriptions or engines differ, or that they do not.
+
+    Attributes
+    ----------
+    a, b : str
+        What the two sides are called.
+    agree : bool
+        Whether all terms agree by joint name.
+    gaps : tuple of Gap
+        How far each term is apart, joints matched by name where they have the same names.
+    comparable : bool
+        Whether both have the same coordinates, so that terms can be compared.
+    matches : tuple of Match
+        Who is who, and whether by name or by structure.
+    only_a, only_b : tuple of str
+        Joints without a counterpart.
+    causes : tuple of Cause
+    notes : tuple of str
+        Differences that are none, such as frames drawn elsewhere.
+    explained : bool
+        Whether the difference vanishes once all causes are applied to one side.
+    left : tuple of Gap
+        What remains then.
+    subtree : tuple of str
+        Where something remains: the joints of the smallest part that still differs.
+    samples, seed : int
+    tolerance : float
+        Relative difference of a term above which two sides differ.
+    """
+
+    a: str
+    b: str
+    agree: bool
+    gaps: tuple[Gap, ...]
+    comparable: bool
+    matches: tuple[Match, ...]
+    only_a: tuple[str, ...]
+    only_b: tuple[str, ...]
+    causes: tuple[Cause, ...]
+    notes: tuple[str, ...]
+    explained: bool
+    left: tuple[Gap, ...]
+    subtree: tuple[str, ...]
+    samples: int
+    seed: int
+    tolerance: float
+
+    @property
+    def acting(self) -> tuple[Cause, ...]:
+        """The causes that change the motion."""
+        return tuple(c for c in self.causes if c.acts)
+
+    @property
+    def worst(self) -> float:
+        """The largest relative difference of a term; infinite where the coordinates are not the same."""
+        return max((g.relative for g in self.gaps), default=0.0) if self.comparable else math.inf
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: the same, or why not."""
+        silent = len(self.causes) - len(self.acting)
+        beside = f"; {silent} difference{'s' if silent > 1 else ''} in data that move nothing" if silent else ""
+        if self.agree:
+            return f"{self.b} moves as {self.a} does (to {self.worst:.1e}){beside}"
+        apart = f"by {self.worst:.1e}" if self.comparable else "in its coordinates"
+        head = f"{self.b} differs from {self.a} {apart}"
+        if not self.explained:
+            where = f"; the smallest part that still differs: {', '.join(self.subtree)}" if self.subtree else ""
+            found = (
+                f"{len(self.acting)} causes found do not explain it all" if self.acting else "no usual cause does it"
+            )
+            return f"{head}, and {found}{where}"
+        count = len(self.acting)
+        return f"{head}, for {'one reason' if count == 1 else f'{count} reasons'}{beside}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return asdict(self) | {"verdict": self.verdict}
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """Return the result as JSON, and write it to `path` if given. Infinity and NaN become null."""
+        return saved(self.to_dict(), path)
+
+    def to_markdown(self) -> str:
+        """Return verdict, causes and notes in Markdown."""
+        lines = [f"**{self.a} and {self.b}**: {self.verdict}", ""]
+        if self.causes:
+            lines += ["| cause | what | effect |", "|---|---|---|"]
+            lines += [f"| {kind} | {says} | {what} |" for kind, says, what in grouped(self.causes)]
+            lines.append("")
+        lines += [f"- {note}" for note in self.notes]
+        return "\n".join(lines).rstrip() + "\n"
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f"<tr><td>{html.escape(kind)}</td><td>{html.escape(says)}</td><td>{what}</td></tr>"
+            for kind, says, what in grouped(self.causes)
+        )
+        head = "".join(f"<th>{h}</th>" for h in ("cause", "what", "effect"))
+        notes = "".join(f"<li>{html.escape(n)}</li>" for n in self.notes)
+        return (
+            f"<p><b>{html.escape(self.a)} and {html.escape(self.b)}</b>: {html.escape(self.verdict)}</p>"
+            + (f"<table><tr>{head}</tr>{cells}</table>" if cells else "")
+            + (f"<ul>{notes}</ul>" if notes else "")
+        )
+
+    def __repr__(self) -> str:
+        return f"<Explanation: {self.verdict}>"
+
+
+def effect(cause: Cause) -> str:
+    """Return what a cause does, in a few words."""
+    if not cause.acts:
+        return "moves nothing"
+    term, largest = max(cause.effects.items(), key=lambda x: x[1])
+    if math.isnan(largest):
+        return "one of many"
+    return "other coordinates" if math.isinf(largest) else f"{term} by {largest:.1e}"
+
+
+def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:
+    """Return kind, sentence and effect of each cause, many of one kind and effect taken together."""
+    by_kind: dict[tuple[str, bool], list[Cause]] = {}
+    for c in causes:
+        by_kind.setdefault((c.kind, c.acts), []).append(c)
+    out = []
+    for (kind, _), some in by_kind.items():
+        if len(some) <= _FEW:
+            out += [(kind, c.says, effect(c)) for c in some]
+            continue
+        largest = max(some, key=lambda c: max(c.effects.values(), default=0.0))
+        names = ", ".join(c.subject.split("'")[1] if "'" in c.subject else c.subject for c in some)
+        out.append((kind, f"{len(some)} times, first {some[0].says}; in all: {names}", effect(largest)))
+    return out
+
+
+def plain(value: Any) -> Any:
+    """Return numbers of a description as JSON takes them."""
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (np.floating, np.integer)):
+        return value.item()
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def saved(data: dict[str, Any], path: str | Path | None) -> str:
+    """Return data as JSON, and write it if a path is given."""
+    text = json.dumps(plain(data), indent=1, allow_nan=False)
+    if path is not None:
+        try:
+            Path(path).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}; the result itself is kept") from error
+    return text

@@ -1,0 +1,80 @@
+"""Usual mistakes with what belongs to no single body or joint: gravity, springs between points, the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.model import Model
+from mbkit.studies.causes.hypothesis import Guess, Hypothesis, told
+from mbkit.studies.causes.near import Near
+
+__all__ = ["gravities", "named", "with_gravity"]
+
+
+def with_gravity(model: Model, gravity: Array) -> Model:
+    """Return the description under another gravity."""
+    return replace(model, gravity=gravity)
+
+
+def gravities(a: Array) -> Iterator[Guess]:
+    """Yield what gravity could be after each mistake."""
+    if a.any():
+        yield Guess("gravity", "has no gravity", np.zeros(3))
+        yield Guess("gravity", "has gravity with the other sign", -a)
+
+
+def named(a: Model, b: Model, near: Near) -> list[Hypothesis]:
+    """Return what makes gravity, springs, loops and prescribed motions of `a` those of `b`."""
+    out = []
+    if not near.vector(a.gravity, b.gravity, max(1.0, float(np.abs(a.gravity).max()))):
+        says = next((g.says for g in gravities(a.gravity) if near.vector(g.value, b.gravity)), None)
+        says = says or f"has the gravity {told(b.gravity)} m/s² for {told(a.gravity)}"
+        gravity = b.gravity
+        out.append(Hypothesis("gravity", "", says, lambda m: with_gravity(m, gravity), a.gravity, b.gravity))
+    for field, kind, what in (
+        ("springs", "point spring", "spring"),
+        ("loops", "loop", "loop"),
+        ("prescribed", "prescribed motion", "motion of"),
+    ):
+        out += _parts(a, b, field, kind, what, near)
+    return out
+
+
+def _parts(a: Model, b: Model, field: str, kind: str, what: str, near: Near) -> list[Hypothesis]:
+    key = "joint" if field == "prescribed" else "name"
+    ours, theirs = ({getattr(x, key): x for x in getattr(m, field)} for m in (a, b))
+    out = []
+    for name in dict.fromkeys([*ours, *theirs]):
+        one, other = ours.get(name), theirs.get(name)
+        if one is not None and other is not None and _alike(one, other, near):
+            continue
+        says = "lacks it" if other is None else "has it besides" if one is None else "has other numbers for it"
+        out.append(Hypothesis(kind, f"{what} {name!r}", says, _exchange(field, key, name, other)))
+    return out
+
+
+def _exchange(field: str, key: str, name: str, part: Any) -> Any:
+    def apply(model: Model) -> Model:
+        kept = [x for x in getattr(model, field) if getattr(x, key) != name]
+        changes: Any = {field: tuple(kept if part is None else [*kept, part])}
+        return replace(model, **changes)
+
+    return apply
+
+
+def _alike(a: Any, b: Any, near: Near) -> bool:
+    for x, y in zip(a._values(), b._values(), strict=True):
+        if isinstance(x, np.ndarray):
+            if not near.point(x, y):
+                return False
+        elif isinstance(x, float):
+            if not near.number(x, y):
+                return False
+        elif x != y:
+            return False
+    return True

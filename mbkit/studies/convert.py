@@ -1,0 +1,186 @@
+"""`convert`: a description in another format, checked by reading it back."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from mbkit._version import __version__
+from mbkit.errors import InputError, MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
+from mbkit.load import load
+from mbkit.load.urdf_text import urdf_text
+from mbkit.model import Model
+from mbkit.studies.causes.explaining import explain
+from mbkit.studies.causes.result import Cause
+from mbkit.studies.causes.terms import Gap, evaluated, gaps, model_terms, states_of
+
+__all__ = ["FORMATS", "Converted", "convert"]
+
+FORMATS: Final = ("mjcf", "urdf")
+#: What rounding of rotations and of principal axes may cost.
+_TOLERANCE: Final = 1e-11
+_STATES: Final = 5
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A description in another format.
+
+    Attributes
+    ----------
+    model : str
+    format : str
+        ``"mjcf"`` or ``"urdf"``.
+    text : str
+    gaps : tuple of Gap
+        How far each term of what was read back is from the description's.
+    notes : tuple of str
+        What the text does not hold, and what it holds otherwise.
+    """
+
+    model: str
+    format: str
+    text: str
+    gaps: tuple[Gap, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def worst(self) -> float:
+        """The largest relative difference of a term after reading back."""
+        return max((g.relative for g in self.gaps), default=0.0)
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the text to a file, and return its path."""
+        out = Path(path)
+        try:
+            out.write_text(self.text, encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"cannot write {out}: {error.strerror}; the text itself is kept") from error
+        return out
+
+    def __repr__(self) -> str:
+        return (
+            f"<Converted {self.model!r} to {self.format}: {len(self.text)} characters, read back to {self.worst:.1e}>"
+        )
+
+
+def convert(model: Model, to: str) -> Converted:
+    """Write a description as MJCF or URDF, and read it back to see that it says the same.
+
+    The motion alone is written: bodies, joints, masses, inertias, springs, dampers, armature, limits, dry
+    friction, frames; no geometry. MJCF is the MuJoCo model that mbkit itself builds, with all digits, read
+    back with MuJoCo's own parser; URDF is read back with Pinocchio's.
+
+    Parameters
+    ----------
+    model : Model
+        Parameters take their values.
+    to : {"mjcf", "urdf"}
+
+    Returns
+    -------
+    Converted
+        With ``text``, ``notes`` and the differences of terms after reading back.
+
+    Raises
+    ------
+    UnsupportedError
+        The format cannot say it; everything that it cannot say is named.
+    MbkitError
+        What was read back differs, with the reason.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> made = mb.convert(mb.catalog.pendulum(), "mjcf")
+    >>> made.worst < 1e-12
+    True
+    """
+    if not isinstance(model, Model):
+        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    if to not in FORMATS:
+        raise UnknownNameError("format", str(to), FORMATS)
+    if model.written is not None:
+        raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
+    if model.parameters:
+        model.require_values("convert")
+        model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
+    return _to_mjcf(model) if to == "mjcf" else _to_urdf(model)
+
+
+def _head(model: Model, to: str) -> str:
+    return (
+        f"{model.name}, written by mbkit {__version__} from its own description (digest {model.digest[:12]}): the "
+        "motion alone, without geometry, contacts, sensors or actuators. Read back when it was written: M, g, nle and "
+        f"passive forces {to}."
+    )
+
+
+def _to_mjcf(model: Model) -> Converted:
+    from mbkit.engines.mujoco_text import mjcf_text, read_back
+
+    notes = []
+    if model.layout.reduced:
+        notes.append("mimic joints are free joints with equality constraints, which MuJoCo keeps softly")
+    if model.needs.limits or model.needs.friction:
+        notes.append("MuJoCo acts on joint limits and dry friction, softly, which mbkit's terms leave out")
+    if any(np.isfinite(j.velocity_limit).any() for j in model.joints):
+        notes.append("MJCF has no velocity limits")
+    lifted = _degenerate(model)
+    if lifted:
+        notes.append(f"principal moments of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}")
+    text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
+    at = states_of(model, _STATES, 0)
+    values = evaluated(read_back(model, text), at)
+    found = gaps(model_terms(model, at), values, at.v, _owners(model))
+    if not found.comparable or found.worst > _TOLERANCE:
+        why = f"MuJoCo wants inertias with A + B >= C of {', '.join(lifted)}" if lifted else "please report this model"
+        raise MbkitError(
+            f"convert: what was written of {model.name} reads back otherwise: {found.worst:.1e} at {found.joint}; {why}"
+        )
+    return Converted(model.name, "mjcf", text, found.terms, tuple(notes))
+
+
+def _degenerate(model: Model) -> list[str]:
+    """Return the bodies whose moments MuJoCo would not take as they are."""
+    names = []
+    for body in model.bodies:
+        low, middle, high = np.linalg.eigvalsh(body.inertia)
+        if body.mass and (low < 1e-15 or low + middle < high):
+            names.append(repr(body.name))
+    return names
+
+
+def _to_urdf(model: Model) -> Converted:
+    notes = []
+    if not np.array_equal(model.gravity, [0.0, 0.0, -9.81]):
+        notes.append(f"URDF has no gravity: load it with gravity={tuple((model.gravity + 0.0).tolist())}")
+    hidden = {f.name for f in model.frames} & {b.name for b in model.bodies}
+    if hidden:
+        notes.append(f"frames that have a body's name were left out: {', '.join(sorted(hidden))}")
+    text = urdf_text(model, _head(model, "agreed with the description by Pinocchio's parser"))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.urdf"
+        path.write_text(text, encoding="utf-8")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MbkitWarning)
+            back = load(path, gravity=model.gravity, nonphysical="warn")
+    found = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
+    acting: tuple[Cause, ...] = found.acting
+    if not found.agree or acting:
+        told = "; ".join(str(c) for c in acting) or found.verdict
+        raise MbkitError(
+            f"convert: what was written of {model.name} reads back otherwise: {told}; please report this model"
+        )
+    order = [c.says for c in found.causes if c.kind == "joint order"]
+    return Converted(model.name, "urdf", text, found.gaps, (*notes, *order))
+
+
+def _owners(model: Model) -> list[str]:
+    return [j.name for j in model.independent_joints for _ in range(j.type.nv)]

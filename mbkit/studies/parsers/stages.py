@@ -1,0 +1,215 @@
+"""The stages at which a reading of a file is compared with another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines.imported import Imported
+from mbkit.model import Joint, Model
+from mbkit.studies.causes.alignment import aligned, renamed
+from mbkit.studies.causes.compact import Compact
+from mbkit.studies.causes.hypothesis import angle_of, told
+from mbkit.studies.causes.joints import HINGES
+from mbkit.studies.causes.matching import Matching
+from mbkit.studies.causes.near import Near
+from mbkit.studies.causes.structure import settled
+from mbkit.studies.causes.terms import States, Values, gaps, model_terms, states_of
+from mbkit.studies.parsers.result import Stage
+
+__all__ = ["stages", "unmimicked"]
+
+_LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
+
+
+@dataclass(frozen=True)
+class _Difference:
+    where: str
+    size: float
+    says: str
+
+
+def unmimicked(model: Model) -> Model:
+    """Return the description with every mimic joint free, as importers leave them."""
+    return replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))
+
+
+def stages(reference: Model, imported: Imported, samples: int, seed: int, tolerance: float) -> tuple[Stage, ...]:
+    """Compare what an importer made with the reference, from the tree to the terms.
+
+    Parameters
+    ----------
+    reference : Model
+    imported : Imported
+    samples, seed : int
+        Random states for M, g and nle, which the importer's own engine computes on its own model.
+    tolerance : float
+    """
+    free = unmimicked(reference)
+    near = Near.of(free, tolerance)
+    one, other, matching, structural = settled(free, imported.model, near)
+    there = aligned(renamed(other, one.model, matching), one.model, near).compact
+    pairs = [(a, b) for a, b in zip(one.model.joints, there.model.joints, strict=False) if a.name == b.name]
+    alone = [h.subject for h in structural]
+    out = [
+        Stage(
+            "joints",
+            not alone,
+            float(len(alone)),
+            alone[0] if alone else "",
+            f"{len(alone)} without a counterpart: {', '.join(alone)}" if alone else "",
+        ),
+        *_tree(pairs, near),
+        _mimics(reference, imported.model, matching),
+        *_matter(one, there, near),
+        *_numbers(pairs, near),
+    ]
+    return (*out, *_terms(one.model, imported, matching, structural, samples, seed, tolerance))
+
+
+def _stage(name: str, found: Iterable[_Difference]) -> Stage:
+    some = list(found)
+    if not some:
+        return Stage(name, True, 0.0, "", "")
+    worst = max(some, key=lambda d: d.size)
+    more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
+    return Stage(name, False, worst.size, worst.where, f"{worst.where}: {worst.says}{more}")
+
+
+def _tree(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
+    def kinds(a: Joint, b: Joint) -> _Difference | None:
+        same = a.kind == b.kind or {a.kind, b.kind} == HINGES
+        return None if same else _Difference(a.name, 1.0, f"{b.kind} for {a.kind}")
+
+    def parents(a: Joint, b: Joint) -> _Difference | None:
+        return None if a.parent == b.parent else _Difference(a.name, 1.0, f"on {b.parent} for {a.parent}")
+
+    def places(a: Joint, b: Joint) -> _Difference | None:
+        if near.vector(a.rotation, b.rotation) and near.point(a.translation, b.translation):
+            return None
+        far = float(np.linalg.norm(a.translation - b.translation))
+        turn = angle_of(a.rotation.T @ b.rotation)
+        return _Difference(a.name, max(far, turn), f"{far:.3g} m and {turn:.3g} rad off")
+
+    def axes(a: Joint, b: Joint) -> _Difference | None:
+        if near.vector(a.axes, b.axes):
+            return None
+        return _Difference(a.name, float(np.abs(a.axes - b.axes).max()), f"{told(b.axes)} for {told(a.axes)}")
+
+    checks: dict[str, Callable[[Joint, Joint], _Difference | None]] = {
+        "kinds": kinds,
+        "parents": parents,
+        "places": places,
+        "axes": axes,
+    }
+    same_kind = [(a, b) for a, b in pairs if a.axes.shape == b.axes.shape]
+    return [
+        _stage(name, (d for a, b in (same_kind if name == "axes" else pairs) if (d := check(a, b)) is not None))
+        for name, check in checks.items()
+    ]
+
+
+def _mimics(reference: Model, made: Model, matching: Matching) -> Stage:
+    theirs = {j.name: j.mimic for j in made.joints}
+    lost = [
+        j.name for j in reference.joints if j.mimic is not None and theirs.get(matching.to_b.get(j.name, "")) is None
+    ]
+    says = f"{len(lost)} left free: {', '.join(lost)}" if lost else ""
+    return Stage("mimic", not lost, float(len(lost)), lost[0] if lost else "", says)
+
+
+def _matter(one: Compact, other: Compact, near: Near) -> list[Stage]:
+    total = [sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other)]
+    whole = []
+    if not near.number(*total):
+        base = " (the base's)" if near.number(total[0] - total[1], one.ground.mass - other.ground.mass) else ""
+        whole = [_Difference("all", abs(total[1] / total[0] - 1), f"{told(total[1])} kg for {told(total[0])} kg{base}")]
+    masses, coms, inertias = [], [], []
+    theirs = {b.name: b for b in other.model.bodies}
+    for a in one.model.bodies:
+        if a.name not in theirs:
+            continue
+        b = theirs[a.name]
+        if not near.number(a.mass, b.mass):
+            size = abs(b.mass - a.mass) / max(a.mass, b.mass)
+            masses.append(_Difference(a.name, size, f"{told(b.mass)} kg for {told(a.mass)} kg"))
+        if not near.point(a.com, b.com):
+            size = float(np.linalg.norm(a.com - b.com))
+            coms.append(_Difference(a.name, size, f"{told(b.com)} for {told(a.com)} m"))
+        if not near.inertia(a.inertia, b.inertia, a.mass):
+            size = float(np.abs(b.inertia - a.inertia).max() / max(np.abs(a.inertia).max(), np.abs(b.inertia).max()))
+            inertias.append(_Difference(a.name, size, f"{told(b.inertia)} for {told(a.inertia)} kg m²"))
+    return [
+        _stage("total mass", whole),
+        _stage("masses", masses),
+        _stage("centres of mass", coms),
+        _stage("inertias", inertias),
+    ]
+
+
+def _numbers(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
+    out = []
+    for name in ("armature", "damping", "friction", "limits"):
+        found = []
+        for a, b in pairs:
+            for field in _LIMITS if name == "limits" else (name,):
+                x, y = getattr(a, field), getattr(b, field)
+                if x.shape == y.shape and not near.numbers(x, y):
+                    size = float(np.max(np.where(np.isfinite(x) & np.isfinite(y), np.abs(y - x), np.inf)))
+                    label = f"{field.replace('_', ' ')} " if name == "limits" else ""
+                    found.append(_Difference(a.name, size, f"{label}{told(y)} for {told(x)}"))
+        out.append(_stage(name, found))
+    return out
+
+
+def _terms(
+    reference: Model,
+    imported: Imported,
+    matching: Matching,
+    structural: list[Any],
+    samples: int,
+    seed: int,
+    tolerance: float,
+) -> list[Stage]:
+    names = ("M", "g", "nle")
+    if structural:
+        return [Stage(n, None, np.nan, "", "other coordinates") for n in names]
+    at = states_of(reference, samples, seed)
+    values = _asked(reference, imported, matching, at)
+    owners = [j.name for j in reference.independent_joints for _ in range(j.type.nv)]
+    found = gaps(model_terms(reference, at), values, at.v, owners)
+    if not found.comparable:
+        return [Stage(n, None, np.nan, "", "other coordinates") for n in names]
+    return [
+        Stage(g.term, g.relative <= tolerance, g.relative, g.joint, f"{g.relative:.1e} at {g.joint}")
+        for g in found.terms
+        if g.term in names
+    ]
+
+
+def _asked(reference: Model, imported: Imported, matching: Matching, at: States) -> Values:
+    """Return the engine's own terms of its own model, in the reference's coordinates by joint name."""
+    theirs = imported.model.layout
+    q_order, v_order = (
+        np.concatenate(
+            [
+                np.arange(r[matching.to_b[j.name]].start, r[matching.to_b[j.name]].stop)
+                for j in reference.independent_joints
+            ]
+        )
+        for r in (theirs.q, theirs.v)
+    )
+    q, v = np.empty((len(at.q), theirs.sizes[0])), np.empty((len(at.v), theirs.sizes[1]))
+    if q.shape != at.q.shape or v.shape != at.v.shape:
+        return {}
+    q[:, q_order], v[:, v_order] = at.q, at.v
+    made = imported.terms(q, v)
+    return {k: _ordered(x, v_order) for k, x in made.items()}
+
+
+def _ordered(x: Array, order: np.ndarray) -> Array:
+    return x[:, order][:, :, order] if x.ndim == 3 else x[:, order]

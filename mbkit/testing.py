@@ -1,0 +1,219 @@
+"""Asserts for tests of robots and engines, in pytest, unittest or a script.
+
+Each raises AssertionError with what differs, at which joint, and what to do next. With pytest
+there are fixtures too, see `mbkit.pytest_plugin`.
+"""
+
+from __future__ import annotations
+
+import os
+import unittest
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mbkit.model import Model
+    from mbkit.studies.baseline import BaselineResult
+    from mbkit.studies.causes import Explanation
+    from mbkit.studies.result import Comparison, Row
+
+__all__ = ["STRICT", "assert_baseline", "assert_engines_agree", "assert_same_dynamics"]
+
+#: Set to 1, an engine that is not installed fails a test instead of being skipped.
+STRICT = "MBKIT_TEST_STRICT"
+# A person acts on the first few.
+_MOST = 8
+_SAMPLES = 16
+
+
+def assert_engines_agree(
+    model: Model,
+    engines: Sequence[str] = ("pinocchio", "lagrangian", "mujoco"),
+    rtol: float = 1e-12,
+    *,
+    samples: int = _SAMPLES,
+    seed: int = 0,
+    strict: bool | None = None,
+) -> Comparison:
+    """Assert that every engine gives every term of a model as the 34-digit oracle does.
+
+    Parameters
+    ----------
+    model : Model
+    engines : sequence of str
+        At least two. One that is not installed is left out, and with fewer than two left the test is
+        skipped; one that refuses the model fails.
+    rtol : float
+        Largest error, normwise relative to the forces at play, as `mbkit.compare` measures it.
+    samples, seed : int
+        Random states, beside which stand neutral, at-limit and near-singular ones.
+    strict : bool, optional
+        Whether an engine that is not installed fails; by default what ``MBKIT_TEST_STRICT`` says.
+
+    Returns
+    -------
+    Comparison
+        What `mbkit.compare` returns.
+
+    Raises
+    ------
+    AssertionError
+        Engines differ; with terms, joints, the worst state, known defects and versions.
+    unittest.SkipTest
+        Fewer than two of the engines are installed.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> from mbkit.testing import assert_engines_agree
+    >>> assert_engines_agree(mb.catalog.pendulum(), engines=("pinocchio", "lagrangian"), samples=2).passed
+    True
+    """
+    __tracebackhide__ = True
+    from mbkit.studies import compare
+    from mbkit.studies.installed import not_installed
+
+    missing = {} if isinstance(engines, str) else not_installed(engines)
+    present = [name for name in engines if name not in missing]
+    told = "; ".join(f"{name}: {why}" for name, why in missing.items())
+    if missing and _strict(strict):
+        raise AssertionError(f"engines are missing, and the test is strict: {told}")
+    if missing and len(present) < 2:
+        raise unittest.SkipTest(told)
+    result = compare(model, present if missing else engines, samples, seed, tolerance=rtol, terms_only=True)
+    refused = [r for r in result.refusals if not r.term]
+    failed = [r for r in result.rows if not r.passed]
+    if failed or refused or not result.rows:
+        raise AssertionError(_comparison_text(result, failed, [f"{r.engine} refuses it: {r.reason}" for r in refused]))
+    return result
+
+
+def assert_same_dynamics(
+    model_a: Model, model_b: Model, rtol: float = 1e-9, *, samples: int = 3, seed: int = 0
+) -> Explanation:
+    """Assert that two models move alike: the same terms at the same states, joint by joint.
+
+    Joints may stand in another order, bodies be cut otherwise, and frames be drawn elsewhere.
+
+    Parameters
+    ----------
+    model_a, model_b : Model
+    rtol : float
+        Largest difference, normwise relative to the forces at play. A converted file has as many digits as
+        its converter wrote.
+    samples, seed : int
+        Random states.
+
+    Returns
+    -------
+    Explanation
+        What `mbkit.studies.causes.explain` returns.
+
+    Raises
+    ------
+    AssertionError
+        They do not; with the causes that make the difference vanish, or the smallest part that differs.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> from mbkit.testing import assert_same_dynamics
+    >>> assert_same_dynamics(mb.catalog.pendulum(), mb.catalog.pendulum()).agree
+    True
+    """
+    __tracebackhide__ = True
+    from mbkit.studies.causes import explain
+
+    names = (model_a.name, model_b.name) if model_a.name != model_b.name else ("model_a", "model_b")
+    found = explain(model_a, model_b, samples=samples, seed=seed, tolerance=rtol, names=names)
+    if not found.agree:
+        raise AssertionError(_explanation_text(found))
+    return found
+
+
+def assert_baseline(
+    model: Model,
+    path: str | os.PathLike[str],
+    *,
+    strict: bool | None = None,
+    target: str | None = None,
+    remedy: str = "",
+) -> BaselineResult:
+    """Assert that a model and the engines are as a baseline has them.
+
+    Parameters
+    ----------
+    model : Model
+    path : path
+        What `mbkit.baseline.record` wrote.
+    strict : bool, optional
+        Whether an engine that was recorded and is not installed fails; by default what
+        ``MBKIT_TEST_STRICT`` says.
+    target : str, optional
+        What the model was loaded from, where that is not what was recorded.
+    remedy : str
+        How to record anew, for the message.
+
+    Returns
+    -------
+    BaselineResult
+        Of which the status ``"versions"`` says that it is time to record anew.
+
+    Raises
+    ------
+    AssertionError
+        A parameter or a number changed.
+    unittest.SkipTest
+        None of the engines is installed.
+    BaselineError
+        The file cannot be read, or is another robot's.
+    """
+    __tracebackhide__ = True
+    from mbkit.studies.baseline import check
+
+    result = check(model, path, strict=_strict(strict), target=target)
+    if result.status == "skipped" and not result.strict:
+        raise unittest.SkipTest(result.verdict)
+    if not result.passed:
+        raise AssertionError(result.text(remedy or f"mbkit.baseline.record(model, {os.fspath(path)!r})"))
+    return result
+
+
+def _strict(asked: bool | None) -> bool:
+    return os.environ.get(STRICT, "0") not in ("", "0") if asked is None else asked
+
+
+def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterable[str]) -> str:
+    lines = [
+        f"{result.model}: {len(failed)} of {len(result.rows)} comparisons are off by more than {result.tolerance:.0e}"
+    ]
+    worst = sorted(failed, key=lambda r: -r.relative)
+    lines += [f"  {r.engine}, {r.term}: {r.reason}" for r in worst[:_MOST]]
+    if len(worst) > _MOST:
+        lines.append(f"  and {len(worst) - _MOST} more")
+    lines += [f"  {told}" for told in refused]
+    if worst and worst[0].worst_q:
+        lines.append(f"  worst state ({worst[0].worst_kind}): q = {_numbers(worst[0].worst_q)}")
+        lines.append(f"                v = {_numbers(worst[0].worst_v)}")
+    packages = {"pinocchio": "pin", "mujoco": "mujoco", "drake": "drake", "lagrangian": "casadi"}
+    lines.append(f"  {', '.join(f'{packages[e]} {result.versions[packages[e]]}' for e in result.engines)}")
+    lines.append(f"  to see it all: mbkit.compare(model, {result.engines}, {result.samples}, {result.seed})")
+    return "\n".join(lines)
+
+
+def _explanation_text(found: Explanation) -> str:
+    lines = [f"{found.verdict} (rtol {found.tolerance:.0e})"]
+    apart = [g for g in found.gaps if g.relative > found.tolerance]
+    lines += [f"  {g.term} at {g.joint or 'no single joint'}: off by {g.relative:.1e}" for g in apart]
+    lines += [f"  cause: {c.says}" for c in found.acting[:_MOST]]
+    if len(found.acting) > _MOST:
+        lines.append(f"  and {len(found.acting) - _MOST} more causes")
+    for names, side in ((found.only_a, found.a), (found.only_b, found.b)):
+        if names:
+            lines.append(f"  only in {side}: {', '.join(names)}")
+    lines += [f"  note: {note}" for note in found.notes]
+    return "\n".join(lines)
+
+
+def _numbers(x: Sequence[float]) -> str:
+    return f"[{', '.join(f'{a:.6g}' for a in x)}]"

@@ -1,0 +1,471 @@
+"""Planted differences are found and named, in descriptions and engines; what nothing explains is narrowed down."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from random_trees import random_tree
+
+import mbkit as mb
+from mbkit import spatial
+from mbkit.engines.base import per_sample
+from mbkit.engines.mujoco import MujocoDynamics
+from mbkit.engines.pinocchio import PinocchioDynamics
+from mbkit.errors import InputError, MbkitWarning
+from mbkit.model import Body, Joint, Mimic, Model
+
+ROBOTS = ("panda", "ur5", "solo8", "so100", "kinova")
+
+
+@cache
+def robot(name: str) -> Model:
+    """A robot with a free base, a helical joint, a mimic joint, damping and a tool fixed to it in a rotated frame."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MbkitWarning)
+        model = mb.load(name, floating_base=True, mimic="free")
+    joints = list(model.joints)
+    hinges = [k for k, j in enumerate(joints) if j.kind in ("revolute", "continuous")]
+    first, second, _, *_, last = hinges
+    joints[second] = replace(joints[second], kind="helical", pitch=0.03)
+    joints[last] = replace(joints[last], mimic=Mimic(joints[first].name, 0.5, 0.2))
+    joints = [replace(j, damping=j.damping + 0.01) if j.type.nv == 1 else j for j in joints]
+    R = spatial.matrix_from_rpy(0.4, -0.7, 1.1)
+    fixed = _fixed("mount", joints[hinges[2]].child, "tool", R, np.array([0.1, 0.02, -0.05]))
+    I = np.array([[3e-3, 2e-4, -1e-4], [2e-4, 4e-3, 3e-4], [-1e-4, 3e-4, 5e-3]])
+    tool = Body("tool", 0.8, np.array([0.03, -0.02, 0.06]), I)
+    return replace(model, joints=(*joints, fixed), bodies=(*model.bodies, tool), nonphysical=())
+
+
+def _fixed(name: str, parent: str, child: str, R: np.ndarray, p: np.ndarray) -> Joint:
+    none = np.empty(0)
+    return Joint(name, "fixed", parent, child, R, p, np.empty((0, 3)), 0.0, *[none] * 9)
+
+
+def hinges(model: Model) -> list[Joint]:
+    return [j for j in model.joints if j.kind in ("revolute", "continuous") and j.mimic is None]
+
+
+def carried(model: Model) -> Body:
+    """A body whose inertia is no ball's and whose centre of mass is off its origin."""
+    bodies = [model.body(j.child) for j in model.joints if j.type.nv == 1]
+    return max(bodies, key=lambda b: np.ptp(np.linalg.eigvalsh(b.inertia)) * (1 + np.linalg.norm(b.com)))
+
+
+def with_joint(model: Model, name: str, **changes: object) -> Model:
+    return replace(model, joints=tuple(replace(j, **changes) if j.name == name else j for j in model.joints))
+
+
+def with_body(model: Model, name: str, **changes: object) -> Model:
+    return replace(model, bodies=tuple(replace(b, **changes) if b.name == name else b for b in model.bodies))
+
+
+Planted = tuple[Model, str, str]
+
+
+def armature(m: Model) -> Planted:
+    j = hinges(m)[1]
+    return with_joint(m, j.name, armature=j.armature + 0.1), "armature", j.name
+
+
+def damping(m: Model) -> Planted:
+    j = hinges(m)[2]
+    return with_joint(m, j.name, damping=np.array([0.1])), "damping", j.name
+
+
+def quaternion(m: Model) -> Planted:
+    j = hinges(m)[1]
+    x, y, z, w = spatial.quaternion_from_matrix(j.rotation)
+    return (
+        with_joint(m, j.name, rotation=spatial.matrix_from_quaternion(np.array([w, x, y, z]))),
+        "quaternion order",
+        j.name,
+    )
+
+
+def inertia_about_origin(m: Model) -> Planted:
+    b = carried(m)
+    moved = b.inertia + b.mass * (b.com @ b.com * np.eye(3) - np.outer(b.com, b.com))
+    return with_body(m, b.name, inertia=moved), "inertia about the wrong point", b.name
+
+
+def fused_unturned(m: Model) -> Planted:
+    """The tool fused to what it is fixed to, with its inertia as it stands in its own axes."""
+    mount, tool = m.joint("mount"), m.body("tool")
+    b = m.body(mount.parent)
+    p = mount.translation + mount.rotation @ tool.com
+    mass = b.mass + tool.mass
+    com = (b.mass * b.com + tool.mass * p) / mass
+    I = np.zeros((3, 3))
+    for kg, at, own in ((b.mass, b.com, b.inertia), (tool.mass, p, tool.inertia)):
+        d = at - com
+        I += own + kg * (d @ d * np.eye(3) - np.outer(d, d))
+    m = replace(m, joints=m.joints[:-1], bodies=m.bodies[:-1])
+    return with_body(m, b.name, mass=mass, com=com, inertia=I), "fused with a rotated frame", b.name
+
+
+def lost_tool(m: Model) -> Planted:
+    return replace(m, joints=m.joints[:-1], bodies=m.bodies[:-1]), "lost body", "tool"
+
+
+def gravity(m: Model) -> Planted:
+    return replace(m, gravity=(0, 0, -9.80)), "gravity", ""
+
+
+def order(m: Model) -> Planted:
+    joints = list(m.joints)
+    i, k = (joints.index(j) for j in hinges(m)[:2])
+    joints[i], joints[k] = joints[k], joints[i]
+    return replace(m, joints=tuple(joints)), "joint order", joints[i].name
+
+
+def names(m: Model) -> Planted:
+    a, b = hinges(m)[1].name, hinges(m)[2].name
+    other = {a: b, b: a}
+    return replace(m, joints=tuple(replace(j, name=other.get(j.name, j.name)) for j in m.joints)), "names exchanged", a
+
+
+def mimic(m: Model) -> Planted:
+    j = next(j for j in m.joints if j.mimic)
+    return with_joint(m, j.name, mimic=None), "mimic", j.name
+
+
+def base(m: Model) -> Planted:
+    b = m.joint("root_joint").child
+    return with_body(m, b, mass=0.0, com=np.zeros(3), inertia=np.zeros((3, 3))), "base mass", b
+
+
+def pitch(m: Model) -> Planted:
+    j = next(j for j in m.joints if j.kind == "helical")
+    return with_joint(m, j.name, pitch=j.pitch / (2 * np.pi)), "unit of pitch", j.name
+
+
+def axis(m: Model) -> Planted:
+    j = hinges(m)[2]
+    return with_joint(m, j.name, axes=-j.axes), "axis sign", j.name
+
+
+def origin(m: Model) -> Planted:
+    j = hinges(m)[1]
+    return with_joint(m, j.name, translation=j.translation + np.array([0.0, 0.01, 0.002])), "joint origin", j.name
+
+
+def inertia_axes(m: Model) -> Planted:
+    b = carried(m)
+    R = spatial.matrix_from_rpy(0.3, 0.2, 0.5)
+    return with_body(m, b.name, inertia=R @ b.inertia @ R.T), "inertia axes", b.name
+
+
+def mass(m: Model) -> Planted:
+    b = carried(m)
+    return with_body(m, b.name, mass=1.3 * b.mass, inertia=1.3 * b.inertia), "mass", b.name
+
+
+def zero(m: Model) -> Planted:
+    j = hinges(m)[1]
+    turn = spatial.matrix_from_quaternion(spatial.exp_quaternion(0.25 * j.axes[0]))
+    return with_joint(m, j.name, rotation=j.rotation @ turn), "zero position", j.name
+
+
+def still(m: Model) -> Planted:
+    j = hinges(m)[2]
+    return (
+        with_joint(m, j.name, **{f: np.empty(0) for f in _PER}, kind="fixed", axes=np.empty((0, 3))),
+        "joint held still",
+        j.name,
+    )
+
+
+def friction(m: Model) -> Planted:
+    j = hinges(m)[1]
+    return with_joint(m, j.name, friction=np.array([0.3])), "friction", j.name
+
+
+def limits(m: Model) -> Planted:
+    j = hinges(m)[1]
+    return with_joint(m, j.name, upper=np.array([57.3])), "limits", j.name
+
+
+_PER = ("lower", "upper", "velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness", "rest")
+KINDS = (
+    armature,
+    damping,
+    quaternion,
+    inertia_about_origin,
+    fused_unturned,
+    lost_tool,
+    gravity,
+    order,
+    names,
+    mimic,
+    base,
+    pitch,
+    axis,
+    origin,
+    inertia_axes,
+    mass,
+    zero,
+    still,
+    friction,
+    limits,
+)
+SILENT = {"friction", "limits", "joint order"}
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("plant", KINDS, ids=lambda f: f.__name__)
+def test_a_planted_difference_is_named(name: str, plant: Callable[[Model], Planted]) -> None:
+    a = robot(name)
+    b, kind, where = plant(a)
+    found = mb.explain(a, b, samples=1)
+    assert [c.kind for c in found.causes] == [kind], found.to_markdown()
+    (cause,) = found.causes
+    assert where in str(cause)
+    assert found.explained
+    assert cause.acts == (kind not in SILENT)
+    assert found.agree == (kind in SILENT)
+
+
+def test_a_robot_agrees_with_itself_and_with_its_frames_drawn_elsewhere() -> None:
+    a = robot("panda")
+    assert mb.explain(a, a).agree
+    assert not mb.explain(a, a).causes
+    # Every one-axis joint's frame turned and slid along its axis: other numbers, the same robot.
+    b = mb.ModelBuilder("again", gravity=a.gravity)
+    rng = np.random.default_rng(0)
+    moved = {"world": (np.eye(3), np.zeros(3))}
+    for j in a.tree:
+        R, p = moved[j.parent]
+        turn = spatial.matrix_from_quaternion(spatial.normalized(rng.standard_normal(4)))
+        shift = j.axes[0] * rng.standard_normal() if j.kind in ("revolute", "helical", "prismatic") else np.zeros(3)
+        if j.kind in ("free", "fixed"):
+            turn = np.eye(3)
+        moved[j.child] = turn, shift
+        body = a.body(j.child)
+        b.add_body(j.child, mass=body.mass, com=turn.T @ (body.com - shift), inertia=turn.T @ body.inertia @ turn)
+        numbers = {n: getattr(j, n) for n in _PER}
+        b.add_joint(
+            j.name,
+            j.kind,
+            parent=j.parent,
+            child=j.child,
+            rotation=R.T @ j.rotation @ turn,
+            translation=R.T @ (j.translation + j.rotation @ shift - p),
+            axis=None if not j.axes.size else turn.T @ j.axes[0],
+            pitch=j.pitch,
+            mimic=j.mimic,
+            **numbers,
+        )
+    found = mb.explain(a, b.build(nonphysical="warn"))
+    assert found.agree
+    assert not [c for c in found.causes if c.kind != "joint order"]
+    assert any("drawn elsewhere" in note for note in found.notes)
+
+
+def test_several_differences_are_told_apart_with_their_own_effects() -> None:
+    a = robot("ur5")
+    b, kinds = a, []
+    for plant in (armature, damping, mass, axis, gravity):
+        b, kind, _ = plant(b)
+        kinds.append(kind)
+    found = mb.explain(a, b, samples=1)
+    assert sorted(c.kind for c in found.causes) == sorted(kinds)
+    effects = {c.kind: c.effects for c in found.causes}
+    assert effects["damping"]["M"] < 1e-14 < 1e-4 < effects["damping"]["passive"]
+    assert effects["armature"]["nle"] < 1e-14 < 1e-4 < effects["armature"]["M"]
+    told = json.loads(found.to_json())
+    assert told["explained"]
+    assert "| axis sign |" in found.to_markdown()
+    assert "axis sign" in found._repr_html_()
+
+
+def test_other_names_are_matched_by_structure_and_six_digits_are_told_as_rounding() -> None:
+    a = robot("so100")
+    b = replace(a, joints=tuple(replace(j, name=f"motor_{j.name}", mimic=None) for j in a.joints))
+    a = replace(a, joints=tuple(replace(j, mimic=None) for j in a.joints))
+    found = mb.explain(a, b, samples=1)
+    assert [c.kind for c in found.causes] == ["renamed"]
+    assert {m.how for m in found.matches} == {"structure"}
+    noise = np.random.default_rng(0)
+    six = [replace(x, mass=x.mass * (1 + 3e-6 * noise.random()), inertia=x.inertia * (1 + 3e-6)) for x in a.bodies]
+    c = replace(a, bodies=tuple(six))
+    found = mb.explain(a, c, samples=1)
+    assert [x.kind for x in found.causes] == ["rounding"]
+    assert found.explained
+
+
+def test_joints_that_only_one_side_has() -> None:
+    a = robot("kinova")
+    below = {"tool"}
+    gone = set()
+    for j in a.tree:
+        if j.name == hinges(a)[3].name or j.parent in below - {"tool"}:
+            gone.add(j.name)
+            below.add(j.child)
+    b = replace(
+        a,
+        joints=tuple(j for j in a.joints if j.name not in gone),
+        bodies=tuple(x for x in a.bodies if x.name not in below - {"tool"}),
+        frames=(),
+    )
+    found = mb.explain(a, b, samples=1)
+    assert [c.kind for c in found.causes] == ["lost joint"]
+    assert found.only_a == (hinges(a)[3].name,)
+    back = mb.explain(b, a, samples=1)
+    assert [c.kind for c in back.causes] == ["added joint"]
+    assert not back.agree
+
+
+# Engines, of which nothing is known but their answers.
+
+
+def other_engine(change: Callable[[Model], Model]) -> type[PinocchioDynamics]:
+    """Pinocchio, told something else than it says."""
+
+    class Other(PinocchioDynamics):
+        engine = "other"
+
+        def __init__(self, model: Model) -> None:
+            super().__init__(model)
+            self._told = PinocchioDynamics(change(model))
+
+        def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
+            return self._told._mass_matrix(q)
+
+        def _gravity(self, q: np.ndarray) -> np.ndarray:
+            return self._told._gravity(q)
+
+        def _nle(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            return self._told._nle(q, v)
+
+        def _passive(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            return self._told._passive(q, v)
+
+    return Other
+
+
+@cache
+def arm() -> Model:
+    rng = np.random.default_rng(1)
+    b = mb.ModelBuilder("arm")
+    parent = "world"
+    for k, ax in enumerate(np.eye(3)[[2, 1, 0]]):
+        d = rng.uniform(0.01, 0.02, 3)
+        b.add_body(
+            f"b{k}", mass=1.0 + k, com=rng.uniform(-0.1, 0.1, 3), inertia=[d[0] + d[1], d[1] + d[2], d[2] + d[0]]
+        )
+        at = rng.uniform(0.1, 0.3, 3)
+        b.add_joint(
+            f"j{k}", "revolute", parent=parent, child=f"b{k}", translation=at, rpy=(0.1, 0.2, k), axis=ax, damping=0.2
+        )
+        parent = f"b{k}"
+    return b.build()
+
+
+def com_of_the_last(m: Model) -> Planted:
+    return with_body(m, "b2", com=-m.body("b2").com), "centre of mass", "b2"
+
+
+@pytest.mark.parametrize("plant", [armature, damping, gravity, axis, com_of_the_last], ids=lambda f: f.__name__)
+def test_an_engine_that_was_told_something_else(plant: Callable[[Model], Planted]) -> None:
+    _, kind, where = plant(arm())
+    b = other_engine(lambda m: plant(m)[0])(arm())
+    (cause,) = mb.explain(mb.dynamics(arm()), b).causes
+    assert cause.kind == kind
+    assert where in str(cause)
+
+
+def test_engines_that_are_asked_in_another_convention() -> None:
+    free = random_tree(2, 3, kinds=("free", "revolute", "revolute"), springs=False, damping=False, armature=False)
+
+    class Raw(MujocoDynamics):
+        """MuJoCo as it is: linear velocity in the world's axes."""
+
+        engine = "raw"
+
+        def _rotation(self, start_q: int) -> np.ndarray:  # noqa: ARG002
+            return np.eye(3)
+
+        def _nle(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            def one(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+                self._set(q, v)
+                self._velocities()
+                return self._force(self._d.qfrc_bias)
+
+            return per_sample(one, q, v)
+
+    class Unturned(Raw):
+        """MuJoCo with forces turned and ω × v forgotten."""
+
+        engine = "unturned"
+        _rotation = MujocoDynamics._rotation
+
+    class Shuffled(PinocchioDynamics):
+        """Quaternions read w first."""
+
+        engine = "shuffled"
+
+        def _full_q(self, q: np.ndarray) -> np.ndarray:
+            q = q.copy()
+            start = self.model.quaternions[0][0]
+            q[..., start : start + 4] = np.roll(q[..., start : start + 4], -1, axis=-1)
+            return super()._full_q(q)
+
+    plain = mb.dynamics(free)
+    world = replace(
+        free,
+        joints=tuple(
+            replace(j, rotation=np.eye(3), translation=np.zeros(3)) if j.kind == "free" else j for j in free.joints
+        ),
+    )
+    assert [c.kind for c in mb.explain(mb.dynamics(world), Raw(world)).causes] == ["velocity frame"]
+    told = mb.explain(mb.dynamics(world), Unturned(world)).causes
+    assert [c.kind for c in told] == ["velocity frame"]
+    assert "ω × v" in str(told[0])
+    assert [c.kind for c in mb.explain(plain, Shuffled(free)).causes] == ["quaternion order"]
+
+
+def test_a_known_defect_is_the_cause_and_no_defect_is_none() -> None:
+    tree = random_tree(4, 3, kinds=("revolute",))
+    found = mb.explain(mb.dynamics(tree), mb.dynamics(tree, "mujoco"))
+    assert [c.kind for c in found.causes] == ["engine defect"]
+    assert "computeKineticEnergy" in str(found.causes[0])
+    assert not found.agree
+    clean = tree.without("armature")
+    assert mb.explain(mb.dynamics(clean), mb.dynamics(clean, "mujoco")).agree
+
+
+def test_what_nothing_explains_is_narrowed_to_its_joints() -> None:
+    class Odd(PinocchioDynamics):
+        """Wrong in one entry of M, of two joints."""
+
+        engine = "odd"
+
+        def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
+            M = super()._mass_matrix(q).copy()
+            if {"j1", "j2"} <= set(self.model.joint_names):
+                i, k = (self.model.joint_names.index(n) for n in ("j1", "j2"))
+                M[..., i, k] *= 1.1
+                M[..., k, i] *= 1.1
+            return M
+
+    found = mb.explain(mb.dynamics(arm()), Odd(arm()))
+    assert not found.explained
+    assert found.subtree == ("j1", "j2")
+    assert "no usual cause" in found.verdict
+    assert [g.term for g in found.left if g.relative > found.tolerance] == ["M"]
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(InputError, match="expected a Model"):
+        mb.explain("panda", arm())  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="samples"):
+        mb.explain(arm(), arm(), samples=0)
+    unknown = mb.catalog.pendulum(mass=mb.Parameter("m"))
+    with pytest.raises(InputError, match="no value for parameter 'm'"):
+        mb.explain(unknown, unknown)

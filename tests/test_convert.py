@@ -1,0 +1,105 @@
+"""What is written as MJCF or URDF says the same, and what a format cannot say is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from random_trees import IN_MUJOCO, random_tree
+
+import mbkit as mb
+from mbkit import spatial
+from mbkit.cli import cli
+from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_tree_of_every_kind_survives_mjcf(seed: int) -> None:
+    model = random_tree(seed, 9, kinds=IN_MUJOCO, damping=False, mimic=seed % 2 == 0)
+    made = mb.convert(model, "mjcf")
+    assert made.worst < 1e-12
+    assert "without geometry" in made.text
+
+
+def test_a_robot_survives_mjcf_and_mbkit_s_own_reader(tmp_path: Path) -> None:
+    model = mb.load("panda", mimic="free")
+    made = mb.convert(model, "mjcf")
+    back = mb.load(made.write(tmp_path / "panda.xml"))
+    found = mb.explain(model, back, samples=1, tolerance=1e-12)
+    assert found.agree
+    # MJCF has no velocity limits, and the rest is there to the last digit.
+    assert {c.kind for c in found.causes} == {"limits"}
+    assert all("no velocity limit" in str(c) for c in found.causes)
+    assert any("velocity limits" in note for note in made.notes)
+    q = model.neutral()
+    for frame in ("panda_hand", "panda_link8"):
+        np.testing.assert_allclose(
+            mb.dynamics(back).pose(q, frame), mb.dynamics(model).pose(q, frame), rtol=0, atol=1e-14
+        )
+
+
+def test_a_hand_built_model_survives_urdf(tmp_path: Path) -> None:
+    model = random_tree(5, 7, kinds=("revolute", "continuous", "prismatic", "fixed", "free", "planar"), **_PLAIN)
+    made = mb.convert(model, "urdf")
+    assert made.worst < 1e-12
+    back = mb.load(made.write(tmp_path / "tree.urdf"), gravity=model.gravity)
+    assert mb.explain(model, back, samples=1, tolerance=1e-12).agree
+    assert any("gravity" in note for note in made.notes)
+
+
+_PLAIN = {"springs": False, "damping": False, "armature": False}
+
+
+def test_every_catalog_system_is_written_or_told_why_not() -> None:
+    told: dict[str, str] = {}
+    for name, system in mb.catalog.systems().items():
+        model = system()
+        # Points and plates are below what MuJoCo takes, and are lifted to it: the motion is the same to rounding.
+        assert mb.convert(model, "mjcf").worst < 1e-12
+        try:
+            assert mb.convert(model, "urdf").worst < 1e-12
+        except UnsupportedError as error:
+            told[name] = str(error)
+    assert "'spin' is a ball joint" in told["heavy_top"]
+    assert "'stretch' has a spring" in told["elastic_pendulum"]
+
+
+def test_all_that_a_format_cannot_say_is_named_at_once() -> None:
+    model = random_tree(3, 10)
+    with pytest.raises(UnsupportedError) as urdf:
+        mb.convert(model, "urdf")
+    for what in ("universal", "spherical-zyx", "helical", "ball joint", "armature", "spring 'to_ground'"):
+        assert what in str(urdf.value)
+    with pytest.raises(UnsupportedError, match="is helical"):
+        mb.convert(model, "mjcf")
+    with pytest.raises(UnknownNameError, match="mjcf"):
+        mb.convert(model, "sdf")
+    with pytest.raises(InputError, match="expected a Model"):
+        mb.convert("panda", "mjcf")  # type: ignore[arg-type]
+    with pytest.raises(OutputError, match="kept"):
+        mb.convert(mb.catalog.pendulum(), "mjcf").write("/nowhere/at/all.xml")
+
+
+def test_roll_pitch_yaw_are_those_of_the_matrix_next_to_a_right_angle_too() -> None:
+    rng = np.random.default_rng(0)
+    for pitch in (0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 1e-8 - np.pi / 2, np.pi / 2 - 1e-5):
+        roll, yaw = rng.uniform(-3, 3, 2)
+        R = spatial.matrix_from_rpy(roll, pitch, yaw)
+        np.testing.assert_allclose(spatial.matrix_from_rpy(*spatial.rpy_from_matrix(R)), R, rtol=0, atol=2e-15)
+
+
+def test_the_door(tmp_path: Path) -> None:
+    run = CliRunner().invoke
+    out = tmp_path / "acrobot.xml"
+    done = run(cli, ["convert", "acrobot", "--to", "mjcf", "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "read back, every term agrees" in done.stderr
+    assert out.read_text().startswith("<mujoco")
+    assert "is there already" in run(cli, ["convert", "acrobot", "--to", "mjcf", "-o", str(out)]).stderr
+    assert run(cli, ["convert", "heavy_top", "--to", "urdf"]).exit_code == 2
+    printed = run(cli, ["convert", "acrobot", "--to", "urdf"])
+    assert printed.stdout.startswith("<robot")
+    same = run(cli, ["diff", str(out), "acrobot"])
+    assert same.exit_code == 0, same.output

@@ -1,0 +1,222 @@
+"""Every importer's reading is compared with the file as written, and what differs has its cause."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import mbkit as mb
+from mbkit.cli import cli
+from mbkit.engines import imported
+from mbkit.errors import InputError, LoadError, UnknownNameError
+from mbkit.load.stripped import strip
+
+LINK = (
+    '<link name="{0}"><inertial><origin xyz="0 0.01 0.1" rpy="0.1 0 0"/><mass value="{1}"/>'
+    '<inertia ixx="{2}" ixy="0" ixz="0" iyy="{3}" iyz="0" izz="{4}"/></inertial>{5}</link>'
+)
+JOINT = (
+    '<joint name="{0}" type="{1}"><origin xyz="0 0 0.2" rpy="0 0.3 0"/><parent link="{2}"/><child link="{3}"/>'
+    '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="5" velocity="2"/>{4}</joint>'
+)
+
+
+def urdf(*parts: str) -> str:
+    return f'<?xml version="1.0"?><robot name="r">{"".join(parts)}</robot>'
+
+
+def arm(*beside: str, tool: str = LINK.format("tool", 0.3, 1e-3, 2e-3, 2e-3, "")) -> str:
+    return urdf(
+        LINK.format("base", 1, 0.01, 0.01, 0.01, ""),
+        LINK.format("upper", 2, 0.01, 0.02, 0.015, ""),
+        LINK.format("lower", 1, 0.004, 0.003, 0.002, ""),
+        tool,
+        JOINT.format("shoulder", "revolute", "base", "upper", '<dynamics damping="0.5" friction="0.2"/>'),
+        JOINT.format("elbow", "continuous", "upper", "lower", ""),
+        JOINT.format("mount", "fixed", "lower", "tool", ""),
+        *beside,
+    )
+
+
+def write(folder: Path, text: str, name: str = "r.urdf") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def causes(result: object, engine: str) -> dict[str, list[str]]:
+    out: dict[str, list[str]] = {}
+    found = next(p for p in result.importers if p.engine == engine).explanation  # type: ignore[attr-defined]
+    for c in found.causes:
+        out.setdefault(c.kind, []).append(str(c))
+    return out
+
+
+def test_three_importers_of_one_sound_file(tmp_path: Path) -> None:
+    result = mb.compare_parsers(write(tmp_path, arm()))
+    assert result.agree
+    assert [p.engine for p in result.importers] == ["pinocchio", "mujoco", "drake"]
+    assert not causes(result, "pinocchio")
+    # What is known of each: MuJoCo drops the base and velocity limits, Drake dry friction and effort limits.
+    assert causes(result, "mujoco").keys() == {"base mass", "limits"}
+    assert "1 kg" in causes(result, "mujoco")["base mass"][0]
+    assert causes(result, "drake").keys() == {"friction", "limits"}
+    stages = {s.name: s for s in result.importers[1].stages}
+    assert stages["total mass"].same is False
+    assert stages["M"].worst < 1e-14
+    told = json.loads(result.to_json())
+    assert told["agree"]
+    assert "| total mass | same |" in result.to_markdown()
+    assert "total mass" in result._repr_html_()
+
+
+def test_massless_inertia_and_impossible_inertia_as_each_importer_takes_them(tmp_path: Path) -> None:
+    massless = mb.compare_parsers(write(tmp_path, arm(tool=LINK.format("tool", 0, 1e-3, 2e-3, 2e-3, ""))))
+    assert not massless.agree
+    assert "leaves out link 'tool'" in causes(massless, "mujoco")["lost body"][0]
+    assert "a ball of water of 1 kg" in causes(massless, "drake")["replaced inertia"][0]
+    assert all(p.explanation is not None and p.explanation.explained for p in massless.importers)
+    impossible = mb.compare_parsers(write(tmp_path, arm(tool=LINK.format("tool", 0.3, 1e-3, 1e-3, 9e-3, ""))))
+    assert "A + B >= C" in impossible.importers[1].refused
+    assert "link 'tool'" in causes(impossible, "drake")["replaced inertia"][0]
+    # By Drake itself, nothing of mbkit between.
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(arm(tool=LINK.format("tool", 0, 1e-3, 2e-3, 2e-3, "")), "urdf")
+    M = plant.GetBodyByName("tool").default_spatial_inertia()
+    assert M.get_mass() == pytest.approx(1.0, rel=1e-15)
+    radius = (1 / (4 / 3 * np.pi * 1000)) ** (1 / 3)
+    assert M.get_unit_inertia().get_moments()[0] - 0.01**2 - 0.1**2 == pytest.approx(0.4 * radius**2, rel=1e-12)
+
+
+def test_real_robots_differ_as_the_table_says() -> None:
+    table = json.loads((Path(__file__).parents[1] / "validation" / "importers.json").read_text(encoding="utf-8"))
+    result = mb.compare_parsers("bolt", samples=1)
+    row = table["bolt_description/bolt"]
+    for p in result.importers:
+        assert row[p.engine]["status"] == ("agrees" if p.agrees else "differs")
+        assert p.explanation is not None
+        assert [c["says"] for c in row[p.engine]["causes"]] == [str(c) for c in p.explanation.acting]
+    assert all(p["explained"] for r in table.values() for p in r.values() if p["status"] != "refuses")
+
+
+MJCF = """<mujoco model="arm">
+  <compiler angle="degree"/>
+  <option gravity="0 0 -9.8"/>
+  <default><joint damping="0.2" armature="0.01"/><geom density="500"/></default>
+  <worldbody>
+    <body name="upper" pos="0 0 0.1" euler="0 30 0">
+      <joint name="shoulder" axis="0 1 0" range="-90 90"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/>
+      <body name="lower" pos="0.3 0 0" quat="0.9 0.1 0.2 0.3">
+        <joint name="elbow" axis="0 0 1" pos="0.01 0 0" ref="20" stiffness="3" springref="10"/>
+        <geom type="box" size="0.1 0.02 0.03" pos="0.1 0 0"/>
+        <body name="hand" pos="0.2 0 0">
+          <joint name="slide" type="slide" axis="1 0 0"/>
+          <joint name="roll" axis="1 0 0"/>
+          <inertial pos="0.01 0.02 0.03" mass="0.4" fullinertia="0.002 0.003 0.0035 0.0001 0.0002 0.0003"/>
+        </body>
+      </body>
+    </body>
+    <body name="ball" pos="1 0 0"><freejoint name="fly"/><geom type="sphere" size="0.05"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+def test_an_mjcf_through_three_importers(tmp_path: Path) -> None:
+    result = mb.compare_parsers(write(tmp_path, MJCF, "arm.xml"))
+    pinocchio, mujoco, drake = result.importers
+    assert mujoco.agrees
+    assert not causes(result, "mujoco")
+    assert causes(result, "drake").keys() == {"armature", "spring", "renamed"}
+    assert len(causes(result, "drake")["armature"]) == 4
+    # Pinocchio 4.1 reads the first body of the world alone.
+    assert pinocchio.explanation is not None
+    assert pinocchio.explanation.only_a == ("fly",)
+    assert {"lost joint", "gravity", "spring"} <= causes(result, "pinocchio").keys()
+    assert drake.explanation is not None
+    assert drake.explanation.explained
+    assert any("drawn elsewhere" in note for note in drake.notes)
+
+
+def test_refusals_are_told_and_the_rest_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # mbkit itself does not read it: the first importer that does is the reference.
+    loose = (
+        arm()
+        .replace('name="elbow" type="continuous"', 'name="elbow" type="revolute"')
+        .replace('upper="1" effort', 'upper="-2" effort')
+    )
+    result = mb.compare_parsers(write(tmp_path, loose))
+    assert result.reference == "pinocchio"
+    assert "lower limit" in result.faults
+    monkeypatch.setitem(imported.IMPORTERS, "drake", ("nothing_of_this_name", "drake", "mbkit[drake]"))
+    result = mb.compare_parsers(write(tmp_path, arm()))
+    assert "pip install mbkit[drake]" in result.importers[2].refused
+    assert result.importers[1].agrees
+    assert not result.agree
+    assert "drake refuses" in result.verdict
+    nothing = mb.compare_parsers(write(tmp_path, urdf('<link name="a"/>')))
+    assert all(p.refused for p in nothing.importers)
+    assert json.loads(nothing.to_json())["agree"] is False
+
+
+def test_no_other_file_is_opened_and_what_would_open_one_is_told(tmp_path: Path) -> None:
+    shapes = (
+        '<collision><geometry><mesh filename="package://nowhere/a.stl"/></geometry></collision>'
+        '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+        '<visual><geometry><box size="1 1 1"/></geometry><material name="m"><texture filename="file:///etc/x"/></material></visual>'
+    )
+    text = arm(
+        LINK.format("extra", 0.1, 1e-3, 1e-3, 1e-3, shapes),
+        JOINT.format("last", "fixed", "tool", "extra", ""),
+        # Drake 1.51 ends the process over a transmission without a type.
+        '<transmission name="t"><type/><joint name="elbow"/><actuator name="m"/></transmission>',
+        '<gazebo><plugin filename="lib.so"/></gazebo>',
+    )
+    stripped = strip(write(tmp_path, text))
+    assert not any(x in stripped.text for x in ("package", "filename", "mesh", "<type"))
+    assert stripped.text.count("<box") == 1
+    assert dict(stripped.gone) == {"collision": 1, "gazebo": 1, "transmission": 1, "visual": 1}
+    result = mb.compare_parsers(stripped.path)
+    assert result.agree
+    assert "collision" in result.notes[0]
+    for bad, told in (
+        ('<mujoco><include file="/etc/passwd"/></mujoco>', "names another file"),
+        ('<!DOCTYPE r [<!ENTITY e "x">]><robot name="r"/>', "DOCTYPE"),
+        ("<sdf/>", "expected <robot>"),
+    ):
+        with pytest.raises(LoadError, match=told):
+            mb.compare_parsers(write(tmp_path, bad, "bad.xml"))
+
+
+def test_arguments_and_doors(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="pinocchio"):
+        mb.compare_parsers("panda", importers=("pinoccio",))
+    with pytest.raises(InputError, match="importers"):
+        mb.compare_parsers("panda", importers=())
+    with pytest.raises(UnknownNameError, match="robot"):
+        mb.compare_parsers("no_such_robot")
+    run = CliRunner().invoke
+    path = write(tmp_path, arm(tool=LINK.format("tool", 0, 1e-3, 2e-3, 2e-3, "")))
+    out = ["--out", str(tmp_path / "out")]
+    done = run(cli, ["check", str(path), "--own-parsers", *out])
+    assert done.exit_code == 1, done.output
+    assert "a ball of water of 1 kg" in " ".join(done.stdout.split())
+    data = json.loads((tmp_path / "out" / "r.importers.json").read_text(encoding="utf-8"))
+    assert data["reference"] == "file"
+    assert run(cli, ["check", "--own-parsers"]).exit_code == 2
+    other = write(tmp_path, arm().replace('damping="0.5"', 'damping="0.6"'), "other.urdf")
+    same = write(tmp_path, arm())
+    done = run(cli, ["diff", str(same), str(other), "--json"])
+    assert done.exit_code == 1
+    assert [c["kind"] for c in json.loads(done.stdout)["causes"]] == ["damping"]
+    done = run(cli, ["diff", str(same), str(other)])
+    assert "other.urdf has damping 0.6 for 0.5" in " ".join(done.stdout.split())
+    assert run(cli, ["diff", str(same), "--engines", "pinocchio,mujoco"]).exit_code == 0
+    assert run(cli, ["diff", str(same)]).exit_code == 2

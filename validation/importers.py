@@ -1,0 +1,77 @@
+"""Every robot of example-robot-data through Pinocchio's, MuJoCo's and Drake's own importers.
+
+Run ``python -m validation.importers``; it writes ``validation/importers.json`` in about a minute.
+
+For each robot and importer: whether it moves as the file says, why not, and the lines of the file
+that make the difference, so that each cause can be checked by eye.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from mbkit.load import robots, xml
+from mbkit.load.xml import Element
+from mbkit.studies.causes.result import Cause, effect, grouped, plain
+from mbkit.studies.parsers import Parsed, compare_parsers
+
+HERE = Path(__file__).parent
+QUOTED = re.compile(r"'([^']+)'")
+
+
+def excerpt(root: Element, lines: list[str], text: str) -> str:
+    """Return the lines of the first link or joint that a sentence names, with its numbers."""
+    for name in QUOTED.findall(text):
+        for element in root.all("link") + root.all("joint"):
+            if element.attributes.get("name") == name:
+                part = element.first("inertial") or element.first("mimic")
+                if part is not None:
+                    end = max(e.line for e in part.walk())
+                    told = " ".join(x.strip() for x in lines[part.line - 1 : end])
+                    return f"line {part.line}: {' '.join(told.split())}"
+    return ""
+
+
+def told(p: Parsed, root: Element, lines: list[str]) -> dict[str, Any]:
+    """Return one importer's reading as a row."""
+    out: dict[str, Any] = {"version": p.version}
+    if p.refused:
+        return out | {"status": "refuses", "why": p.refused, "excerpt": excerpt(root, lines, p.refused)}
+    assert p.explanation is not None
+    acting = [cause(c, root, lines) for c in p.explanation.causes if c.acts]
+    silent = [says for _, says, _ in grouped(c for c in p.explanation.causes if not c.acts)]
+    worst = {s.name: s.worst for s in p.stages if s.name in ("M", "g", "nle")}
+    status = "agrees" if p.agrees else "differs"
+    return out | {
+        "status": status,
+        "worst": worst,
+        "causes": acting,
+        "data": silent,
+        "notes": list(p.notes),
+        "explained": p.explanation.explained,
+    }
+
+
+def cause(c: Cause, root: Element, lines: list[str]) -> dict[str, str]:
+    """Return a cause with the lines that it stems from."""
+    # "body 'A': mujoco leaves out link 'B'": B is the culprit.
+    culprit = c.says.split(": ", 1)[1] if "link '" in c.says.split(": ", 1)[-1] else c.says
+    return {"kind": c.kind, "says": c.says, "effect": effect(c), "excerpt": excerpt(root, lines, culprit)}
+
+
+def main() -> None:
+    """Run and write."""
+    table: dict[str, Any] = {}
+    for robot in robots():
+        result = compare_parsers(robot.path)
+        root, lines = xml.read(robot.path), robot.path.read_text(encoding="utf-8").splitlines()
+        table[robot.name] = {p.engine: told(p, root, lines) for p in result.importers}
+        print(f"{robot.name}: {result.verdict}", flush=True)
+    (HERE / "importers.json").write_text(json.dumps(plain(table), indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
