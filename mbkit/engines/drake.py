@@ -60,7 +60,8 @@ class DrakeDynamics(Dynamics):
         with self._lock:
             try:
                 return super()._evaluate(quantity, method, **arguments)
-            except RuntimeError as error:
+            except (RuntimeError, SystemExit) as error:
+                # Drake's failed demands come as either.
                 if isinstance(error, NotImplementedError):
                     raise
                 told = str(error).strip().splitlines()[0]
@@ -78,13 +79,15 @@ class DrakeDynamics(Dynamics):
         self._rotations = []
         for joint, iq, iv in made.turning:
             own_q, own_v = full_q[layout.full_q[joint.name]], full_v[layout.full_v[joint.name]]
-            R = spatial.matrix_from_quaternion(own_q[-4:])
+            # The shape of an empty batch's answer is asked for with zeros, which no rotation is.
+            unit = own_q[-4:] if own_q[-4:].any() else np.array([0.0, 0.0, 0.0, 1.0])
+            R = spatial.matrix_from_quaternion(unit)
             if joint.kind == "ball":
                 x[iq : iq + 3] = RollPitchYaw(RotationMatrix(R)).vector()
                 self._rotations.append((R, iv, None))
                 u[iv : iv + 3] = R @ own_v
                 continue
-            x[iq : iq + 7] = [own_q[6], *own_q[3:6], *own_q[:3]]
+            x[iq : iq + 7] = [unit[3], *unit[:3], *own_q[:3]]
             self._rotations.append((R, iv, iv + 3))
             u[iv : iv + 3], u[iv + 3 : iv + 6] = R @ own_v[3:], R @ own_v[:3]
             b[iv + 3 : iv + 6] = R @ np.cross(own_v[3:], own_v[:3])

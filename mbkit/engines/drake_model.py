@@ -81,7 +81,7 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
     added = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
     try:
         plant.Finalize()
-    except RuntimeError as error:
+    except (RuntimeError, SystemExit) as error:
         raise UnsupportedError(f"drake: refuses {description.name}: {str(error).splitlines()[0]}") from None
     return _mapped(plant, description, made, bodies, added)
 
@@ -114,7 +114,7 @@ def _inertia(body: Body) -> Any:
     try:
         central = tree.RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
         return tree.SpatialInertia.MakeFromCentralInertia(float(body.mass), np.array(body.com), central)
-    except RuntimeError as error:
+    except (RuntimeError, SystemExit) as error:
         told = str(error).strip().splitlines()
         raise UnsupportedError(
             f"drake: refuses body {body.name!r} (mass {body.mass:.4g} kg): {told[0] if told else 'not physical'}"
@@ -174,7 +174,7 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
         spring = tree.RevoluteSpring if kind == "revolute" else tree.PrismaticSpring
         try:
             plant.AddForceElement(spring(made, rest, stiffness))
-        except RuntimeError as error:
+        except (RuntimeError, SystemExit) as error:
             raise UnsupportedError(f"drake: refuses the spring of joint {joint.name!r}: {error}") from None
     return made
 
