@@ -52,15 +52,14 @@ class MujocoDynamics(Dynamics):
         self.mj_model = self._m = self._made.model
         self.disabled = self._made.disabled
         self._d = mujoco.MjData(self._m)
-        # MuJoCo tells each kind of warning once, unless its count is put back.
-        self._warned = self._d.warning.number
         self._reduced = model.layout.reduced
         self._lock = threading.RLock()
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
         # One MjData and one handler of warnings: two threads in here end the process.
         with self._lock, heard_warnings() as heard:
-            self._warned.fill(0)
+            # MuJoCo tells each kind of warning once, unless its count is put back.
+            self._d.warning.number.fill(0)
             out = super()._evaluate(quantity, method, **arguments)
         if heard:
             raise NumericalError(f"mujoco: {quantity} of {self.model.name}: {heard[0].strip()}{self._blame()}")
