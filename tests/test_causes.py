@@ -10,7 +10,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from random_trees import random_tree
 
 import mbkit as mb
 from mbkit import spatial
@@ -19,6 +18,7 @@ from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.pinocchio import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.model import Body, Joint, Mimic, Model
+from tests.random_trees import random_tree
 
 ROBOTS = ("panda", "ur5", "solo8", "so100", "kinova")
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from random_trees import IN_MUJOCO, random_tree
 
 import mbkit as mb
 from mbkit import spatial
 from mbkit.cli import cli
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
+from tests.random_trees import IN_MUJOCO, random_tree
 
 
 @pytest.mark.parametrize("seed", range(3))

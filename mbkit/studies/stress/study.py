@@ -223,7 +223,10 @@ def stress(
         keeper.keep(result(complete=False))
         raise
     keeper.keep(whole)
-    keeper.tell(1.0, "done")
+    try:
+        keeper.tell(1.0, "done")
+    except KeyboardInterrupt:
+        raise InterruptedSweepError(whole) from None
     return whole
 
 
