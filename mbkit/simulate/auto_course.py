@@ -59,7 +59,16 @@ _AWAY: Final = 1e-9
 #: Where steps fall below rounding: by how much the tolerance is loosened, up to what, and how often anything is done.
 _LOOSER: Final = 10.0
 _LOOSEST: Final = 1e-5
-_RESCUES: Final = 8
+_RESCUES: Final = 12
+#: Points within this part of a step, by whose accelerations their rounding is judged: what a cubic through them leaves.
+_NEAR: Final = 0.03
+_AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
+_CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
+_ROUGH: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
+_LEFT: Final = len(_AHEAD) - 4
+#: Of a step's estimated error that is rounding: the length of rk853's weights, and the part that is too much.
+_WEIGHT: Final = 2.0
+_ROUNDED: Final = 0.3
 #: Changes of the method that are told one by one.
 _TOLD: Final = 3
 
@@ -133,7 +142,6 @@ class Course:
         self._least = _LEAST
         self._next: Trials | None = None
         self._ahead: list[Stretch] = []
-        self._stalled_at = -1.0
 
     # On the way
 
@@ -213,6 +221,8 @@ class Course:
         to_come = rate * self._rest
         if to_come < pace.worth or not step:
             return
+        if self._rounds(trials, place, step):
+            return
         found = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._scene.duration))
         held = found is not None and step * found.stable >= _EDGE
         # Not where steps have been short alone, but where they are.
@@ -222,7 +232,7 @@ class Course:
             size = "" if found is None else f" (h|λ| = {step * found.stable:.1f}{told})"
             self._legs.append(_Leg(IMPLICIT, self._at[0], f"where {why}{size}"))
             if found is not None:
-                self._kept = min(_KEPT, step * found.stable)
+                self._kept = min(_KEPT, step * found.stable) or _KEPT
         elif found is not None:
             before, slower = self._looser
             if slower and rate / slower > (before / self._tolerances.rtol) ** _COLLAPSE > 1:
@@ -292,33 +302,69 @@ class Course:
         if not 0.5 < rtol / self._tolerances.rtol < 2.0:
             self._tolerances = Tolerances(rtol, atol)
             trials.tighten(place, self._tolerances)
-            if not self._legs[-1].note or rtol < self._tightest:
+            if factor < 1 and (not self._legs[-1].note or rtol < self._tightest):
                 self._tightest = rtol
                 self._legs[-1].note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
 
+    def _rounds(self, trials: Trials, place: int, step: float) -> bool:
+        """Return whether rounding takes part in the errors that hold rk853's steps, and let it have less part."""
+        share, rough = self._rough(trials, place, step, _NEAR)
+        if share > _ROUNDED:
+            # What is smooth is far smoother nearer by.
+            nearer, rough = self._rough(trials, place, step, _NEAR / 10)
+            if nearer > _ROUNDED:
+                self._loosen(trials, place, rough)
+                return True
+        asked = self._scene.tolerances
+        if self._base.rtol > asked.rtol and share * self._base.rtol / asked.rtol < _ROUNDED / 10:
+            # What was rough is passed.
+            self._base = asked
+            self._tolerate(trials, place, 0.0)
+        return False
+
+    def _rough(self, trials: Trials, place: int, step: float, near: float) -> tuple[float, float]:
+        """Return what rounding makes of a step's estimated error, in terms of the tolerance, and of accelerations."""
+        (_, q, w), space = self._at, self._scene.space
+        try:
+            k = trials.rates(place, q[None], w[None])
+            ahead = near * step * _AHEAD
+            found = trials.rates(place, space.move(np.broadcast_to(q, (len(ahead), len(q))), ahead * w), w + ahead * k)
+        except FunctionError:
+            return 0.0, 0.0
+        rtol, atol = self._tolerances
+        scatter = np.sqrt(np.sum((_ROUGH @ found) ** 2, axis=0) / _LEFT)
+        share = _WEIGHT * step * float(np.sqrt(np.mean((scatter / (atol + rtol * np.abs(w))) ** 2)))
+        return share, float(scatter.max() / max(np.abs(k).max(), np.finfo(float).tiny))
+
+    def _loosen(self, trials: Trials | None, place: int, rough: float) -> None:
+        """Ask for less where rounding does not give more."""
+        if self._tolerances.rtol < self._base.rtol:
+            # It was only too much to ask for.
+            self._least = math.inf
+        else:
+            asked, t = self._scene.tolerances.rtol, self._at[0]
+            self._base = Tolerances(*(min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base))
+            digits = f"to {rough:.0e} of themselves" if rough else "to few digits"
+            self.doubt = (
+                f"near t = {t:.6g} s accelerations are known {digits}, which is not enough for rtol = {asked:g}; there "
+                f"it took {self._base.rtol:.0e}. Leave out what has next to no mass, or compute with 34 digits: "
+                "mbkit.dynamics(model, 'oracle') and method='taylor'"
+            )
+        if trials is None:
+            self._tolerances = self._base
+        else:
+            self._tolerate(trials, place, 0.0)
+
     def _rescue(self) -> None:
-        """Go on where steps fell below rounding: by the other method, or else with a looser tolerance."""
-        t, other = self._at[0], IMPLICIT if self._legs[-1].method == EXPLICIT else EXPLICIT
-        if t != self._stalled_at or self._tolerances.rtol < self._base.rtol:
-            self._stalled_at = t
-            if self._tolerances.rtol < self._base.rtol:
-                # It was only too much to ask for.
-                other, self._least = self._legs[-1].method, math.inf
-            self._turn(other, "where its steps fell below rounding")
-            return
-        looser = [min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base]
-        if looser[0] <= self._base.rtol:
-            # The next time is the last.
-            self.track.rescues = _RESCUES
-        asked, self._base = self._scene.tolerances.rtol, Tolerances(*looser)
-        self._tolerances = self._base
-        self.doubt = (
-            f"at rtol = {asked:g} its steps fell below rounding near t = {t:.6g} s, where accelerations are known to "
-            f"few digits; it went on at {self._base.rtol:.0e}. Leave out what has next to no mass, or compute with 34 "
-            "digits: mbkit.dynamics(model, 'oracle') and method='taylor'"
-        )
-        self._turn(EXPLICIT, "where its steps fell below rounding too")
-        self._legs[-1].note = f"at rtol = {self._base.rtol:.0e}"
+        """Go on where steps fell below rounding: by the other method, and each second time with a looser tolerance."""
+        method = self._legs[-1].method
+        if self.track.rescues % 2 == 0:
+            before = self._tolerances.rtol
+            self._loosen(None, 0, 0.0)
+            if self._tolerances.rtol <= before:
+                # The next time is the last.
+                self.track.rescues = _RESCUES
+        self._turn(IMPLICIT if method == EXPLICIT else EXPLICIT, "where its steps fell below rounding")
 
     # In words
 

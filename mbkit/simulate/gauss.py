@@ -27,6 +27,7 @@ __all__ = ["gauss_legendre", "gauss_step"]
 
 _EPS: Final = float(np.finfo(float).eps)
 _MOST: Final = 60
+_MOST_NEWTON: Final = 25
 # Where a correction is not this much smaller than the last one, plain iteration gives
 # way to Newton's, and Newton's matrix to a new one.
 _SLOW: Final = 0.05
@@ -109,9 +110,21 @@ class _Gauss:
     ) -> tuple[Array, Array | None]:
         """Return the rates, and Newton's matrix if plain iteration was too slow.
 
-        Plain iteration, or a matrix of an earlier step, gives way to the matrix at the
-        start of this one.
+        Plain iteration, or a matrix of an earlier step, gives way to the matrix at the start of this one, and
+        that to one of every iterate, with the derivatives at its stages: where a stiff direction turns during
+        the step, no other leads there.
         """
+        try:
+            return self._iterated(t, h, q, w, force, guess, inverse)
+        except DivergenceError:
+            rates = self._newton(t, h, q, w, force, guess)
+            if rates is None:
+                raise
+            return rates, None
+
+    def _iterated(
+        self, t: float, h: float, q: Array, w: Array, force: Force, guess: Array, inverse: Array | None
+    ) -> tuple[Array, Array | None]:
         rates, last, fresh = guess, np.full(w.shape[:-1], np.inf), False
         for _ in range(_MOST):
             try:
@@ -134,6 +147,22 @@ class _Gauss:
                 inverse, fresh = self._inverse(t, h, q, w, force), True
                 last = np.full(w.shape[:-1], np.inf)
         raise DivergenceError(_UNSOLVED)
+
+    def _newton(self, t: float, h: float, q: Array, w: Array, force: Force, rates: Array) -> Array | None:
+        """Return the rates by Newton's method proper; None where that leads nowhere."""
+        last = np.full(w.shape[:-1], np.inf)
+        for _ in range(_MOST_NEWTON):
+            try:
+                change = self._mapped(t, h, q, w, force, rates) - rates
+                change = _times(self._inverse_at(t, h, q, w, force, rates), change)
+            except DivergenceError:
+                return None
+            rates, size = rates + change, self._size(h, change)
+            done, _ = self._judged(h, w, rates, size, last)
+            if done.all():
+                return rates
+            last = size
+        return None
 
     def _judged(
         self, h: float, w: Array, rates: Array, size: Array, last: Array
@@ -171,27 +200,45 @@ class _Gauss:
         return out
 
     def _inverse(self, t: float, h: float, q: Array, w: Array, force: Force) -> Array:
-        """Return (1 - h A⊗J)⁻¹ with J = ∂(u̇, ẇ)/∂(u, w) at the start of the step.
+        """Return (1 - h A⊗J)⁻¹ with J = ∂(u̇, ẇ)/∂(u, w) at the start of the step."""
+        J = self._slopes(t, q, np.zeros(w.shape), w, force)
+        return _inverse_of(np.einsum("ij,...kl->...ikjl", h * self._A, J))
 
-        J is of differences, of any engine and torque: half of the digits are plenty for
+    def _inverse_at(self, t: float, h: float, q: Array, w: Array, force: Force, rates: Array) -> Array:
+        """Return (1 - h A⊗J)⁻¹ with J of row i at stage i of these rates."""
+        moved = _mixed(h * self._A, rates)
+        u, w_i = moved[..., : self._nv], w + moved[..., self._nv :]
+        J = np.stack([self._slopes(t + c * h, q, *at, force) for c, *at in zip(self._times, u, w_i, strict=True)])
+        return _inverse_of(np.einsum("ij,i...kl->...ikjl", h * self._A, J))
+
+    def _slopes(self, t: float, q: Array, u: Array, w: Array, force: Force) -> Array:
+        """Return J = ∂(u̇, ẇ)/∂(u, w).
+
+        It is of differences, of any engine and torque: half of the digits are plenty for
         an iteration that multiplies errors by h times the change of J over the step.
         """
-        s, nv = self._s, self._nv
+        nv = self._nv
         size = sqrt(_EPS) * max(1.0, float(np.abs(w).max(initial=0.0)))
         J = np.empty((*w.shape[:-1], 2 * nv, 2 * nv))
         there, moved = np.empty(J.shape[:-1]), np.empty(J.shape[:-1])
-        y = np.zeros(J.shape[:-1])
-        self._rates(t, q, y[..., :nv], w, force, there)
+        y = np.concatenate([u, w], axis=-1)
+        self._rates(t, q, u, w, force, there)
         for k in range(2 * nv):
-            y[..., k] = size
-            self._rates(t, q, y[..., :nv], w + y[..., nv:], force, moved)
-            y[..., k] = 0.0
+            y[..., k] += size
+            self._rates(t, q, y[..., :nv], y[..., nv:], force, moved)
+            y[..., k] = (u if k < nv else w)[..., k % nv]
             J[..., k] = (moved - there) / size
-        product = np.einsum("ij,...kl->...ikjl", h * self._A, J).reshape(*w.shape[:-1], 2 * s * nv, 2 * s * nv)
-        try:
-            return np.asarray(np.linalg.inv(np.eye(2 * s * nv) - product))
-        except np.linalg.LinAlgError:
-            raise DivergenceError(_UNSOLVED if np.isfinite(product).all() else RAN_AWAY) from None
+        return J
+
+
+def _inverse_of(product: Array) -> Array:
+    """Return (1 - product)⁻¹ of (..., s, m, s, m) as (..., s m, s m)."""
+    rows = product.shape[-1] * product.shape[-2]
+    product = product.reshape(*product.shape[:-4], rows, rows)
+    try:
+        return np.asarray(np.linalg.inv(np.eye(rows) - product))
+    except np.linalg.LinAlgError:
+        raise DivergenceError(_UNSOLVED if np.isfinite(product).all() else RAN_AWAY) from None
 
 
 def _mixed(weights: Array, rates: Array) -> Array:
