@@ -194,7 +194,7 @@ def simulate(
         states = _from_start(outcome, q, v)
         found = doubts(dyn, chosen, setting, *states, pushed=torque is not None)
         steps = round(duration / dt)
-        if chosen.order == 1 and torque is None and _FEWEST <= steps <= _MOST and not model.clock:
+        if chosen.order == 1 and torque is None and _FEWEST <= steps <= _MOST and not model.clock and v.size:
             one = (dyn, q, v) if batch is None else (dyn.of_samples([0]), q[:1], v[:1])
             found += halved(model, chosen.name, dt, states, lambda times: _coarser(one, chosen.name, dt, times))
     return _wrapped(dyn, chosen, applied, outcome, seconds, (*outcome.doubts, *found))

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from mbkit._check import Array
 
@@ -131,8 +130,7 @@ def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[fl
     exact = h * rates
     gap = made[None, :] - exact[:, None]
     gap.imag = (gap.imag + np.pi) % (2 * np.pi) - np.pi
-    # Each mode to its own: the pairing that is nearest in all.
-    modes, partners = linear_sum_assignment(np.minimum(np.abs(gap), 1e3))
+    modes, partners = _paired(np.abs(gap))
     off = np.abs(gap[modes, partners])
     # As long as there is anything of it, in truth or in what the steps made of it.
     dies = np.minimum(-rates.real[modes], -made.real[partners] / h)
@@ -140,3 +138,15 @@ def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[fl
     part = np.where(lasting < _BRIEF * duration, 0.0, off * lasting / h)
     worst = int(part.argmax())
     return float(part[worst]), complex(rates[modes[worst]])
+
+
+def _paired(gap: Array) -> tuple[Array, Array]:
+    """Return rows and columns of pairs, the nearest first, each once."""
+    rows, columns = np.unravel_index(np.argsort(gap, axis=None, kind="stable"), gap.shape)
+    partner: dict[int, int] = {}
+    taken: set[int] = set()
+    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+        if row not in partner and column not in taken:
+            partner[row] = column
+            taken.add(column)
+    return np.array(list(partner)), np.array(list(partner.values()))
