@@ -249,6 +249,45 @@ def test_redundant_rows_are_named():
         pendulum(constraints=[x + y, sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1]).project([1, 0], [0, 0])
 
 
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ([x + y, 2 * x + 2 * y], r"constraints\[1\] .* follows from constraints\[0\]"),
+        ([x + y, x + y - 1], "contradict each other"),
+        ([x**2 + 1], r"constraints\[0\] \(x\*\*2 \+ 1\) cannot hold"),
+        ([(x - y) ** 2], r"constraints\[0\] .* has no slope where it holds"),
+        ([sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1], "holds by itself"),
+    ],
+)
+def test_rows_are_named_wherever_they_are_met(rows, told):
+    lag = pendulum(constraints=rows)
+    asked = [
+        lambda: lag.dynamics(options=OWN).forward_dynamics([0, 0], [0, 0], [0, 0]),
+        lambda: lag.multipliers([0, 0], [0, 0]),
+        lambda: lag.embedded(),
+        lambda: mb.equilibrium(lag.dynamics(options=OWN)),
+    ]
+    for ask in asked:
+        with pytest.raises(InputError, match=told):
+            ask()
+
+
+def test_rows_that_a_late_value_makes_the_same_are_named():
+    lag = pendulum(constraints=[x + y, x + a * y], parameters={**NUMBERS, a: None})
+    with pytest.raises(InputError, match=r"follows from constraints\[0\]"):
+        lag.dynamics(options=OWN).at(a=1.0).forward_dynamics([0, 0], [0, 0], [0, 0])
+    contradictory = pendulum(constraints=[x + y, x + y - 1]).model
+    with pytest.raises(InputError, match="contradict each other"):
+        contradictory.random_state(np.random.default_rng(0))
+
+
+def test_several_states_are_projected_at_once(rod):
+    q, v = np.array([[1.0, -1.0], [0.5, -2.0]]), np.array([[1.0, 0.0], [0.0, 1.0]])
+    both = rod.project(q, v)
+    for i in range(2):
+        assert np.array_equal([part[i] for part in both], rod.project(q[i], v[i]))
+
+
 def test_contradictory_rows_are_named():
     with pytest.raises(InputError, match=r"constraints\[0\].*constraints\[1\].*contradict each other"):
         pendulum(constraints=[x + y, x + y - 1]).project([1, 0], [0, 0])

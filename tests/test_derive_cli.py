@@ -15,6 +15,7 @@ import mbkit as mb
 from mbkit.cli import cli
 from mbkit.lagrangian import systems
 from mbkit.lagrangian.blackboard import Blackboard, written
+from mbkit.lagrangian.layout import folded
 from mbkit.lagrangian.python_code import python_code
 from mbkit.load.names import find
 
@@ -42,6 +43,33 @@ def test_a_double_pendulum_reads_as_in_a_textbook():
     assert last in out.stdout
     # The name is a robot's too.
     assert "note" in out.stderr
+
+
+def test_a_slider_crank_reads_as_in_a_textbook():
+    text = derive("slider_crank").stdout
+    assert "T = ½ m r² (1 + r cos θ/ρ)² θ̇² sin² θ\n" in text
+    assert "with ρ = √(l² - r² sin² θ)\n" in text
+    half_slope = "m r² (cos θ + r (l² cos 2θ + r² sin⁴ θ)/ρ³) (1 + r cos θ/ρ)"
+    assert f"[ {half_slope} θ̇ sin θ ]" in text
+    equation = f"m r² (1 + r cos θ/ρ)² θ̈ sin² θ + {half_slope} θ̇² sin θ = τ + F r (1 + r cos θ/ρ) sin θ"
+    assert equation in " ".join(text.split())
+
+
+def test_terms_and_factors_stand_where_one_writes_them():
+    acrobot = derive("mbkit.lagrangian.systems:acrobot").stdout
+    assert "V = -(m₁ l_c₁ + m₂ l₁) g cos θ₁ - m₂ g l_c₂ cos(θ₁ + θ₂)\n" in acrobot
+    assert "m l² θ̈ - m a l Ω² sin θ cos(Ω t) + m g l sin θ = 0" in derive("driven_pendulum").stdout
+    assert "((A - C) φ̇ cos θ - ½ C ψ̇) sin θ" in derive("heavy_top").stdout
+    # Coordinates in their own order, not the alphabet's, and no line beyond the page.
+    names = sp.symbols("q1:12")
+    board = Blackboard(names, sp.symbols("v1:12"))
+    assert board.text(sp.cos(sum(names))).endswith("q₉ + q₁₀ + q₁₁)")
+    a, b, m = sp.symbols("m1 m2 m3")
+    v = sp.Symbol("v1")
+    assert board.text((a + b) * m * v**2 + m * v ** sp.Symbol("n")) == "(m₁ + m₂) m₃ v₁² + m₃ v1**n"
+    assert board.text(sp.Rational(2802749430154621, 302749430154621)) == "9.25765385825233"
+    long = " + ".join(f"θ̇{k} sin(θ{k})" for k in range(40))
+    assert max(sum(c != "\u0307" for c in line) for line in folded(long, 60)) <= 60
 
 
 def test_systems_on_paper_and_functions_of_ones_own():

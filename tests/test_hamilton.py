@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from scipy.integrate import solve_ivp
+from sympy.physics.mechanics import dynamicsymbols
 
 import mbkit as mb
 from mbkit.errors import InputError, NumericalError, UnsupportedError
@@ -94,6 +95,30 @@ def test_pendulum_and_top_are_the_textbooks():
     told = str(pendulum().hamiltonian().equations())
     assert told == "thetadot = p_theta/(l**2*m)\npdot_theta = -g*l*m*sin(theta)"
     assert r"\dot{p}_{\theta} &= - m g l \sin" in pendulum().hamiltonian().equations().latex()
+
+
+def test_the_shortest_of_several_forms():
+    hamiltonian = cart_pole().hamiltonian()
+    square = (p_x - p_theta * sp.cos(theta) / ell) ** 2 / (M + m * sp.sin(theta) ** 2) / 2
+    assert p_theta**2 / (2 * m * ell**2) + square - m * g * ell * sp.cos(theta) == hamiltonian.H
+    turned = (p_phi - p_psi * sp.cos(theta)) * (p_phi * sp.cos(theta) - p_psi) / (A * sp.sin(theta) ** 3)
+    assert sp.expand(heavy_top().hamiltonian().equations().pdot[1] - turned - m * g * ell * sp.sin(theta)) == 0
+    # No sum of squares, but not singular.
+    assert p_theta * p_x + theta * x == Lagrangian(w * xdot, x * theta, [theta, x], [w, xdot]).hamiltonian().H
+
+
+def test_symbols_are_known_by_their_names():
+    hamiltonian = cart_pole().hamiltonian()
+    rate = hamiltonian.poisson(x, hamiltonian.H)
+    assert rate != 0
+    for other in (dynamicsymbols("x"), sp.Symbol("x", real=True), "x"):
+        assert hamiltonian.poisson(other, hamiltonian.H) == rate
+    assert sp.simplify(hamiltonian.canonical(dynamicsymbols("x").diff()) - rate) == 0
+    with pytest.raises(InputError, match="p_y is no symbol of"):
+        hamiltonian.poisson("p_y", hamiltonian.H)
+    # An input that is called as the momentum would be.
+    taken = Lagrangian(w**2 / 2, 0, [theta], [w], forces={theta: p_theta}).hamiltonian()
+    assert str(taken.equations()) == "thetadot = P_theta\nPdot_theta = p_theta"
 
 
 @pytest.mark.parametrize("case", CASES)

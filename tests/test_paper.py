@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pickle
+import random
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,6 +16,9 @@ from sympy.physics.mechanics import dynamicsymbols
 import mbkit as mb
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import Lagrangian
+from mbkit.lagrangian.probe import vanishes
+from mbkit.lagrangian.reading import forms
+from mbkit.lagrangian.tidy import tidy
 from mbkit.simulate import METHODS as METHODS_OF
 
 EPS = np.finfo(float).eps
@@ -163,6 +168,34 @@ def test_dynamicsymbols_and_plain_ones_are_the_same_system():
     assert (lag.T, lag.V, lag.coordinates, lag.velocities) == tuple(
         getattr(pendulum(), n) for n in ("T", "V", "coordinates", "velocities")
     )
+
+
+def test_lagranges_own_formula_gives_the_same_accelerations():
+    """d/dt ∂L/∂q̇ - ∂L/∂q + ∂R/∂q̇ = 0 with functions of the time, and nothing of mbkit's; also in quasi-velocities."""
+    lag, now = rheonomic(), dynamicsymbols._t
+    f = dynamicsymbols("x theta")
+    put = {x: f[0], th: f[1], u: f[0].diff(now), w: f[1].diff(now), t: now}
+    L, R = ((lag.T - lag.V).subs(put), lag.dissipation.subs(put))
+    rows = [L.diff(q.diff(now)).diff(now) - L.diff(q) + R.diff(q.diff(now)) for q in f]
+    second = sp.symbols("a1 a2")
+    back = [(q.diff(now, 2), b) for q, b in zip(f, second, strict=True)]
+    back += [(q.diff(now), v) for q, v in zip(f, lag.velocities, strict=True)] + [(f[0], x), (f[1], th), (now, t)]
+    told = sp.Matrix([row.subs(back) for row in rows])
+    A, rest = told.jacobian(second), -told.subs(dict.fromkeys(second, 0))
+    # Products of D and M have cubes of cosines, which no tree of joints has.
+    D = sp.Matrix([[1, sp.cos(th) ** 2 / 4], [0, 1 + sp.sin(th) / 3]])
+    quasi, off = lag.quasi_velocities(D), []
+    for q, v, s in zip(*states(lag), strict=True):
+        at = {x: q[0], th: q[1], u: v[0], w: v[1], t: s}
+        truth = np.linalg.solve(*(np.array(X.subs(at), dtype=float) for X in (A, rest)))[:, 0]
+        dyn, turned = (made.dynamics(options={"compile": False}).at(t=s) for made in (lag, quasi))
+        off.append(dyn.forward_dynamics(q, v, 0 * v) - truth)
+        rates = quasi.to_quasi_velocity(q, v)
+        flow = D * sp.Matrix(rates)
+        drift = flow.jacobian([x, th]) * sp.Matrix(v)
+        accelerations = turned.forward_dynamics(q, rates, 0 * v)
+        off.append(np.array((D * sp.Matrix(accelerations) + drift).subs(at), dtype=float)[:, 0] - truth)
+    assert np.abs(off).max() < 1e-12
 
 
 METHODS = ("rk4", "gauss6", "rk853", "taylor", "dop853", "radau", "bdf", "lsoda", "cvodes", "implicit_midpoint")
@@ -335,6 +368,7 @@ def test_a_third_keeps_34_digits():
     assert str(lag.dynamics("oracle").digits("gravity", [0.5])[0]).startswith("0.33333333333333333333333333333333")
 
 
+MANY = sp.symbols("b:6")
 WRONG = [
     (lambda: Lagrangian(w**3 * m, 0, [th], parameters=[m]), "its term m\\*thetadot\\*\\*3 is not"),
     (lambda: Lagrangian(sp.sqrt(1 - w**2), 0, [th]), "T: expected at most the second degree"),
@@ -355,6 +389,33 @@ WRONG = [
     (lambda: Lagrangian(w**2, dynamicsymbols("z"), [th]), "z\\(t\\) is no coordinate"),
     (lambda: Lagrangian(w**2, sp.gamma(th), [th]).dynamics().gravity([1.0]), "gamma: no engine computes"),
     (lambda: Lagrangian(m * w**2, 0, [th], parameters=[m]).dynamics().mass_matrix([0.0]), "no value for parameter 'm'"),
+    # What is of no degree at all, found without a search.
+    (lambda: Lagrangian(w**2 + sp.Abs(w) * w, 0, [th]), "its term thetadot\\*Abs\\(thetadot\\) is not"),
+    (lambda: Lagrangian(sp.Piecewise((w**2, w > 0), (2 * w**2, True)), 0, [th]), "second degree.*Piecewise"),
+    (lambda: Lagrangian(w**2 + u**3 / w, 0, [th, x], [w, u]), "its term xdot\\*\\*3/thetadot is not"),
+    # Singular everywhere, by an identity and for more coordinates than have a short determinant.
+    (lambda: Lagrangian((w * sp.cos(th) + u * sp.sin(th)) ** 2, 0, [th, x], [w, u]), "thetadot, xdot together"),
+    (lambda: Lagrangian(sum((a + b) ** 2 for a, b in pairwise(MANY)), 0, sp.symbols("a:6"), MANY), "b5 together"),
+    (
+        lambda: Lagrangian(w**2, x, [th, x], [w, u], constraints=[th - 1]),
+        "no kinetic energy has xdot and no constraint",
+    ),
+    # Names stand for one thing each.
+    (lambda: Lagrangian(w**2 * m, 0, [th], parameters={m: 1.0, sp.Symbol("m"): 2.0}), "'m' stands twice"),
+    (lambda: Lagrangian(w**2, 0, [th], parameters=[sp.Symbol("thetaddot")]), "the derivative of thetadot is called"),
+    (lambda: Lagrangian(w**2, 0, [th], forces={th: sp.Symbol("thetaddot")}), "the derivative of thetadot is called"),
+    (lambda: Lagrangian(w**2, 0, [th], parameters={sp.Symbol("theta", real=True): 1.0}), "theta is a coordinate"),
+    (lambda: Lagrangian(w**2, 0, [th], forces={th: 1, "theta": 2}), "theta stands twice"),
+    (lambda: Lagrangian(w**2 + u**2, 0, {th, x}, [w, u]), "a set, which has no order"),
+    (lambda: Lagrangian(sp.Symbol("n") ** 2, 0, [sp.Symbol("k", integer=True)], [sp.Symbol("n")]), "to be integer"),
+    (lambda: Lagrangian(m * w**2, 0, [th], [sp.Symbol("thetadot", positive=True)]), "to be nonnegative"),
+    (lambda: Lagrangian((1 + sp.I) * w**2, 0, [th]), "imaginary unit"),
+    (lambda: Lagrangian(w**2 * sp.IndexedBase("m")[0], 0, [th]), "m\\[0\\] is no plain symbol"),
+    (lambda: Lagrangian(w**2, 0, [th], forces=[k]), "expected {coordinate: force}"),
+    (lambda: Lagrangian(w**2, 0, [th], forces={th: -k}), "an input is a symbol that is all of one force"),
+    (lambda: Lagrangian(w**2, 0, [th], dissipation=th**2), "holds none of the velocities thetadot"),
+    (lambda: Lagrangian(w**2, 0, [th], constraints=[k], parameters=[k]), "k holds no coordinate"),
+    (lambda: Lagrangian(w**2, 0, [th], name=5), "name: expected a text"),
     (lambda: pendulum().dynamics("pinocchio"), "was written as energies and has no bodies"),
     (lambda: pendulum().dynamics().pose([0.0], "tip"), "was written as energies and has no frames"),
     (lambda: pendulum().model.without("gravity"), "only 'damping' can be left out"),
@@ -365,6 +426,86 @@ WRONG = [
 def test_bad_input_is_named(call, told):
     with pytest.raises((InputError, UnsupportedError), match=told):
         call()
+
+
+def test_a_name_is_one_symbol_whatever_is_assumed_of_it():
+    plain, real = sp.Symbol("m"), sp.Symbol("theta", real=True)
+    lag = Lagrangian(m * w**2, plain * real**2, [th], parameters={sp.Symbol("m", real=True): 2.0})
+    assert str(lag.equations()) == "2*m*thetaddot + 2*m*theta = 0"
+    assert 3 * th**2 == lag.substituted({m: 3}).V
+    # A speed of what is positive has either sign.
+    r = sp.Symbol("r", positive=True)
+    speed = Lagrangian(sp.Symbol("rdot") ** 2, r, [r]).velocities[0]
+    assert sp.Abs(speed) != speed
+    assert Lagrangian("m*rdot**2/2", "beta*gamma*r", [r], parameters=sp.symbols("m beta gamma")).V.has(r)
+
+
+def test_constraints_are_equations_or_one_expression():
+    assert Lagrangian(w**2 + u**2, 0, [th, x], [w, u], constraints=sp.Eq(th, 2 * x)).constraints == (th - 2 * x,)
+    taken = Lagrangian(
+        sp.Symbol("lambda1") * (w**2 + u**2),
+        0,
+        [th, x],
+        [w, u],
+        parameters=sp.symbols("lambda1,"),
+        constraints=th - x,
+    )
+    assert str(taken.equations()).splitlines()[0] == "2*lambda1*thetaddot = Lambda1"
+
+
+def random_sum(pick: random.Random) -> sp.Expr:
+    """Return a sum of products of powers, cosines, roots and quotients."""
+    angles = [th, k, th + k, th - k, 2 * th, c * th]
+    others = [sp.sqrt(l**2 + m * sp.cos(th) + 3), 1 / (m + l * sp.sin(k)), 1 / sp.sin(th), sp.tan(k), sp.exp(m)]
+    others += [(3 + sp.cos(th - k)) ** sp.Rational(-3, 2), 1 / (3 + sp.cos(th - k)), 1 / (l + 1 / (m + c))]
+
+    def factor() -> sp.Expr:
+        turned = pick.choice([sp.sin, sp.cos])(pick.choice(angles)) ** pick.choice([1, 1, 2, 3])
+        power = pick.choice([m, l, c]) ** pick.choice([1, 2, -1])
+        return pick.choice([turned, turned, power, power, pick.choice(others)])
+
+    return sum(
+        (pick.choice([1, -1, sp.Rational(2, 3)]) * sp.prod(factor() for _ in range(2)) for _ in range(3)), sp.S(0)
+    )
+
+
+CUBES = [
+    # A square's other half, where the cosine stands before it and where such a term is there already.
+    th + sp.sin(c) ** 3 * sp.cos(m * c) ** 3 / 2 - 2 * sp.sin(2 * c),
+    2 * m * k * sp.sin(th) - l * sp.cos(th) ** 3 - sp.sin(2 * c) * sp.cos(th) / 2,
+]
+
+
+def test_shorter_forms_are_equal():
+    """What is cancelled, put over one denominator or freed of even powers of roots is the same function."""
+    pick = random.Random(3)
+    at = {s: sp.Float(0.3 + 0.17 * i, 40) for i, s in enumerate((th, k, m, l, c))}
+    for long in [*CUBES, *(random_sum(pick) for _ in range(8))]:
+        for form in [*forms(long), tidy(long)]:
+            scale = 1 + sum(abs(x.subs(at).evalf(25)) for x in sp.Add.make_args(long))
+            assert abs((form - long).subs(at).evalf(25)) < 1e-20 * scale, long
+
+
+def test_what_cancels_is_found_without_a_search():
+    s, co, rho = sp.sin(th), sp.cos(th), sp.sqrt(l**2 - a**2 * sp.sin(th) ** 2)
+    long = co * (1 + a * co / rho) + s * sp.diff(a * co / rho, th)
+    short = co + (a * l**2 * sp.cos(2 * th) + a**3 * s**4) / rho**3
+    assert tidy(long) == short
+    assert tidy(1 / s**2 - 1 / sp.tan(th) ** 2) == 1
+    assert tidy((m * s**2 - k * s**2 + k) / (m * s**2 + k * co**2)) == 1
+    assert tidy((m**2 - k**2) / (m + k)) == m - k
+    assert tidy(co**3 * x - co * x) == -x * s**2 * co
+    # What no form makes short is left, at once.
+    assert tidy((m + k + l + c + a) ** 12 * (1 + co) ** 12 / (1 + s) ** 12).count_ops() < 30
+
+
+def test_zero_is_told_by_value():
+    assert vanishes(sp.cosh(x) ** 2 - sp.sinh(x) ** 2 - 1)
+    assert vanishes(sp.log(sp.exp(x) * m) - x - sp.log(m))
+    for other in (sp.sqrt(x**2) - x, sp.Abs(x) - x, sp.Max(x, th) - th, 1e-40 * x, sp.sign(x) - 1):
+        assert not vanishes(other)
+    hidden = Lagrangian(w**2 / 2, sp.asin(th / 9) + sp.acos(th / 9) + sp.tan(th) * sp.cos(th) - sp.sin(th), [th])
+    assert hidden.cyclic_coordinates() == (th,)
 
 
 def test_without_damping_is_without_what_takes_energy():

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import sympy as sp
+from sympy.physics.mechanics import dynamicsymbols
 
 import mbkit as mb
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
@@ -241,6 +242,11 @@ def test_what_cannot_be_ignored_says_why():
         top.routhian(theta)
     with pytest.raises(InputError, match="x is no coordinate"):
         top.routhian([x])
+    with pytest.raises(InputError, match="expected a list of symbols, got 3"):
+        top.routhian(3)
+    with pytest.raises(InputError, match="expected at least one"):
+        top.routhian([])
+    assert top.routhian(dynamicsymbols("phi")).R == top.routhian("phi").R
     forced = Lagrangian(m * (xdot**2 + rdot**2) / 2, k * r**2, [x, r], parameters=[m, k], forces={x: F})
     with pytest.raises(InputError, match="x is in no energy, but F acts along it"):
         forced.routhian()

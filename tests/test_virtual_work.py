@@ -297,6 +297,27 @@ def test_free_directions_are_not_decided():
     assert len(rest.frequencies) == 1
 
 
+def test_places_and_turns_are_those_of_the_coordinates():
+    place = [ell * sp.sin(th), -ell * sp.cos(th)]
+    force = generalized_force([[0, -m * g]], [place], [sp.Symbol(th.name, real=True)])
+    assert list(force.values()) == [-m * g * ell * sp.sin(sp.Symbol(th.name, real=True))]
+    with pytest.raises(InputError, match=r"points\[0\].*got the velocity xdot"):
+        generalized_force([[1]], [[x + sp.Symbol("xdot")]], [x])
+    with pytest.raises(InputError, match=r"positions\[0\].*got the velocity xdot"):
+        from_particles([m], [[x + sp.Symbol("xdot")]], [x], parameters=[m])
+    # A rate that nobody declared would do no work.
+    with pytest.raises(InputError, match=r"angular_velocities\[0\].*holds none of the velocities xdot"):
+        generalized_force([], [], [x], torques=[[k]], angular_velocities=[[sp.Symbol("omega")]])
+
+
+def test_rest_that_the_time_does_not_move():
+    """A pendulum on a driven pivot rests, and only its whole period says whether it is stable."""
+    rest = equilibrium(mb.lagrangian.systems.driven_pendulum(), [0.3])
+    assert rest.q == pytest.approx(0.0, abs=1e-12)
+    assert rest.stable is None
+    assert not len(rest.frequencies)
+
+
 def test_rest_reads_well():
     rest = equilibrium(mb.dynamics(mb.catalog.pendulum(), "pinocchio"), holding=[0.5])
     assert "pendulum: equilibrium, stable" in str(rest)

@@ -13,13 +13,15 @@ from mbkit.lagrangian.abbreviations import Abbreviations
 from mbkit.lagrangian.blackboard import Blackboard, spread, written
 from mbkit.lagrangian.layout import folded, matrix
 from mbkit.lagrangian.lines import lines
-from mbkit.lagrangian.motion import EquationsOfMotion
+from mbkit.lagrangian.motion import EquationsOfMotion, equations_of_motion
 from mbkit.lagrangian.system import Lagrangian
 
 __all__ = ["Account"]
 
 #: Operations of T above which C and the equations are left out of a page.
 _READABLE: Final = 1500
+#: And above which M is.
+_WRITTEN: Final = 6000
 #: Letters above which a conserved quantity is only named.
 _LONG: Final = 800
 
@@ -36,11 +38,14 @@ class Account:
 
     def __init__(self, system: Lagrangian, names: Mapping[str, str] | None = None) -> None:
         self.system, self._names = system, dict(names or {})
-        self.long = system.T.count_ops() > _READABLE
+        self._size = int(system.T.count_ops())
+        self.long = self._size > _READABLE
 
     @cached_property
     def equations(self) -> EquationsOfMotion:
-        """The equations of motion."""
+        """The equations of motion; where they are too long for a page, without C."""
+        if self.long and type(self.system) is Lagrangian:
+            return equations_of_motion(self.system, coriolis=False)
         return self.system.equations()
 
     @cached_property
@@ -89,12 +94,16 @@ class Account:
             out.append(f"parameters {', '.join(given)}")
         if s.time:
             out.append(f"time {s.time}")
-        out += ["", *self._sum("T", s.T, width), *self._sum("V", s.V, width)]
+        kinetic = [f"T is too long for a page ({self._size} operations): ½ vᵀ M v with"] if self.long else None
+        out += ["", *(kinetic or self._sum("T", s.T, width)), *self._sum("V", s.V, width)]
         if s.dissipation != 0:
             out += self._sum("R", s.dissipation, width)
         for letter, root in self._short.roots.items():
             out.append(f"with {board.text(letter)} = {board.text(root)}")
         for name, (A, told) in self._matrices.items():
+            if name == "M" and self._size > _WRITTEN:
+                out += ["", f"M is too long for a page as well; its size is {A.rows} by {A.cols}."]
+                continue
             out += ["", f"{name}, {told}:", *matrix(name, A.applyfunc(self._short), board.text, width)]
         out.append("")
         if self.long:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from fractions import Fraction
 from itertools import combinations
-from math import comb, gcd, lcm, prod
-from random import Random
 from typing import Any, Final
 
 import sympy as sp
 
-from mbkit.lagrangian.harmonic import Harmonic, Key, Space
+from mbkit.lagrangian.harmonic import Harmonic, Key
+from mbkit.lagrangian.splitting import Form, FormKey, of_one_angle, split
+from mbkit.lagrangian.terms import Poly, content, paired, product
 
 __all__ = ["cost", "number", "written_out"]
 
@@ -19,22 +18,8 @@ __all__ = ["cost", "number", "written_out"]
 _SMALL: Final = 60
 #: Forms of fewest terms that are made into SymPy's expressions, to count their operations.
 _TRIED: Final = 4
-#: Sums of angles that are taken as one.
-_COMBINED: Final = 2
 #: Terms up to which a sum is tried to be a product of sums.
 _FACTORED: Final = 10
-
-#: Possible terms up to which a product of sums is looked for, and places at which it is ruled out first.
-_DENSE: Final = 50_000
-_PROBES: Final = 4
-
-#: Powers (angle, of cos, of sin) of single angles.
-_Powers = tuple[tuple[int, int, int], ...]
-#: Those, the kind and multiples of what is left, exponents of the generators.
-_Key = tuple[_Powers, int, tuple[int, ...], tuple[int, ...]]
-_Form = dict[_Key, Fraction]
-#: A product of powers of atoms -> its coefficient.
-_Poly = dict[tuple[tuple[sp.Expr, int], ...], Fraction]
 
 
 def cost(x: sp.Expr) -> int:
@@ -83,33 +68,11 @@ def written_out(x: Harmonic, *, whole: bool = True, decimals: bool = True) -> sp
     if len(x.terms) > _SMALL:
         return writer.expression(writer.as_it_is())
     forms = [(writer, form) for form in writer.forms()]
-    forms += [(other, form) for other in map(writer.like, _of_one_angle(x)) for form in other.squares()]
+    forms += [(other, form) for other in map(writer.like, of_one_angle(x)) for form in other.squares()]
     forms.sort(key=lambda pair: len(pair[1]))
     near = [(w, form) for w, form in forms[:_TRIED] if len(form) <= len(forms[0][1]) + 2]
     made = [w.expression(form) for w, form in near]
     return min(made, key=lambda e: (cost(e), made.index(e)))
-
-
-def _of_one_angle(x: Harmonic) -> Iterator[Harmonic]:
-    """Yield a sum with an angle more, such as θ₁ - θ₂, where twice that angle stands in it."""
-    space = x.space
-    found = dict.fromkeys(_direction(key[1]) for key in x.terms if gcd(*key[1]) > 1 and sum(map(bool, key[1])) > 1)
-    for direction in list(found)[:_COMBINED]:
-        angle = sp.Add(*(k * a for k, a in zip(direction, space.angles, strict=True)))
-        # SymPy writes sin(b - a) as -sin(a - b).
-        sign = -1 if sp.sin(angle).is_Mul else 1
-        wider = Space(space.name, [*space.angles, sign * angle], space.generators, space.most)
-        terms = {}
-        for (kind, turns, powers), value in x.terms.items():
-            along = any(turns) and _direction(turns) == direction
-            more = ((0,) * len(turns), gcd(*turns)) if along else (turns, 0)
-            # Of a sine the sign of the angle comes before it.
-            terms[kind, (*more[0], more[1]), powers] = value * (sign if along and kind else 1)
-        yield Harmonic(wider, terms)
-
-
-def _direction(turns: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(k // gcd(*turns) for k in turns) if any(turns) else turns
 
 
 class _Writer:
@@ -121,66 +84,66 @@ class _Writer:
         """Return a writer of another sum."""
         return _Writer(x, self._whole, self._decimals)
 
-    def squares(self) -> list[_Form]:
+    def squares(self) -> list[Form]:
         """Return the sum with its last angle split off."""
         last = len(self._x.space.angles) - 1
-        return [_split(self._x, (last,), kept) for kept in (0, 1)]
+        return [split(self._x, (last,), kept) for kept in (0, 1)]
 
-    def as_it_is(self) -> _Form:
+    def as_it_is(self) -> Form:
         return {((), kind, multiples, powers): value for (kind, multiples, powers), value in self._x.terms.items()}
 
-    def forms(self) -> list[_Form]:
+    def forms(self) -> list[Form]:
         """Return the sum with the angles of each subset split off as powers of their own cosine and sine."""
         x = self._x
         present = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
         subsets: list[tuple[int, ...]] = [()]
         if len(present) <= 4:
             subsets = [s for n in range(len(present) + 1) for s in combinations(present, n)]
-        forms: list[_Form] = []
+        forms: list[Form] = []
         for subset in subsets:
             # The square that stays, of cosines (0) or sines (1); neither is shorter always.
             for kept in (0, 1) if subset else (0,):
-                form = _split(x, subset, kept)
+                form = split(x, subset, kept)
                 if form not in forms:
                     forms.append(form)
         mixed = self._by_monomial(subsets)
         return forms if mixed in forms else [*forms, mixed]
 
-    def _by_monomial(self, subsets: list[tuple[int, ...]]) -> _Form:
+    def _by_monomial(self, subsets: list[tuple[int, ...]]) -> Form:
         """Return the sum with the shortest form of what multiplies each product of generators."""
         groups: dict[tuple[int, ...], dict[Key, Fraction]] = {}
         for key, value in self._x.terms.items():
             groups.setdefault(key[2], {})[key] = value
-        out: _Form = {}
+        out: Form = {}
         for terms in groups.values():
             part = Harmonic(self._x.space, terms)
-            tried = [_split(part, subset, kept) for subset in subsets for kept in ((0, 1) if subset else (0,))]
-            best: _Form = min(tried, key=len)
+            tried = [split(part, subset, kept) for subset in subsets for kept in ((0, 1) if subset else (0,))]
+            best: Form = min(tried, key=len)
             out |= best
         return out
 
-    def expression(self, form: _Form) -> sp.Expr:
-        poly = _paired(dict(self._term(key, value) for key, value in form.items()))
+    def expression(self, form: Form) -> sp.Expr:
+        poly = paired(dict(self._term(key, value) for key, value in form.items()))
         by_angle = self._by_angle(poly)
         if not self._whole or len(by_angle) == len(poly):
             made = [sp.Add(*map(self._written, by_angle))]
         else:
-            shared, scale, left = _content(poly)
+            shared, scale, left = content(poly)
             inside = sp.Add(*map(self._written, self._by_angle(left)))
             made = [sp.Mul(self._number(scale), *(a**e for a, e in shared), inside)]
         if self._whole:
             made.append(self._written(poly))
         return min(made, key=lambda e: (cost(e), made.index(e)))
 
-    def _by_angle(self, poly: _Poly) -> list[_Poly]:
+    def _by_angle(self, poly: Poly) -> list[Poly]:
         """Return the terms of each cosine and sine."""
-        groups: dict[tuple[tuple[sp.Expr, int], ...], _Poly] = {}
+        groups: dict[tuple[tuple[sp.Expr, int], ...], Poly] = {}
         for atoms, value in poly.items():
             turned = tuple(a for a in atoms if isinstance(a[0], (sp.sin, sp.cos)))
             groups.setdefault(turned, {})[atoms] = value
         return list(groups.values())
 
-    def _term(self, key: _Key, value: Fraction) -> tuple[tuple[tuple[sp.Expr, int], ...], Fraction]:
+    def _term(self, key: FormKey, value: Fraction) -> tuple[tuple[tuple[sp.Expr, int], ...], Fraction]:
         done, kind, rest, powers = key
         space = self._x.space
         out = [(g, e) for g, e in zip(space.generators, powers, strict=True) if e]
@@ -198,12 +161,12 @@ class _Writer:
     def _number(self, x: Fraction) -> sp.Expr:
         return number(x) if self._decimals else sp.Rational(x.numerator, x.denominator)
 
-    def _written(self, poly: _Poly) -> sp.Expr:
+    def _written(self, poly: Poly) -> sp.Expr:
         """Return a polynomial with what its terms share taken out, most shared first."""
         if len(poly) == 1:
             ((atoms, value),) = poly.items()
             return sp.Mul(self._number(value), *(a**e for a, e in atoms))
-        shared, scale, left = _content(poly)
+        shared, scale, left = content(poly)
         outside = sp.Mul(self._number(scale), *(a**e for a, e in shared))
         inside = self._sum(left)
         if outside.is_Number and isinstance(inside, sp.Add):
@@ -211,7 +174,7 @@ class _Writer:
             return self._sum({atoms: scale * value for atoms, value in left.items()}) if outside != 1 else inside
         return sp.Mul(outside, inside)
 
-    def _sum(self, poly: _Poly) -> sp.Expr:
+    def _sum(self, poly: Poly) -> sp.Expr:
         """Return a sum by the atom that most of its terms have, and what has it not likewise."""
         # The same parts come up in many forms.
         key = frozenset(poly.items())
@@ -219,7 +182,7 @@ class _Writer:
             self._sums[key] = self._summed(poly)
         return self._sums[key]
 
-    def _summed(self, poly: _Poly) -> sp.Expr:
+    def _summed(self, poly: Poly) -> sp.Expr:
         counts: dict[sp.Expr, int] = {}
         for atoms in poly:
             for a, e in atoms:
@@ -230,166 +193,15 @@ class _Writer:
         tried = [self._plain(poly)]
         if len(poly) > 2:
             tried += [self._taken(poly, a) for a in counts if counts[a] == most > 1]
-            tried += _product(poly, tried[0])
+            tried += product(poly, tried[0])
         return min(tried, key=lambda e: (cost(e), -tried.index(e)))
 
-    def _plain(self, poly: _Poly) -> sp.Expr:
+    def _plain(self, poly: Poly) -> sp.Expr:
         return sp.Add(*(self._written({atoms: value}) for atoms, value in poly.items()))
 
-    def _taken(self, poly: _Poly, atom: sp.Expr) -> sp.Expr:
+    def _taken(self, poly: Poly, atom: sp.Expr) -> sp.Expr:
         with_it = {atoms: value for atoms, value in poly.items() if dict(atoms).get(atom, 0) > 0}
         without = {atoms: value for atoms, value in poly.items() if atoms not in with_it}
         if not without:
             return self._plain(poly)
         return sp.Add(self._written(with_it), self._written(without) if len(without) == 1 else self._sum(without))
-
-
-def _product(poly: _Poly, x: sp.Expr) -> list[sp.Expr]:
-    """Return a sum as a product of sums, if it is one; its atoms are as good as symbols."""
-    highest: dict[sp.Expr, int] = {}
-    for a, e in (pair for atoms in poly for pair in atoms):
-        highest[a] = max(highest.get(a, 0), e)
-    # SymPy's polynomials are as large as all powers together.
-    large = prod(e + 1 for e in highest.values()) > _DENSE
-    # The factors of a sum with decimals would have others.
-    if large or x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms) or _irreducible(poly):
-        return []
-    symbols = {a: sp.Dummy(f"x{i}") for i, a in enumerate(dict.fromkeys(a for atoms in poly for a, _ in atoms))}
-    named = sp.Add(
-        *(
-            sp.Rational(v.numerator, v.denominator) * sp.Mul(*(symbols[a] ** e for a, e in atoms))
-            for atoms, v in poly.items()
-        )
-    )
-    product = sp.factor(named)
-    return [] if product.is_Add else [product.xreplace({symbol: a for a, symbol in symbols.items()})]
-
-
-def _irreducible(poly: _Poly) -> bool:
-    """Return whether a sum is surely no product: what is Q a + R has no factor but those that Q and R share.
-
-    At random whole numbers for the other atoms Q and R share no factor either, most of the time.
-    """
-    atoms = list(dict.fromkeys(a for powers in poly for a, _ in powers))
-    rows = [tuple(dict(powers).get(a, 0) for a in atoms) for powers in poly]
-    # Without what all terms share, which is no factor that is looked for.
-    least = [min(es) for es in zip(*rows, strict=True)]
-    rows = [tuple(e - f for e, f in zip(row, least, strict=True)) for row in rows]
-    scale = lcm(*(v.denominator for v in poly.values()))
-    numbers = [int(v * scale) for v in poly.values()]
-    shared, rng = gcd(*numbers), Random(0)
-    for i, highest in enumerate(max(es) for es in zip(*rows, strict=True)):
-        for _ in range(_PROBES if highest == 1 else 0):
-            at = [rng.randrange(1_000, 1_000_000) for _ in atoms]
-            parts = [0, 0]
-            for row, x in zip(rows, numbers, strict=True):
-                others = (at[j] ** e for j, e in enumerate(row) if j != i)
-                parts[row[i]] += x // shared * prod(others)
-            if gcd(*parts) == 1:
-                return True
-    return False
-
-
-def _content(poly: _Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, _Poly]:
-    """Return the powers and the number that all terms share, and what is left."""
-    first, *others = (dict(atoms) for atoms in poly)
-    powers = {a: [e, *(o.get(a, 0) for o in others)] for a, e in first.items()}
-    # k/r² - p/r³ stays as it is.
-    shared = {a: min(es) for a, es in powers.items() if min(es) > 0 or min(es) == max(es)}
-    values = list(poly.values())
-    scale = min(map(abs, values))
-    if any(v.denominator > 1 or abs(v) > 100 for v in (x / scale for x in values)):
-        scale = Fraction(gcd(*(v.numerator for v in values)), lcm(*(v.denominator for v in values)))
-        # Decimals share many numbers by accident; a common factor of a sum is read where it is a small one.
-        if scale.numerator > 100 or scale.denominator > 100:
-            scale = Fraction(1)
-    # ½ (2 a + b) reads worse than a + ½ b.
-    if _numbers(values) < _numbers([x / scale for x in values]) + (scale != 1):
-        scale = Fraction(1)
-    if sum(v > 0 for v in values) == 0:
-        scale = -scale
-    left = {
-        tuple((a, e - shared.get(a, 0)) for a, e in atoms if e != shared.get(a, 0)): v / scale
-        for atoms, v in poly.items()
-    }
-    return list(shared.items()), scale, left
-
-
-def _numbers(values: list[Fraction]) -> int:
-    """Return how many numbers are written."""
-    return sum(abs(x) != 1 for x in values)
-
-
-def _paired(poly: _Poly) -> _Poly:
-    """Write c - c cos² a as c sin² a, and c - c sin² a as c cos² a."""
-    out = dict(poly)
-    for atoms, value in poly.items():
-        for a, e in atoms:
-            if e != 2 or not isinstance(a, (sp.sin, sp.cos)) or atoms not in out:
-                continue
-            alone = tuple(x for x in atoms if x[0] != a)
-            if out.get(alone) == -value:
-                other = (sp.cos if isinstance(a, sp.sin) else sp.sin)(*a.args)
-                del out[alone], out[atoms]
-                # There may be such a term already, with its atoms in another order.
-                made = {*alone, (other, 2)}
-                place = next((k for k in out if set(k) == made), (*alone, (other, 2)))
-                total = out.pop(place, Fraction(0)) - value
-                if total:
-                    out[place] = total
-    return out
-
-
-def _split(x: Harmonic, subset: tuple[int, ...], kept: int) -> _Form:
-    """Return a form: Re or Im of Π (cos a + i sin a)^k (cos rest + i sin rest), power by power."""
-    out: _Form = {}
-    for (kind, multiples, powers), value in x.terms.items():
-        rest = tuple(0 if i in subset else k for i, k in enumerate(multiples))
-        first = next((k for k in rest if k), 0)
-        sign = -1 if first < 0 else 1
-        rest = tuple(sign * k for k in rest)
-        parts: list[tuple[_Powers, int, int]] = [((), 0, 1)]
-        for i in subset:
-            if multiples[i]:
-                parts = [
-                    ((*done, (i, c, s)), turns + (s if multiples[i] > 0 else -s), factor * times)
-                    for done, turns, factor in parts
-                    for c, s, times in _powers(abs(multiples[i]))
-                ]
-        for done, turns, factor in parts:
-            for part in (0, 1) if first else (0,):
-                # A power of i: real for a cosine, imaginary for a sine.
-                total = (turns + part) % 4
-                if total % 2 == kind:
-                    amount = value * factor * (-1 if total >= 2 else 1) * (sign if part else 1)
-                    for reduced, weight in _reduced(done, kept):
-                        _gather(out, (reduced, part, rest, powers), amount * weight)
-    return out
-
-
-def _powers(k: int) -> list[tuple[int, int, int]]:
-    """Return (power of cos, of sin, coefficient) of (cos + i sin)^k, without the powers of i."""
-    return [(k - s, s, comb(k, s)) for s in range(k + 1)]
-
-
-def _reduced(done: _Powers, kept: int) -> Iterator[tuple[_Powers, int]]:
-    """Yield a product of powers with the square that is not kept replaced by 1 less the other's."""
-    if not done:
-        yield (), 1
-        return
-    (i, c, s), *others = done
-    gone, stays = (s, c) if kept == 0 else (c, s)
-    for rest, weight in _reduced(tuple(others), kept):
-        half = gone // 2
-        for n in range(half + 1):
-            a, b = stays + 2 * n, gone % 2
-            power = (i, a, b) if kept == 0 else (i, b, a)
-            yield ((power, *rest) if a or b else rest), weight * comb(half, n) * (-1) ** n
-
-
-def _gather(out: _Form, key: _Key, value: Fraction) -> None:
-    total = out.get(key, Fraction(0)) + value
-    if total:
-        out[key] = total
-    else:
-        out.pop(key, None)

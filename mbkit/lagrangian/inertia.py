@@ -44,6 +44,7 @@ def require_inertia(
     for seed in range(_PLACES):
         values = probe(probe.place(seed))
         if values is None:
+            # No judgement where it has no value.
             return
         with mpmath.workdps(DIGITS):
             A = mpmath.matrix(n, n)
@@ -51,8 +52,16 @@ def require_inertia(
                 for j in range(n):
                     pulls = (mpmath.conj(values[k + i]) * values[k + j] for k in range(n * n, len(values), n))
                     A[i, j] = values[n * i + j] + mpmath.fsum(pulls)
-            sizes = [mpmath.norm(A[i, :]) for i in range(n)]
-            if any(s == 0 for s in sizes) or abs(mpmath.det(A)) > _ROUNDED * mpmath.fprod(sizes):
+            rows = [mpmath.norm(A[i, :]) for i in range(n)]
+            if any(x == 0 for x in rows):
+                continue
+            # Masses may differ by any number of decades.
+            scaled = mpmath.matrix(n, n)
+            for i in range(n):
+                for j in range(n):
+                    scaled[i, j] = A[i, j] / mpmath.sqrt(rows[i] * rows[j])
+            sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
+            if abs(mpmath.det(scaled)) > _ROUNDED * mpmath.fprod(sizes):
                 return
     told = f" {M.tolist()}" if len(str(M)) <= _TOLD else ""
     raise InputError(

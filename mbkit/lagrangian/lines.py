@@ -8,6 +8,7 @@ import sympy as sp
 
 from mbkit.lagrangian.abbreviations import Abbreviations
 from mbkit.lagrangian.blackboard import Blackboard, spread
+from mbkit.lagrangian.compact import cost
 from mbkit.lagrangian.motion import EquationsOfMotion
 from mbkit.lagrangian.tidy import tidy
 
@@ -43,12 +44,13 @@ def lines(
 
 
 def by_speeds(x: sp.Expr, velocities: tuple[sp.Symbol, ...]) -> sp.Expr:
-    """Return what is quadratic in the velocities term by term, where it would hold cosines in brackets."""
+    """Return what is quadratic in the velocities term by term, where that is shorter or frees cosines from brackets."""
     moving = [v for v in velocities if x.has(v)]
-    brackets = (a for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add)
-    if len(moving) < 2 or not any(a.has(sp.sin, sp.cos) for a in brackets):
+    if len(moving) < 2 or not x.has(sp.sin, sp.cos):
         return x
     pairs = combinations_with_replacement(moving, 2)
     # Of a square the second derivative is twice its factor.
     terms = ((tidy(sp.diff(x, v, w) / (2 if v == w else 1)), v * w) for v, w in pairs)
-    return sp.Add(*(factor * pair for factor, pair in terms))
+    grouped = sp.Add(*(factor * pair for factor, pair in terms))
+    brackets = (a for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add)
+    return grouped if cost(grouped) < cost(x) or any(a.has(sp.sin, sp.cos) for a in brackets) else x

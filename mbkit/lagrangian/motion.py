@@ -8,7 +8,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import sympy as sp
+from sympy.matrices.exceptions import NonInvertibleMatrixError
 
+from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.slopes import gradient, slope
 from mbkit.lagrangian.tidy import tidy, tidy_matrix
 
@@ -62,7 +64,9 @@ class EquationsOfMotion:
     @cached_property
     def coriolis_force(self) -> sp.ImmutableMatrix:
         """C v, (n, 1)."""
-        return tidy_matrix(self.coriolis_matrix * sp.Matrix(self.velocities))
+        C, v = self.coriolis_matrix, sp.Matrix(self.velocities)
+        # One product is as short as its factors.
+        return tidy_matrix(C * v) if len(v) > 1 else sp.ImmutableMatrix(C * v)
 
     @property
     def applied(self) -> sp.ImmutableMatrix:
@@ -95,11 +99,21 @@ class EquationsOfMotion:
         """Return v̇ of each velocity, solved for in symbols: M⁻¹ (Q - C v - d - ∂V/∂q).
 
         Grows fast with the number of coordinates; `Lagrangian.dynamics` solves numerically instead.
+
+        Raises
+        ------
+        UnsupportedError
+            The mass matrix alone has no inverse, as of coordinates that only constraints bind.
         """
         n = len(self.accelerations)
         # One quotient is worth shortening; SymPy has no bound on its time for a solved system.
         shorter = tidy if n == 1 else sp.factor_terms
-        solved = self.mass_matrix.LUsolve(self.applied)
+        try:
+            solved = self.mass_matrix.LUsolve(self.applied)
+        except NonInvertibleMatrixError:
+            raise UnsupportedError(
+                "explicit: the mass matrix has no inverse without the constraints; Lagrangian.dynamics solves with them"
+            ) from None
         return tuple(sp.Eq(a, shorter(x), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True))
 
     def latex(self) -> str:
@@ -132,8 +146,8 @@ def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
     return out or "0"
 
 
-def equations_of_motion(system: Lagrangian) -> EquationsOfMotion:
-    """Return Lagrange's equations of a system: d/dt ∂L/∂v - ∂L/∂q = Q + Jᵀ λ."""
+def equations_of_motion(system: Lagrangian, *, coriolis: bool = True) -> EquationsOfMotion:
+    """Return Lagrange's equations of a system: d/dt ∂L/∂v - ∂L/∂q = Q + Jᵀ λ; C is zero where nobody asks for it."""
     q, v, k, t = system.coordinates, sp.Matrix(system.velocities), system.kinetic, system.time
     n, m = len(q), len(system.constraints)
     drift = sp.zeros(n, 1)
@@ -154,7 +168,7 @@ def equations_of_motion(system: Lagrangian) -> EquationsOfMotion:
         velocities=system.velocities,
         accelerations=system.accelerations,
         mass_matrix=k.M,
-        coriolis_matrix=christoffel(k.M, q, system.velocities),
+        coriolis_matrix=christoffel(k.M, q, system.velocities) if coriolis else sp.ImmutableMatrix.zeros(n),
         drift=tidy_matrix(drift),
         potential_gradient=sp.ImmutableMatrix(gradient(system.V, q)),
         forces=tidy_matrix(forces),

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 
 from mbkit.derivation.factorize import solve
-from mbkit.lagrangian.constraints import weight
+from mbkit.lagrangian.constraint_terms import weight
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.written import WrittenEquations
+    from mbkit.lagrangian.written_equations import WrittenEquations
 
 __all__ = ["constrained", "derivatives"]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["bracket", "momentum_symbols", "shorter"]
 
 # Operations up to which a bracket is tidied.
-_SHORT: Final = 200
+_SHORT: Final = 100
 
 
 def momentum_symbols(system: Lagrangian, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:

@@ -16,13 +16,13 @@ is ω × p, Euler's.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
+from sympy.core.function import AppliedUndef
 
 from mbkit._check import Array, rows
 from mbkit.errors import InputError, UnsupportedError
@@ -32,6 +32,7 @@ from mbkit.lagrangian.degree import KineticSplit
 from mbkit.lagrangian.inverse import inverse
 from mbkit.lagrangian.motion import EquationsOfMotion
 from mbkit.lagrangian.numeric import Numeric, values_of
+from mbkit.lagrangian.quasi_equations import QuasiEquationsOfMotion, quasi_equations
 from mbkit.lagrangian.symbols import fits, in_symbols_of, plain
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.tidy import tidy, tidy_matrix
@@ -42,32 +43,6 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.routh import Routhian
 
 __all__ = ["QuasiEquationsOfMotion", "QuasiLagrangian"]
-
-
-@dataclass(frozen=True)
-class QuasiEquationsOfMotion(EquationsOfMotion):
-    """M ẇ + C w + d + Dᵀ ∂V/∂q = Dᵀ Q, with q̇ = D w.
-
-    `velocities` are w, `potential_gradient` is Dᵀ ∂V/∂q and `forces` Dᵀ Q. C is Christoffel's
-    with the structure of D in it, so that Ṁ - 2C is skew.
-
-    Attributes
-    ----------
-    D : (n, n) sympy.Matrix
-    rates : tuple of sympy.Symbol
-        q̇.
-    hamel_coefficients : (n, n, n) sympy array
-        γ, with ``hamel_coefficients[k, i, j]`` = γ^k_ij.
-    """
-
-    D: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 0, []))
-    rates: tuple[sp.Symbol, ...] = ()
-    hamel_coefficients: sp.ImmutableDenseNDimArray = field(default_factory=lambda: sp.ImmutableDenseNDimArray([]))
-
-    def kinematics(self) -> tuple[sp.Eq, ...]:
-        """Return q̇ = D w, one equation per coordinate."""
-        right = self.D * sp.Matrix(self.velocities)
-        return tuple(sp.Eq(a, b, evaluate=False) for a, b in zip(self.rates, right, strict=True))
 
 
 class QuasiLagrangian(Lagrangian):
@@ -137,57 +112,9 @@ class QuasiLagrangian(Lagrangian):
         inputs = [self.system.inputs.get(q, sp.Integer(0)) for q in self.coordinates]
         return tidy_matrix(self.D.T * sp.Matrix(inputs))
 
-    def _along(self, x: Any) -> list[Any]:
-        """Return the derivative of x along each column of D."""
-        by = [sp.diff(x, q) for q in self.coordinates]
-        n = len(by)
-        return [sum((self.D[r, i] * by[r] for r in range(n)), 0 * x) for i in range(n)]
-
     @cached_property
     def _equations(self) -> EquationsOfMotion:
-        k, n, t = self.kinetic, len(self.coordinates), self.time
-        v, gamma, w = sp.Matrix(self.velocities), self.hamel_coefficients, self.velocities
-        drift = sp.zeros(n, 1)
-        if any(k.b) or k.T0 != 0:
-            slope = sp.Matrix.hstack(*self._along(k.b))
-            turned = sp.Matrix(n, n, lambda i, j: sum(gamma[h, i, j] * k.b[h] for h in range(n)))
-            drift += (slope - slope.T + turned) * v - sp.Matrix(self._along(k.T0))
-        if t is not None:
-            drift += sp.diff(k.M, t) * v + sp.diff(k.b, t)
-        friction = sp.Matrix([sp.diff(self.dissipation, x) for x in w])
-        return QuasiEquationsOfMotion(
-            coordinates=self.coordinates,
-            velocities=w,
-            accelerations=self.accelerations,
-            mass_matrix=k.M,
-            coriolis_matrix=self._coriolis_matrix(),
-            drift=tidy_matrix(drift),
-            potential_gradient=tidy_matrix(self._along(self.V)),
-            forces=tidy_matrix(sp.Matrix(self.forces) + self.input_forces - friction),
-            D=self.D,
-            rates=self.system.velocities,
-            hamel_coefficients=gamma,
-        )
-
-    def _coriolis_matrix(self) -> sp.ImmutableMatrix:
-        """Return C_ij = ½ Σ_k (D_k M_ij + D_j M_ik - D_i M_jk + c_ikj - c_jki - c_kji) w_k.
-
-        Koszul's formula for the connection of M in the frame of D's columns, with D_k the derivative
-        along a column and c_lij = Σ_h M_lh γ^h_ij.
-        """
-        M, n, gamma = self.kinetic.M, len(self.coordinates), self.hamel_coefficients
-        slopes = self._along(sp.Matrix(M))
-        c = [[[sum(M[h, m] * gamma[m, i, j] for m in range(n)) for j in range(n)] for i in range(n)] for h in range(n)]
-
-        def entry(i: int, j: int) -> sp.Expr:
-            terms = (
-                (slopes[k][i, j] + slopes[j][i, k] - slopes[i][j, k] + c[i][k][j] - c[j][k][i] - c[k][j][i])
-                * self.velocities[k]
-                for k in range(n)
-            )
-            return tidy(sum(terms, sp.Integer(0)) / 2)
-
-        return sp.ImmutableMatrix(n, n, entry)
+        return quasi_equations(self)
 
     # Variants
 
@@ -297,14 +224,17 @@ def _checked(system: Lagrangian, given: Any) -> sp.ImmutableMatrix:
             f"D: expected shape ({n}, {n}), one row for each of {', '.join(map(str, system.coordinates))}, "
             f"got {D.shape}"
         )
-    D = D.applyfunc(lambda x: in_symbols_of(system, "D", x))
+    if D.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise InputError(f"D: expected finite entries, got {D.tolist()}")
+    D = D.applyfunc(lambda x: in_symbols_of(system, "D", x, others=True))
     if system.time is not None and system.time in D.free_symbols:
         raise InputError(f"D: expected coordinates and parameters only, got the time {system.time}")
-    others = D.free_symbols - set(system.coordinates) - set(system.parameters)
+    others = {str(x) for x in D.free_symbols - set(system.coordinates) - set(system.parameters)}
+    others |= {str(x) for x in D.atoms(AppliedUndef)}
     if others:
         raise InputError(
             f"D: expected the coordinates {', '.join(map(str, system.coordinates))} and parameters only, "
-            f"got {plain(others)}; q̇ = D w with D of q alone"
+            f"got {', '.join(sorted(others))}; q̇ = D w with D of q alone"
         )
     return D
 

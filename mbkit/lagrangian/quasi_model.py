@@ -16,7 +16,8 @@ from mbkit._check import Array, batch_of
 from mbkit.derivation.machine import Machine
 from mbkit.errors import InputError
 from mbkit.lagrangian.conversion import Conversion
-from mbkit.lagrangian.written import WrittenEquations, WrittenModel
+from mbkit.lagrangian.written import WrittenModel
+from mbkit.lagrangian.written_equations import WrittenEquations
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.quasi import QuasiLagrangian

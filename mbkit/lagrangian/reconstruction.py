@@ -20,7 +20,7 @@ from mbkit._check import Array, finite_array, real, require_finite
 from mbkit.derivation.machine import Machine
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.numeric import Numeric
-from mbkit.lagrangian.written import WrittenEquations
+from mbkit.lagrangian.written_equations import WrittenEquations
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.routh import Routhian

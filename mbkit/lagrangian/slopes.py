@@ -14,6 +14,8 @@ __all__ = ["gradient", "slope"]
 _WORTH: Final = 0.7
 #: Operations up to which the derivative is multiplied out too.
 _SMALL: Final = 60
+#: Operations up to which what stands in brackets is tidied.
+_LONG: Final = 150
 
 
 def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
@@ -22,11 +24,12 @@ def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
     A slider-crank's inertia m r² λ² sin² θ has the slope 2 m r² λ (λ cos θ + λ′ sin θ) sin θ, which nobody finds
     again once it is multiplied out.
     """
-    broken = (f.base for f in x.atoms(sp.Pow) if not f.exp.is_Integer or f.exp.is_negative)
-    if all(base.is_Symbol or not base.has(q) for base in broken):
+    broken = [f for f in x.atoms(sp.Pow) if f.base.has(q) and (not f.exp.is_Integer or f.exp.is_negative)]
+    if all(f.base.is_Symbol for f in broken):
         return tidy(sp.diff(x, q))
     product = _product(x, q)
-    if x.count_ops() > _SMALL:
+    # Multiplied out, what has roots gets shorter in rare cases only.
+    if x.count_ops() > _SMALL or not all(f.exp.is_Integer for f in broken):
         return product
     plain = tidy(sp.diff(x, q))
     # A sum that was written as products stays one, unless it gets much shorter.
@@ -54,5 +57,5 @@ def _product(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
         rate = _product(b, q) if b.is_Add else sp.diff(b, q)
         inside += e * rate * sp.Mul(*(other for i, (other, _) in enumerate(moving) if i != k))
     # A number would be multiplied into the sum.
-    number, rest = tidy(inside).primitive()
+    number, rest = (tidy(inside) if inside.count_ops() <= _LONG else inside).primitive()
     return shared * number * rest

@@ -8,6 +8,7 @@ hold quotients of quotients, the cofactors of M over its determinant are shorter
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import permutations
 from typing import Any, Final, Protocol
 
@@ -24,6 +25,8 @@ __all__ = ["Squares"]
 _TRIED: Final = 3
 #: Operations of three coupled rows up to which they are.
 _SMALL: Final = 24
+#: Operations up to which a step of an elimination is tidied.
+_LONG: Final = 250
 
 
 class _Inverse(Protocol):
@@ -55,7 +58,7 @@ class Squares:
             part = sp.ImmutableMatrix(M.extract(block, block))
             p = sp.symbols(f"p0:{len(block)}", cls=sp.Dummy)
             tried = _tried(part, f"{what} {sp.Matrix(M).tolist()}")
-            self._blocks.append((block, min(tried, key=lambda a: cost(a.form(p, p)))))
+            self._blocks.append((block, min(tried, key=lambda a: cost(a.form(p, p)) if len(tried) > 1 else 0)))
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
         """Return xᵀ M⁻¹ y."""
@@ -73,16 +76,29 @@ class Squares:
 
 def _tried(M: sp.ImmutableMatrix, what: str) -> list[_Inverse]:
     n = M.shape[0]
-    if n > _TRIED or (n > 2 and sum(x.count_ops() for x in M) > _SMALL):
-        return [_Eliminated(M, what)]
-    squares: list[_Inverse] = [_Eliminated(M, what, order) for order in permutations(range(n))]
-    return [*squares, _Cofactors(M)] if n > 1 else squares
+    few = n <= _TRIED and (n < _TRIED or sum(x.count_ops() for x in M) <= _SMALL)
+    out: list[_Inverse] = []
+    for order in permutations(range(n)) if few else (None,):
+        with suppress(_NoPivotError):
+            out.append(_Eliminated(M, order))
+    if not out or (few and n > 1):
+        out.append(_Cofactors(M, what))
+    return out
+
+
+def _shorter(x: sp.Expr) -> sp.Expr:
+    """Return an expression tidied; one that nobody reads as it is."""
+    return tidy(x) if x.count_ops() <= _LONG else x
+
+
+class _NoPivotError(Exception):
+    """All pivots that are left are zero."""
 
 
 class _Eliminated:
     """M = L D Lᵀ, with pivots in an order, or the shortest first."""
 
-    def __init__(self, M: sp.ImmutableMatrix, what: str, order: Sequence[int] | None = None) -> None:
+    def __init__(self, M: sp.ImmutableMatrix, order: Sequence[int] | None = None) -> None:
         left, entries = list(range(M.shape[0])), {(i, j): M[i, j] for i in range(M.shape[0]) for j in range(i + 1)}
 
         def entry(i: int, j: int) -> sp.Expr:
@@ -93,16 +109,16 @@ class _Eliminated:
         while left:
             pivots = {i: entry(i, i) for i in left if entry(i, i) != 0}
             if not pivots:
-                raise InputError(f"{what} is singular everywhere")
+                raise _NoPivotError
             k = min(pivots, key=lambda i: (pivots[i].count_ops(), left.index(i)))
             if order is not None:
                 k = next(i for i in order if i in pivots)
             left.remove(k)
-            factors = {i: tidy(entry(i, k) / pivots[k]) for i in left if entry(i, k) != 0}
+            factors = {i: _shorter(entry(i, k) / pivots[k]) for i in left if entry(i, k) != 0}
             for i, factor in factors.items():
                 for j in factors:
                     if j <= i:
-                        entries[i, j] = tidy(entries[i, j] - factor * entry(j, k))
+                        entries[i, j] = _shorter(entries[i, j] - factor * entry(j, k))
             self._steps.append((k, pivots[k], factors))
 
     def _lowered(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
@@ -110,7 +126,7 @@ class _Eliminated:
         out = list(x)
         for k, _, factors in self._steps:
             for i, factor in factors.items():
-                out[i] = tidy(out[i] - factor * out[k])
+                out[i] = _shorter(out[i] - factor * out[k])
         return out
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
@@ -127,8 +143,10 @@ class _Eliminated:
 class _Cofactors:
     """M⁻¹ = adj M / det M."""
 
-    def __init__(self, M: sp.ImmutableMatrix) -> None:
+    def __init__(self, M: sp.ImmutableMatrix, what: str) -> None:
         self._below = tidy(M.det(method="berkowitz"))
+        if self._below == 0:
+            raise InputError(f"{what} is singular everywhere")
         self._above = M.adjugate(method="berkowitz").applyfunc(tidy)
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:

@@ -183,13 +183,15 @@ def by_name(x: Any, named: Mapping[str, sp.Symbol]) -> Any:
     return x.xreplace(put) if put else x
 
 
-def in_symbols_of(system: Lagrangian, what: str, given: Any, also: Iterable[sp.Symbol] = ()) -> sp.Expr:
+def in_symbols_of(
+    system: Lagrangian, what: str, given: Any, also: Iterable[sp.Symbol] = (), *, others: bool = False
+) -> sp.Expr:
     """Return an expression in a system's own symbols, whatever variants of them or dynamicsymbols it is written in.
 
     Raises
     ------
     InputError
-        It holds others; they are named.
+        It holds others, unless there may be; they are named.
     """
     own = [*system.parameters, *system.inputs.values(), *([system.time] if system.time is not None else [])]
     own += [*system.velocities, *system.coordinates, *also]
@@ -203,7 +205,7 @@ def in_symbols_of(system: Lagrangian, what: str, given: Any, also: Iterable[sp.S
     out = out.subs({f: known[name_of(f)] for f in out.atoms(AppliedUndef) if name_of(f) in rates})
     out = by_name(out, known)
     unknown = [str(x) for x in (*out.atoms(sp.Derivative), *out.atoms(AppliedUndef), *(out.free_symbols - set(own)))]
-    if unknown:
+    if unknown and not others:
         raise InputError(f"{what}: {', '.join(sorted(unknown))} is no symbol of {system.name}: {', '.join(known)}")
     return out
 

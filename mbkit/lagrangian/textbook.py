@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
+from itertools import count
 from typing import Any, Final
 
 import numpy as np
@@ -94,7 +95,11 @@ def letters(model: Model) -> list[str] | None:
         return None
     if model.name in _LETTERS and len(_LETTERS[model.name]) == model.nq:
         return list(_LETTERS[model.name])
-    return [f"q{i}" for i in range(1, model.nq + 1)]
+    # Of a joint with several coordinates, such as hub.x, the last part may be one.
+    tails = [n.rpartition(".")[2] for n in model.coordinate_names]
+    known = {t for t in tails if _LETTER.fullmatch(t) and tails.count(t) == 1 and not t.startswith("q")}
+    numbers = count(1)
+    return [t if t in known else f"q{next(numbers)}" for t in tails]
 
 
 def _numbered(name: str, system: str) -> bool:

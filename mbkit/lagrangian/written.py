@@ -3,34 +3,31 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property, partial
 from html import escape
-from types import MappingProxyType, SimpleNamespace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 import sympy as sp
 
 from mbkit._check import Array, count, real
-from mbkit.derivation.equations import Equations
-from mbkit.derivation.values import Constants, Values
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian.constraints import ConstraintTerms, Manifold, manifold_of
-from mbkit.lagrangian.conversion import Conversion
-from mbkit.lagrangian.multipliers import constrained, derivatives
+from mbkit.lagrangian.abstract_parts import abstract_parts
+from mbkit.lagrangian.constraints import Manifold, manifold_of
 from mbkit.lagrangian.redundancy import require_independent
+from mbkit.lagrangian.written_equations import WrittenEquations
 from mbkit.model import Model
 from mbkit.model.needs import Needs
-from mbkit.model.parts import Body, Frame, Joint
+from mbkit.model.parts import Frame
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
 
-__all__ = ["WrittenEquations", "WrittenModel", "abstract_parts"]
+__all__ = ["WrittenModel"]
 
 #: Random states that are tried, of which each may be too far from the constraints.
 _DRAWS = 50
@@ -176,156 +173,6 @@ class WrittenModel(Model):
 
     def _repr_html_(self) -> str:
         return f"<p><b>{escape(self.name)}</b>: {self.system._repr_latex_()}</p>"
-
-
-class WrittenEquations(Equations):
-    """The equations of a `WrittenModel`, derived from its T and V as those of a robot are."""
-
-    model: WrittenModel
-
-    def __init__(self, model: WrittenModel, constants: Constants = "literal") -> None:
-        values = Values(model, constants)
-        self.model = model
-        self.q, self.v = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
-        self.a, self.tau = ca.SX.sym("a", model.nv), ca.SX.sym("tau", model.nv)
-        s = model.system
-        names = {**{p: values.named[p.name] for p in s.parameters}}
-        names |= {c: self.q[i] for i, c in enumerate(s.coordinates)}
-        names |= {w: self.v[i] for i, w in enumerate(s.velocities)}
-        self.time = values.named[model.clock] if model.clock else None
-        if s.time is not None:
-            names[s.time] = values.named[s.time.name]
-        read = Conversion(names, values.number)
-        self._T, self._V, self._R = ca.SX(read(s.T)), ca.SX(read(s.V)), ca.SX(read(s.dissipation))
-        self._Q = read.matrix(s.forces)
-        self.constraints = ConstraintTerms(read.matrix(s.constraints), self.q, self.v, self.time)
-        self._kinematics(read)
-        self.parameters = values.parameters
-        self.constants, self.constant_values = values.constants, values.constant_values
-
-    def _kinematics(self, read: Conversion) -> None:  # noqa: ARG002  # quasi-velocities have something to read
-        """Set what velocities are to coordinates: their rates."""
-        self.kin = SimpleNamespace(qdot=self.v, pullback=lambda x: x)  # type: ignore[assignment]
-
-    def _turned(self, p: Any) -> Any:  # noqa: ARG002
-        """Return what quasi-velocities add to the rate of a momentum."""
-        return 0
-
-    @property
-    def kinetic_energy(self) -> Any:
-        """T(q, v)."""
-        return self._T
-
-    @property
-    def potential_energy(self) -> Any:
-        """V(q)."""
-        return self._V
-
-    @cached_property
-    def gravity(self) -> Any:
-        """∂V/∂q, whatever it comes from."""
-        return self.kin.pullback(ca.gradient(self._V, self.q))
-
-    @cached_property
-    def damping(self) -> Any:
-        """Q - ∂R/∂v."""
-        return self._Q - ca.gradient(self._R, self.v)
-
-    @property
-    def passive(self) -> Any:
-        """The same: springs are in V."""
-        return self.damping
-
-    @cached_property
-    def energy_rate(self) -> Any:
-        """d/dt (T + V) along (v, a), with the time's own part."""
-        E = self._T + self._V
-        rate = ca.jtimes(E, ca.vertcat(self.q, self.v), ca.vertcat(self.kin.qdot, self.a))
-        return rate if self.time is None else rate + ca.gradient(E, self.time)
-
-    def _inertial(self, a: ca.SX) -> Any:
-        """D/dt ∂T/∂v - ∂T/∂q: M a + C v + d."""
-        rate = ca.jtimes(self.momentum, ca.vertcat(self.q, self.v), ca.vertcat(self.kin.qdot, a))
-        if self.time is not None:
-            rate += ca.jacobian(self.momentum, self.time)
-        return rate + self._turned(self.momentum) - self.kin.pullback(ca.gradient(self._T, self.q))
-
-    @cached_property
-    def coriolis_force(self) -> Any:
-        """C(q, v) v, of T2 alone."""
-        T2 = 0.5 * ca.dot(self.v, ca.mtimes(self.mass_matrix, self.v))
-        p = ca.mtimes(self.mass_matrix, self.v)
-        rate = ca.jtimes(p, self.q, self.kin.qdot) + self._turned(p)
-        return rate - self.kin.pullback(ca.gradient(T2, self.q))
-
-    @cached_property
-    def nle(self) -> Any:
-        """C v + d + ∂V/∂q."""
-        return self._inertial(ca.SX(self.model.nv, 1)) + self.gravity
-
-    @cached_property
-    def _constrained(self) -> tuple[Any, Any]:
-        return constrained(self)
-
-    @property
-    def multipliers(self) -> Any:
-        """λ(q, v, τ) of the constraints."""
-        return self._constrained[1]
-
-    @cached_property
-    def forward_dynamics(self) -> Any:
-        """M⁻¹ (τ + τ_passive - nle + Jᵀ λ); every other term of the equation is the one without constraints."""
-        if not self.model.constrained:
-            return super().forward_dynamics
-        self.model.require_independent()
-        return self._constrained[0]
-
-    @cached_property
-    def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
-        """∂FD/∂q, ∂FD/∂v and ∂FD/∂τ, under the constraints."""
-        return derivatives(self) if self.model.constrained else super().forward_dynamics_derivatives
-
-    @property
-    def elimination_order(self) -> tuple[int, ...]:
-        """The coordinates as they stand."""
-        return tuple(range(self.model.nv))
-
-    def _frame(self, name: str) -> tuple[str, Any]:
-        raise UnsupportedError(f"frame {name!r}: {self.model.name} was written as energies and has no frames")
-
-
-def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint, ...]]:
-    """Return what gives a model coordinates of these names, and nothing else."""
-    # One coordinate a joint, each on the one before: the pattern of a full mass matrix.
-    joints = tuple(_coordinate(name, before) for name, before in zip(names, ["world", *names], strict=False))
-    return tuple(_massless(name) for name in names), joints
-
-
-def _coordinate(name: str, before: str) -> Joint:
-    zero, endless = np.zeros(1), np.full(1, np.inf)
-    return Joint(
-        name=name,
-        kind="prismatic",
-        parent=before,
-        child=name,
-        rotation=np.eye(3),
-        translation=np.zeros(3),
-        axes=np.array([[1.0, 0.0, 0.0]]),
-        pitch=0.0,
-        lower=-endless,
-        upper=endless,
-        velocity_limit=endless,
-        effort_limit=endless,
-        armature=zero,
-        damping=zero,
-        friction=zero,
-        stiffness=zero,
-        rest=zero,
-    )
-
-
-def _massless(name: str) -> Body:
-    return Body(name=name, mass=0.0, com=np.zeros(3), inertia=np.zeros((3, 3)))
 
 
 def _sha(*parts: str) -> str:

@@ -1,0 +1,131 @@
+"""Holonomic constraints as expressions: f(q, t), what follows from it, and the functions that are compiled.
+
+Twice differentiated the constraints say J v̇ + γ = 0, with γ of J̇ v and of the time's own derivatives.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import casadi as ca
+import numpy as np
+
+from mbkit.derivation.factorize import solve
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.written_equations import WrittenEquations
+
+__all__ = ["FUNCTIONS", "ConstraintTerms", "weight"]
+
+
+class ConstraintTerms:
+    """f and what follows from it, as CasADi expressions of (q, v).
+
+    Attributes
+    ----------
+    value : (m, 1) casadi.SX
+        f.
+    jacobian : (m, n) casadi.SX
+        J = ∂f/∂q.
+    by_time : (m, 1) casadi.SX
+        ∂f/∂t.
+    rate : (m, 1) casadi.SX
+        ḟ = J v + ∂f/∂t.
+    gamma : (m, 1) casadi.SX
+        f̈ at v̇ = 0: J̇ v and the time's own terms.
+    """
+
+    def __init__(self, value: ca.SX, q: ca.SX, v: ca.SX, time: Any) -> None:
+        self.value = value
+        self.jacobian = ca.jacobian(value, q)
+        self.by_time = ca.SX(value.shape[0], 1) if time is None else ca.jacobian(value, time)
+        self.rate = ca.mtimes(self.jacobian, v) + self.by_time
+        self.gamma = ca.jtimes(self.rate, q, v)
+        if time is not None:
+            self.gamma = self.gamma + ca.jacobian(self.rate, time)
+
+
+def weight(eq: WrittenEquations) -> tuple[Any, Any]:
+    """Return M + s JᵀJ and s; s = 0 unless M alone is singular, as of coordinates that move no mass.
+
+    With J v̇ given, the added term changes neither v̇ nor λ.
+    """
+    M, J = eq.mass_matrix, eq.constraints.jacobian
+    if not _singular(eq):
+        return M, 0.0
+    s = ca.trace(M) / ca.sumsqr(J)
+    return M + s * ca.mtimes(J.T, J), s
+
+
+def _singular(eq: WrittenEquations) -> bool:
+    """Return whether M has no inverse anywhere, of a few random configurations and values."""
+    rng = np.random.default_rng(0)
+    given = [eq.q, *eq.trailing.values()]
+    M = ca.Function("M", given, [ca.densify(eq.mass_matrix)])
+    for _ in range(3):
+        at = [rng.uniform(0.5, 1.5, x.numel()) for x in given]
+        if np.linalg.matrix_rank(np.array(M(*at)), hermitian=True) == eq.model.nv:
+            return False
+    return True
+
+
+# The functions that are compiled
+
+
+def _function(eq: WrittenEquations, name: str, given: dict[str, Any], made: dict[str, Any]) -> ca.Function:
+    given = {**given, **eq.trailing}
+    dense = [ca.densify(x) for x in made.values()]
+    return ca.Function(name, list(given.values()), dense, list(given), list(made), {"cse": True})
+
+
+def _rows(eq: WrittenEquations) -> ca.Function:
+    c = eq.constraints
+    return _function(eq, "constraint_rows", {"q": eq.q}, {"f": c.value, "J": c.jacobian})
+
+
+def _all(eq: WrittenEquations) -> ca.Function:
+    c = eq.constraints
+    made = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": weight(eq)[0]}
+    return _function(eq, "constraint", {"q": eq.q, "v": eq.v}, made)
+
+
+def _step(eq: WrittenEquations) -> ca.Function:
+    """(q, v) -> q after a step of Newton's, v made consistent there, f before it and its scale."""
+    c, m = eq.constraints, eq.constraints.value.shape[0]
+    W = weight(eq)[0]
+    Y = solve(W, c.jacobian.T, eq.elimination_order)
+    S = ca.mtimes(c.jacobian, Y)
+    q1 = eq.q - ca.mtimes(Y, solve(S, c.value, range(m)))
+    Y1, S1, rate1 = (ca.substitute(x, eq.q, q1) for x in (Y, S, c.rate))
+    v1 = eq.v - ca.mtimes(Y1, solve(S1, rate1, range(m)))
+    scale = ca.sqrt(ca.sum2(c.jacobian**2))
+    return _function(eq, "constraint_step", {"q": eq.q, "v": eq.v}, {"q1": q1, "v1": v1, "f": c.value, "scale": scale})
+
+
+def _multipliers(eq: WrittenEquations) -> ca.Function:
+    return _function(eq, "multipliers", {"q": eq.q, "v": eq.v, "tau": eq.tau}, {"lambda": eq.multipliers})
+
+
+def _embedded(eq: WrittenEquations) -> ca.Function:
+    c = eq.constraints
+    made = {"J": c.jacobian, "by_time": c.by_time, "gamma": c.gamma, "M": eq.mass_matrix, "force": eq.applied}
+    return _function(eq, "embedded", {"q": eq.q, "v": eq.v}, made)
+
+
+def _curvature(eq: WrittenEquations) -> ca.Function:
+    """(q, λ) -> ∂(Jᵀ λ)/∂q; λ takes the place of v's first entries."""
+    c = eq.constraints
+    m = c.value.shape[0]
+    pull = ca.mtimes(c.jacobian.T, eq.v[:m])
+    return _function(eq, "curvature", {"q": eq.q, "v": eq.v}, {"H": ca.jacobian(pull, eq.q)})
+
+
+#: Name -> what derives it.
+FUNCTIONS: Final = {
+    "constraint_rows": _rows,
+    "constraint": _all,
+    "constraint_step": _step,
+    "multipliers": _multipliers,
+    "embedded": _embedded,
+    "curvature": _curvature,
+}
