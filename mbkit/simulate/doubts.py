@@ -76,8 +76,8 @@ def doubts(
             # Each has parameters of its own.
             dyn = dyn.of_samples(list(range(min(_MEMBERS, len(q)))))
         q, v = q[:_MEMBERS], v[:_MEMBERS]
-    here = at_times(dyn, t[times], len(q) if q.ndim == 3 else None)
     try:
+        here = at_times(dyn, t[times], len(q) if q.ndim == 3 else None)
         M = along(here, (nv, nv), lambda own, q: own.mass_matrix(q), q)
     except MbkitError:
         return []
