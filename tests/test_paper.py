@@ -411,6 +411,7 @@ WRONG = [
     (lambda: Lagrangian(m * w**2, 0, [th], [sp.Symbol("thetadot", positive=True)]), "to be nonnegative"),
     (lambda: Lagrangian((1 + sp.I) * w**2, 0, [th]), "imaginary unit"),
     (lambda: Lagrangian(w**2 * sp.IndexedBase("m")[0], 0, [th]), "m\\[0\\] is no plain symbol"),
+    (lambda: Lagrangian(w**2, th * t, [th]), "the time is given as time=t"),
     (lambda: Lagrangian(w**2, 0, [th], forces=[k]), "expected {coordinate: force}"),
     (lambda: Lagrangian(w**2, 0, [th], forces={th: -k}), "an input is a symbol that is all of one force"),
     (lambda: Lagrangian(w**2, 0, [th], dissipation=th**2), "holds none of the velocities thetadot"),
@@ -473,6 +474,8 @@ CUBES = [
     # A square's other half, where the cosine stands before it and where such a term is there already.
     th + sp.sin(c) ** 3 * sp.cos(m * c) ** 3 / 2 - 2 * sp.sin(2 * c),
     2 * m * k * sp.sin(th) - l * sp.cos(th) ** 3 - sp.sin(2 * c) * sp.cos(th) / 2,
+    # Roots that are no square roots.
+    sp.cbrt(m) ** -1 + k * (l + sp.cos(th)) ** sp.Rational(-2, 3) + c**m / sp.sqrt(2),
 ]
 
 

@@ -187,6 +187,8 @@ def _check_declared(d: Declaration) -> None:
     told += f"add {first}=... to it as parameters={{{first}: 1.0}}, or with None for no value yet"
     if all(name.startswith("forces") for name in where):
         told += " (an input is a symbol that is all of one force, and stands nowhere else)"
+    elif "t" in {s.name for s in unknown} and d.time is None:
+        told += " (the time is given as time=t)"
     else:
         told += f" (the velocities are {', '.join(map(str, d.velocities))})"
     raise InputError(told)

@@ -103,10 +103,10 @@ class _Reading:
 
     def __init__(self, x: sp.Expr) -> None:
         self._angles: dict[sp.Expr, None] = {}
-        self._plain: dict[sp.Expr, None] = {}
+        self._symbols: dict[sp.Expr, None] = {}
         self._powers: dict[sp.Expr, sp.Dummy] = {}
         self._gather(x)
-        generators = [*self._plain, *self._powers.values()]
+        generators = [*self._symbols, *self._powers.values()]
         self._space = Space("expression", list(self._angles), generators, _MOST)
         self._known: dict[sp.Dummy, _Power] = {}
         self._decimals = x.has(sp.Float)
@@ -126,9 +126,9 @@ class _Reading:
         elif x.is_Pow and x.exp.is_Integer and 0 < x.exp <= _HIGHEST:
             self._gather(x.base)
         elif not _is_power(x):
-            self._plain[x] = None
+            self._symbols[x] = None
         elif x.base.is_Symbol and x.exp.is_Integer:
-            self._plain[x.base] = None
+            self._symbols[x.base] = None
         else:
             self._gather(x.base)
             self._powers.setdefault(_power(x), sp.Dummy())
@@ -243,8 +243,10 @@ def _shared(x: Harmonic, i: int, least: int, power: _Power, step: int) -> Harmon
 
 
 def _is_power(x: sp.Expr) -> bool:
-    """Return whether an expression is a root, or one over something."""
-    return bool(x.is_Pow and x.exp.is_Rational and abs(x.exp) <= _HIGHEST and (x.exp.q == 2 or x.exp.is_negative))
+    """Return whether an expression is a square root, or one over something; other roots are generators themselves."""
+    if not (x.is_Pow and x.exp.is_Rational and abs(x.exp) <= _HIGHEST):
+        return False
+    return bool(x.exp.q == 2 or (x.exp.is_Integer and x.exp.is_negative))
 
 
 def _power(x: sp.Expr) -> sp.Expr:

@@ -29,10 +29,9 @@ def tidy(x: sp.Expr) -> sp.Expr:
     if not x.free_symbols or x.count_ops() > LARGE:
         return x
     rooted = any(p.has(TrigonometricFunction) for p in x.atoms(sp.Pow) if not p.exp.is_Integer)
-    costs = [(cost(x) * (_WORTH if rooted else 1.0), 0, x)]
-    # Of equal forms the one that was combined.
-    costs += [(cost(form), k - 10, form) for k, form in enumerate(forms(x))]
-    return min(costs, key=lambda told: told[:2])[2]
+    # Of equal forms one that was combined.
+    tried = [(cost(form), form) for form in forms(x)] + [(cost(x) * (_WORTH if rooted else 1.0), x)]
+    return min(tried, key=lambda pair: pair[0])[1]
 
 
 def tidy_matrix(x: Any) -> sp.ImmutableMatrix:
