@@ -71,7 +71,7 @@ _ROUGH: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
 _LEFT: Final = len(_AHEAD) - 4
 #: Of a step's estimated error that is rounding: the length of rk853's weights, and the part that is too much.
 _WEIGHT: Final = 2.0
-_ROUNDED: Final = 0.3
+_ROUNDED: Final = 0.03
 #: Changes of the method that are told one by one.
 _TOLD: Final = 3
 
@@ -230,9 +230,9 @@ class Course:
         to_come = rate * self._rest
         if to_come < pace.worth or not step:
             return
-        if self._rounds(trials, place, step):
-            return
         found = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._scene.duration))
+        if self._rounds(trials, place, step, found):
+            return
         held = found is not None and step * found.stable >= _EDGE
         # Not where steps have been short alone, but where they are.
         worth = (held or to_come >= pace.guess) and self._tries >= self._pilot_from
@@ -329,17 +329,18 @@ class Course:
                 self._tightest = rtol
                 self._legs[-1].note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
 
-    def _rounds(self, trials: Trials, place: int, step: float) -> bool:
+    def _rounds(self, trials: Trials, place: int, step: float, found: Stiffness | None) -> bool:
         """Return whether rounding takes part in the errors that hold rk853's steps, and let it have less part."""
         share, rough = self._rough(trials, place, step, _NEAR)
-        if share > _ROUNDED:
-            # What is smooth is far smoother nearer by.
-            nearer, rough = self._rough(trials, place, step, _NEAR / 10)
-            if nearer > _ROUNDED:
-                self._loosen(trials, place, rough)
-                return True
+        # What is smooth is far smoother nearer by.
+        nearer = self._rough(trials, place, step, _NEAR / 10)[0] if share > _ROUNDED else 0.0
+        # Steps near rounding themselves are too short for either, and for all motions there are.
+        crawls = step < _AWAY * self._scene.duration and found is not None and step * found.rate < _ROUNDED
+        if nearer > _ROUNDED or crawls:
+            self._loosen(trials, place, 0.0 if crawls else rough)
+            return True
         asked = self._scene.tolerances
-        if self._base.rtol > asked.rtol and share * self._base.rtol / asked.rtol < _ROUNDED / 10:
+        if self._base.rtol > asked.rtol and share * self._base.rtol / asked.rtol < _ROUNDED:
             # What was rough is passed.
             self._base = asked
             self._tolerate(trials, place, 0.0)

@@ -63,7 +63,7 @@ def doubts(
     """
     nv = dyn.model.nv
     # The oracle's digits are not in doubt, and its terms take long.
-    if len(t) < 2 or not nv or dyn.engine == "oracle":
+    if len(t) < 2 or not v.size or dyn.engine == "oracle":
         return []
     # The first trajectory's fastest state is where a step is longest for it.
     fastest = int(np.nan_to_num(np.abs(v.reshape(-1, *v.shape[-2:])[0]).max(axis=-1), posinf=0.0).argmax())

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from mbkit._check import Array
 
@@ -124,6 +123,9 @@ def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[fl
     >>> bool(abs(part - 10.0**3 * 0.01**2 / 24 * 24.0) < 1e-3), abs(round(rate.imag, 6))
     (True, 10.0)
     """
+    # Adaptive methods never come here, and need no SciPy.
+    from scipy.optimize import linear_sum_assignment
+
     rates = np.linalg.eigvals(_companion(A, B))
     made = np.linalg.eigvals(STEPS[method](h, A, B))
     # Beyond a turn a step no phase is its own; and what a step ends has no logarithm.
