@@ -25,7 +25,7 @@ from typing import Any
 import casadi as ca
 
 from mbkit._check import Array
-from mbkit._step_control import GROWTH, SAFETY
+from mbkit._step_control import DEFECT, GROWTH, SAFETY
 from mbkit.derivation.embedded_step import AdaptiveParts
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.step import Part, SymbolicSpace, choose, function_of
@@ -34,7 +34,7 @@ __all__ = ["rosenbrock_parts"]
 
 
 def rosenbrock_parts(
-    equations: Equations, gamma: float, A: Array, C: Array, b: Array, error: Array
+    equations: Equations, gamma: float, A: Array, C: Array, b: Array, error: Array, dense: Array
 ) -> tuple[Part, ...]:
     """Return the parts of one try, in order.
 
@@ -43,14 +43,14 @@ def rosenbrock_parts(
     equations : Equations
         In which time does not enter.
     gamma : float
-    A, C, b, error : (s, s), (s, s), (s,) and (s,) arrays
+    A, C, b, error, dense : (s, s), (s, s), (s,), (s,) and (3, s) arrays
         Of a method of order 5 with one of order 4 inside, as in `mbkit.simulate.rosenbrock_tableau`.
 
     Returns
     -------
     tuple of Part
         They read and write what those of `mbkit.derivation.embedded_step` do. The parts
-        "field" and "solve" stand once for each stage; "field" writes k = ẇ and r = u̇.
+        "field" and "solve" stand once for each stage, "field" at the end too; it writes k = ẇ and r = u̇.
     """
     stages = _Stages(equations, gamma, len(b))
     stages.begin()
@@ -61,7 +61,9 @@ def rosenbrock_parts(
         if not i:
             stages.matrix()
         stages.solve(i)
-    stages.end(b, error)
+    stages.arrive(b)
+    stages.field()
+    stages.end(b, error, dense)
     return tuple(stages.parts)
 
 
@@ -179,14 +181,29 @@ class _Stages(AdaptiveParts):
         made = {"q_i": self._space.move(given["q"], u), "w_i": given["w"] + dw, "u_i": u}
         self._part(f"stage_{i}", given, made | {"sum_u": sum_u, "sum_w": sum_w})
 
-    def end(self, b: Array, error: Array) -> None:
-        """Form the new state and its error, and decide."""
+    def arrive(self, b: Array) -> None:
+        """Form the new state, where the rates are looked at too."""
+        given = {**self._given("q", "w"), **self._named(len(b))}
         u, dw = self._sum(b)
-        q1, w1 = self._space.move(self._s["q"], u), self._s["w"] + dw
-        in_u, in_w = self._sum(error)
+        made = {"q_i": self._space.move(given["q"], u), "w_i": given["w"] + dw, "u_i": u}
+        self._part("arrive", given, made)
+
+    def end(self, b: Array, error: Array, dense: Array) -> None:
+        """Estimate the error of the new state, and decide."""
+        s, step = self._s, self._s["step"]
+        q1, w1, u = self._at["q_i"], self._at["w_i"], self._at["u_i"]
         by_w, by_u = self._scales(q1, w1, u)
-        mean = (ca.sumsqr(in_w / by_w) + ca.sumsqr(in_u / by_u)) / (2 * self._equations.model.nv)
-        self._decide(self._named(len(b)), q1, w1, ca.sqrt(mean))
+
+        def norm(in_u: Any, in_w: Any) -> Any:
+            return ca.sqrt((ca.sumsqr(in_w / by_w) + ca.sumsqr(in_u / by_u)) / (2 * self._equations.model.nv))
+
+        # The slope of the polynomial at the end, times the step.
+        slope_u, slope_w = self._sum(b - dense.sum(axis=0))
+        defect = norm(step * s["r"] - slope_u, step * s["k"] - slope_w) / DEFECT
+        found = norm(*self._sum(error))
+        # NaN is chosen where it is one of the two.
+        worst = choose(found < defect, defect, found) + 0 * defect
+        self._decide({**self._at, **self._given("k", "r"), **self._named(len(b))}, q1, w1, worst)
 
     def _factors(self, error: Any) -> tuple[Any, Any, Any]:
         eighth = ca.sqrt(ca.sqrt(ca.sqrt(error)))

@@ -46,8 +46,11 @@ _BEGIN: Final = 1e-3
 #: Fastest rate times duration from which on the tolerance follows the number of steps.
 _MANY: Final = 1000.0
 #: n steps with errors of the tolerance, in a norm that is a mean over 2 nv numbers, add up to at most n √(2 nv)
-#: of it. They shall not exceed _SUM of it; what was measured is a third to a three-hundredth of that.
-_SUM: Final = 400.0
+#: of it. They shall not exceed this much of what was asked for; measured is a third to a three-hundredth of that for
+#: rk853, a tenth to a thirtieth for rodas5.
+_SUM: Final = {EXPLICIT: 400.0, IMPLICIT: 1000.0}
+#: Tries of rodas5 in vain are repeated when there were so many times the tries.
+_PATIENCE: Final = 4
 #: Steps that are believed to come, for each that there was.
 _BELIEVED: Final = 64
 #: No tolerance below: rounding would be taken for error, and steps shrink without end. Where that comes earlier, it
@@ -68,7 +71,7 @@ _ROUGH: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
 _LEFT: Final = len(_AHEAD) - 4
 #: Of a step's estimated error that is rounding: the length of rk853's weights, and the part that is too much.
 _WEIGHT: Final = 2.0
-_ROUNDED: Final = 0.3
+_ROUNDED: Final = 0.03
 #: Changes of the method that are told one by one.
 _TOLD: Final = 3
 
@@ -141,6 +144,7 @@ class Course:
         self._returns = 0
         self._least = _LEAST
         self._next: Trials | None = None
+        self._pilot_from = 0
         self._ahead: list[Stretch] = []
 
     # On the way
@@ -203,14 +207,19 @@ class Course:
     def _begun(self, method: str) -> Trials:
         """Return tries of a method that begin here."""
         t, q, w = self._at
-        trials = self._scene.make(method, self._base)
+        trials = self._scene.make(method, self._granted(method))
         trials.start([self._index], q[None], w[None], t, _BEGIN * self._rest if method == IMPLICIT else 0.0)
         return trials
 
+    def _granted(self, method: str) -> Tolerances:
+        """Return the loosest tolerances that a method has here."""
+        freely = self._scene.pace.freely if method == IMPLICIT else 1.0
+        return Tolerances(*(freely * x for x in self._base))
+
     def _turn(self, method: str, why: str) -> None:
         """Go on with a method from here."""
-        self._next, self._tolerances = self._begun(method), self._base
-        self._looser = self._base.rtol, 0.0
+        self._next, self._tolerances = self._begun(method), self._granted(method)
+        self._looser = self._tolerances.rtol, 0.0
         self._legs.append(_Leg(method, self._at[0], why))
 
     # Looks
@@ -221,23 +230,24 @@ class Course:
         to_come = rate * self._rest
         if to_come < pace.worth or not step:
             return
-        if self._rounds(trials, place, step):
-            return
         found = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._scene.duration))
+        if self._rounds(trials, place, step, found):
+            return
         held = found is not None and step * found.stable >= _EDGE
         # Not where steps have been short alone, but where they are.
-        if (held or to_come >= pace.guess) and self._faster(min(rate, 1 / step)):
+        worth = (held or to_come >= pace.guess) and self._tries >= self._pilot_from
+        if worth and self._faster(min(rate, 1 / step)):
             told = "" if found is None else f"; {found}"
             why = "stability held its steps" if held else "rodas5 got further with a try"
             size = "" if found is None else f" (h|λ| = {step * found.stable:.1f}{told})"
             self._legs.append(_Leg(IMPLICIT, self._at[0], f"where {why}{size}"))
             if found is not None:
                 self._kept = min(_KEPT, step * found.stable) or _KEPT
-        elif found is not None:
-            before, slower = self._looser
-            if slower and rate / slower > (before / self._tolerances.rtol) ** _COLLAPSE > 1:
-                self._least = before
-            self._looser = self._tolerances.rtol, rate
+            return
+        if worth:
+            self._pilot_from = _PATIENCE * self._tries
+        if found is not None:
+            self._mind(rate)
             self._fastest = max(self._fastest, found.rate)
             if self._fastest * self._scene.duration >= _MANY:
                 # By the pace of the whole leg: what comes and goes is no sign of what is to come.
@@ -259,10 +269,11 @@ class Course:
             # Of a state where rk853 may never come.
             return False
         # With the tolerance that so many steps ask for.
-        tighter = self._factor(gauge.rate() * self._rest) ** (-1 / 5)
+        tighter = (self._factor(IMPLICIT, gauge.rate() * self._rest) / pace.freely) ** (-1 / 5)
         better = bool(pace.dearer * _FASTER * tighter * gauge.rate() < rate)
         if better:
-            self._next, self._ahead, self._tolerances = trials, ahead, self._base
+            self._next, self._ahead, self._tolerances = trials, ahead, self._granted(IMPLICIT)
+            self._looser = self._tolerances.rtol, 0.0
         return better
 
     def _look_back(self, trials: Trials, place: int, gauge: Gauge) -> None:
@@ -270,13 +281,24 @@ class Course:
         pace, rate = self._scene.pace, gauge.rate()
         # Steps may be growing still.
         to_come = min(rate, 1 / gauge.step() if gauge.step() else math.inf) * self._rest
-        if pace.dearer * to_come >= pace.worth and gauge.step() > _AWAY * self._scene.duration:
+        collapsed = self._mind(rate)
+        if pace.dearer * to_come >= pace.worth and gauge.step() > _AWAY * self._scene.duration and not collapsed:
             found = self._spectrum(trials, place, 0.0)
             if found is not None and found.stable / self._kept < pace.dearer * rate:
                 self._returns += 1
                 self._turn(EXPLICIT, f"where stability no longer held rk853's steps ({found})")
                 return
         self._tolerate(trials, place, to_come)
+
+    def _mind(self, rate: float) -> bool:
+        """Note the tries for each second, and return whether the tolerance before would have been better."""
+        before, slower = self._looser
+        collapsed = bool(slower and rate / slower > (before / self._tolerances.rtol) ** _COLLAPSE > 1)
+        if collapsed:
+            # Of rodas5, half the way would do: what it meets is an oscillation of its rounding.
+            self._least = before if self._legs[-1].method == EXPLICIT else 2 * self._tolerances.rtol
+        self._looser = self._tolerances.rtol, rate
+        return collapsed
 
     def _spectrum(self, trials: Trials, place: int, enough: float) -> Stiffness | None:
         """Return how fast the motions here are; None where that is no number."""
@@ -287,16 +309,17 @@ class Course:
         except (NumericalError, FunctionError):
             return None
 
-    def _factor(self, to_come: float) -> float:
+    def _factor(self, method: str, to_come: float) -> float:
         """Return what the tolerance is multiplied by, so that the errors of all steps to come are as small together."""
-        steps = min(to_come, _BELIEVED * self._tries)
-        return min(1.0, _SUM / (steps * math.sqrt(2 * self._scene.space.nv))) if steps else 1.0
+        steps = max(1.0, min(to_come, _BELIEVED * self._tries))
+        freely = self._scene.pace.freely if method == IMPLICIT else 1.0
+        return min(freely, _SUM[method] / (steps * math.sqrt(2 * self._scene.space.nv)))
 
     def _tolerate(self, trials: Trials, place: int, to_come: float) -> None:
         """Let the tolerance follow the number of steps to come."""
         if not math.isfinite(to_come):
             return
-        factor = max(self._factor(to_come), min(1.0, self._least / self._base.rtol))
+        factor = max(self._factor(self._legs[-1].method, to_come), min(1.0, self._least / self._base.rtol))
         rtol, atol = (x * factor for x in self._base)
         # A change that hardly changes a step is none.
         if not 0.5 < rtol / self._tolerances.rtol < 2.0:
@@ -306,17 +329,18 @@ class Course:
                 self._tightest = rtol
                 self._legs[-1].note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
 
-    def _rounds(self, trials: Trials, place: int, step: float) -> bool:
+    def _rounds(self, trials: Trials, place: int, step: float, found: Stiffness | None) -> bool:
         """Return whether rounding takes part in the errors that hold rk853's steps, and let it have less part."""
         share, rough = self._rough(trials, place, step, _NEAR)
-        if share > _ROUNDED:
-            # What is smooth is far smoother nearer by.
-            nearer, rough = self._rough(trials, place, step, _NEAR / 10)
-            if nearer > _ROUNDED:
-                self._loosen(trials, place, rough)
-                return True
+        # What is smooth is far smoother nearer by.
+        nearer = self._rough(trials, place, step, _NEAR / 10)[0] if share > _ROUNDED else 0.0
+        # Steps near rounding themselves are too short for either, and for all motions there are.
+        crawls = step < _AWAY * self._scene.duration and found is not None and step * found.rate < _ROUNDED
+        if nearer > _ROUNDED or crawls:
+            self._loosen(trials, place, 0.0 if crawls else rough)
+            return True
         asked = self._scene.tolerances
-        if self._base.rtol > asked.rtol and share * self._base.rtol / asked.rtol < _ROUNDED / 10:
+        if self._base.rtol > asked.rtol and share * self._base.rtol / asked.rtol < _ROUNDED:
             # What was rough is passed.
             self._base = asked
             self._tolerate(trials, place, 0.0)

@@ -36,6 +36,9 @@ class Pace:
         Tries by which rodas5 is judged.
     dearer : float
         Time of a try of rodas5 over that of one of rk853.
+    freely : float
+        How much of the tolerance rodas5 has where its steps are few: its error is about the tolerance then,
+        that of rk853 up to a hundred times as much.
     """
 
     first: int
@@ -44,14 +47,15 @@ class Pace:
     guess: int
     pilot: int
     dearer: float
+    freely: float
 
 
 # Measured by validation/auto.py, in time of the processor. In machine code a look takes as long as 50 to 100 tries of
 # rk853, and those of rodas5 as long as 60; in Python as 2 to 5, and as 15. A try of rodas5 takes 0.5 to 1.2 times as
 # long as one of rk853 in machine code, where eight stages, a Jacobian and its factors stand against twelve
 # stages, and 1.2 to 1.6 times in Python. So all looks together cost at most a tenth of a run.
-_COMPILED: Final = Pace(first=64, later=4, worth=1500, guess=3000, pilot=24, dearer=1.2)
-_IN_PYTHON: Final = Pace(first=8, later=2, worth=100, guess=1000, pilot=10, dearer=1.5)
+_COMPILED: Final = Pace(first=64, later=4, worth=1500, guess=3000, pilot=24, dearer=1.2, freely=1.0)
+_IN_PYTHON: Final = Pace(first=5, later=2, worth=100, guess=300, pilot=8, dearer=1.3, freely=5.0)
 
 
 class Scene:

@@ -67,12 +67,12 @@ class _Scheme:
 def _scheme(method: str) -> _Scheme:
     if method == "rodas5":
         own = rodas5p()
-        tables = own.A, own.C, own.b, own.error
+        tables = own.A, own.C, own.b, own.error, own.dense
         return _Scheme(
             own.name,
             [[own.gamma], *(x.tolist() for x in tables)],
             lambda equations: rosenbrock_parts(equations, own.gamma, *tables),
-            stages=own.stages,
+            stages=own.stages + 1,
             rate="k",
             grows=5,
             jacobians=1,

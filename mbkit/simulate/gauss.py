@@ -208,7 +208,7 @@ class _Gauss:
         """Return (1 - h A⊗J)⁻¹ with J of row i at stage i of these rates."""
         moved = _mixed(h * self._A, rates)
         u, w_i = moved[..., : self._nv], w + moved[..., self._nv :]
-        J = np.stack([self._slopes(t + c * h, q, a, b, force) for c, a, b in zip(self._times, u, w_i, strict=True)])
+        J = np.stack([self._slopes(t + c * h, q, u[i], w_i[i], force) for i, c in enumerate(self._times)])
         return _inverse_of(np.einsum("ij,i...kl->...ikjl", h * self._A, J))
 
     def _slopes(self, t: float, q: Array, u: Array, w: Array, force: Force) -> Array:

@@ -56,7 +56,10 @@ class Linearization:
         self._own = self._twin
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
-        self._last: Array = np.zeros((dyn.model.nq + dyn.model.nv,) * 2)
+        nq, nv = dyn.model.nq, dyn.model.nv
+        self._last: Array = np.zeros((nq + nv,) * 2)
+        # Where positions add and v is q̇.
+        self._plain = np.eye(nq + nv, k=nq) if dyn.model.rates is None and not dyn.model.quaternions else None
         self.evaluations = 0
 
     def only(self, member: int) -> None:
@@ -81,10 +84,14 @@ class Linearization:
         if not isinstance(force, np.ndarray):
             torque_by_q, torque_by_v = _differences(self._model, force, t, q, v, tau)
             by_q, by_v = by_q + by_tau @ torque_by_q, by_v + by_tau @ torque_by_v
-        out = np.empty((nq + nv, nq + nv))
-        rate_by_q, D, tangent = self._kinematics(q, v, lengths)
-        out[:nq, :nq], out[:nq, nq:] = rate_by_q, D
-        out[nq:, :nq], out[nq:, nq:] = by_q @ tangent, by_v
+        if self._plain is not None:
+            out = self._plain.copy()
+            out[nq:, :nq], out[nq:, nq:] = by_q, by_v
+        else:
+            out = np.empty((nq + nv, nq + nv))
+            rate_by_q, D, tangent = self._kinematics(q, v, lengths)
+            out[:nq, :nq], out[:nq, nq:] = rate_by_q, D
+            out[nq:, :nq], out[nq:, nq:] = by_q @ tangent, by_v
         self._last = out
         return out
 
@@ -94,8 +101,6 @@ class Linearization:
         if self._model.rates is not None:
             rate, D, tangent = self._model.rates.linear(q, v)
             return rate, D, tangent
-        if not self._model.quaternions:
-            return np.zeros((nq, nq)), np.eye(nq), np.eye(nq)
         rate, D, tangent = np.zeros((nq, nq)), np.zeros((nq, nv)), np.zeros((nv, nq))
         left = iter(lengths.tolist())
         for kind, a, b in self._joints:

@@ -10,7 +10,7 @@ from mbkit.engines.clock import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
 from mbkit.simulate.consistent import settled
-from mbkit.simulate.steps import credible
+from mbkit.simulate.steps import RUNAWAY
 from mbkit.simulate.torque import Force
 
 __all__ = ["Rates", "unit_quaternions"]
@@ -52,8 +52,8 @@ class Rates:
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
-        # A user's function never sees a state that is none.
-        if not credible(y):
+        # A user's function never sees a state that is none. By its norm, which is quicker than by each number.
+        if not float(y @ y) < RUNAWAY**2:
             return np.full(len(y), np.nan)
         nq = self._model.nq
         q, lengths = unit_quaternions(self._model, y[:nq])
@@ -87,10 +87,9 @@ class Rates:
 
 def unit_quaternions(model: Model, q: Array) -> tuple[Array, Array]:
     """Return q with unit quaternions, and the lengths that they had."""
-    lengths = np.empty(len(model.quaternions))
     if not model.quaternions:
-        return q, lengths
-    q = q.copy()
+        return q, np.empty(0)
+    q, lengths = q.copy(), np.empty(len(model.quaternions))
     for i, (start, _) in enumerate(model.quaternions):
         lengths[i] = np.linalg.norm(q[start : start + 4])
         q[start : start + 4] /= lengths[i]

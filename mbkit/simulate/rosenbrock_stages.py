@@ -1,7 +1,8 @@
 """The Rosenbrock step stage by stage, on any engine's forward dynamics and under any torque.
 
 It acts on y = (q, v) with quaternions as four numbers, whose exact flow keeps their length, and takes the exact
-Jacobian of `mbkit.simulate.linearization`.
+Jacobian of `mbkit.simulate.linearization`. A state within a step is that of the method's own polynomial of order 4,
+whose error is a part of the one that the step is judged by; a shorter step would cost as much as the step.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit._step_control import GROWTH, SAFETY
+from mbkit._step_control import DEFECT, GROWTH, SAFETY
 from mbkit.engines import Dynamics
 from mbkit.model.space import Space
 from mbkit.simulate.embedded_stages import StageTrials
+from mbkit.simulate.embedded_trials import Stretch
 from mbkit.simulate.linearization import Linearization
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.rates import Rates, unit_quaternions
@@ -55,7 +57,11 @@ class RosenbrockTrials(StageTrials):
         self._turning = np.zeros(dyn.model.nq + dyn.model.nv)
         for start, _ in dyn.model.quaternions:
             self._turning[start : start + 4] = 1.0
+        self._dense = own.dense
         self._start: tuple[Array, Array, Array] | None = None
+        self._arrived: tuple[Array, Array] | None = None
+        # Of the last try: t and y at both ends, and the stages.
+        self._last_try: tuple[float, float, Array, Array, Array] | None = None
 
     @property
     def evaluations(self) -> int:
@@ -82,19 +88,38 @@ class RosenbrockTrials(StageTrials):
 
     def _tried(self, step: float) -> tuple[Array, Array, float]:
         y, there, J = self._known()
-        y1, error = self._stepped(self._t, y, step, there, J)
+        k = self._stages(self._t, y, step, there, J)
+        y1, error = y + self._b @ k, self._e @ k
+        t1 = self._t + step
+        self._last_try = self._t, t1, y, y1, k
         rtol, atol = self._tolerances
-        sizes = np.maximum(np.maximum(np.abs(y), np.abs(y1)), self._turning)
-        scaled = error / (atol + rtol * sizes)
-        return *self._state(y1), math.sqrt(float(scaled @ scaled) / max(len(y), 1))
+        scale = atol + rtol * np.maximum(np.maximum(np.abs(y), np.abs(y1)), self._turning)
+        found = _norm(error / scale)
+        if found < 1:
+            rate = self._rate(t1, y1)
+            slope = (self._b - self._dense.sum(axis=0)) @ k
+            found = max(found, _norm((step * rate - slope) / scale) / DEFECT)
+            self._arrived = y1, rate
+            if not math.isfinite(found):
+                raise DivergenceError(self._own_rates.why or RAN_AWAY)
+        return *self._state(y1), found
 
     def _known(self) -> tuple[Array, Array, Array]:
         """Return y, ẏ and ∂ẏ/∂y where the step starts, evaluated once for all tries from there."""
         if self._fresh or self._start is None:
             self._own_rates.why = ""
             y = np.concatenate([self._q, self._space.leave(self._q, self._w)])
-            self._start = y, self._rate(self._t, y), self._exact(self._t, y, self._force)
+            arrived, self._arrived = self._arrived, None
+            # Where the last step ended the rate is known, unless another force acts from there.
+            known = arrived is not None and np.array_equal(arrived[0], y)
+            rate = arrived[1] if known and arrived is not None else self._rate(self._t, y)
+            self._start = y, rate, self._exact(self._t, y, self._force)
         return self._start
+
+    def hold(self, k: int, stop: float) -> None:
+        """Go on to a time, under the force of an interval."""
+        self._arrived = None
+        super().hold(k, stop)
 
     def _rate(self, t: float, y: Array) -> Array:
         return self._own_rates(t, y, self._force)
@@ -104,8 +129,8 @@ class RosenbrockTrials(StageTrials):
         q = unit_quaternions(self._model, y[:nq])[0]
         return q, self._space.enter(q, y[nq:])
 
-    def _stepped(self, t: float, y: Array, h: float, there: Array, J: Array) -> tuple[Array, Array]:
-        """Return y after h and its error."""
+    def _stages(self, t: float, y: Array, h: float, there: Array, J: Array) -> Array:
+        """Return what the stages of a step of length h come to, (s, n)."""
         from scipy.linalg import lapack
 
         g, n = self._gamma * h, len(y)
@@ -123,24 +148,37 @@ class RosenbrockTrials(StageTrials):
         # What was no number anywhere is none here.
         if not np.isfinite(k).all():
             raise DivergenceError(self._own_rates.why or RAN_AWAY)
-        return y + self._b @ k, self._e @ k
+        return k
 
     def _by_time(self, t: float, y: Array, h: float, there: Array) -> Array:
         apart = _APART * h
         near, far = self._rate(t + apart, y), self._rate(t + 2 * apart, y)
         return (4 * near - far - 3 * there) / (2 * apart)
 
-    def _step(
-        self,
-        t: float,
-        q: Array,
-        w: Array,
-        h: float,
-        *,
-        fresh: bool = True,  # noqa: ARG002  # what is kept belongs to the tries
-    ) -> tuple[Array, Array, Array]:
-        """Return q, w and nothing more after h."""
-        self._own_rates.why = ""
-        y = np.concatenate([q, self._space.leave(q, w)])
-        y1, _ = self._stepped(t, y, h, self._rate(t, y), self._exact(t, y, self._force))
-        return *self._state(y1), np.empty(0)
+    def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        """Return states within steps: of the last one by its polynomial, of others by shorter steps."""
+        made = [
+            self._within(t, q, w, end) for t, q, w, end in zip(start.t.tolist(), start.q, start.w, times, strict=True)
+        ]
+        q, w = (np.array([pair[i] for pair in made]) for i in (0, 1))
+        return q, w
+
+    def _within(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
+        last = self._last_try
+        try:
+            if last is not None and last[0] == t and end <= last[1]:
+                t0, t1, y0, y1, k = last
+                part = (end - t0) / (t1 - t0)
+                one, two, three = self._dense @ k
+                bend = (1 - part) * (one + part * (two + part * three))
+                return self._state((1 - part) * y0 + part * (y1 + bend))
+            self._own_rates.why = ""
+            y = np.concatenate([q, self._space.leave(q, w)])
+            k = self._stages(t, y, end - t, self._rate(t, y), self._exact(t, y, self._force))
+            return self._state(y + self._b @ k)
+        except DivergenceError:
+            return np.full(q.shape, np.nan), np.full(w.shape, np.nan)
+
+
+def _norm(x: Array) -> float:
+    return math.sqrt(float(x @ x) / max(len(x), 1))

@@ -40,6 +40,10 @@ class RosenbrockTableau:
         Strictly lower triangular.
     b, error : (s,) array_like
         Weights, and b minus those of the other method.
+    dense : (3, s) array_like
+        Of the state within a step, at t + θ h and with D = dense k::
+
+            y(θ) = (1 - θ) y + θ (y1 + (1 - θ) (D₁ + θ (D₂ + θ D₃)))
     order, lower : int
         The orders that both must have.
 
@@ -60,17 +64,18 @@ class RosenbrockTableau:
     C: Array
     b: Array
     error: Array
+    dense: Array
     order: int
     lower: int
 
     def __post_init__(self) -> None:
-        for name in ("A", "C", "b", "error"):
+        for name in ("A", "C", "b", "error", "dense"):
             array = np.array(getattr(self, name), dtype=np.float64)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         s = self.stages
-        if self.A.shape != (s, s) or self.C.shape != (s, s) or self.error.shape != (s,):
-            raise InputError(f"tableau {self.name!r}: expected A, C ({s}, {s}) and error ({s},)")
+        if self.A.shape != (s, s) or self.C.shape != (s, s) or self.error.shape != (s,) or self.dense.shape != (3, s):
+            raise InputError(f"tableau {self.name!r}: expected A, C ({s}, {s}), error ({s},) and dense (3, {s})")
         if np.any(np.triu(self.A)) or np.any(np.triu(self.C)):
             raise InputError(f"tableau {self.name!r}: A and C are not strictly lower triangular")
         self._require(self.b, self.order)
@@ -140,6 +145,7 @@ def rodas5p() -> RosenbrockTableau:
         _lower(_C),
         np.array((*last, 1.0)),
         np.array((0.0,) * 7 + (1.0,)),
+        np.array(_DENSE),
         order=5,
         lower=4,
     )
@@ -185,5 +191,37 @@ _C: Final[tuple[tuple[float, ...], ...]] = (
         -40.06618937091002,
         -54.66780262877968,
         -9.48861652309627,
+    ),
+)
+_DENSE: Final = (
+    (
+        25.948786856663858,
+        -2.5579724845846235,
+        10.433815404888879,
+        -2.3679251022685204,
+        0.524948541321073,
+        1.1241088310450404,
+        0.4272876194431874,
+        -0.17202221070155493,
+    ),
+    (
+        -9.91568850695171,
+        -0.9689944594115154,
+        3.0438037242978453,
+        -24.495224566215796,
+        20.176138334709044,
+        15.98066361424651,
+        -6.789040303419874,
+        -6.710236069923372,
+    ),
+    (
+        11.419903575922262,
+        2.8879645146136994,
+        72.92137995996029,
+        80.12511834622643,
+        -52.072871366152654,
+        -59.78993625266729,
+        -0.15582684282751913,
+        4.883087185713722,
     ),
 )
