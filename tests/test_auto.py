@@ -63,9 +63,9 @@ def same(a: Trajectory, b: Trajectory) -> bool:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_where_nothing_is_stiff_it_is_rk853_to_the_bit(way: str) -> None:
+def test_where_nothing_is_stiff_it_is_rk853_with_a_tenth_of_the_tolerance_to_the_bit(way: str) -> None:
     dyn = WAYS[way].at(k=10.0, c=0.1)
-    auto, plain = (simulate(dyn, *START, method, rtol=1e-9) for method in ("auto", "rk853"))
+    auto, plain = (simulate(dyn, *START, method, rtol=rtol) for method, rtol in (("auto", 1e-9), ("rk853", 1e-10)))
     assert same(auto, plain)
     assert auto.stats.chosen == "rk853 throughout"
     assert plain.stats.chosen == ""

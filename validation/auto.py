@@ -93,7 +93,7 @@ class Task:
 
     def warm(self, method):
         """Compile what is to be compiled."""
-        short = self.grid[-1] * 1e-6
+        short = self.grid[-1] * (1e-15 if METHODS[method].kind == "adaptive" else 1e-6)
         option = {"rtol": 1e-6} if METHODS[method].kind == "adaptive" else {"dt": short}
         self.run(method, grid=np.array([0.0, short]), **option)
 

@@ -54,7 +54,7 @@ def run_auto(
     space = Space(dyn.model)
     scene = Scene(dyn, space, tolerances, torque, duration, batch, stops_of(duration, save, torque))
     courses = [Course(scene, i, q0.shape[1], save, events) for i in range(len(q0))]
-    explicit = scene.make(EXPLICIT, tolerances)
+    explicit = scene.make(EXPLICIT, scene.granted(EXPLICIT, tolerances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), explicit.width):
             part = slice(first, first + explicit.width)

@@ -4,9 +4,8 @@ After some tries, and each time that there are several times as many, it is aske
 Where that is a lot, the linearized system (`mbkit.simulate.stiffness`) tells what holds the steps: near the edge of
 rk853's region of stability, h|λ| of about 5, they are short for no other reason. There, and where very many are to
 come, rodas5 makes some tries of its own from the state reached. If it gets further with them than rk853, it goes on
-from their end; if not, they are forgotten, and rk853 goes on as if there had been none. Where there are motions far
-faster than the run is long, the errors of many steps add up, and the tolerance is tightened to what their number asks
-for; the same holds of rodas5.
+from their end; if not, they are forgotten, and rk853 goes on as if there had been none. The errors of many steps add
+up: rk853 has a tenth of the tolerance that was asked for, and both have less where the number of steps asks for it.
 
 While rodas5 goes on, looks at the linearized system say whether rk853 would be as fast, as where what is stiff has
 come to an end. Where one method's steps fall below rounding the other one may go on; where neither can, as where a
@@ -24,7 +23,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import FunctionError, NumericalError
-from mbkit.simulate.auto_scene import EXPLICIT, IMPLICIT, Gauge, Scene
+from mbkit.simulate.auto_scene import EXPLICIT, IMPLICIT, LEAST, Gauge, Scene
 from mbkit.simulate.embedded import Track, march
 from mbkit.simulate.embedded_trials import ROUNDS, Stretch, Trials
 from mbkit.simulate.events import Event
@@ -53,9 +52,8 @@ _SUM: Final = {EXPLICIT: 400.0, IMPLICIT: 1000.0}
 _PATIENCE: Final = 4
 #: Steps that are believed to come, for each that there was.
 _BELIEVED: Final = 64
-#: No tolerance below: rounding would be taken for error, and steps shrink without end. Where that comes earlier, it
-#: shows in steps that shrink with this power of the tolerance, and not with the eighth root as rk853's.
-_LEAST: Final = 1e-13
+#: Where rounding is taken for error before `LEAST`, it shows in steps that shrink with this power of the tolerance,
+#: and not with the eighth root as rk853's.
 _COLLAPSE: Final = 1 / 3
 #: Steps of this part of a run are far from rounding.
 _AWAY: Final = 1e-9
@@ -131,18 +129,18 @@ class Course:
         self.track = _Track(scene.space, nq, index, scene.batch, save, events, scene.tolerances)
         self.doubt = ""
         # As asked for or loosened, and as tightened.
-        self._base = self._tolerances = scene.tolerances
+        self._base, self._tolerances = scene.tolerances, scene.granted(EXPLICIT, scene.tolerances)
         self._legs = [_Leg(EXPLICIT, 0.0)]
         self._gauge: Gauge | None = None
         self._at: tuple[float, Array, Array] = 0.0, np.empty(0), np.empty(0)
         self._tries = 0
         # At the last look at rk853: its tolerance and the tries for each second.
-        self._looser = scene.tolerances.rtol, 0.0
-        self._fastest, self._tightest = 0.0, math.inf
+        self._looser = self._tolerances.rtol, 0.0
+        self._tightest = math.inf
         # h|λ| of rk853 when it was left.
         self._kept = _KEPT
         self._returns = 0
-        self._least = _LEAST
+        self._least = LEAST
         self._next: Trials | None = None
         self._pilot_from = 0
         self._ahead: list[Stretch] = []
@@ -213,8 +211,7 @@ class Course:
 
     def _granted(self, method: str) -> Tolerances:
         """Return the loosest tolerances that a method has here."""
-        freely = self._scene.pace.freely if method == IMPLICIT else 1.0
-        return Tolerances(*(freely * x for x in self._base))
+        return self._scene.granted(method, self._base)
 
     def _turn(self, method: str, why: str) -> None:
         """Go on with a method from here."""
@@ -229,6 +226,7 @@ class Course:
         rate, step, pace = gauge.rate(), gauge.step(), self._scene.pace
         to_come = rate * self._rest
         if to_come < pace.worth or not step:
+            self._add_up(trials, place, gauge)
             return
         found = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._scene.duration))
         if self._rounds(trials, place, step, found):
@@ -246,12 +244,15 @@ class Course:
             return
         if worth:
             self._pilot_from = _PATIENCE * self._tries
-        if found is not None:
-            self._mind(rate)
-            self._fastest = max(self._fastest, found.rate)
-            if self._fastest * self._scene.duration >= _MANY:
-                # By the pace of the whole leg: what comes and goes is no sign of what is to come.
-                self._tolerate(trials, place, gauge.overall() * self._rest)
+        self._mind(rate)
+        self._add_up(trials, place, gauge)
+
+    def _add_up(self, trials: Trials, place: int, gauge: Gauge) -> None:
+        """Let the tolerance follow the steps of rk853, by the pace of the whole leg.
+
+        What comes and goes is no sign of what is to come.
+        """
+        self._tolerate(trials, place, gauge.overall() * self._rest)
 
     def _faster(self, rate: float) -> bool:
         """Let rodas5 try, and make its tries the next ones if it is faster."""
@@ -312,22 +313,23 @@ class Course:
     def _factor(self, method: str, to_come: float) -> float:
         """Return what the tolerance is multiplied by, so that the errors of all steps to come are as small together."""
         steps = max(1.0, min(to_come, _BELIEVED * self._tries))
-        freely = self._scene.pace.freely if method == IMPLICIT else 1.0
-        return min(freely, _SUM[method] / (steps * math.sqrt(2 * self._scene.space.nv)))
+        share = self._granted(method).rtol / self._base.rtol
+        return min(share, _SUM[method] / (steps * math.sqrt(2 * self._scene.space.nv)))
 
     def _tolerate(self, trials: Trials, place: int, to_come: float) -> None:
         """Let the tolerance follow the number of steps to come."""
         if not math.isfinite(to_come):
             return
-        factor = max(self._factor(self._legs[-1].method, to_come), min(1.0, self._least / self._base.rtol))
+        leg = self._legs[-1]
+        factor = max(self._factor(leg.method, to_come), min(1.0, self._least / self._base.rtol))
         rtol, atol = (x * factor for x in self._base)
         # A change that hardly changes a step is none.
         if not 0.5 < rtol / self._tolerances.rtol < 2.0:
             self._tolerances = Tolerances(rtol, atol)
             trials.tighten(place, self._tolerances)
-            if factor < 1 and (not self._legs[-1].note or rtol < self._tightest):
+            if rtol < self._granted(leg.method).rtol and (not leg.note or rtol < self._tightest):
                 self._tightest = rtol
-                self._legs[-1].note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
+                leg.note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
 
     def _rounds(self, trials: Trials, place: int, step: float, found: Stiffness | None) -> bool:
         """Return whether rounding takes part in the errors that hold rk853's steps, and let it have less part."""

@@ -42,6 +42,8 @@ _LATER: Final = 1.1
 _TURNS_TO: Final = {"auto": ("rk853", "rodas5")}
 #: What a run may take that compiles on its way, beside one that does not.
 _FIRST: Final = 2.0
+#: Part of an interval in which nothing happens.
+_MOMENT: Final = 1e-15
 #: Steps of an engine's own integrator after which it is known how long all of them will take.
 _TRIAL: Final = 2000
 _EPS: Final = float(np.finfo(float).eps)
@@ -181,8 +183,9 @@ def _setting(asked: Run, problem: Problem, times: Array) -> dict[str, Any]:
 
 
 def _begin(asked: Run, problem: Problem, dyn: Dynamics, times: Array, setting: dict[str, Any]) -> None:
-    """Integrate a step, or the thousandth part of an interval, for all that is compiled."""
-    short = setting.get("dt", 1e-3 * float(times[1]))
+    """Integrate a step, or next to nothing of an interval, for all that is compiled."""
+    # However stiff the system, steps are not many in that.
+    short = setting.get("dt", _MOMENT * float(times[1]))
     for method in (*_TURNS_TO.get(asked.method, ()), asked.method):
         quiet_simulate(dyn, problem.q, problem.v, short, method, save=[short], **setting)
 
