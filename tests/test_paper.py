@@ -525,3 +525,13 @@ def test_it_shows_itself():
     assert lag.model._repr_html_()
     assert lag._repr_latex_().startswith("$T = ")
     assert lag.equations()._repr_latex_().startswith("$\\begin{aligned}")
+
+
+@pytest.mark.parametrize("study", [mb.dynamics, mb.compare, mb.work_precision, mb.convert], ids=lambda f: f.__name__)
+def test_what_takes_a_description_or_an_engine_says_where_paper_has_it(study) -> None:
+    lag = pendulum()
+    more = {"to": "mjcf"} if study is mb.convert else {}
+    with pytest.raises(InputError, match=r"model: expected a Model, got Lagrangian; its \.model is one"):
+        study(lag, **more)
+    with pytest.raises(InputError, match=r"dyn: expected a Dynamics, got Lagrangian; its \.dynamics\(\) makes one"):
+        mb.simulate(lag, [0.1], [0.0], 1.0)

@@ -9,6 +9,7 @@ from typing import Any, Final
 from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.expected import expect_model
 
 __all__ = ["ENGINES", "QUANTITIES", "Dynamics", "dynamics"]
 
@@ -47,8 +48,7 @@ def dynamics(model: Model, engine: str = "pinocchio", **options: Any) -> Dynamic
     UnsupportedError
         The engine is not installed, or cannot hold this model; with the reason.
     """
-    if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    expect_model(model)
     if engine not in ENGINES:
         raise UnknownNameError("engine", str(engine), ENGINES)
     module, name, package = ENGINES[engine]

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
+from mbkit.engines.expected import no_dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, UnsupportedError
 from mbkit.simulate.applied import Applied, TorqueFunction
 from mbkit.simulate.consistent import along_constraints, from_consistent
@@ -160,7 +161,7 @@ def simulate(
 
             given = q0, v0, duration, dt, rtol, atol, torque, save, as_events(events)
             return run_on_charts(dyn, method_of(method), *given)
-        raise InputError(f"dyn: expected a Dynamics, got {type(dyn).__name__}; mbkit.dynamics(model, engine) makes one")
+        raise no_dynamics(dyn)
     chosen = method_of(method)
     model = dyn.model
     q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of, finite_array, real
 from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_time
+from mbkit.engines.expected import no_dynamics
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.space import Space
 from mbkit.simulate.applied import Asked, TorqueFunction
@@ -149,7 +150,7 @@ def stiffness(
     <Stiffness: fastest oscillation 1e+06 rad/s>
     """
     if not isinstance(dyn, Dynamics):
-        raise InputError(f"dyn: expected a Dynamics, got {type(dyn).__name__}; mbkit.dynamics(model, engine) makes one")
+        raise no_dynamics(dyn)
     model = dyn.model
     q, v, t, enough = model.check_q(q), model.check_v(v), real("t", t), real("enough", enough, nonnegative=True)
     given = tau if callable(tau) else finite_array("tau", np.zeros(model.nv) if tau is None else tau, (model.nv,))

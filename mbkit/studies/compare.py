@@ -11,6 +11,7 @@ from mbkit.engines import ENGINES, Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, MbkitError, UnknownNameError
 from mbkit.model import Model
+from mbkit.model.expected import expect_model
 from mbkit.studies import stamp
 from mbkit.studies.facts import facts_of
 from mbkit.studies.judge import Judge
@@ -160,8 +161,7 @@ def _silent(_fraction: float, _text: str) -> None:
 
 
 def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tolerance: float) -> tuple[str, ...]:
-    if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    expect_model(model)
     if not model.nv:
         raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to compare; add a joint")
     if isinstance(engines, str):

@@ -12,10 +12,11 @@ from typing import Final
 import numpy as np
 
 from mbkit._version import __version__
-from mbkit.errors import InputError, MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
+from mbkit.errors import MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import load
 from mbkit.load.urdf_text import urdf_text
 from mbkit.model import Model
+from mbkit.model.expected import expect_model
 from mbkit.studies.causes.explaining import explain
 from mbkit.studies.causes.result import Cause
 from mbkit.studies.causes.terms import Gap, evaluated, gaps, model_terms, states_of
@@ -102,8 +103,7 @@ def convert(model: Model, to: str) -> Converted:
     >>> made.worst < 1e-12
     True
     """
-    if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    expect_model(model)
     if to not in FORMATS:
         raise UnknownNameError("format", str(to), FORMATS)
     if model.written is not None:

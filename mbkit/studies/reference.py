@@ -20,6 +20,7 @@ from mbkit.derivation.taylor import order_of, precision, taylor_system
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.expected import expect_model
 from mbkit.simulate.applied import TorqueFunction
 from mbkit.simulate.grid import save_times
 from mbkit.simulate.progress import Progress, ProgressFunction
@@ -175,8 +176,7 @@ def reference(
 
 
 def _checked(model: Model, q0: ArrayLike, v0: ArrayLike, duration: float, save: ArrayLike, torque: Any) -> Motion:
-    if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    expect_model(model)
     model.require_values("a reference")
     q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
     if q.ndim != 1 or v.ndim != 1:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import count, finite_array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
+from mbkit.model.expected import expect_model
 from mbkit.simulate.applied import TorqueFunction
 from mbkit.simulate.methods import METHODS
 from mbkit.studies import stamp
@@ -243,8 +244,7 @@ def _check_executor(executor: Executor | None, torque: object) -> None:
 
 
 def _check_model(model: Model) -> None:
-    if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    expect_model(model)
     if not model.nv:
         raise InputError(f"model: nothing moves in {model.name} (nv = 0), nothing to integrate; add a joint")
     model.require_values("a study of run time")

@@ -8,6 +8,7 @@ from typing import Any, Final
 from mbkit.engines import ENGINES, Dynamics, dynamics
 from mbkit.errors import InputError, MbkitError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.expected import expect_model
 from mbkit.studies.compare import COMPARABLE
 from mbkit.studies.result import Refusal
 
@@ -17,10 +18,9 @@ __all__ = ["checked_model", "checked_names", "made", "with_values"]
 _OPTIONS: Final[dict[str, dict[str, Any]]] = {"lagrangian": {"compile": False}}
 
 
-def checked_model(model: object) -> Model:
+def checked_model(given: object) -> Model:
     """Return a model that has something to record."""
-    if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
+    model = expect_model(given)
     if not model.nv:
         raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to record; add a joint")
     model.require_values("a baseline")
