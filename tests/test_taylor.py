@@ -24,6 +24,8 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, Trajectory, at_section, simulate
+from mbkit.simulate.asked import Asked
+from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.taylor import run_taylor
 from mbkit.simulate.torque import Torque
@@ -344,7 +346,7 @@ def test_progress_is_told(swing: Any) -> None:
 def _direct(dyn: Any, torque: Any) -> None:
     read = Torque(torque, dyn.model, None, None)
     q, v = dyn.model.neutral(), np.zeros(dyn.model.nv)
-    run_taylor(dyn, "taylor", q, v, 1.0, (1e-10, 1e-10), read, None, (), Progress(None, ""))  # type: ignore[arg-type]
+    run_taylor(Asked(dyn, "taylor", q, v, 1.0, Tolerances(1e-10, 1e-10), read, None, (), Progress(None, "")))
 
 
 def test_what_has_no_series_is_refused(swing: Any) -> None:

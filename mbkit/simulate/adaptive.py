@@ -20,14 +20,14 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, MbkitError
 from mbkit.model import Model
-from mbkit.simulate.events import Event, State, Watch
-from mbkit.simulate.members import Member, check_save, gathered, reporter
+from mbkit.simulate.asked import Asked
+from mbkit.simulate.events import State, Watch
+from mbkit.simulate.members import Member, gathered
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.outcome import Outcome
-from mbkit.simulate.progress import Progress
 from mbkit.simulate.rates import Rates, unit_quaternions
 from mbkit.simulate.steps import RAN_AWAY, credible
-from mbkit.simulate.torque import Force, Torque
+from mbkit.simulate.torque import Force
 
 __all__ = ["run_scipy"]
 
@@ -75,45 +75,32 @@ class _Task:
     watch: Watch | None
 
 
-def run_scipy(
-    dyn: Dynamics,
-    method: str,
-    q0: Array,
-    v0: Array,
-    duration: float,
-    tolerances: Tolerances,
-    torque: Torque,
-    save: Array | None,
-    events: tuple[Event, ...],
-    bar: Progress,
-) -> Outcome:
+def run_scipy(asked: Asked) -> Outcome:
     """Integrate one state, or each of a batch by itself.
 
     Saved states are as accurate as the steps: steps of DOP853 and Radau end on the
     saved times, BDF and LSODA interpolate. Without `save`, the solver's own steps are
     kept. Torques held as an array start every method anew at each interval.
     """
-    batch = None if q0.ndim == 1 else len(q0)
-    y0 = np.concatenate([q0, v0], axis=-1).reshape(-1, q0.shape[-1] + v0.shape[-1])
-    check_save(save, batch, y0.shape[1])
-    scheme = _SCHEMES[method]
+    dyn, save, torque, duration = asked.dyn, asked.save, asked.torque, asked.duration
+    scheme = _SCHEMES[asked.method]
     ends = (duration,) if save is None or (scheme.dense and not torque.held) else (*save.tolist(), duration)
     stops = tuple(sorted({*ends} - {0.0}))
-    solve = _Solve(dyn, scheme, tolerances)
+    solve = _Solve(dyn, scheme, asked.tolerances)
     members = []
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"), _quiet():
-        for i, start in enumerate(y0):
-            which = None if batch is None else i
+        for i, start in enumerate(asked.y):
+            which = asked.member(i)
             if which is not None:
                 solve.only(which)
-            watch = Watch(events, which) if events else None
+            watch = Watch(asked.events, which) if asked.events else None
             saved = None if save is None else tuple(save.tolist())
             task = _Task(start, stops, saved, torque.of_member(which), torque.held, watch)
-            members.append(solve.member(task, reporter(bar, i, len(y0), duration)))
+            members.append(solve.member(task, asked.report(i)))
             if members[-1].error is not None:
                 break
     return gathered(
-        dyn.model, members, batch, save, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations
+        dyn.model, members, asked.batch, save, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations
     )
 
 

@@ -14,20 +14,15 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
-from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
 from mbkit.model.space import Space
+from mbkit.simulate.asked import Asked
 from mbkit.simulate.auto_course import Course, pause
 from mbkit.simulate.auto_scene import EXPLICIT, Scene
 from mbkit.simulate.embedded import march, outcome_of, stops_of
 from mbkit.simulate.embedded_trials import Trials
-from mbkit.simulate.events import Event
-from mbkit.simulate.members import check_save
-from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.torque import Torque
 
 __all__ = ["run_auto"]
 
@@ -35,30 +30,17 @@ __all__ = ["run_auto"]
 _FEW: Final = 3
 
 
-def run_auto(
-    dyn: Dynamics,
-    method: str,  # noqa: ARG001  # there is one such method
-    q0: Array,
-    v0: Array,
-    duration: float,
-    tolerances: Tolerances,
-    torque: Torque,
-    save: Array | None,
-    events: tuple[Event, ...],
-    bar: Progress,
-) -> Outcome:
+def run_auto(asked: Asked) -> Outcome:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
-    batch = None if q0.ndim == 1 else len(q0)
-    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
-    check_save(save, batch, q0.shape[1] + v0.shape[1])
-    space = Space(dyn.model)
-    scene = Scene(dyn, space, tolerances, torque, duration, batch, stops_of(duration, save, torque))
-    courses = [Course(scene, i, q0.shape[1], save, events) for i in range(len(q0))]
-    explicit = scene.make(EXPLICIT, scene.granted(EXPLICIT, tolerances))
+    q0, v0, save, batch, duration = asked.q, asked.v, asked.save, asked.batch, asked.duration
+    space, stops = Space(asked.dyn.model), stops_of(duration, save, asked.torque)
+    scene = Scene(asked.dyn, space, asked.tolerances, asked.torque, duration, batch, stops)
+    courses = [Course(scene, i, q0.shape[1], save, asked.events) for i in range(len(q0))]
+    explicit = scene.make(EXPLICIT, scene.granted(EXPLICIT, asked.tolerances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), explicit.width):
             part = slice(first, first + explicit.width)
-            group = _Group(courses[part], first, len(q0), duration, bar)
+            group = _Group(courses[part], first, len(q0), duration, asked.bar)
             try:
                 for course, q, v in zip(group.courses, q0[part], v0[part], strict=True):
                     course.track.begin(q, v)
@@ -70,7 +52,7 @@ def run_auto(
                 group.courses[0 if which is None else which - first].track.member.fail(error)
                 break
     tracks = [course.track for course in courses]
-    outcome = outcome_of(dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
+    outcome = outcome_of(asked.dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
     told = outcome.ended in ("finished", "event")
     doubts = tuple(dict.fromkeys(course.doubt for course in courses if course.doubt and told))
     return replace(outcome, chosen=_chosen(courses, batch), doubts=doubts)

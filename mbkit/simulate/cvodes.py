@@ -16,18 +16,15 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
-from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, UnsupportedError
+from mbkit.errors import UnsupportedError
 from mbkit.model import Model
-from mbkit.simulate.events import Event
-from mbkit.simulate.members import Member, check_save, gathered, reporter
+from mbkit.simulate.asked import Asked
+from mbkit.simulate.members import Member, gathered
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.outcome import Outcome
-from mbkit.simulate.progress import Progress
 from mbkit.simulate.stats import Ended
 from mbkit.simulate.steps import RAN_AWAY, credible
-from mbkit.simulate.torque import Torque
 
 __all__ = ["run_cvodes"]
 
@@ -48,43 +45,28 @@ class _Failure(NamedTuple):
     told: str
 
 
-def run_cvodes(
-    dyn: Dynamics,
-    method: str,
-    q0: Array,
-    v0: Array,
-    duration: float,
-    tolerances: Tolerances,
-    torque: Torque,
-    save: Array | None,
-    events: tuple[Event, ...],
-    bar: Progress,
-) -> Outcome:
+def run_cvodes(asked: Asked) -> Outcome:
     """Integrate one state, or each of a batch by itself, to the times of `save`.
 
     The times are passed by and interpolated, as accurately as CVODES steps. Torques
     held as an array start it anew at each interval.
     """
+    dyn, torque = asked.dyn, asked.torque
     if not isinstance(dyn, LagrangianDynamics):
         raise UnsupportedError(
-            f"{method}: integrates expressions, which {dyn.engine} has not; "
+            f"{asked.method}: integrates expressions, which {dyn.engine} has not; "
             "use mbkit.dynamics(model, 'lagrangian'), or method='bdf' or 'lsoda'"
         )
-    if torque.callable or events:
-        raise UnsupportedError(f"{method}: takes neither torque functions nor events; use method='bdf' or 'lsoda'")
-    batch = None if q0.ndim == 1 else len(q0)
-    if save is None:
-        raise InputError(
-            f"save: {method} does not tell its own steps; give the times to keep, such as [0, {duration:g}]"
+    if torque.callable or asked.events:
+        raise UnsupportedError(
+            f"{asked.method}: takes neither torque functions nor events; use method='bdf' or 'lsoda'"
         )
-    y0 = np.concatenate([q0, v0], axis=-1).reshape(-1, q0.shape[-1] + v0.shape[-1])
-    check_save(save, batch, y0.shape[1])
-    times = np.array([0.0, *sorted({*save.tolist(), duration} - {0.0})])
-    solve = _Solve(dyn, tolerances)
+    save, times = asked.told()
+    solve = _Solve(dyn, asked.tolerances)
     members = []
-    for i, start in enumerate(y0):
-        which = None if batch is None else i
-        run = _Run(solve, save, reporter(bar, i, len(y0), duration))
+    for i, start in enumerate(asked.y):
+        which = asked.member(i)
+        run = _Run(solve, save, asked.report(i))
         values = dyn.parameter_values if which is None else dyn.of_samples([which]).parameter_values
         force = torque.of_member(which)
         # A jump within a call is one that CVODES does not know of: its error test fails.
@@ -95,7 +77,7 @@ def run_cvodes(
             if not run.over(piece, given):
                 break
         members.append(run.member)
-    return gathered(dyn.model, members, batch, save, evaluations=solve.evaluations, jacobians=solve.jacobians)
+    return gathered(dyn.model, members, asked.batch, save, evaluations=solve.evaluations, jacobians=solve.jacobians)
 
 
 class _Run:

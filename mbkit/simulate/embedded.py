@@ -18,14 +18,14 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
 from mbkit.model.space import Space
+from mbkit.simulate.asked import Asked
 from mbkit.simulate.embedded_stages import StageTrials
 from mbkit.simulate.embedded_trials import Stretch, Trials
 from mbkit.simulate.events import Event, Hit, State, Watch
 from mbkit.simulate.grid import Indices
-from mbkit.simulate.members import Member, check_save, gathered
+from mbkit.simulate.members import Member, gathered
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.outcome import Outcome
-from mbkit.simulate.progress import Progress
 from mbkit.simulate.steps import RAN_AWAY, credible
 from mbkit.simulate.torque import Torque
 
@@ -34,31 +34,18 @@ __all__ = ["Track", "make_trials", "march", "outcome_of", "run_embedded", "stops
 _BEYOND: Final = f"diverged: {RAN_AWAY}"
 
 
-def run_embedded(
-    dyn: Dynamics,
-    method: str,
-    q0: Array,
-    v0: Array,
-    duration: float,
-    tolerances: Tolerances,
-    torque: Torque,
-    save: Array | None,
-    events: tuple[Event, ...],
-    bar: Progress,
-) -> Outcome:
+def run_embedded(asked: Asked) -> Outcome:
     """Integrate one state, or a batch of them, each with steps of its own.
 
     Where the own derivation is compiled and the torque is no function, the steps run
     as machine code; elsewhere stage by stage, by the same formulas. Torques held as an
     array start a new step at each interval.
     """
-    batch = None if q0.ndim == 1 else len(q0)
-    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
-    check_save(save, batch, q0.shape[1] + v0.shape[1])
-    space = Space(dyn.model)
-    trials = make_trials(method, dyn, space, tolerances, torque, duration, batch)
-    tracks = [Track(space, q0.shape[1], i, batch, save, events, tolerances) for i in range(len(q0))]
-    stops = stops_of(duration, save, torque)
+    dyn, tolerances, duration, batch, save = asked.dyn, asked.tolerances, asked.duration, asked.batch, asked.save
+    q0, v0, space = asked.q, asked.v, Space(asked.dyn.model)
+    trials = make_trials(asked.method, dyn, space, tolerances, asked.torque, duration, batch)
+    tracks = [Track(space, q0.shape[1], i, batch, save, asked.events, tolerances) for i in range(len(q0))]
+    stops = stops_of(duration, save, asked.torque)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), trials.width):
             part = slice(first, first + trials.width)
@@ -69,7 +56,7 @@ def run_embedded(
                 trials.start(range(first, first + len(group)), q0[part], space.enter(q0[part], v0[part]))
                 for _ in march(trials, group, stops):
                     now = sum(track.member.reached for track in group) / len(group)
-                    bar.update((first + len(group) * now / duration) / len(q0))
+                    asked.bar.update((first + len(group) * now / duration) / len(q0))
             except FunctionError as error:
                 # Where the torque is a function, trajectories run one by one.
                 which = getattr(error, "member", None)

@@ -15,6 +15,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.expected import no_dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, UnsupportedError
 from mbkit.simulate.applied import Applied, TorqueFunction
+from mbkit.simulate.asked import Asked
 from mbkit.simulate.consistent import along_constraints, from_consistent
 from mbkit.simulate.doubts import doubts, halved
 from mbkit.simulate.events import Event, as_events
@@ -263,7 +264,7 @@ def _adaptive(
     times = None if save is None else save_times(save, duration)
     whole = times is not None and times[0] == 0 and times[-1] == duration
     read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
-    outcome = adaptive_runner(method)(dyn, method.name, q, v, duration, tolerances, read, times, events, bar)
+    outcome = adaptive_runner(method)(Asked(dyn, method.name, q, v, duration, tolerances, read, times, events, bar))
     return read.applied(times), outcome
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mbkit.engines import Dynamics
+from mbkit.simulate.asked import Asked
 from mbkit.simulate.methods import Method
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.torque import Torque
@@ -27,8 +28,8 @@ def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[...,
     return run_fixed
 
 
-def adaptive_runner(method: Method) -> Callable[..., Outcome]:
-    """Return run(dyn, method, q0, v0, duration, tolerances, torque, save, events, bar)."""
+def adaptive_runner(method: Method) -> Callable[[Asked], Outcome]:
+    """Return what integrates with tolerances."""
     if method.name == "auto":
         from mbkit.simulate.auto import run_auto
 

@@ -14,20 +14,17 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.taylor import Precision, TaylorSystem, precision, taylor_system
-from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.model import Model
-from mbkit.simulate.events import Event, State, Watch
-from mbkit.simulate.members import Member, check_save, gathered, reporter
-from mbkit.simulate.methods import Tolerances
+from mbkit.simulate.asked import Asked
+from mbkit.simulate.events import State, Watch
+from mbkit.simulate.members import Member, gathered
 from mbkit.simulate.outcome import Outcome
-from mbkit.simulate.progress import Progress
 from mbkit.simulate.rates import Rates, unit_quaternions
 from mbkit.simulate.stats import Ended
 from mbkit.simulate.steps import RAN_AWAY, credible
-from mbkit.simulate.torque import Torque
 
 __all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
 
@@ -36,18 +33,7 @@ _JUMP: Final = 1e-6
 _BITS: Final = {"lagrangian": 53, "oracle": 113}
 
 
-def run_taylor(
-    dyn: Dynamics,
-    method: str,
-    q0: Array,
-    v0: Array,
-    duration: float,
-    tolerances: Tolerances,
-    torque: Torque,
-    save: Array | None,
-    events: tuple[Event, ...],
-    bar: Progress,
-) -> Outcome:
+def run_taylor(asked: Asked) -> Outcome:
     """Integrate one state, or each of a batch by itself.
 
     The tolerance bounds each step's error: absolute while all numbers of the state are
@@ -61,33 +47,33 @@ def run_taylor(
         heyoka is not installed; another engine; a torque that is a function, of which
         there is no series; or a model too large to be written out.
     """
+    dyn, save, torque = asked.dyn, asked.save, asked.torque
     if torque.callable:
         raise UnsupportedError(
-            f"{method}: a torque function has no Taylor series; use method='rk853' or 'dop853', "
+            f"{asked.method}: a torque function has no Taylor series; use method='rk853' or 'dop853', "
             "or an array held over each interval of save"
         )
     if not isinstance(dyn, (LagrangianDynamics, OracleDynamics)):
-        raise UnsupportedError(f"{method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')")
-    batch = None if q0.ndim == 1 else len(q0)
-    y0 = np.concatenate([q0, v0], axis=-1).reshape(-1, q0.shape[-1] + v0.shape[-1])
-    check_save(save, batch, y0.shape[1])
+        raise UnsupportedError(
+            f"{asked.method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')"
+        )
     kind = precision(_BITS[dyn.engine])
-    system, tolerance = taylor_system(dyn.equations), max(min(tolerances), kind.eps)
-    ends = [duration] if save is None or not torque.held else [*save.tolist(), duration]
+    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances), kind.eps)
+    ends = [asked.duration, *(save.tolist() if save is not None and torque.held else [])]
     stops = sorted({*ends} - {0.0})
     members = []
     with system.integrator(kind, tolerance) as integrator:
-        for i, start in enumerate(y0):
-            which = None if batch is None else i
+        for i, start in enumerate(asked.y):
+            which = asked.member(i)
             own: Any = dyn if which is None else dyn.of_samples([which])
             # With 34 digits the drift is far below what a double tells.
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             steps = TaylorSteps(system, integrator, kind, _behind(own, kind), settled)
-            watch = Watch(events, which) if events else None
-            one = _Run(own, steps, save, watch, reporter(bar, i, len(y0), duration))
+            watch = Watch(asked.events, which) if asked.events else None
+            one = _Run(own, steps, save, watch, asked.report(i))
             members.append(one.all(start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
-    return gathered(dyn.model, members, batch, save, evaluations=evaluations)
+    return gathered(dyn.model, members, asked.batch, save, evaluations=evaluations)
 
 
 def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:
