@@ -186,6 +186,9 @@ def test_nothing_is_lost_on_the_way_to_json_and_back(study):
     again = StressResult.from_json(study.to_json())
     assert again.to_json() == study.to_json()
     assert again.breaking() == study.breaking()
+    row = replace(study.case("gliding").rows[0], theory=math.inf)
+    boundless = replace(study, cases=(replace(study.case("gliding"), rows=(row,)),))
+    assert StressResult.from_json(boundless.to_json()) == boundless
     assert pickle.loads(pickle.dumps(study)).to_json() == study.to_json()
     rows = list(csv.DictReader(io.StringIO(study.to_csv())))
     assert len(rows) == sum(len(row.cells) for _, row in study.rows())

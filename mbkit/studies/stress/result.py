@@ -36,6 +36,8 @@ BAR: Final = 1e-6
 #: Where an answer is no longer inaccurate but wrong: a hundredth of the motion, or of the term. A method of
 #: low order misses the bar with every step that is affordable, and nobody is misled by that.
 GROSS: Final = 1e-2
+#: What JSON has for a limit that is infinite: it has no infinity, and null is a limit that nobody knows.
+_NO_LIMIT: Final = "no limit"
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class Row:
     setting : str
         The step or tolerance.
     theory : float or None
-        Where linear theory lets it break.
+        Where linear theory lets it break; infinite where it does not, ``"no limit"`` in JSON.
     """
 
     engine: str
@@ -313,6 +315,8 @@ class StressResult:
             for line, row in zip(told["rows"], case.rows, strict=True):
                 broken = row.breaking(case.bar)
                 line.update(held=broken.held, failed=broken.failed, how=broken.how)
+                if row.theory == math.inf:
+                    line["theory"] = _NO_LIMIT
                 for entry, cell in zip(line["cells"], row.cells, strict=True):
                     entry["outcome"] = cell.outcome(case.bar)
         return out
@@ -411,7 +415,8 @@ def _case(told: dict[str, Any]) -> CaseResult:
     rows = []
     for row in told["rows"]:
         cells = tuple(remade(Cell, c | {"warnings": tuple(c["warnings"])}) for c in row["cells"])
-        rows.append(Row(row["engine"], row["method"], cells, row["setting"], row["theory"]))
+        theory = math.inf if row["theory"] == _NO_LIMIT else row["theory"]
+        rows.append(Row(row["engine"], row["method"], cells, row["setting"], theory))
     facts = tuple({k: math.nan if x is None else x for k, x in f.items()} for f in told["facts"])
     parts = {"values": tuple(told["values"]), "truths": tuple(told["truths"]), "facts": facts, "rows": tuple(rows)}
     made: CaseResult = remade(CaseResult, told | parts)
