@@ -116,7 +116,7 @@ def truth(task, name):
         task.q, task.v = tight.q, tight.v
         return "rk853 at 1e-12 and rodas5 at 1e-11", task.error(other)
     # By differences of eighth order.
-    apart = 0.1 / problem.facts["fastest frequency"] if name in RINGING else 1e-4
+    apart = 0.1 / problem.facts["fastest frequency, rad/s"] if name in RINGING else 1e-4
     offsets = apart * np.arange(-4, 5)
     around = np.stack([problem.exact(grid[1:] + x) for x in offsets])
     v = np.einsum("k,kij->ij", _EIGHTH, around) / apart

@@ -61,7 +61,8 @@ class Problem:
     dt : float or None
         Step of fixed-step methods, s, where the case prescribes it.
     facts : dict
-        Numbers worth telling: the fastest frequency, a ratio, a condition number.
+        Numbers worth telling, with a unit behind a comma in their names: ``"fastest frequency, rad/s"``,
+        a condition number.
     """
 
     model: Model

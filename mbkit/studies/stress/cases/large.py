@@ -40,7 +40,7 @@ def _many_turns(angle: float) -> Problem:
         exact=lambda t: start + (swing(t) - apart),
         floor=EPS * start + 1e-14,
         source=_SOURCE,
-        facts={"spacing of doubles there": math.ulp(start)},
+        facts={"spacing of doubles there, rad": math.ulp(start)},
     )
 
 
@@ -57,20 +57,20 @@ def _far_on_rail(place: float) -> Problem:
         floor=EPS * place + 1e-12,
         source="energy and momentum with a quadrature",
         scale=2 * theta,
-        facts={"spacing of doubles there": math.ulp(place)},
+        facts={"spacing of doubles there, m": math.ulp(place)},
     )
 
 
 def _far_base(place: float) -> Problem:
     made = tumbling(place * np.array([1.0, -1.0, 0.5]), np.array([1.0, 2.0, -1.0]), 1.0)
-    return replace(made, facts={"spacing of doubles there": math.ulp(place)})
+    return replace(made, facts={"spacing of doubles there, m": math.ulp(place)})
 
 
 def _far_base_terms(place: float) -> Problem:
     made = terms_at(load("anymal_b", floating_base=True))
     q = made.q.copy()
     q[:, :3] += place * np.array([1.0, -1.0, 0.5])
-    return replace(made, q=q, facts={"spacing of doubles there": math.ulp(place)})
+    return replace(made, q=q, facts={"spacing of doubles there, m": math.ulp(place)})
 
 
 def _gravity(gravity: float, speed: float, duration: float) -> Problem:
@@ -82,7 +82,7 @@ def _gravity(gravity: float, speed: float, duration: float) -> Problem:
         exact=pendulum(1.0, speed, gravity),
         floor=16 * EPS * (1 + math.sqrt(gravity) * duration),
         source=_SOURCE,
-        facts={"fastest frequency": math.sqrt(gravity)},
+        facts={"fastest frequency, rad/s": math.sqrt(gravity)},
     )
 
 

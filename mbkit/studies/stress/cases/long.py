@@ -23,7 +23,7 @@ def _steps(count: float) -> Problem:
         np.zeros(2),
         duration=count * _STEP,
         dt=_STEP,
-        facts={"seconds of motion": count * _STEP},
+        facts={"duration, s": count * _STEP},
     )
 
 

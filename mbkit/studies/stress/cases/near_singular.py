@@ -47,7 +47,7 @@ def _gimbal_pass(distance: float) -> Problem:
         exact=motion,
         floor=64 * EPS,
         source="steady turn about one axis, in angles",
-        facts={"fastest rate": speed / math.sin(distance)},
+        facts={"fastest rate, 1/s": speed / math.sin(distance)},
     )
 
 
@@ -93,7 +93,7 @@ def _dead_centre(distance: float) -> Problem:
         # The way left is known to eps of the way, and the angle goes with its root.
         floor=8 * EPS * (1 + 1 / distance),
         source="a piston without force moves steadily",
-        facts={"inertia at the end": (r * lever(distance)) ** 2},
+        facts={"inertia at the end, kg m²": (r * lever(distance)) ** 2},
     )
 
 

@@ -33,7 +33,7 @@ def _heavy_top(spin: float) -> Problem:
         exact=motion,
         floor=8 * EPS * (1 + spin * duration),
         source="steady precession, Landau, Lifshitz 1976, §35",
-        facts={"fastest rate": spin, "precession": rate},
+        facts={"fastest rate, 1/s": spin, "precession, rad/s": rate},
     )
 
 
@@ -84,7 +84,7 @@ def _ball(spin: float, duration: float, dt: float | None = None) -> Problem:
         floor=8 * EPS * (1 + spin * duration),
         source="steady turn about one axis",
         dt=dt,
-        facts={"fastest rate": spin, "turns": spin * duration / (2 * np.pi)},
+        facts={"fastest rate, 1/s": spin, "turns": spin * duration / (2 * np.pi)},
     )
 
 

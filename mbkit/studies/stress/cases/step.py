@@ -39,7 +39,7 @@ _STIFF: Final = 1e6
 
 def _hinge(step: float, frequency: float, damping: float, rate: float) -> Problem:
     """Let a body on a hinge with a spring and a damper go from 1 rad, at rest."""
-    name = "fastest rate" if damping else "fastest frequency"
+    name = "fastest rate, 1/s" if damping else "fastest frequency, rad/s"
     return Problem(
         hinge(frequency**2, 2 * damping * frequency),
         np.ones(1),
@@ -68,7 +68,7 @@ def _overdamped(step: float) -> Problem:
 def _circling(step: float) -> Problem:
     """Return a mass that circles on an undamped point spring."""
     made, _ = conical(_STIFF, 0.0)
-    return replace(made, duration=_STEPS * step, dt=step, facts={"fastest frequency": math.sqrt(_STIFF)})
+    return replace(made, duration=_STEPS * step, dt=step, facts={"fastest frequency, rad/s": math.sqrt(_STIFF)})
 
 
 def _limit(engine: str, method: str, frequency: float, damping: float) -> float | None:  # noqa: ARG001  # the same on all

@@ -49,7 +49,7 @@ def _spring(stiffness: float, damping: float) -> Problem:
 
 
 def _facts(frequency: float, duration: float, *, damped: bool = False) -> dict[str, float]:
-    name = "fastest rate" if damped else "fastest frequency"
+    name = "fastest rate, 1/s" if damped else "fastest frequency, rad/s"
     return {name: frequency, "steps of dop853 at the least": stable_steps(duration, frequency, damped=damped)}
 
 
@@ -219,7 +219,7 @@ def _ringing_elastic_pendulum(stiffness: float) -> Problem:
         exact=motion,
         floor=16 * EPS * (1 + frequency * duration) * push / math.sqrt(stiffness) + 1e-13,
         source="central motion by quadrature, Landau, Lifshitz 1976, §14",
-        facts=_facts(frequency, duration) | {"amplitude of the ringing": push / math.sqrt(stiffness)},
+        facts=_facts(frequency, duration) | {"amplitude of the ringing, m": push / math.sqrt(stiffness)},
     )
 
 
@@ -264,7 +264,7 @@ def _light_cart_pole(cart: float) -> Problem:
         # Found against 40 digits at the lightest cart.
         floor=2e-11,
         source="energy and momentum with a quadrature, IFToMM proposal 'light cart-pole'",
-        facts={"fastest rate": peak, "cond(M) below": 2 * (1 + cart) / cart},
+        facts={"fastest rate, 1/s": peak, "cond(M) below": 2 * (1 + cart) / cart},
     )
 
 
@@ -293,7 +293,7 @@ def _flexible_appendage(stiffness: float) -> Problem:
         floor=angle**3 * float(np.abs(shape[1:]).sum()) ** 2 + 16 * EPS,
         source="slowest linear mode",
         scale=angle,
-        facts=_facts(fastest, duration) | {"slowest frequency": frequency},
+        facts=_facts(fastest, duration) | {"slowest frequency, rad/s": frequency},
     )
 
 
