@@ -307,8 +307,7 @@ BODY = '<body name="b"><joint name="j"/><inertial pos="0 0 0" mass="1" diaginert
 MJCFS = {
     "no_bodies": (mjcf(""), ["no bodies"]),
     "no_joints": (mjcf('<body><geom size="1"/></body>'), ["no joints", "floating_base=True"]),
-    "include": (mjcf(BODY, '<include file="/etc/passwd"/>'), ["<include> is not read", "names another file"]),
-    "include_in_body": (mjcf('<body><include file="x.xml"/></body>'), ["<include> is not read"]),
+    "attach": (mjcf(f'{BODY}<attach model="m" body="b" prefix="p"/>'), ["<attach> is not read", "names another model"]),
     "replicate": (mjcf(f'<replicate count="3">{BODY}</replicate>'), ["<replicate> is not read"]),
     "mesh_inertia": (
         mjcf(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,11 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.engines import imported
-from mbkit.errors import InputError, LoadError, UnknownNameError
+from mbkit.errors import InputError, LoadError, ModelError, UnknownNameError
 from mbkit.load.stripped import strip
+from mbkit.load.urdf_links import urdf_links
+from mbkit.report.causes import meaning
+from mbkit.report.page import importers_page
 
 LINK = (
     '<link name="{0}"><inertial><origin xyz="0 0.01 0.1" rpy="0.1 0 0"/><mass value="{1}"/>'
@@ -23,6 +27,10 @@ JOINT = (
     '<joint name="{0}" type="{1}"><origin xyz="0 0 0.2" rpy="0 0.3 0"/><parent link="{2}"/><child link="{3}"/>'
     '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="5" velocity="2"/>{4}</joint>'
 )
+
+
+VALIDATION = Path(__file__).parents[1] / "validation"
+DRAKE = imported.IMPORTERS["drake"]
 
 
 def urdf(*parts: str) -> str:
@@ -96,7 +104,7 @@ def test_massless_inertia_and_impossible_inertia_as_each_importer_takes_them(tmp
 
 
 def test_real_robots_differ_as_the_table_says() -> None:
-    table = json.loads((Path(__file__).parents[1] / "validation" / "importers.json").read_text(encoding="utf-8"))
+    table = json.loads((VALIDATION / "importers.json").read_text(encoding="utf-8"))
     result = mb.compare_parsers("bolt", samples=1)
     row = table["bolt_description/bolt"]
     for p in result.importers:
@@ -155,7 +163,7 @@ def test_refusals_are_told_and_the_rest_is_compared(tmp_path: Path, monkeypatch:
     result = mb.compare_parsers(write(tmp_path, loose))
     assert result.reference == "pinocchio"
     assert "lower limit" in result.faults
-    monkeypatch.setitem(imported.IMPORTERS, "drake", ("nothing_of_this_name", "drake", "mbkit[drake]"))
+    monkeypatch.setitem(imported.IMPORTERS, "drake", DRAKE._replace(library="nothing_of_this_name"))
     result = mb.compare_parsers(write(tmp_path, arm()))
     assert "pip install mbkit[drake]" in result.importers[2].refused
     assert result.importers[1].agrees
@@ -187,12 +195,88 @@ def test_no_other_file_is_opened_and_what_would_open_one_is_told(tmp_path: Path)
     assert result.agree
     assert "collision" in result.notes[0]
     for bad, told in (
-        ('<mujoco><include file="/etc/passwd"/></mujoco>', "names another file"),
+        ('<mujoco><include file="/etc/passwd"/></mujoco>', "an absolute path is not followed"),
+        ('<mujoco><worldbody><attach model="m"/></worldbody></mujoco>', "names another file"),
         ('<!DOCTYPE r [<!ENTITY e "x">]><robot name="r"/>', "DOCTYPE"),
         ("<sdf/>", "expected <robot>"),
     ):
         with pytest.raises(LoadError, match=told):
             mb.compare_parsers(write(tmp_path, bad, "bad.xml"))
+
+
+def test_a_quadruped_and_a_humanoid_with_a_floating_base() -> None:
+    solo = mb.compare_parsers("solo8", floating_base=True, samples=1)
+    assert solo.agree
+    assert solo.floating_base
+    assert max(s.worst for p in solo.importers for s in p.stages if s.name in ("M", "g", "nle")) < 1e-12
+    # An inertia at the base that no body has: it moves nothing while the base stands, and does when it floats.
+    anymal = mb.compare_parsers("anymal", floating_base=True, samples=1)
+    pinocchio, mujoco, drake = anymal.importers
+    assert pinocchio.agrees
+    assert "positive eigenvalues" in mujoco.refused
+    assert drake.explanation is not None
+    assert drake.explanation.explained
+    assert [c.kind for c in drake.explanation.acting] == ["replaced inertia"]
+    still = mb.compare_parsers("anymal", ("drake",), samples=1).importers[0]
+    assert still.agrees
+    talos = mb.compare_parsers("talos", floating_base=True, samples=1)
+    assert [p.agrees for p in talos.importers] == [True, True, False]
+    assert "cannot mimic" in talos.importers[2].refused
+    table = json.loads((VALIDATION / "importers_floating.json").read_text(encoding="utf-8"))
+    assert [p["status"] for p in table["talos_data/talos_reduced"].values()] == ["agrees", "agrees", "refuses"]
+    assert all(p.get("explained", True) for r in table.values() for p in r.values())
+
+
+def test_a_floating_base_is_the_one_of_load(tmp_path: Path) -> None:
+    # A base link of the ground's name, and what hangs on it stands elsewhere and turned.
+    mount = JOINT.format("mount_base", "fixed", "world", "base", "")
+    path = write(tmp_path, arm('<link name="world"/>', mount))
+    result = mb.compare_parsers(path, floating_base=True, samples=1)
+    assert result.agree
+    assert any("'world' is called 'world_link'" in note for note in result.notes)
+    for p in result.importers:
+        assert "root_joint" in {m.b for m in p.explanation.matches}  # type: ignore[union-attr]
+    links = urdf_links(strip(path, floating_base=True).root, "r", floating_base=True)
+    assert mb.explain(mb.load(path, floating_base=True), links).agree
+    # An MJCF gets the joint in the text that all of them read.
+    body = '<body name="{0}" pos="0 0 1" euler="10 20 30"><geom type="box" size="0.1 0.2 0.3"/>{1}</body>'
+    leg = '<body name="leg" pos="0 0 -0.3"><joint name="hip" axis="0 1 0"/><geom size="0.1"/></body>'
+    mjcf = "<mujoco model='m'><worldbody>{}</worldbody></mujoco>"
+    path = write(tmp_path, mjcf.format(body.format("base", leg)), "m.xml")
+    assert mb.compare_parsers(path, floating_base=True, samples=1).agree
+    # MuJoCo alone reads frames.
+    path = write(tmp_path, mjcf.format(f"<frame pos='1 0 0'>{body.format('base', leg)}</frame>"), "frame.xml")
+    assert mb.compare_parsers(path, ("mujoco",), floating_base=True, samples=1).importers[0].agrees
+    two = write(tmp_path, mjcf.format(body.format("a", leg) + body.format("b", "")), "two.xml")
+    with pytest.raises(ModelError, match="needs one body of the world, without joints"):
+        mb.compare_parsers(two, floating_base=True)
+
+
+def test_the_page_tells_it_all_and_obeys_nothing(tmp_path: Path) -> None:
+    bad = '<script>alert("x")</script>'.replace("<", "&lt;").replace('"', "&quot;")
+    text = arm(tool=LINK.format("tool", 0, 1e-3, 2e-3, 2e-3, "")).replace('"tool"', f'"{bad}"')
+    result = mb.compare_parsers(write(tmp_path, text), floating_base=True, samples=1)
+    page = importers_page(result, data="r.importers.json")
+    assert page.index('class="verdict bad">✗ pinocchio agrees') < page.index("<table") < page.index("Why they differ")
+    assert "alert" in page
+    assert "<script" not in page
+    for told in ("the base floats", "a ball of water put in its place", "✓ same", "✗ differs", "! differs", "mujoco 4"):
+        assert told in page
+    # Whoever reads nothing is told with the reason, in the place of a column.
+    result = mb.compare_parsers(write(tmp_path, arm(tool=LINK.format("tool", 0.3, 1e-3, 1e-3, 9e-3, ""))), samples=1)
+    page = importers_page(result)
+    assert 'class="refuses" rowspan="17"' in page
+    assert page.count("A + B &gt;= C") == 2
+    nobody = mb.compare_parsers(write(tmp_path, urdf('<link name="a"/>')))
+    assert "and none reads it" in importers_page(nobody)
+
+
+def test_every_kind_of_cause_has_a_meaning() -> None:
+    folder = Path(mb.__file__).parent / "studies" / "causes"
+    source = "".join(p.read_text(encoding="utf-8") for p in folder.glob("*.py"))
+    kinds = set(re.findall(r'(?:Guess|Hypothesis|Convention)\(\s*"([a-z ]+)"', source))
+    assert len(kinds) > 25
+    assert not {k for k in kinds if not meaning(k)}
 
 
 def test_arguments_and_doors(tmp_path: Path) -> None:
@@ -210,6 +294,10 @@ def test_arguments_and_doors(tmp_path: Path) -> None:
     assert "a ball of water of 1 kg" in " ".join(done.stdout.split())
     data = json.loads((tmp_path / "out" / "r.importers.json").read_text(encoding="utf-8"))
     assert data["reference"] == "file"
+    assert not data["floating_base"]
+    assert "✗ pinocchio agrees" in (tmp_path / "out" / "r.importers.html").read_text(encoding="utf-8")
+    done = run(cli, ["check", str(path), "--own-parsers", "--floating-base", "--json", *out])
+    assert json.loads(done.stdout)["floating_base"]
     assert run(cli, ["check", "--own-parsers"]).exit_code == 2
     other = write(tmp_path, arm().replace('damping="0.5"', 'damping="0.6"'), "other.urdf")
     same = write(tmp_path, arm())

@@ -52,10 +52,13 @@ def check(
 
     TARGET is a robot (mbkit robots lists them), a catalog system, a path to a URDF or
     MJCF file, or package.module:function for a function that returns a Model. With --own-parsers
-    it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves.
+    it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves; --floating-base then lets
+    its base go in all of them.
     """
-    if own_parsers and (everything or target is None or floating_base or mimic or nonphysical or no_rollouts):
-        raise click.UsageError("--own-parsers takes one TARGET as it is written, and --seed, --json and --out")
+    if own_parsers and (everything or target is None or mimic or nonphysical or no_rollouts):
+        raise click.UsageError(
+            "--own-parsers takes one TARGET as it is written, and --floating-base, --seed, --json and --out"
+        )
     if everything and (target is not None or nonphysical is not None):
         raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")
     if not everything and jobs is not None:
@@ -64,7 +67,7 @@ def check(
 
     if own_parsers:
         check_writable(out)
-        _check_parsers(str(target), seed, as_json, out)
+        _check_parsers(str(target), floating_base, seed, as_json, out)
         return
     check_engines(engines, least=2)
     check_writable(out)
@@ -117,21 +120,27 @@ def _check_one(
     leave(MISUSE if not written or not result.rows else AGREE if result.passed else DIFFER)
 
 
-def _check_parsers(target: str, seed: int, as_json: bool, out: Path) -> None:
+def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, out: Path) -> None:
     from mbkit.load.names import find
     from mbkit.report.folder import file_stem
     from mbkit.studies.parsers import compare_parsers
 
-    result = compare_parsers(target, seed=seed)
+    result = compare_parsers(target, floating_base=floating_base, seed=seed)
 
     def table() -> RenderableType:
         from mbkit.report import cause_tables
 
         return cause_tables.importers(result)
 
-    stem = file_stem(target if find(target) else Path(target).stem)
+    def page() -> str:
+        from mbkit.report.page import importers_page
+
+        return importers_page(result, data=f"{stem}.json")
+
+    stem = f"{file_stem(target if find(target) else Path(target).stem)}.importers"
     data = result.to_json()
-    written = show(data, table, (File("data", f"{stem}.importers.json", lambda: data + "\n"),), out, as_json=as_json)
+    files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
+    written = show(data, table, files, out, as_json=as_json)
     read = any(p.stages for p in result.importers)
     if not read:
         say("error", f"no importer reads {target}")

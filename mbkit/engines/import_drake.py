@@ -23,6 +23,7 @@ from mbkit.engines.drake import DrakeDynamics
 from mbkit.engines.drake_model import DrakeModel
 from mbkit.engines.imported import Imported, checked, unused
 from mbkit.errors import UnsupportedError
+from mbkit.load.floating import BASE_JOINT
 from mbkit.model import Body, Joint, Model
 from mbkit.model.kinds import kind_of
 from mbkit.spatial import skew
@@ -43,18 +44,18 @@ _TURN: Final = 2 * np.pi
 _IDLE: Final = ("safety_controller", "calibration")
 
 
-def read(text: str, format_: str) -> Imported:
-    """Return what Drake's parser makes of a text, its base welded to the world."""
+def read(text: str, format_: str, floating_base: bool = False) -> Imported:
+    """Return what Drake's parser makes of a text, its base welded to the world unless it is to float."""
     plant = MultibodyPlant(0.0)
     with _heard() as heard:
         try:
             models = Parser(plant).AddModelsFromString(text, "urdf" if format_ == "urdf" else "xml")
-            welded = _weld(plant, models) if format_ == "urdf" else ""
+            welded = _weld(plant, models) if format_ == "urdf" and not floating_base else ""
             plant.Finalize()
         except (Exception, SystemExit) as error:
             # A demand of Drake's that fails comes as SystemExit.
             raise UnsupportedError(f"drake: {' '.join(str(error).split())}") from None
-    described = _Description(plant)
+    described = _Description(plant, floating_base)
     dyn = _Read(checked("drake", described.model), described.made)
     notes = [f"the base {welded!r} floats by itself; welded to the world here"] if welded else []
     notes += [h for h in dict.fromkeys(heard) if not any(x in h for x in _IDLE)]
@@ -112,7 +113,7 @@ class _Read(DrakeDynamics):
 class _Description:
     """Reads a finalized plant joint by joint."""
 
-    def __init__(self, plant: Any) -> None:
+    def __init__(self, plant: Any, floating_base: bool) -> None:
         self.plant = plant
         rotors = self._rotors()
         #: R and p of Drake's body frame in ours, which is the joint's moving one.
@@ -139,8 +140,12 @@ class _Description:
                 R_F, p_F = R_F @ np.array(X_FM.rotation().matrix()), p_F + R_F @ np.array(X_FM.translation())
             name = str(joint.name())
             effort, armature = rotors.get(int(joint.index()), (np.inf, 0.0))
+            if floating_base and kind == "free" and not int(parent.index()):
+                # Called after its body by itself.
+                name = BASE_JOINT
             joints.append(
                 _described(
+                    name,
                     joint,
                     kind,
                     self.names[int(parent.index())],
@@ -225,7 +230,7 @@ def _matter(name: str, body: Any, R: Array, p: Array) -> Body:
 
 
 def _described(
-    joint: Any, kind: str, parent: str, child: str, R: Array, p: Array, effort: float, armature: float
+    name: str, joint: Any, kind: str, parent: str, child: str, R: Array, p: Array, effort: float, armature: float
 ) -> Joint:
     type_ = kind_of(kind)
     lower, upper = np.full(type_.nq, -np.inf), np.full(type_.nq, np.inf)
@@ -245,7 +250,7 @@ def _described(
         if kind == "revolute" and not np.isfinite([lower, upper]).any():
             kind = "continuous"
     return Joint(
-        name=str(joint.name()),
+        name=name,
         kind=kind,
         parent=parent,
         child=child,

@@ -22,6 +22,7 @@ from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel
 from mbkit.errors import UnsupportedError
+from mbkit.load.floating import BASE_JOINT
 from mbkit.model import Body, Joint, Model
 from mbkit.model.kinds import kind_of
 
@@ -30,19 +31,32 @@ __all__ = ["ImportedMujoco", "read"]
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
 
 
-def read(text: str, format_: str) -> Imported:  # noqa: ARG001  # MuJoCo tells the formats apart by itself
-    """Return what MuJoCo's parser and compiler make of a text."""
+def read(text: str, format_: str, floating_base: bool = False) -> Imported:
+    """Return what MuJoCo's parser and compiler make of a text; an MJCF says by itself that its base floats."""
     # A singular M at the zero configuration is a warning, and no refusal.
     with heard_warnings() as heard, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
-            made = mujoco.MjModel.from_xml_string(text)
+            made = _floating(text) if floating_base and format_ == "urdf" else mujoco.MjModel.from_xml_string(text)
+        except UnsupportedError:
+            raise
         except Exception as error:
             lines = " ".join(str(error).split())
             raise UnsupportedError(f"mujoco: {lines.removeprefix('XML Error: ').removeprefix('Error: ')}") from None
     described = _Description(made)
     dyn = ImportedMujoco(checked("mujoco", described.model), described.made)
     return Imported(described.model, dyn.terms, (*_beside(made), *(" ".join(w.split()) for w in heard)))
+
+
+def _floating(text: str) -> Any:
+    """Return a compiled URDF whose base floats: between parser and compiler, which fuses a base that does not."""
+    spec = mujoco.MjSpec.from_string(text)
+    tops = list(spec.worldbody.bodies)
+    if len(tops) != 1:
+        told = ", ".join(repr(b.name) for b in tops) or "none"
+        raise UnsupportedError(f"mujoco: no single body stands in the world that could float; there are: {told}")
+    tops[0].add_freejoint(name=BASE_JOINT)
+    return spec.compile()
 
 
 class ImportedMujoco(MujocoDynamics):

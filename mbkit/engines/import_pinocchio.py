@@ -17,6 +17,7 @@ import pinocchio as pin
 from mbkit._check import Array
 from mbkit.engines.imported import Imported, checked, unused
 from mbkit.errors import UnsupportedError
+from mbkit.load.floating import BASE_JOINT
 from mbkit.model import Body, Joint, Model
 from mbkit.model.kinds import kind_of
 
@@ -36,14 +37,20 @@ _UNALIGNED: Final = {
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
 
 
-def read(text: str, format_: str) -> Imported:
-    """Return what Pinocchio's parser makes of a text."""
+def read(text: str, format_: str, floating_base: bool = False) -> Imported:
+    """Return what Pinocchio's parser makes of a text; an MJCF says by itself that its base floats."""
     try:
-        raw = pin.buildModelFromXML(text) if format_ == "urdf" else _mjcf(text)
+        raw = _urdf(text, floating_base) if format_ == "urdf" else _mjcf(text)
     except Exception as error:
         raise UnsupportedError(f"pinocchio: {' '.join(str(error).split())}") from None
     described = _Description(raw)
     return Imported(checked("pinocchio", described.model), described.terms, tuple(_beside(raw)))
+
+
+def _urdf(text: str, floating_base: bool) -> Any:
+    if floating_base:
+        return pin.buildModelFromXML(text, pin.JointModelFreeFlyer(), BASE_JOINT)
+    return pin.buildModelFromXML(text)
 
 
 def _mjcf(text: str) -> Any:

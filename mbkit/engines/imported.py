@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Container
 from dataclasses import dataclass
-from typing import Final
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -13,13 +14,34 @@ from mbkit._check import Array
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 
-__all__ = ["IMPORTERS", "Imported", "checked", "importer", "unused"]
+__all__ = ["IMPORTERS", "Imported", "Importer", "check_installed", "checked", "reader", "unused"]
 
-#: Engine -> (module, package that has its version, package to install).
+
+class Importer(NamedTuple):
+    """Where an engine's importer is.
+
+    Attributes
+    ----------
+    module : str
+        That reads with it.
+    library : str
+        The module that it needs.
+    distribution : str
+        Whose version is told.
+    package : str
+        To install.
+    """
+
+    module: str
+    library: str
+    distribution: str
+    package: str
+
+
 IMPORTERS = {
-    "pinocchio": ("mbkit.engines.import_pinocchio", "pin", "pin"),
-    "mujoco": ("mbkit.engines.import_mujoco", "mujoco", "mujoco"),
-    "drake": ("mbkit.engines.import_drake", "drake", "mbkit[drake]"),
+    "pinocchio": Importer("mbkit.engines.import_pinocchio", "pinocchio", "pin", "pin"),
+    "mujoco": Importer("mbkit.engines.import_mujoco", "mujoco", "mujoco", "mujoco"),
+    "drake": Importer("mbkit.engines.import_drake", "pydrake", "drake", "mbkit[drake]"),
 }
 # What mbkit's own loaders take.
 _LARGEST: Final = 1e30
@@ -78,19 +100,27 @@ def checked(engine: str, model: Model) -> Model:
     return model
 
 
-def importer(engine: str) -> Callable[[str, str], Imported]:
-    """Return the function (text, format) -> Imported of an engine.
+def check_installed(engine: str) -> None:
+    """Raise `UnsupportedError` if an engine is not installed; nothing is loaded.
 
     Raises
     ------
     UnsupportedError
-        The engine is not installed. The function itself raises it where the importer refuses a text.
     """
-    module, _, package = IMPORTERS[engine]
+    library, package = IMPORTERS[engine].library, IMPORTERS[engine].package
     try:
-        made: Callable[[str, str], Imported] = importlib.import_module(module).read
-    except ModuleNotFoundError as error:
-        if error.name and error.name.startswith("mbkit"):
-            raise
-        raise UnsupportedError(f"{engine} is not installed ({error}); pip install {package}") from error
+        found = find_spec(library) is not None
+    except (ImportError, ValueError):
+        # What stands in for a module that was taken away.
+        found = False
+    if not found:
+        raise UnsupportedError(f"{engine} is not installed (no module {library!r}); pip install {package}")
+
+
+def reader(module: str) -> Callable[[str, str, bool], Imported]:
+    """Return the function (text, format, floating_base) -> Imported of an importer's module.
+
+    It raises `UnsupportedError` where the importer refuses a text.
+    """
+    made: Callable[[str, str, bool], Imported] = import_module(module).read
     return made

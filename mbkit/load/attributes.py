@@ -28,8 +28,8 @@ class Reader:
         self.faults: list[str] = []
 
     def fault(self, text: str, element: Element | None = None) -> None:
-        """Keep one fault; the element tells the line."""
-        where = f" (line {element.line})" if element else ""
+        """Keep one fault; the element tells the line, and the file where that is an included one."""
+        where = f" ({element.place})" if element else ""
         self.faults.append(text + where)
 
     def name(self, element: Element, attribute: str, who: str) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from mbkit.errors import InputError, LoadError
 from mbkit.load import names, xml
+from mbkit.load.includes import expanded
 from mbkit.load.urdf_file import examine
 from mbkit.model import Model
 
@@ -28,8 +29,8 @@ def load(
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
-    No mesh or other file is opened. What was decided on the way (mimic joints, parts
-    left out, rounded zeros) stands in the model's ``notes``.
+    No mesh is opened, and no other file but those that an MJCF includes. What was decided on the way
+    (mimic joints, parts left out, rounded zeros) stands in the model's ``notes``.
 
     Parameters
     ----------
@@ -61,7 +62,7 @@ def load(
     UnknownNameError
         No robot has this name.
     LoadError
-        The file is missing, or is not readable as a URDF or MJCF.
+        The file, or one that it includes, is missing, or is not readable as a URDF or MJCF.
     ModelError
         The file has faults; all of them are listed.
 
@@ -103,7 +104,8 @@ def load(
     if root.tag == "mujoco":
         from mbkit.load.mjcf import model_of_mjcf
 
-        return model_of_mjcf(root, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
+        whole = expanded(root, path)
+        return model_of_mjcf(whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
     raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
 
 

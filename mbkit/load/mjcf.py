@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.errors import ModelError
 from mbkit.load.attributes import Reader
+from mbkit.load.floating import floated
 from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
 from mbkit.load.snap import Snapper
@@ -33,7 +34,6 @@ from mbkit.model import Model, ModelBuilder
 __all__ = ["model_of_mjcf"]
 
 _REFUSED: Final = {
-    "include": "it names another file; write that file's content in its place (MuJoCo's save as XML does)",
     "attach": "it names another model; save the compiled model as one XML",
     "replicate": "write the copies out; MuJoCo's save as XML does",
     "composite": "write its bodies out; MuJoCo's save as XML does",
@@ -58,6 +58,8 @@ def model_of_mjcf(
     """Describe the bodies and joints of a <mujoco> element."""
     read = Reader()
     _refuse(mujoco, read)
+    if floating_base:
+        mujoco = floated(mujoco, read)
     scene = Scene(Compiler.of(mujoco, read), Defaults(mujoco, read), read)
     for world in mujoco.all("worldbody"):
         scene.collect_names(world)
@@ -66,8 +68,6 @@ def model_of_mjcf(
             if element.tag == "body":
                 walk(element, "world", X, childclass, scene)
     own_gravity = _gravity(mujoco, read)
-    if floating_base:
-        _float(scene)
     if not scene.bodies:
         read.fault("no bodies; expected <worldbody> with <body> elements")
     elif not any(b.joints for b in scene.bodies):
@@ -106,21 +106,6 @@ def _gravity(mujoco: Element, read: Reader) -> tuple[float, ...]:
     for option in mujoco.all("option"):
         out = read.numbers(option, "gravity", "the file", count=3, default=out)
     return (0.0, 0.0, 0.0) if "gravity" in _disabled(mujoco) else out
-
-
-def _float(scene: Scene) -> None:
-    """Give the base a free joint."""
-    tops = [b for b in scene.bodies if b.parent == "world"]
-    if not tops:
-        return
-    if len(tops) != 1 or tops[0].joints:
-        told = ", ".join(f"{b.name!r} ({len(b.joints)} joints)" for b in tops)
-        scene.read.fault(f"floating_base=True needs one body of the world, without joints; there are: {told}")
-        return
-    if "root_joint" in scene.names["joint"]:
-        scene.read.fault("joint 'root_joint': floating_base=True adds a joint of that name; rename yours")
-    empty = Element("freejoint", {}, 0)
-    tops[0].joints.append(MjcfJoint("root_joint", empty, "free", np.zeros(3), np.zeros(3), 0.0))
 
 
 def _total_scale(scene: Scene) -> float:
@@ -221,6 +206,9 @@ def _range(element: Element, range_: str, limited: str, who: str, scene: Scene) 
 def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
     """Say what was decided and what was left out."""
     out = []
+    files = list(dict.fromkeys(e.file for e in mujoco.walk() if e.file))
+    if files:
+        out.append(f"included: {', '.join(files)}")
     sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in _READ)
     if sections:
         told = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))

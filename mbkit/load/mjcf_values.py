@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -65,7 +65,7 @@ class Compiler:
         merged = Element("compiler", {}, mujoco.line)
         for element in mujoco.all("compiler"):
             merged.attributes.update(element.attributes)
-            merged.line = element.line
+            merged.line, merged.file = element.line, element.file
         given = merged.attributes
         who = "the file"
         if given.get("coordinate", "local") != "local":
@@ -132,7 +132,7 @@ class Defaults:
         """Return the element with its defaults: its own class, else the enclosing childclass."""
         name = self.known(element.attributes.get("class"), element) or childclass or "main"
         values = self.classes[name].get(element.tag, {})
-        return Element(element.tag, _over(values, element.attributes), element.line, element.children)
+        return replace(element, attributes=_over(values, element.attributes))
 
 
 def _over(values: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:

@@ -14,8 +14,11 @@ from pathlib import Path
 from typing import Final
 from xml.sax.saxutils import escape, quoteattr
 
-from mbkit.errors import LoadError
+from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml
+from mbkit.load.attributes import Reader
+from mbkit.load.floating import floated, with_base
+from mbkit.load.includes import expanded
 from mbkit.load.xml import Element
 
 __all__ = ["Stripped", "strip"]
@@ -40,11 +43,13 @@ class Stripped:
     format : str
         ``"urdf"`` or ``"mjcf"``.
     root : Element
-        As it was read.
+        As it was read, with the files that an MJCF includes.
     text : str
         What the parsers are given.
     gone : tuple of (str, int)
         Elements that were taken out, and how many.
+    renamed : str
+        What the base link is called, where it may not be ``world``; else empty.
     shapeless : tuple of str
         Bodies whose inertia might have come from a mesh that was taken out.
     """
@@ -54,31 +59,47 @@ class Stripped:
     root: Element
     text: str
     gone: tuple[tuple[str, int], ...]
+    renamed: str
     shapeless: tuple[str, ...]
 
 
-def strip(path: Path) -> Stripped:
+def strip(path: Path, *, floating_base: bool = False) -> Stripped:
     """Read a file and take out what would open another.
+
+    An MJCF whose base is to float is given the joint for it, which all parsers read. A URDF cannot say that:
+    its base link is only given a name that no parser takes for the ground's.
 
     Raises
     ------
+    ModelError
+        No single body of an MJCF could float.
     LoadError
-        It cannot be read, is neither URDF nor MJCF, or is written in several files.
+        It cannot be read, is neither URDF nor MJCF, or names a file that is not read.
     """
     root = xml.read(path)
     format_ = _FORMATS.get(root.tag)
     if format_ is None:
         raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    if format_ == "mjcf":
+        root = expanded(root, path)
     foreign = [e for e in root.walk() if e.tag in _FOREIGN]
     if foreign:
         raise LoadError(
-            f"{path}: line {foreign[0].line}: <{foreign[0].tag}> names another file, which is not opened; "
+            f"{path}: {foreign[0].place}: <{foreign[0].tag}> names another file, which is not opened; "
             "write its content in its place"
         )
+    renamed = ""
+    if floating_base and format_ == "urdf":
+        root, renamed = with_base(root)
+    elif floating_base:
+        read = Reader()
+        root = floated(root, read)
+        if read.faults:
+            raise ModelError(str(path), read.faults)
     gone: Counter[str] = Counter()
     shapeless: list[str] = []
     text = _written(root, format_, gone, shapeless)
-    return Stripped(path, format_, root, text, tuple(sorted(gone.items())), tuple(dict.fromkeys(shapeless)))
+    return Stripped(path, format_, root, text, tuple(sorted(gone.items())), renamed, tuple(dict.fromkeys(shapeless)))
 
 
 def _written(element: Element, format_: str, gone: Counter[str], shapeless: list[str]) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load import xml
+from mbkit.load.floating import BASE_JOINT
 from mbkit.load.snap import Snapper
 from mbkit.load.urdf_file import UrdfFile, examine
 from mbkit.load.xml import Element
@@ -26,17 +27,17 @@ _KINDS: Final = {"floating": "free"}
 _SINGLE: Final = ("revolute", "continuous", "prismatic")
 
 
-def urdf_links(root: Element, source: str) -> Model:
+def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Model:
     """Return the description that a <robot> element is, one body for each link.
 
-    The root link stands in the world, unless it is called ``world``, which is the world then.
+    The root link stands in the world, or floats there; or it is called ``world``, and is the world then.
 
     Raises
     ------
     ModelError
         The file has faults; all of them are listed.
     """
-    urdf = examine(root, source, floating_base=False, mimic_matters=False, lenient=True)
+    urdf = examine(root, source, floating_base=floating_base, mimic_matters=False, lenient=True)
     # What was examined is clean XML of known elements.
     robot = xml.parse(urdf.text.encode(), source)
     snap = Snapper()
@@ -44,13 +45,15 @@ def urdf_links(root: Element, source: str) -> Model:
     for link in robot.all("link"):
         if link.attributes["name"] != "world":
             _add_link(b, link, snap)
-    ground = urdf.root
-    if ground != "world":
+    base = urdf.root
+    if floating_base:
+        b.add_joint(BASE_JOINT, "free", parent="world", child=base)
+    elif base != "world":
         names = {j.name for j in urdf.joints}
-        name = f"world_to_{ground}"
+        name = f"world_to_{base}"
         while name in names:
             name += "_"
-        b.add_joint(name, "fixed", parent="world", child=ground)
+        b.add_joint(name, "fixed", parent="world", child=base)
     for joint in robot.all("joint"):
         _add_joint(b, joint, urdf, snap)
     for note in urdf.notes:

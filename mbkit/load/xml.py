@@ -15,22 +15,31 @@ from xml.parsers import expat
 
 from mbkit.errors import LoadError
 
-__all__ = ["Element", "parse", "read"]
+__all__ = ["MOST_BYTES", "MOST_LEVELS", "Element", "parse", "read"]
 
-# Far above any robot, far below what would exhaust memory or the stack.
-_MOST_BYTES: Final = 64 * 2**20
-_MOST_LEVELS: Final = 250
+#: Far above any robot, far below what would exhaust memory or the stack.
+MOST_BYTES: Final = 64 * 2**20
+MOST_LEVELS: Final = 250
 
 
 @dataclass
 class Element:
-    """An element as it was written: tag, attributes, line, children, and what text is in it, joined."""
+    """An element as it was written: tag, attributes, line, children, and what text is in it, joined.
+
+    `file` is the included file that it stands in, and empty in the file that was asked for.
+    """
 
     tag: str
     attributes: dict[str, str]
     line: int
     children: list[Element] = field(default_factory=list)
     text: str = ""
+    file: str = ""
+
+    @property
+    def place(self) -> str:
+        """Where it stands, for messages."""
+        return f"{self.file}, line {self.line}" if self.file else f"line {self.line}"
 
     def all(self, tag: str) -> list[Element]:
         """Return the children of this tag."""
@@ -63,8 +72,8 @@ def read(path: Path) -> Element:
             what = "a folder" if path.is_dir() else "not a regular file"
             raise LoadError(f"{path}: expected a URDF or MJCF file, this is {what}")
         size = path.stat().st_size
-        if size > _MOST_BYTES:
-            raise LoadError(f"{path}: {size} bytes; a description of up to {_MOST_BYTES} bytes was expected")
+        if size > MOST_BYTES:
+            raise LoadError(f"{path}: {size} bytes; a description of up to {MOST_BYTES} bytes was expected")
         content = path.read_bytes()
     except (OSError, ValueError) as error:
         if isinstance(error, LoadError):
@@ -86,8 +95,8 @@ def parse(content: bytes, name: str) -> Element:
         element = Element(tag, attributes, parser.CurrentLineNumber)
         (stack[-1].children if stack else roots).append(element)
         stack.append(element)
-        if len(stack) > _MOST_LEVELS:
-            raise LoadError(f"{name}: line {element.line}: elements are nested more than {_MOST_LEVELS} deep")
+        if len(stack) > MOST_LEVELS:
+            raise LoadError(f"{name}: line {element.line}: elements are nested more than {MOST_LEVELS} deep")
 
     def end(_: str) -> None:
         stack.pop()

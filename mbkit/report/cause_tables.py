@@ -60,7 +60,8 @@ def importers(result: ParserComparison) -> RenderableType:
         for k, stage in enumerate(read[0].stages):
             table.add_row(stage.name, *(_cell(p.stages[k]) for p in read))
         against = "the file as written, link by link" if result.reference == "file" else f"what {result.reference} read"
-        parts += titled(f"Stages, against {against}; mimic joints free in M, g and nle", table)
+        base = "; the base floats" if result.floating_base else ""
+        parts += titled(f"Stages, against {against}{base}; mimic joints free in M, g and nle", table)
     for p in result.importers:
         parts += _importer(p)
     notes = [*result.notes, *([result.faults] if result.faults else [])]

@@ -7,7 +7,7 @@ from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from mbkit.report import figures, precision, stress
+from mbkit.report import figures, importers, precision, stress
 from mbkit.report.numbers import count_text, error_text, plain, time_text
 from mbkit.report.reading import allowances, by_term, failures, headline, judged, notices, omission_state, told
 from mbkit.report.stress_figures import stable_steps
@@ -18,6 +18,7 @@ from mbkit.report.stress_steps import kinds, rules, steps
 from mbkit.report.terms_figure import term_costs
 from mbkit.studies import drawing
 from mbkit.studies.all_robots import Sweep
+from mbkit.studies.parsers.result import ParserComparison
 from mbkit.studies.precision_result import WorkPrecision
 from mbkit.studies.result import Comparison
 from mbkit.studies.stress.figure import error_short, number_text
@@ -27,7 +28,7 @@ from mbkit.studies.stress.result import StressResult
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["bench_page", "check_page", "stress_page", "sweep_page"]
+__all__ = ["bench_page", "check_page", "importers_page", "stress_page", "sweep_page"]
 
 
 def check_page(result: Comparison, *, asked: str = "", data: str = "", when: datetime | None = None) -> str:
@@ -104,6 +105,28 @@ def _study(result: WorkPrecision) -> dict[str, Any]:
         "order_tolerance": precision.ORDER_TOLERANCE,
         "notices": notices(result.refusals),
     }
+
+
+def importers_page(result: ParserComparison, *, data: str = "", when: datetime | None = None) -> str:
+    """Return the page of one file through several importers.
+
+    Parameters
+    ----------
+    result : ParserComparison
+    data : str
+        Name of the JSON file beside the page.
+    when : datetime, optional
+        Stamped on the page; by default now.
+    """
+    return _render(
+        "importers.html",
+        when,
+        data,
+        result,
+        title=importers.title(result),
+        lines=importers.lines(result),
+        reasons={p.engine: importers.reasons(p) for p in result.importers},
+    )
 
 
 def sweep_page(result: Sweep, *, data: str = "", when: datetime | None = None) -> str:

@@ -10,15 +10,17 @@ from importlib import metadata
 from pathlib import Path
 
 from mbkit._check import count, real
-from mbkit.engines.imported import IMPORTERS, Imported, importer
-from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError
+from mbkit.engines.imported import IMPORTERS, Imported, check_installed
+from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import names
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.stripped import Stripped, strip
 from mbkit.load.urdf_links import urdf_links
 from mbkit.model import Model
+from mbkit.studies import stamp
 from mbkit.studies.causes.explaining import explain
 from mbkit.studies.causes.terms import gaps, model_terms, states_of
+from mbkit.studies.parsers.process import ImporterError, Reading, one_at_a_time
 from mbkit.studies.parsers.result import Parsed, ParserComparison
 from mbkit.studies.parsers.stages import stages
 
@@ -29,17 +31,22 @@ def compare_parsers(
     source: str | os.PathLike[str],
     importers: Sequence[str] = tuple(IMPORTERS),
     *,
+    floating_base: bool = False,
     samples: int = 3,
     seed: int = 0,
     tolerance: float = 1e-9,
+    seconds: float = 60.0,
 ) -> ParserComparison:
     """Read a file with each engine's own importer, and compare what comes out with the file as written.
 
-    The importers are given the file without meshes and textures, so that nothing else is opened; boxes,
-    cylinders and spheres stay. What each made is compared stage by stage: joints, kinds, parents,
-    places, axes, mimic joints, masses, centres of mass, inertias, armature, damping, friction, limits, and
-    M, g and nle by joint name, by the engine itself on its own model. Links that an importer fuses are fused on
-    the other side too. Why one differs is in its ``explanation``.
+    The importers are given the file without meshes and textures, so that nothing else is opened but what
+    an MJCF includes; boxes, cylinders and spheres stay. Each runs in a process of its own, kept until this
+    one ends: a crash or an endless loop there is told like any other refusal.
+
+    What each made is compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses,
+    centres of mass, inertias, armature, damping, friction, limits, and M, g and nle by joint name, by the
+    engine itself on its own model. Links that an importer fuses are fused on the other side too. Why one
+    differs is in its ``explanation``.
 
     Parameters
     ----------
@@ -47,10 +54,14 @@ def compare_parsers(
         A URDF or MJCF file, or a robot of example-robot-data.
     importers : sequence of str
         Of pinocchio, mujoco and drake. One that is not installed is told as refusing.
+    floating_base : bool
+        Whether the base moves freely, in the file's reading and in every importer's.
     samples, seed : int
         Random states for the terms.
     tolerance : float
         Relative difference that counts.
+    seconds : float
+        That an importer may take over the file, of the processor's time.
 
     Returns
     -------
@@ -59,7 +70,9 @@ def compare_parsers(
     Raises
     ------
     LoadError
-        The file is missing, is neither URDF nor MJCF, or is written in several files.
+        The file, or one that it includes, is missing or unreadable; or it is neither URDF nor MJCF.
+    ModelError
+        The base of an MJCF is to float, and no single body stands still in its world.
     """
     begun = time.perf_counter()
     for name in importers:
@@ -70,43 +83,77 @@ def compare_parsers(
     count("samples", samples, least=1)
     count("seed", seed)
     real("tolerance", tolerance, positive=True)
-    stripped = strip(_path(source))
-    read: dict[str, Imported] = {}
-    refused: dict[str, str] = {}
-    for engine in dict.fromkeys(importers):
-        try:
-            read[engine] = importer(engine)(stripped.text, stripped.format)
-        except MbkitError as error:
-            refused[engine] = str(error).removeprefix(f"{engine}: ")
-    reference, label, faults = _reference(stripped, read)
-    parsed = []
-    for engine in dict.fromkeys(importers):
-        if engine in refused:
-            parsed.append(Parsed(engine, _version(engine), refused[engine]))
-            continue
-        made = read[engine]
-        assert reference is not None
-        found = explain(reference, made.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine))
-        compared = stages(reference, made, samples, seed, tolerance)
-        notes = (*found.notes, *made.notes, *_unheld(made, samples, seed, tolerance))
-        parsed.append(Parsed(engine, _version(engine), "", compared, found, notes))
+    real("seconds", seconds, positive=True)
+    stripped = strip(_path(source), floating_base=floating_base)
+    engines = tuple(dict.fromkeys(importers))
+    parsed: dict[str, Parsed] = {}
+    with one_at_a_time():
+        read, refused = _read(stripped, engines, floating_base, seconds)
+        reference, label, faults = _reference(stripped, read, floating_base)
+        for engine, made in read.items():
+            assert reference is not None
+            try:
+                parsed[engine] = _compared(engine, made, reference, label, samples, seed, tolerance)
+            except ImporterError as error:
+                refused[engine] = str(error)
+    parsed |= {engine: Parsed(engine, _version(engine), why) for engine, why in refused.items()}
     return ParserComparison(
         source=str(stripped.path),
         format=stripped.format,
+        floating_base=floating_base,
         reference=label,
         faults=faults,
-        importers=tuple(parsed),
+        importers=tuple(parsed[engine] for engine in engines),
         notes=tuple(_notes(stripped)),
         samples=samples,
         seed=seed,
         tolerance=tolerance,
+        versions=stamp.versions(),
+        processor=stamp.processor(),
         seconds=time.perf_counter() - begun,
     )
 
 
+def _read(
+    stripped: Stripped, engines: Sequence[str], floating_base: bool, seconds: float
+) -> tuple[dict[str, Imported], dict[str, str]]:
+    """Return what each importer made of a file, and why the others did not; all read at the same time."""
+    begun: dict[str, Reading] = {}
+    read: dict[str, Imported] = {}
+    refused: dict[str, str] = {}
+
+    for engine in engines:
+        try:
+            check_installed(engine)
+            begun[engine] = Reading(engine, stripped.text, stripped.format, floating_base, seconds)
+        except (UnsupportedError, ImporterError) as error:
+            refused[engine] = str(error)
+    for engine, reading in begun.items():
+        try:
+            reading.send()
+        except ImporterError as error:
+            refused[engine] = str(error)
+    for engine in [e for e in begun if e not in refused]:
+        try:
+            read[engine] = begun[engine].made()
+        except ImporterError as error:
+            refused[engine] = str(error)
+    return read, refused
+
+
+def _compared(
+    engine: str, made: Imported, reference: Model, label: str, samples: int, seed: int, tolerance: float
+) -> Parsed:
+    """Return what an importer made, against the reference."""
+    found = explain(reference, made.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine))
+    compared = stages(reference, made, samples, seed, tolerance)
+    notes = (*found.notes, *made.notes, *_unheld(made, samples, seed, tolerance))
+    return Parsed(engine, _version(engine), "", compared, found, notes)
+
+
 def written(source: str | os.PathLike[str]) -> Model:
     """Return a file as it is written: nothing fused and no engine's parser between, a URDF link by link."""
-    return _written(strip(_path(source)))
+    return _written(strip(_path(source)), floating_base=False)
 
 
 def _path(source: str | os.PathLike[str]) -> Path:
@@ -121,18 +168,18 @@ def _path(source: str | os.PathLike[str]) -> Path:
     return Path(os.fspath(source))
 
 
-def _written(stripped: Stripped) -> Model:
+def _written(stripped: Stripped, floating_base: bool) -> Model:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
         if stripped.format == "urdf":
-            return urdf_links(stripped.root, str(stripped.path))
+            return urdf_links(stripped.root, str(stripped.path), floating_base=floating_base)
         return model_of_mjcf(stripped.root, stripped.path, floating_base=False, nonphysical="warn", gravity=None)
 
 
-def _reference(stripped: Stripped, read: dict[str, Imported]) -> tuple[Model | None, str, str]:
+def _reference(stripped: Stripped, read: dict[str, Imported], floating_base: bool) -> tuple[Model | None, str, str]:
     """Return what the importers are compared with, what it is called, and why it is not the file itself."""
     try:
-        return _written(stripped), "file", ""
+        return _written(stripped, floating_base), "file", ""
     except MbkitError as error:
         faults = f"mbkit does not read it: {error}"
     for engine, made in read.items():
@@ -155,6 +202,8 @@ def _notes(stripped: Stripped) -> list[str]:
     if stripped.gone:
         told = ", ".join(f"{n} {tag}" for tag, n in stripped.gone)
         out.append(f"taken out before, because they name other files or say nothing of the motion: {told}")
+    if stripped.renamed:
+        out.append(f"the base link 'world' is called {stripped.renamed!r}: importers take that name for the ground")
     if stripped.shapeless:
         some = ", ".join(stripped.shapeless[:6]) + (", ..." if len(stripped.shapeless) > 6 else "")
         out.append(f"bodies without <inertial>, whose meshes MuJoCo would have given a mass: {some}")
@@ -163,6 +212,6 @@ def _notes(stripped: Stripped) -> list[str]:
 
 def _version(engine: str) -> str:
     try:
-        return metadata.version(IMPORTERS[engine][1])
+        return metadata.version(IMPORTERS[engine].distribution)
     except metadata.PackageNotFoundError:
         return "not installed"

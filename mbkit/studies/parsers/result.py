@@ -9,8 +9,10 @@ from typing import Any, Final
 
 from mbkit.studies.causes.result import Explanation, grouped, saved
 
-__all__ = ["Parsed", "ParserComparison", "Stage"]
+__all__ = ["DECIDING", "Parsed", "ParserComparison", "Stage"]
 
+#: The stages that say whether two readings move alike.
+DECIDING: Final = ("joints", "kinds", "M", "g", "nle")
 _MARK: Final = {True: "same", False: "differs", None: "not comparable"}
 
 
@@ -65,7 +67,7 @@ class Parsed:
     @property
     def agrees(self) -> bool:
         """Whether it moves as the reference does, mimic joints left free."""
-        return bool(self.stages) and all(s.same for s in self.stages if s.name in ("joints", "kinds", "M", "g", "nle"))
+        return bool(self.stages) and all(s.same for s in self.stages if s.name in DECIDING)
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class ParserComparison:
         The file.
     format : str
         ``"urdf"`` or ``"mjcf"``.
+    floating_base : bool
     reference : str
         What the importers are compared with: ``"file"``, the file as written, link by link; or the
         first importer that reads it, where mbkit itself does not.
@@ -88,11 +91,15 @@ class ParserComparison:
         What was taken out of the file before.
     samples, seed : int
     tolerance : float
+    versions : dict
+        Package -> version, of everything that took part.
+    processor : str
     seconds : float
     """
 
     source: str
     format: str
+    floating_base: bool
     reference: str
     faults: str
     importers: tuple[Parsed, ...]
@@ -100,6 +107,8 @@ class ParserComparison:
     samples: int
     seed: int
     tolerance: float
+    versions: dict[str, str]
+    processor: str
     seconds: float
 
     @property

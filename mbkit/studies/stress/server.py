@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import ctypes
-import faulthandler
 import os
 import pickle
-import signal
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing import spawn
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
 from mbkit._check import Array
+from mbkit._serving import opened
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError
+from mbkit.studies.child import MEMORY
 from mbkit.studies.rollouts import TooLongError
 from mbkit.studies.stress import messages as m
 from mbkit.studies.stress.case import Case, Problem, Truth
@@ -27,12 +24,8 @@ from mbkit.studies.stress.result import Cell
 from mbkit.studies.stress.terms import Terms, condition, terms_of
 from mbkit.studies.stress.truths import Search
 
-__all__ = ["MEMORY", "busy", "serve"]
+__all__ = ["busy", "serve"]
 
-#: How the end of memory is told, by a worker that survived it.
-MEMORY: Final = "it took more memory than allowed"
-#: Linux's prctl: the signal that a process gets when its parent is gone.
-_PR_SET_PDEATHSIG: Final = 1
 _AT_WORK: Final[list[bool]] = []
 
 
@@ -51,16 +44,8 @@ def serve(handle: int, memory: int) -> None:
     memory : int
         Bytes that the process may take; 0 for no bound.
     """
-    # Ctrl-C is the parent's.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.platform == "linux":
-        # Whatever it is at, it does not outlive who asked for it.
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    faulthandler.enable()
+    channel = opened(handle, memory, follow=True)
     _AT_WORK.append(True)
-    if memory:
-        _bound(memory)
-    channel: Connection[Any, Any] = Connection(handle)
     server = Server(Path.cwd().parent, lambda doing: channel.send(m.Stage(doing)))
     channel.send(m.Hello())
     while True:
@@ -70,17 +55,6 @@ def serve(handle: int, memory: int) -> None:
             # Nothing is left to tidy; destructors of loaded libraries could only fail.
             os._exit(0)
         channel.send(server.answer(request))
-
-
-def _bound(memory: int) -> None:
-    import resource
-
-    # What is written to, not what LLVM and heyoka only reserve.
-    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    limit = memory if hard == resource.RLIM_INFINITY else min(memory, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
-    # A crash leaves no core file behind.
-    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
 
 
 class Server:

@@ -1,0 +1,68 @@
+"""What a comparison of importers and their processes say to each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mbkit._check import Array
+from mbkit.model import Model
+
+__all__ = ["Answer", "Ask", "Hello", "Made", "Read", "Refused", "Request"]
+
+
+@dataclass(frozen=True)
+class Read:
+    """Read a text with the importer; answered by `Made` or `Refused`.
+
+    Attributes
+    ----------
+    module, text, format : str
+    floating_base : bool
+    seconds : float
+        After which the process ends itself, should nobody be there to end it.
+    """
+
+    module: str
+    text: str
+    format: str
+    floating_base: bool
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Ask:
+    """Evaluate the terms of what was read last; answered by a dict of arrays or `Refused`.
+
+    Attributes
+    ----------
+    q, v : (N, nq) and (N, nv) arrays
+    seconds : float
+    """
+
+    q: Array
+    v: Array
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Hello:
+    """A process is ready."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What an importer made of a text; see `mbkit.engines.imported.Imported`."""
+
+    model: Model
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why a process that goes on living has no better answer."""
+
+    why: str
+
+
+Request = Read | Ask
+Answer = Made | dict[str, Array] | Refused
