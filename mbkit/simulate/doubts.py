@@ -29,17 +29,21 @@ _EPS: Final = float(np.finfo(float).eps)
 #: States and trajectories of a batch that are looked at.
 _TIMES: Final = 7
 _MEMBERS: Final = 4
-#: Where a quantity is no longer inaccurate but wrong. A first-order method at a common step
-#: oscillates in energy by some parts of a thousand, and means no harm.
+#: Where a quantity is no longer inaccurate but wrong. A method of first or second order at a common step
+#: oscillates in energy by some parts of a thousand, and means no harm; one of higher order has lost the motion.
 _ENERGY: Final = 0.01
+_ENERGY_HIGH: Final = 1e-3
+_LOW: Final = 2
 _DIGITS: Final = 1e-3
 #: h|λ| below which every method follows every mode for as long as runs are.
 _FOLLOWED: Final = 1e-3
-#: Of the motion.
-_OFF: Final = 0.01
+#: Of the motion: a hundredth is wrong, and at a few times the gap is not yet the largest.
+_OFF: Final = 0.008
 _BEYOND: Final = 3.0
-#: Of a mode's phase or amplitude, over a run.
-_LOST: Final = 0.05
+#: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by two to four times that.
+_LOST: Final = 0.02
+#: Whose tolerance is not relative to the coordinates.
+_ABSOLUTE: Final = ("taylor",)
 #: m or rad: what engineers still call a position.
 _POSITION: Final = 1e-6
 
@@ -83,9 +87,9 @@ def doubts(
         return []
     looks = [
         _pole(dyn, crossed),
-        _energy(here, M, q, v, pushed),
+        _energy(here, M, q, v, pushed, _ENERGY if (method.order or 0) <= _LOW else _ENERGY_HIGH),
         _condition(M),
-        _far(q, setting if isinstance(setting, Tolerances) else None),
+        _far(q, setting if isinstance(setting, Tolerances) and method.name not in _ABSOLUTE else None),
     ]
     if not isinstance(setting, Tolerances) and method.name in STEPS:
         # The cause is told before what came of it.
@@ -148,7 +152,7 @@ def _first(q: Array, v: Array, k: int) -> tuple[Array, Array]:
     return q.reshape(-1, *q.shape[-2:])[0, k], v.reshape(-1, *v.shape[-2:])[0, k]
 
 
-def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool) -> Iterator[str]:
+def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool, most: float) -> Iterator[str]:
     """Hold against a run what nothing drives: its energy stays, or with dampers falls."""
     model = dyn.model
     if pushed or model.clock is not None or (model.written is not None and is_damped(model)):
@@ -169,7 +173,7 @@ def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool) -> Iterat
     wrong = change.max(axis=1) if is_damped(model) else np.abs(change).max(axis=1)
     share = np.where(wrong > floor, wrong / np.maximum(size, np.finfo(float).tiny), 0.0)
     worst = int(share.argmax())
-    if share[worst] > _ENERGY:
+    if share[worst] > most:
         gained = "gained" if change[worst][np.abs(change[worst]).argmax()] > 0 or is_damped(model) else "lost"
         yield (
             f"{gained} {share[worst]:.2g} of its energy ({wrong[worst]:.2g} J) with nothing that drives it; "

@@ -17,7 +17,7 @@ __all__ = ["STEPS", "growth", "lost"]
 
 
 #: Of a run: what is gone after that is a transient.
-_BRIEF: Final = 0.03
+_BRIEF: Final = 0.01
 
 
 def _companion(A: Array, B: Array) -> Array:

@@ -30,14 +30,16 @@ __all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
 
 # Of a rate, relative to the largest or 1: what no truncation of a series makes.
 _JUMP: Final = 1e-6
+#: rad, m, rad/s, m/s.
+_COMMON: Final = 10.0
 _BITS: Final = {"lagrangian": 53, "oracle": 113}
 
 
 def run_taylor(asked: Asked) -> Outcome:
     """Integrate one state, or each of a batch by itself.
 
-    The tolerance bounds each step's error: absolute while all numbers of the state are
-    below 1, relative to the largest otherwise, with the smaller of rtol and atol.
+    The tolerance bounds each step's error, with the smaller of rtol and atol: absolute up to a factor of ten in the
+    numbers of the start, whatever their sizes are, and relative to the largest where the state outgrows them.
     Without `save`, the method's own steps are kept. An evaluation is that of a whole
     series, one a step.
 
@@ -58,7 +60,7 @@ def run_taylor(asked: Asked) -> Outcome:
             f"{asked.method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')"
         )
     kind = precision(_BITS[dyn.engine])
-    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances), kind.eps)
+    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / _size(asked.y), kind.eps)
     ends = [asked.duration, *(save.tolist() if save is not None and torque.held else [])]
     stops = sorted({*ends} - {0.0})
     members = []
@@ -74,6 +76,15 @@ def run_taylor(asked: Asked) -> Outcome:
             members.append(one.all(start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
     return gathered(dyn.model, members, asked.batch, save, evaluations=evaluations)
+
+
+def _size(y: Array) -> float:
+    """Return by what heyoka's tolerance, relative to the largest number of a state, is too loose for the others.
+
+    In whole decades, as each order is compiled once; below ten it is the slack that common motions have.
+    """
+    largest = float(np.abs(y).max(initial=0.0))
+    return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON else 1.0
 
 
 def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:
