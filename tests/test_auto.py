@@ -212,8 +212,8 @@ def test_a_run_repeats_to_the_bit_and_travels() -> None:
 
 
 def test_accelerations_of_few_digits_are_passed_and_told() -> None:
-    """The cart weighs next to nothing: where the pole hangs down, rounding is all that rk853 finds."""
-    dyn = dynamics(catalog.cart_pole(cart_mass=1e-11), "lagrangian", compile=False)
+    """The cart weighs next to nothing: where the pole hangs down, rounding is all that rk853 finds in energies' M."""
+    dyn = mb.lagrangian.from_model(catalog.cart_pole(cart_mass=1e-11)).dynamics()
     with pytest.warns(DoubtfulRunWarning, match=r"near t = 0\.45\d+ s accelerations are known to") as heard:
         run = simulate(dyn, [0.0, np.pi / 2], [0.0, 0.0], 0.6, "auto", rtol=1e-8, save=[0.0, 0.6], doubt=False)
     assert len(heard) == 1

@@ -5,7 +5,7 @@ Run ``python -m validation.published``, about two minutes; it writes
 problem of ``published.json`` in one `Way` and returns `Figure`s: an error and the bar
 that it should not pass. What was printed is compared to its last digit, the rest with
 the exact motions of ``elliptic``. A bar that one way misses is told, not hidden: the
-light cart-pole's is beyond mass matrices in double, and the box's last period beyond
+light cart-pole's is beyond MuJoCo's mass matrix in double, and the box's last period beyond
 double itself. Exit status 1 if no way at all reaches a figure.
 """
 

@@ -21,7 +21,6 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.factorize import solve
 
 if TYPE_CHECKING:
     from mbkit.derivation.equations import Equations
@@ -80,10 +79,10 @@ def inverse_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
 
 def forward_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
     """Return ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ as expressions of (q, v, τ)."""
-    by_q, by_v, M = inverse_dynamics(eq)
+    by_q, by_v, _ = inverse_dynamics(eq)
     n = eq.model.nv
     by_q, by_v = ca.substitute([by_q, by_v], [eq.a], [eq.forward_dynamics])
-    out = solve(M, ca.horzcat(-by_q, -by_v, ca.SX.eye(n)), eq.elimination_order)
+    out = eq.over_mass(ca.horzcat(-by_q, -by_v, ca.SX.eye(n)))
     by_q, by_v, by_tau = ca.horzsplit(out, [0, n, 2 * n, 3 * n])
     return by_q, by_v, by_tau
 

@@ -7,6 +7,9 @@ Dynamics, ch. 4.3), with momenta p = ∂T/∂v::
 
 For coordinate velocities D = 1 and the hamel term vanishes: Lagrange's own form.
 d/dt p is one directional derivative along (D v, a).
+
+Forward dynamics solves that by the factors of M. Where those would lose digits (`mbkit.derivation.conditioning`) the
+same accelerations come from Gauss's principle (`mbkit.derivation.least_constraint`).
 """
 
 from __future__ import annotations
@@ -17,10 +20,13 @@ from typing import Any, Final
 import casadi as ca
 
 from mbkit.derivation import derivatives, energies
+from mbkit.derivation.conditioning import loses_digits
 from mbkit.derivation.factorize import elimination_order, solve
 from mbkit.derivation.kinematics import Kinematics, add, constant_transposed_times
+from mbkit.derivation.least_constraint import LeastConstraint
 from mbkit.derivation.scalars import scalar
 from mbkit.derivation.sources import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
+from mbkit.derivation.squares import squares
 from mbkit.derivation.values import Constants
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
@@ -76,6 +82,7 @@ class Equations:
 
     def __init__(self, model: Model, constants: Constants = "literal") -> None:
         self.model = model
+        self._symbolic = constants == "symbols"
         self.kin = Kinematics(model, constants)
         self.parameters = self.kin.values.parameters
         self.constants, self.constant_values = self.kin.values.constants, self.kin.values.constant_values
@@ -184,8 +191,26 @@ class Equations:
 
     @cached_property
     def forward_dynamics(self) -> Any:
-        """M⁻¹ (τ + τ_passive - C v - g), by the tree's sparse factorisation."""
+        """M⁻¹ (τ + τ_passive - C v - g), by the tree's sparse factorisation or by `least_constraint`."""
+        if self.least_constraint is not None:
+            return self.least_constraint.accelerations(self.tau + self.passive)
         return solve(self.mass_matrix, self.tau + self.applied, self.elimination_order)
+
+    @cached_property
+    def least_constraint(self) -> LeastConstraint | None:
+        """The orthogonal elimination, for a model that needs it; None for all others, and with constants as symbols.
+
+        Symbols are for many digits, some of which can be lost.
+        """
+        if self._symbolic or not loses_digits(self.model):
+            return None
+        return LeastConstraint(squares(self.kin), self.elimination_order)
+
+    def over_mass(self, f: ca.SX) -> Any:
+        """Return M⁻¹ f of right-hand sides, (nv,) or (nv, k), by the same elimination as forward dynamics."""
+        if self.least_constraint is not None:
+            return self.least_constraint.over_mass(f)
+        return solve(self.mass_matrix, f, self.elimination_order)
 
     @cached_property
     def elimination_order(self) -> tuple[int, ...]:

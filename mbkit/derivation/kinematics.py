@@ -114,6 +114,11 @@ class Kinematics:
         in_P = constant_times(values.rotation, in_J)
         return add(in_P, [weight * c for c in values.translation])
 
+    def from_parent(self, joint: Joint, x: Vector) -> Vector:
+        """Return R_PCᵀ x of a vector."""
+        R, _ = self.placements[joint.name]
+        return _transposed_times(R, constant_transposed_times(self.values.joints[joint.name].rotation, x))
+
     def to_world(self, body: str, x: Vector, weight: float = 1.0) -> Vector:
         """Return a point (weight 1) or vector (weight 0) of a body in world axes."""
         while body != "world":

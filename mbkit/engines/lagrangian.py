@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count
+from mbkit.derivation.conditioning import loses_digits
 from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
 from mbkit.derivation.equations import Equations, equations_of
 from mbkit.derivation.execution import compile_by_default, executable
@@ -49,6 +50,11 @@ class LagrangianDynamics(Dynamics):
         default compiled, unless the environment says ``MBKIT_COMPILE=0``.
     threads : int, optional
         Threads that share a large batch; by default as many as the process has cores.
+
+    Attributes
+    ----------
+    elimination : {"mass matrix", "least constraint"}
+        What accelerations come from.
     """
 
     engine = "lagrangian"
@@ -70,6 +76,26 @@ class LagrangianDynamics(Dynamics):
         """The expressions, free to read."""
         return equations_of(self.model)
 
+    @cached_property
+    def elimination(self) -> str:
+        """What accelerations come from: ``"mass matrix"``, or ``"least constraint"`` where that would lose digits.
+
+        The sparse LᵀDL of M loses M_kk/D_k of its digits, where D_k is what is left of a diagonal entry once all
+        beyond joint k gives way. Where that is more than six digits at some pose, as of a light cart below a heavy
+        pole, the accelerations, and the products with M⁻¹ in their derivatives, come from Gauss's principle of least
+        constraint instead, in which no M is formed. It is decided from the description, with parameters at the
+        nominal values that the model had when its dynamics were made (a pickled copy is made anew): `at` changes
+        masses but not the way. Systems that were written as energies, and trees too large to be written out, have
+        the mass matrix only.
+        """
+        return "least constraint" if loses_digits(self.model) else "mass matrix"
+
+    @cached_property
+    def form(self) -> str:
+        """The digest of what is derived: that of the description without its parameters' values, and `elimination`."""
+        digest = self.model.form_digest
+        return f"{digest} by {self.elimination}" if self.model.parameters else digest
+
     def code(self, name: str, *extra: str, make: Callable[[], Any] | None = None) -> Any:
         """Return a `Compiled` or `Machine` of a quantity, or of what `make` derives from this model.
 
@@ -85,7 +111,7 @@ class LagrangianDynamics(Dynamics):
                     return getattr(self.equations, name)(*extra)
                 return self.equations.function(name)
 
-            code = executable((self.model.form_digest, *key), derive, compile=self.compile)
+            code = executable((self.form, *key), derive, compile=self.compile)
             if name in _TRIM and not isinstance(code, Machine):
                 self._short[name] = short_way(self.model, code, _TRIM[name], self.threads)
             self._machines[key] = code
@@ -116,7 +142,7 @@ class LagrangianDynamics(Dynamics):
     def _with(self, parameters: ParameterValues) -> LagrangianDynamics:
         out = object.__new__(type(self))
         # What is derived and compiled is shared, also what comes later.
-        out.__dict__.update(self.__dict__, equations=self.equations)
+        out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
         out._parameters, out.model = parameters, parameters.model
         return out
 

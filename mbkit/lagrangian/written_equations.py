@@ -129,6 +129,10 @@ class WrittenEquations(Equations):
         return derivatives(self) if self.model.constrained else super().forward_dynamics_derivatives
 
     @property
+    def least_constraint(self) -> None:
+        """Nothing: energies as written are no sum of squares of rates."""
+
+    @property
     def elimination_order(self) -> tuple[int, ...]:
         """The coordinates as they stand."""
         return tuple(range(self.model.nv))

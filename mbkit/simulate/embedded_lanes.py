@@ -98,7 +98,7 @@ def _code(dyn: LagrangianDynamics, scheme: _Scheme) -> Lanes:
     made = _CODES.setdefault(dyn.equations, {})
     if scheme.name not in made:
         made[scheme.name] = lanes(
-            (dyn.model.form_digest, scheme.name, disk.key_of(repr(scheme.coefficients))),
+            (dyn.form, scheme.name, disk.key_of(repr(scheme.coefficients))),
             lambda: scheme.parts(dyn.equations),
             STATE,
         )
