@@ -47,7 +47,7 @@ _MANY: Final = 1000.0
 #: n steps with errors of the tolerance, in a norm that is a mean over 2 nv numbers, add up to at most n √(2 nv)
 #: of it. They shall not exceed this much of what was asked for; measured is a third to a three-hundredth of that for
 #: rk853, a tenth to a thirtieth for rodas5.
-_SUM: Final = {EXPLICIT: 400.0, IMPLICIT: 1000.0}
+_SUM: Final = {EXPLICIT: 300.0, IMPLICIT: 1000.0}
 #: Tries of rodas5 in vain are repeated when there were so many times the tries.
 _PATIENCE: Final = 4
 #: Steps that are believed to come, for each that there was.
