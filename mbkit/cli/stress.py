@@ -34,7 +34,7 @@ __all__ = ["stress"]
 @click.option("--dt", type=float, help="Step of fixed-step methods, s.  [default: 1e-3]")
 @click.option("--rtol", type=float, help="Tolerance of adaptive methods.  [default: 1e-8]")
 @click.option("--seconds", type=float, help="What one run may take, s.  [default: 2; quick: 0.5]")
-@click.option("--budget", type=float, help="What the study may take, s.  [default: 1700; quick: 105]")
+@click.option("--budget", type=float, help="What the study may take, s.  [default: 1700; quick: 100]")
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes side by side.  [default: one a processor]")
 @click.option("--list", "listing", is_flag=True, help="List the cases, and end.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")

@@ -37,7 +37,7 @@ QUICK_METHODS: Final = {
 }
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}
-_BUDGET: Final = {True: 105.0, False: 1700.0}
+_BUDGET: Final = {True: 100.0, False: 1700.0}
 _MEMORY: Final = 2 * 2**30
 #: Below it no worker starts, bytes.
 _LEAST_MEMORY: Final = 2**29
@@ -93,7 +93,7 @@ def stress(
     memory : int, optional
         Bytes that a worker process may take, 2 GiB when not given; enforced on Linux.
     budget : float, optional
-        Seconds that the study may take as a whole, 1700, in a quick study 105. What is
+        Seconds that the study may take as a whole, 1700, in a quick study 100. What is
         not reached by then is "not run".
     jobs : int, optional
         Processes side by side; by default as many as there are processors, and not
