@@ -103,7 +103,7 @@ def test_a_nearly_singular_mass_matrix_is_told_with_its_digits():
     b.add_body("pole", mass=1.0, com=(0, 0, -1.0), inertia=1e-14 * np.eye(3))
     b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
     b.add_joint("theta", "revolute", parent="cart", child="pole", axis=(0, 1, 0))
-    told = doubts(b.build(), "rk4", [0.0, 0.0], [0.0, 0.0], dt=1e-3, duration=0.01)[1]
+    told = doubts(b.build(), "rk4", [0.0, 0.0], [0.0, 0.0], engine="pinocchio", dt=1e-3, duration=0.01)[1]
     assert "singular" in told[0]
     assert "oracle" in told[0]
 
@@ -189,3 +189,23 @@ def test_taylor_s_tolerance_is_not_relative_to_the_largest_rate():
     run, told = doubts(swing, "taylor", [far + 1.0], rtol=1e-8, save=[0.0, 1.0])
     assert np.abs(run.q - far - near).max() < 1e-7
     assert not told
+
+
+def test_a_state_that_outgrows_its_start_is_told_by_taylor():
+    """A flywheel is driven to 1e8 rad/s; beside it a pendulum is off by a tenth of a radian."""
+    b = mb.ModelBuilder("two")
+    b.add_body("fly", mass=1.0, inertia=(1, 1, 1))
+    b.add_body("bob", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.02))
+    b.add_joint("f", "continuous", parent="world", child="fly", axis=(1, 0, 0))
+    b.add_joint("s", "continuous", parent="world", child="bob", axis=(0, 1, 0))
+    more = {"duration": 10.0, "rtol": 1e-8, "save": [0.0, 10.0], "torque": np.array([1e7, 0.0])}
+    run, told = doubts(b.build(), "taylor", [0.0, 1.0], [0.0, 0.0], **more)
+    assert run.stats.finished
+    assert any("outgrew" in x or "grew to 5e+08" in x for x in told)
+
+
+def test_digits_that_are_not_lost_are_not_doubted():
+    """A cart of 1e-13 kg: M is singular to rounding, and nothing is computed from it."""
+    model = mb.catalog.cart_pole(cart_mass=1e-13)
+    more = {"duration": 1e-6, "rtol": 1e-12, "save": [0.0, 1e-6]}
+    assert not doubts(model, "rk853", [0, 0.0], [0, 1.0], **more)[1]

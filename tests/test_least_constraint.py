@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import casadi as ca
@@ -243,3 +244,57 @@ def test_symbols_and_written_systems_keep_the_mass_matrix():
     written = mb.lagrangian.from_model(model).dynamics()
     assert written.elimination == "mass matrix"
     assert written.equations.least_constraint is None
+
+
+def test_fewer_squares_than_velocities_are_a_singular_mass_matrix_and_no_fault():
+    """Two virtual links and a point: whether its mass is a number or a parameter."""
+    for mass in (1.0, mb.Parameter("m", 1.0)):
+        b = mb.ModelBuilder("few")
+        for name, own in (("a", 0.0), ("b", 0.0), ("c", mass)):
+            b.add_body(name, mass=own, com=(0.3, 0.1, 0.2))
+        b.add_joint("x", "planar", parent="world", child="a")
+        b.add_joint("y", "continuous", parent="a", child="b", axis=(0, 1, 0))
+        b.add_joint("z", "continuous", parent="b", child="c", axis=(1, 0, 0))
+        model = b.build(nonphysical="warn")
+        dyn = mb.dynamics(model, "lagrangian", compile=False)
+        assert dyn.elimination == "mass matrix"
+        q, _ = model.random_state(np.random.default_rng(0))
+        assert np.linalg.matrix_rank(dyn.mass_matrix(q)) == 3
+
+
+@pytest.mark.parametrize("inertia", [(0, 0, 1.0), (0, 1.0, 1.0)], ids=["flat", "rod"])
+def test_planar_descriptions_keep_their_digits(inertia):
+    """Two light links and a point of 1 kg at their end; a flat inertia is no body's, and common in planar models."""
+    b = mb.ModelBuilder("arm", gravity=(0, -9.81, 0))
+    for k, (parent, mass) in enumerate((("world", 1e-9), ("l0", 1e-9), ("l1", 1.0))):
+        own = np.multiply(inertia, 1e-9 / 12 if k < 2 else 0.0)
+        b.add_body(f"l{k}", mass=mass, com=(0.5 if k < 2 else 1.0, 0, 0), inertia=own)
+        place = (float(k > 0), 0, 0)
+        b.add_joint(f"j{k}", "continuous", parent=parent, child=f"l{k}", axis=(0, 0, 1), translation=place)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NonPhysicalWarning)
+        model = b.build(nonphysical="warn")
+    dyn, oracle = mb.dynamics(model, "lagrangian", compile=False), OracleDynamics(model)
+    assert dyn.elimination == "least constraint"
+    q, v, tau = np.random.default_rng(1).standard_normal((3, 20, 3))
+    exact = oracle.extended("forward_dynamics", q, v, tau)
+    # Two in the angles' sines are half of what is left where the arm is nearly straight.
+    assert errors(dyn.forward_dynamics(q, v, tau), exact).max() < 1e-13
+
+
+def test_poses_are_found_one_coordinate_after_the_other():
+    """Three poles of any zeros on one light cart; a ball on a rod that is turned into its own axis."""
+    rng = np.random.default_rng(3)
+    b = mb.ModelBuilder("cart", gravity=(0, 0, -9.81))
+    b.add_body("cart", mass=1e-9)
+    b.add_joint("slide", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    for k, turned in enumerate(rng.uniform(-3, 3, 3)):
+        b.add_body(f"p{k}", mass=1.0, com=(np.sin(turned), 0, np.cos(turned)))
+        b.add_joint(f"h{k}", "continuous", parent="cart", child=f"p{k}", axis=(0, 1, 0))
+    assert cancellation(b.build()) > 1e8
+    b = mb.ModelBuilder("rod")
+    b.add_body("rod", mass=1e-3, inertia=(1, 1, 1e-9))
+    b.add_body("ball", mass=1.0, inertia=(1, 1, 1))
+    b.add_joint("u", "universal", parent="world", child="rod", axis=(1, 0, 0), axis2=(0, 1, 0))
+    b.add_joint("s", "ball", parent="rod", child="ball")
+    assert cancellation(b.build()) > 1e6

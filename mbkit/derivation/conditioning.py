@@ -4,12 +4,14 @@ Eliminating from the leaves to the root leaves D_k of the diagonal entry M_kk: t
 beyond it give way, of that which it moves while they are locked. What is formed to eps M_kk then is known to
 eps M_kk/D_k: a cart of 1e-9 kg below a pole of 1 kg, on which it has to be driven sideways, keeps 7 digits of 16.
 
-The worst pose is looked for, as it may be a special one: the pole upright. D_k there comes from an orthogonal
+The worst pose within the limits is looked for, as it may be a special one: the pole upright. It is found where a
+coordinate at a time leads to it, and may be missed where several have to be right at once. D_k comes from an orthogonal
 factorization in NumPy, of rows that are the square root of the kinetic energy.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
@@ -35,8 +37,9 @@ _STATES: Final = 16
 _ROUNDS: Final = 12
 #: How much nearer the next round looks.
 _NEARER: Final = 0.3
-#: What is below it after so many rounds is no foot of a peak.
-_FLAT: Final = (3, 1e2)
+#: Poses of a whole turn, and along one velocity in each round.
+_STEPS: Final = 24
+_ALONG: Final = 9
 #: Kinds whose own velocities become dependent at some angle, whatever the masses are: gimbal lock.
 _LOCKING: Final = ("spherical_zyx",)
 
@@ -53,35 +56,62 @@ def loses_digits(model: Model) -> bool:
         return False
     if any(x is None for x in model.parameters.values()) or not has_squares(model):
         return False
-    return cancellation(model) > _MOST
+    return cancellation(model, enough=_MOST) > _MOST
 
 
-def cancellation(model: Model) -> float:
+def cancellation(model: Model, enough: float = np.inf) -> float:
     """Return about the largest M_kk/D_k of any pose, or a bound below 5e5.
 
-    Infinite where a joint can lock; 1 where M is singular at every pose.
+    Infinite where a joint can lock; 1 where M is singular at every pose. Nothing is looked for beyond `enough`.
     """
     if any(joint.kind in _LOCKING for joint in model.joints):
         return np.inf
     rng = np.random.default_rng(0)
     q = model.random_state(rng, _STATES)[0]
     with np.errstate(all="ignore"):
+        q = np.concatenate([q, _right_angles(model, rng)])
         bound = _bound(model, q)
         if bound <= _MOST:
             return bound
-        q = np.concatenate([q, _right_angles(model, rng)])
         seen = _ratios(model, q)
         if not seen[:_STATES].min() < _SINGULAR:
             return 1.0
-        worst, best = float(seen.max()), q[np.argmax(seen)]
-        for k in range(_ROUNDS):
-            if k >= _FLAT[0] and worst < _FLAT[1]:
+        found = _Worst(float(seen.max()), q[np.argmax(seen)])
+        for k in range(model.nv + _ROUNDS):
+            if found.ratio > enough:
                 break
-            q = _around(model, best, _NEARER ** (k + 1), rng)
-            seen = _ratios(model, q)
-            if seen.max() > worst:
-                worst, best = float(seen.max()), q[np.argmax(seen)]
-    return worst
+            if k < model.nv:
+                found.look(model, _turn(model, k))
+            else:
+                found.look_around(model, _NEARER ** (k + 1 - model.nv), rng)
+    return found.ratio
+
+
+@dataclass
+class _Worst:
+    """The worst pose so far."""
+
+    ratio: float
+    q: Array
+
+    def look(self, model: Model, moves: Array) -> Array:
+        """Look where some moves lead to, and return the ratio of each."""
+        q = _within(model, model.integrate(np.tile(self.q, (len(moves), 1)), moves))
+        seen = _ratios(model, q)
+        if seen.max() > self.ratio:
+            self.ratio, self.q = float(seen.max()), q[np.argmax(seen)]
+        return seen
+
+    def look_around(self, model: Model, reach: float, rng: np.random.Generator) -> None:
+        """Look along each velocity alone, at the best of all together, and anywhere."""
+        nv, q = model.nv, self.q
+        alone = np.zeros((nv, _ALONG, nv))
+        alone[range(nv), :, range(nv)] = reach * np.linspace(-1.0, 1.0, _ALONG)
+        seen = self.look(model, alone.reshape(-1, nv)).reshape(nv, _ALONG)
+        together = alone[range(nv), seen.argmax(axis=1)].sum(axis=0)
+        anywhere = reach * rng.standard_normal((_STATES, nv))
+        # From where it looked alone, or from what that found.
+        self.look(model, np.vstack([model.difference(self.q, model.integrate(q, together)), anywhere]))
 
 
 def _right_angles(model: Model, rng: np.random.Generator) -> Array:
@@ -95,12 +125,11 @@ def _right_angles(model: Model, rng: np.random.Generator) -> Array:
     return _within(model, model.integrate(np.tile(model.neutral(), (_STATES, 1)), turns))
 
 
-def _around(model: Model, q: Array, reach: float, rng: np.random.Generator) -> Array:
-    """Return poses near one, some of them moved along each velocity alone."""
-    nv = model.nv
-    moves = reach * rng.standard_normal((_STATES + nv, nv))
-    moves[:nv] *= np.eye(nv)
-    return _within(model, model.integrate(np.tile(q, (len(moves), 1)), moves))
+def _turn(model: Model, k: int) -> Array:
+    """Return moves that follow one velocity for a whole turn."""
+    moves = np.zeros((_STEPS, model.nv))
+    moves[:, k] = np.linspace(0.0, 2 * np.pi, _STEPS, endpoint=False)
+    return moves
 
 
 def _within(model: Model, q: Array) -> Array:
@@ -129,8 +158,9 @@ def _bound(model: Model, q: Array) -> float:
             # Of later velocities one moves this body only if it leads a joint before it.
             moving = block.any(axis=(0, 1)) | (np.arange(len(later)) < part.stop - part.start)
             left = _pivots(block[:, :, moving])[:, ::-1][:, : part.stop - part.start].min(axis=0)
-            worst = max(worst, float(np.max(largest[part] / left)))
-    return worst if np.isfinite(worst) else np.inf
+            # Numbers that overflow tell nothing either.
+            worst = max(worst, float(np.max(np.nan_to_num(largest[part] / left, nan=np.inf, posinf=np.inf))))
+    return worst
 
 
 def _ratios(model: Model, q: Array) -> Array:
@@ -145,7 +175,8 @@ def _ratios(model: Model, q: Array) -> Array:
 
 def _pivots(B: Array) -> Array:
     """Return D of BᵀB = LᵀDL, from the last to the first."""
-    R = np.linalg.qr(B[:, :, ::-1], mode="r")
+    missing = max(0, B.shape[2] - B.shape[1])
+    R = np.linalg.qr(np.pad(B, ((0, 0), (0, missing), (0, 0)))[:, :, ::-1], mode="r")
     return np.asarray(np.einsum("nkk->nk", R) ** 2)
 
 

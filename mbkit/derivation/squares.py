@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from mbkit.derivation.inertia_squares import inertia_squares
 from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times, dot3
@@ -59,7 +60,8 @@ def _has_squares(body: Body, bound: set[tuple[int, ...]]) -> bool:
     if bound:
         off = [(i, j) for i in range(3) for j in range(3) if i != j]
         return not any(index in bound or body.inertia[index] for index in off)
-    return inertia_squares(tuple(body.inertia.ravel().tolist())) is not None
+    diagonal = not (body.inertia - np.diag(np.diagonal(body.inertia))).any()
+    return diagonal or inertia_squares(tuple(body.inertia.ravel().tolist())) is not None
 
 
 def squares(kin: Kinematics) -> Squares:
@@ -103,11 +105,17 @@ class _Rows:
         for rate, turned, g in zip(at_com, cross3(angular, at_com), self._gravity[name], strict=True):
             self.row(values.mass, rate, turned - g)
         entries = [x for row in values.inertia for x in row]
-        if all(isinstance(x, float) for x in entries):
-            for square in inertia_squares(tuple(entries)) or ():
+        found = inertia_squares(tuple(entries)) if all(isinstance(x, float) for x in entries) else None
+        if found is not None:
+            for square in found:
                 turning = (c * (angular[i] * angular[j]) for (i, j), c in square.turning)
                 self.row(square.weight, dot3(square.direction, angular), sum(turning, 0.0))
+        elif not all(is_zero(values.inertia[i][j]) for i in range(3) for j in range(3) if i != j):
+            raise ValueError(
+                f"{name}: an inertia with numbers off its diagonal that are not known, or no sum of squares"
+            )
         else:
+            # Of parameters, which may become zero; or flat, turning where nothing resists.
             torque = cross3(angular, constant_times(values.inertia, angular))
             for k in range(3):
                 self.row(values.inertia[k][k], angular[k], 0.0)

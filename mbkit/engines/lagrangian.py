@@ -86,7 +86,9 @@ class LagrangianDynamics(Dynamics):
         constraint instead, in which no M is formed. It is decided from the description, with parameters at the
         nominal values that the model had when its dynamics were made (a pickled copy is made anew): `at` changes
         masses but not the way. Systems that were written as energies, and trees too large to be written out, have
-        the mass matrix only.
+        the mass matrix only, and so have the methods that solve with it themselves, ``"rodas5"`` and
+        ``"implicit_midpoint"``. The pose is looked for within the limits, and may be missed where several coordinates
+        have to be right at once.
         """
         return "least constraint" if loses_digits(self.model) else "mass matrix"
 

@@ -339,12 +339,14 @@ class Course:
         # Steps near rounding themselves are too short for either, and for all motions there are.
         crawls = step < _AWAY * self._scene.duration and found is not None and step * found.rate < _ROUNDED
         if nearer > _ROUNDED or crawls:
-            self._loosen(trials, place, 0.0 if crawls else rough)
+            self._loosen(0.0 if crawls else rough, enough=self._tolerances.rtol < self._base.rtol)
+            self._tolerate(trials, place, 0.0)
             return True
         asked = self._scene.tolerances
-        if self._base.rtol > asked.rtol and share * self._base.rtol / asked.rtol < _ROUNDED:
+        loosened = self._base.rtol > asked.rtol or self._least == math.inf
+        if loosened and share * self._tolerances.rtol / self._scene.granted(EXPLICIT, asked).rtol < _ROUNDED:
             # What was rough is passed.
-            self._base = asked
+            self._base, self._least = asked, LEAST
             self._tolerate(trials, place, 0.0)
         return False
 
@@ -362,34 +364,35 @@ class Course:
         share = _WEIGHT * step * float(np.sqrt(np.mean((scatter / (atol + rtol * np.abs(w))) ** 2)))
         return share, float(scatter.max() / max(np.abs(k).max(), np.finfo(float).tiny))
 
-    def _loosen(self, trials: Trials | None, place: int, rough: float) -> None:
-        """Ask for less where rounding does not give more."""
-        if self._tolerances.rtol < self._base.rtol:
-            # It was only too much to ask for.
+    def _loosen(self, rough: float, *, enough: bool) -> bool:
+        """Ask for less where rounding does not give more; return whether that could be done.
+
+        Parameters
+        ----------
+        rough : float
+            What rounding makes of accelerations, of themselves; 0 where that is not known.
+        enough : bool
+            Whether it may be enough to ask for no more than what the user asked for.
+        """
+        if enough:
             self._least = math.inf
-        else:
-            asked, t = self._scene.tolerances.rtol, self._at[0]
-            self._base = Tolerances(*(min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base))
-            digits = f"to {rough:.0e} of themselves" if rough else "to few digits"
-            self.doubt = (
-                f"near t = {t:.6g} s accelerations are known {digits}, which is not enough for rtol = {asked:g}; there "
-                f"it took {self._base.rtol:.0e}. Leave out what has next to no mass, or compute with 34 digits: "
-                "mbkit.dynamics(model, 'oracle') and method='taylor'"
-            )
-        if trials is None:
-            self._tolerances = self._base
-        else:
-            self._tolerate(trials, place, 0.0)
+            return True
+        asked, t, before = self._scene.tolerances.rtol, self._at[0], self._base.rtol
+        self._base = Tolerances(*(min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base))
+        digits = f"to {rough:.0e} of themselves" if rough else "to few digits"
+        self.doubt = (
+            f"near t = {t:.6g} s accelerations are known {digits}, which is not enough for rtol = {asked:g}; there "
+            f"it took {self._base.rtol:.0e}. Leave out what has next to no mass, or compute with 34 digits: "
+            "mbkit.dynamics(model, 'oracle') and method='taylor'"
+        )
+        return self._base.rtol > before
 
     def _rescue(self) -> None:
         """Go on where steps fell below rounding: by the other method, and each second time with a looser tolerance."""
         method = self._legs[-1].method
-        if self.track.rescues % 2 == 0:
-            before = self._tolerances.rtol
-            self._loosen(None, 0, 0.0)
-            if self._tolerances.rtol <= before:
-                # The next time is the last.
-                self.track.rescues = _RESCUES
+        if self.track.rescues % 2 == 0 and not self._loosen(0.0, enough=self._least < math.inf):
+            # The next time is the last.
+            self.track.rescues = _RESCUES
         self._turn(IMPLICIT if method == EXPLICIT else EXPLICIT, "where its steps fell below rounding")
 
     # In words

@@ -20,6 +20,7 @@ from mbkit.model.space import Space
 from mbkit.simulate.along import along
 from mbkit.simulate.balance import is_damped, kinetic_energy, potential_energy
 from mbkit.simulate.methods import Method, Tolerances
+from mbkit.simulate.size import size_of
 from mbkit.simulate.stability import STEPS, growth, lost
 from mbkit.simulate.stiffness import linearized
 
@@ -33,7 +34,7 @@ _MEMBERS: Final = 4
 #: oscillates in energy by some parts of a thousand, and means no harm; one of higher order has lost the motion.
 _ENERGY: Final = 0.01
 _ENERGY_HIGH: Final = 1e-3
-_LOW: Final = 2
+_LOW: Final = (1, 2)
 _DIGITS: Final = 1e-3
 #: h|λ| below which every method follows every mode for as long as runs are.
 _FOLLOWED: Final = 1e-3
@@ -42,8 +43,10 @@ _OFF: Final = 0.008
 _BEYOND: Final = 3.0
 #: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by two to four times that.
 _LOST: Final = 0.02
-#: Whose tolerance is not relative to the coordinates.
-_ABSOLUTE: Final = ("taylor",)
+#: Whose tolerance is that of the state at the start.
+_OF_START: Final = "taylor"
+#: Who solves with the mass matrix, whatever accelerations come from.
+_BY_MASSES: Final = ("rodas5", "implicit_midpoint")
 #: m or rad: what engineers still call a position.
 _POSITION: Final = 1e-6
 
@@ -87,13 +90,15 @@ def doubts(
         return []
     looks = [
         _pole(dyn, crossed),
-        _energy(here, M, q, v, pushed, _ENERGY if (method.order or 0) <= _LOW else _ENERGY_HIGH),
-        _condition(M),
-        _far(q, setting if isinstance(setting, Tolerances) and method.name not in _ABSOLUTE else None),
+        _energy(here, M, q, v, pushed, _ENERGY if method.order in _LOW else _ENERGY_HIGH),
+        [] if _keeps_digits(dyn, method.name) else _condition(M),
+        _far(q, setting if isinstance(setting, Tolerances) and method.name != _OF_START else None),
     ]
     if not isinstance(setting, Tolerances) and method.name in STEPS:
         # The cause is told before what came of it.
         looks.insert(0, _step(dyn, method.name, setting, float(t[-1]), ends))
+    if isinstance(setting, Tolerances) and method.name == _OF_START:
+        looks.append(_outgrown(q, v, setting))
     found: list[str] = []
     for look in looks:
         try:
@@ -274,3 +279,19 @@ def _far(q: Array, tolerances: Tolerances | None) -> Iterator[str]:
             f"rtol = {tolerances.rtol:g} of a coordinate of {largest:.2g} allows an error of "
             f"{tolerances.rtol * largest:.1g} in each step; count it from a nearer origin, or take a smaller rtol"
         )
+
+
+def _outgrown(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
+    """Look for numbers that have outgrown those of the start, and what their tolerance allows to the others."""
+    largest = max(float(np.nan_to_num(np.abs(x), posinf=0.0).max()) for x in (q, v))
+    allowed = min(tolerances) * largest / size_of(q[..., 0, :], v[..., 0, :])
+    if allowed > max(1e3 * tolerances.atol, _POSITION):
+        yield (
+            f"the state grew to {largest:.2g}, of which the tolerance allows an error of {allowed:.1g} to all "
+            "numbers in each step; take a smaller rtol, or method='rk853'"
+        )
+
+
+def _keeps_digits(dyn: Dynamics, method: str) -> bool:
+    """Return whether no accelerations come from the mass matrix: not by the engine, nor by the method."""
+    return getattr(dyn, "elimination", "") == "least constraint" and method not in _BY_MASSES

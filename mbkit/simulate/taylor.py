@@ -23,6 +23,7 @@ from mbkit.simulate.events import State, Watch
 from mbkit.simulate.members import Member, gathered
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.rates import Rates, unit_quaternions
+from mbkit.simulate.size import size_of
 from mbkit.simulate.stats import Ended
 from mbkit.simulate.steps import RAN_AWAY, credible
 
@@ -30,8 +31,6 @@ __all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
 
 # Of a rate, relative to the largest or 1: what no truncation of a series makes.
 _JUMP: Final = 1e-6
-#: rad, m, rad/s, m/s.
-_COMMON: Final = 10.0
 _BITS: Final = {"lagrangian": 53, "oracle": 113}
 
 
@@ -60,7 +59,7 @@ def run_taylor(asked: Asked) -> Outcome:
             f"{asked.method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')"
         )
     kind = precision(_BITS[dyn.engine])
-    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / _size(asked.y), kind.eps)
+    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / size_of(asked.y), kind.eps)
     ends = [asked.duration, *(save.tolist() if save is not None and torque.held else [])]
     stops = sorted({*ends} - {0.0})
     members = []
@@ -76,15 +75,6 @@ def run_taylor(asked: Asked) -> Outcome:
             members.append(one.all(start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
     return gathered(dyn.model, members, asked.batch, save, evaluations=evaluations)
-
-
-def _size(y: Array) -> float:
-    """Return by what heyoka's tolerance, relative to the largest number of a state, is too loose for the others.
-
-    In whole decades, as each order is compiled once; below ten it is the slack that common motions have.
-    """
-    largest = float(np.abs(y).max(initial=0.0))
-    return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON else 1.0
 
 
 def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:
