@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import mbkit as mb
-from mbkit.studies.stress import Breaking, CaseResult
+from mbkit.studies.stress import Breaking, CaseResult, StressResult
 
 FILE = Path(__file__).with_suffix(".json")
 OURS = ("lagrangian", "pinocchio")
@@ -23,7 +23,12 @@ OURS = ("lagrangian", "pinocchio")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
-    result = mb.stress(quick=parser.parse_args().quick)
+    parser.add_argument("--data", type=Path, help="what mbkit stress wrote, instead of a study now")
+    asked = parser.parse_args()
+    if asked.data is not None:
+        result = StressResult.from_json(asked.data.read_text(encoding="utf-8"))
+    else:
+        result = mb.stress(quick=asked.quick)
     rows = list(result.breaking())
     told: dict[str, Any] = {
         "processor": result.processor,
@@ -85,7 +90,9 @@ def _name(b: Breaking | None) -> str:
 
 
 def _to(case: CaseResult, b: Breaking | None) -> str:
-    if b is None or b.held is None:
+    if b is None:
+        return "–"
+    if b.held is None:
         return "none"
     return "all" if math.isclose(b.held, case.values[-1]) else f"{b.held:g}"
 

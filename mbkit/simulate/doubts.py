@@ -43,6 +43,9 @@ _OFF: Final = 0.008
 _BEYOND: Final = 3.0
 #: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by two to four times that.
 _LOST: Final = 0.02
+#: Whose errors of a step are those allowed, or more; what the others make is a third to a three-hundredth of that.
+_TO_THE_FULL: Final = ("rodas5", "radau", "lsoda", "bdf", "cvodes")
+_SUM: Final = 1e-3
 #: Whose tolerance is that of the state at the start.
 _OF_START: Final = "taylor"
 #: Who solves with the mass matrix, whatever accelerations come from.
@@ -52,7 +55,15 @@ _POSITION: Final = 1e-6
 
 
 def doubts(
-    dyn: Dynamics, method: Method, setting: float | Tolerances, t: Array, q: Array, v: Array, *, pushed: bool
+    dyn: Dynamics,
+    method: Method,
+    setting: float | Tolerances,
+    t: Array,
+    q: Array,
+    v: Array,
+    *,
+    pushed: bool,
+    steps: int,
 ) -> list[str]:
     """Return what speaks against a run, in sentences with the measured reason and the remedy.
 
@@ -67,6 +78,8 @@ def doubts(
         What was kept; states that are not finite are passed over.
     pushed : bool
         Whether a generalized force acted.
+    steps : int
+        Of all trajectories.
     """
     nv = dyn.model.nv
     # The oracle's digits are not in doubt, and its terms take long.
@@ -75,7 +88,7 @@ def doubts(
     # The first trajectory's fastest state is where a step is longest for it.
     fastest = int(np.nan_to_num(np.abs(v.reshape(-1, *v.shape[-2:])[0]).max(axis=-1), posinf=0.0).argmax())
     ends = [_first(q, v, k) for k in sorted({0, fastest, len(t) - 1})]
-    crossed = q
+    crossed, members = q, len(q) if q.ndim == 3 else 1
     times = np.unique(np.linspace(0, len(t) - 1, _TIMES).astype(int))
     q, v = q[..., times, :], v[..., times, :]
     if q.ndim == 3:
@@ -99,6 +112,8 @@ def doubts(
         looks.insert(0, _step(dyn, method.name, setting, float(t[-1]), ends))
     if isinstance(setting, Tolerances) and method.name == _OF_START:
         looks.append(_outgrown(q, v, setting))
+    if isinstance(setting, Tolerances) and method.name in _TO_THE_FULL:
+        looks.append(_adding(method.name, setting, 2 * nv, steps / members))
     found: list[str] = []
     for look in looks:
         try:
@@ -295,3 +310,14 @@ def _outgrown(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
 def _keeps_digits(dyn: Dynamics, method: str) -> bool:
     """Return whether no accelerations come from the mass matrix: not by the engine, nor by the method."""
     return getattr(dyn, "elimination", "") == "least constraint" and method not in _BY_MASSES
+
+
+def _adding(method: str, tolerances: Tolerances, numbers: int, steps: float) -> Iterator[str]:
+    """Look for so many steps that the errors allowed to each add up."""
+    # The norm is a mean over the state's numbers.
+    together = steps * tolerances.rtol * float(np.sqrt(numbers))
+    if together > _SUM:
+        yield (
+            f"errors of {steps:.2g} steps that each use the tolerance of {tolerances.rtol:g}, as those of {method} do, "
+            f"add up to {together:.1g} of the motion and more; take a smaller rtol, or method='auto'"
+        )

@@ -194,7 +194,7 @@ def simulate(
     found: list[str] = []
     if doubt and outcome.ended in ("finished", "event"):
         states = _from_start(outcome, q, v)
-        found = doubts(dyn, chosen, setting, *states, pushed=torque is not None)
+        found = doubts(dyn, chosen, setting, *states, pushed=torque is not None, steps=outcome.steps)
         steps = round(duration / dt)
         if chosen.order == 1 and torque is None and _FEWEST <= steps <= _MOST and not model.clock and v.size:
             one = (dyn, q, v) if batch is None else (dyn.of_samples([0]), q[:1], v[:1])
