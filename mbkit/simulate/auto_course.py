@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import FunctionError, NumericalError
+from mbkit.simulate.auto_legs import Leg, kind, told
 from mbkit.simulate.auto_scene import EXPLICIT, IMPLICIT, LEAST, Gauge, Scene
 from mbkit.simulate.embedded import Track, march
 from mbkit.simulate.embedded_trials import ROUNDS, Stretch, Trials
@@ -70,18 +70,6 @@ _LEFT: Final = len(_AHEAD) - 4
 #: Of a step's estimated error that is rounding: the length of rk853's weights, and the part that is too much.
 _WEIGHT: Final = 2.0
 _ROUNDED: Final = 0.03
-#: Changes of the method that are told one by one.
-_TOLD: Final = 3
-
-
-@dataclass
-class _Leg:
-    """A part of a run by one method: from when on and why, and what else there is to say."""
-
-    method: str
-    t: float
-    why: str = ""
-    note: str = ""
 
 
 class _Track(Track):
@@ -130,7 +118,7 @@ class Course:
         self.doubt = ""
         # As asked for or loosened, and as tightened.
         self._base, self._tolerances = scene.tolerances, scene.granted(EXPLICIT, scene.tolerances)
-        self._legs = [_Leg(EXPLICIT, 0.0)]
+        self._legs = [Leg(EXPLICIT, 0.0)]
         self._gauge: Gauge | None = None
         self._at: tuple[float, Array, Array] = 0.0, np.empty(0), np.empty(0)
         self._tries = 0
@@ -217,7 +205,7 @@ class Course:
         """Go on with a method from here."""
         self._next, self._tolerances = self._begun(method), self._granted(method)
         self._looser = self._tolerances.rtol, 0.0
-        self._legs.append(_Leg(method, self._at[0], why))
+        self._legs.append(Leg(method, self._at[0], why))
 
     # Looks
 
@@ -235,10 +223,10 @@ class Course:
         # Not where steps have been short alone, but where they are.
         worth = (held or to_come >= pace.guess) and self._tries >= self._pilot_from
         if worth and self._faster(min(rate, 1 / step)):
-            told = "" if found is None else f"; {found}"
+            seen = "" if found is None else f"; {found}"
             why = "stability held its steps" if held else "rodas5 got further with a try"
-            size = "" if found is None else f" (h|λ| = {step * found.stable:.1f}{told})"
-            self._legs.append(_Leg(IMPLICIT, self._at[0], f"where {why}{size}"))
+            size = "" if found is None else f" (h|λ| = {step * found.stable:.1f}{seen})"
+            self._legs.append(Leg(IMPLICIT, self._at[0], f"where {why}{size}"))
             if found is not None:
                 self._kept = min(_KEPT, step * found.stable) or _KEPT
             return
@@ -395,24 +383,10 @@ class Course:
             self.track.rescues = _RESCUES
         self._turn(IMPLICIT if method == EXPLICIT else EXPLICIT, "where its steps fell below rounding")
 
-    # In words
-
     def kind(self) -> str:
         """Return the methods in their order."""
-        methods = [leg.method for leg in self._legs]
-        return f"{methods[0]} throughout" if len(methods) == 1 else ", then ".join(methods)
+        return kind(self._legs)
 
     def told(self) -> str:
         """Return what was chosen and why."""
-        legs, parts = self._legs, []
-        skipped = len(legs) - 1 - 2 * _TOLD
-        for i, leg in enumerate(legs):
-            if skipped > 0 and _TOLD < i <= _TOLD + skipped:
-                if i == _TOLD + 1:
-                    parts.append(f"{skipped} more changes")
-                continue
-            part = leg.method + (" from there" if i else "")
-            # What a method was given on the way to being left is of no interest.
-            until = f" to t = {legs[i + 1].t:.3g} s, {legs[i + 1].why}" if i + 1 < len(legs) else ""
-            parts.append(part + (until or (leg.note and f", {leg.note}")))
-        return self.kind() if len(legs) == 1 and not legs[0].note else "; ".join(parts)
+        return told(self._legs)
