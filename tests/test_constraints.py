@@ -264,9 +264,12 @@ def test_rows_are_named_wherever_they_are_met(rows, told):
     asked = [
         lambda: lag.dynamics(options=OWN).forward_dynamics([0, 0], [0, 0], [0, 0]),
         lambda: lag.multipliers([0, 0], [0, 0]),
-        lambda: lag.embedded(),
+        lambda: lag.project([0, 0], [0, 0]),
+        lambda: mb.simulate(lag.dynamics(options=OWN), [0, 0], [0, 0], 1.0),
         lambda: mb.equilibrium(lag.dynamics(options=OWN)),
     ]
+    if len(rows) == 1:
+        asked.append(lambda: mb.simulate(lag.embedded(), [0, 0], [0, 0], 1.0))
     for ask in asked:
         with pytest.raises(InputError, match=told):
             ask()
@@ -292,7 +295,7 @@ def test_contradictory_rows_are_named():
     with pytest.raises(InputError, match=r"constraints\[0\].*constraints\[1\].*contradict each other"):
         pendulum(constraints=[x + y, x + y - 1]).project([1, 0], [0, 0])
     with pytest.raises(InputError, match=r"constraints\[0\] \(x\*\*2 \+ 1\) cannot hold"):
-        pendulum(constraints=[x**2 + 1]).embedded()
+        mb.simulate(pendulum(constraints=[x**2 + 1]).embedded(), [0, 0], [0, 0], 1.0)
     with pytest.raises(InputError, match="3 of them for 2 coordinates"):
         pendulum(constraints=[x, y, x + y]).project([0, 0], [0, 0])
     # Too long a gap for these links.

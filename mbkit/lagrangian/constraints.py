@@ -106,8 +106,7 @@ class Manifold:
         """
         states = zip(np.atleast_2d(q), np.atleast_2d(v), strict=True)
         for k, (one_q, one_v) in enumerate(states):
-            member = self._member(k) if self.dyn.samples is not None else self
-            terms = member._terms(one_q, one_v)
+            terms = self.member(k)._terms(one_q, one_v)
             limits = [_CONSISTENT * terms.scale * max(1.0, float(np.abs(x).max())) for x in (one_q, one_v)]
             for name, what, residual, limit in (
                 ("q0", "f", terms.f, limits[0]),
@@ -121,7 +120,10 @@ class Manifold:
                         f"{where}; lag.project(q0, v0) returns the nearest consistent state"
                     )
 
-    def _member(self, k: int) -> Manifold:
+    def member(self, k: int) -> Manifold:
+        """Return the states of one sample of a batch of parameters; the same where there is none."""
+        if self.dyn.samples is None:
+            return self
         one = self.dyn.of_samples([k])
         return Manifold(one.at(**dict(zip(one.model.parameters, one.parameter_values[0].tolist(), strict=True))))
 

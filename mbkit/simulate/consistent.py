@@ -16,7 +16,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_times
-from mbkit.errors import UnsupportedError
+from mbkit.errors import InputError, UnsupportedError
 from mbkit.simulate.outcome import Outcome
 
 __all__ = ["along_constraints", "from_consistent", "refuse_constraints", "settled"]
@@ -35,11 +35,16 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
         return q, v
     # This and what follows loads CasADi.
     from mbkit.lagrangian.constraints import manifold_of
-    from mbkit.lagrangian.redundancy import require_independent
+    from mbkit.lagrangian.redundancy import refuse_unreachable, require_independent
 
-    require_independent(dyn)
     manifold = manifold_of(dyn).at(0.0)
-    manifold.check(q, v)
+    try:
+        manifold.check(q, v)
+    except InputError:
+        refuse_unreachable(manifold.member(0).dyn, np.atleast_2d(q)[0])
+        raise
+    for k, one in enumerate(np.atleast_2d(q)):
+        require_independent(manifold.member(k).dyn, one)
     return manifold.pulled(q, v)
 
 
