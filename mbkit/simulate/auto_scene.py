@@ -88,14 +88,14 @@ class Scene:
         batch: int | None,
         stops: Sequence[float],
     ) -> None:
-        self._dyn, self._torque, self.batch = dyn, torque, batch
+        self.dyn, self._torque, self.batch = dyn, torque, batch
         self.space, self.tolerances, self.duration, self.stops = space, tolerances, duration, stops
         self._trials: list[Trials] = []
         self.pace = _IN_PYTHON
 
     def make(self, method: str, tolerances: Tolerances) -> Trials:
         """Return what tries a method's steps; its evaluations are counted with all others."""
-        given = self._dyn, self.space, tolerances, self._torque, self.duration, self.batch
+        given = self.dyn, self.space, tolerances, self._torque, self.duration, self.batch
         made = make_trials(method, *given)
         self._trials.append(made)
         self.pace = _COMPILED if made.rounds > 1 else _IN_PYTHON

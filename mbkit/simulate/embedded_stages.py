@@ -26,6 +26,10 @@ class _OneOf(Field):
     def one(self, member: int) -> None:
         self._use(self._dyn.of_samples([member]))
 
+    def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ beside a single state."""
+        return super().consistent(t, q, w, force).reshape(-1)
+
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ of a single state; one of a batch with parameters of its own is a batch of one."""
         return super().__call__(t, q, w, force).reshape(-1)
@@ -165,7 +169,7 @@ class StageTrials:
             moved = (h * A[i, :i]) @ rates[:i]
             u, w_i = moved[:nv], w + moved[nv:]
             rates[i, :nv] = space.rate(u, w_i)
-            rates[i, nv:] = self._field(t + self._c[i] * h, space.move(q, u), w_i, self._force)
+            rates[i, nv:] = self._field.consistent(t + self._c[i] * h, space.move(q, u), w_i, self._force)
         moved = (h * self._tableau.b) @ rates
         return space.move(q, moved[:nv]), w + moved[nv:], moved[:nv]
 

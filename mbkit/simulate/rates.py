@@ -9,7 +9,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
-from mbkit.simulate.consistent import settled
+from mbkit.simulate.consistent import beside, settled
 from mbkit.simulate.steps import RUNAWAY
 from mbkit.simulate.torque import Force
 
@@ -30,7 +30,8 @@ class Rates:
         What the engine said when it last failed.
     """
 
-    def __init__(self, dyn: Dynamics) -> None:
+    def __init__(self, dyn: Dynamics, *, explicit: bool = False) -> None:
+        self._beside = explicit and dyn.model.constrained
         self._dyn, self._model, self._own = dyn, dyn.model, dyn
         self._forward, self._timed = dyn.forward_dynamics, dyn.model.clock is not None
         layout = dyn.model.layout
@@ -58,6 +59,9 @@ class Rates:
         nq = self._model.nq
         q, lengths = unit_quaternions(self._model, y[:nq])
         v = y[nq:]
+        if self._beside:
+            # One of a batch with parameters of its own is a batch of one.
+            q, v = (x.reshape(-1) for x in beside(self._own, t, q, v))
         tau = force if isinstance(force, np.ndarray) else force(t, q, v)
         self.evaluations += 1
         if self._timed:

@@ -20,7 +20,7 @@ from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.asked import Asked
 from mbkit.simulate.events import State, Watch
-from mbkit.simulate.members import Member, gathered
+from mbkit.simulate.members import Member, gathered, member_of
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.rates import Rates, unit_quaternions
 from mbkit.simulate.size import size_of
@@ -71,7 +71,7 @@ def run_taylor(asked: Asked) -> Outcome:
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             steps = TaylorSteps(system, integrator, kind, _behind(own, kind), settled)
             watch = Watch(asked.events, which) if asked.events else None
-            one = _Run(own, steps, save, watch, asked.report(i))
+            one = _Run(own, steps, save, watch, member_of(dyn, which, asked.duration), asked.report(i))
             members.append(one.all(start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
     return gathered(dyn.model, members, asked.batch, save, evaluations=evaluations)
@@ -245,11 +245,12 @@ class _Run:
         steps: TaylorSteps,
         save: Array | None,
         watch: Watch | None,
+        member: Member,
         done: Callable[[float], None],
     ) -> None:
         self._dyn, self._steps, self._watch, self._done = dyn, steps, watch, done
         self._save = None if save is None else save.tolist()
-        self._member = Member()
+        self._member = member
 
     def all(self, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> Member:
         """Return what comes of it."""
@@ -265,7 +266,10 @@ class _Run:
                     return member
                 member.reached = t
                 self._keep(t)
+                member.saw(t, _rounded(steps.y)[: self._dyn.model.nq])
                 self._done(t)
+                if member.crawls():
+                    return member
         except StoppedError as error:
             interval = int(np.searchsorted(stops, steps.t, side="right"))
             why = self._reason(force(min(interval, len(stops) - 1))) if error.ended == "diverged" else ""
