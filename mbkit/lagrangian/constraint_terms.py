@@ -18,6 +18,7 @@ __all__ = ["FUNCTIONS", "ConstraintTerms", "stiffening", "weight"]
 
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
+_TINY: Final = 1e-300
 
 
 class ConstraintTerms:
@@ -59,7 +60,8 @@ def stiffening(eq: WrittenEquations) -> Any:
     masses = M + _MASSLESS / n * ca.sum1(M)
     squares = J**2
     heavy, light = ca.mtimes(squares, masses), ca.mtimes(squares, 1 / masses)
-    return ca.sqrt(heavy / light) / ca.sum2(squares)
+    # Of a row without slope the term is zero.
+    return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
 
 
 def weight(eq: WrittenEquations) -> Any:
@@ -84,7 +86,7 @@ def _rows(eq: WrittenEquations) -> ca.Function:
 
 def _all(eq: WrittenEquations) -> ca.Function:
     c = eq.constraints
-    made = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": weight(eq)}
+    made = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": weight(eq), "M": eq.mass_matrix}
     return _function(eq, "constraint", {"q": eq.q, "v": eq.v}, made)
 
 
