@@ -161,7 +161,8 @@ def simulate(
             from mbkit.simulate.charts import run_on_charts
 
             given = q0, v0, duration, dt, rtol, atol, torque, save, as_events(events)
-            return run_on_charts(dyn, method_of(method), *given)
+            bar = Progress(progress, f"{dyn.model.name}: {method} on independent coordinates")
+            return run_on_charts(dyn, method_of(method), *given, bar)
         raise no_dynamics(dyn)
     chosen = method_of(method)
     model = dyn.model
