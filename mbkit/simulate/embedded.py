@@ -199,7 +199,7 @@ class Track:
             until = float(made.t[0])
         member.steps += steps
         member.reached = until
-        for k in range(1, steps + 1):
+        for k in range(1 if member.poses is not None else max(steps, 1), steps + 1):
             member.saw(float(made.t[k]), made.q[k])
         if hit is not None:
             self._stop_at(hit)

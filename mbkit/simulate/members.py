@@ -50,6 +50,8 @@ class Member:
         Of the whole run, s.
     poses : SingularPoses or None
         Where constraints act.
+    last : (nq,) array or None
+        Configuration of the last good state.
     """
 
     t: list[float] = field(default_factory=list)
@@ -63,10 +65,12 @@ class Member:
     error: FunctionError | None = None
     duration: float = inf
     poses: SingularPoses | None = None
+    last: Array | None = None
     _look: tuple[int, float] = (0, 0.0)
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step that is part of the run."""
+        self.last = q
         if self.poses is not None:
             self.poses.saw(t, q)
 
@@ -186,6 +190,7 @@ def gathered(
         jacobians=jacobians,
         events=tuple(hit for member in members for hit in member.events),
         error=next((member.error for member in members if member.error), None),
+        last=next((member.last for member in members if member.ended in ("diverged", "step_too_small")), None),
         doubts=tuple(dict.fromkeys(member.poses.told() for member in members if member.poses and member.poses.times)),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -17,7 +18,7 @@ from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, Unsupport
 from mbkit.simulate.applied import Applied, TorqueFunction
 from mbkit.simulate.asked import Asked
 from mbkit.simulate.consistent import along_constraints, from_consistent
-from mbkit.simulate.doubts import doubts, halved
+from mbkit.simulate.doubts import doubts, halved, idle
 from mbkit.simulate.events import Event, as_events
 from mbkit.simulate.grid import Grid, save_times
 from mbkit.simulate.methods import METHODS, Method, Tolerances, method_of
@@ -192,6 +193,8 @@ def simulate(
     seconds = time.perf_counter() - started
     setting = dt if chosen.kind != "adaptive" else _tolerances(dyn, chosen, rtol, atol)
     outcome = along_constraints(dyn, outcome)
+    if outcome.last is not None:
+        outcome = replace(outcome, message=outcome.message + idle(dyn, outcome.last))
     found: list[str] = []
     if doubt and outcome.ended in ("finished", "event"):
         states = _from_start(outcome, q, v)

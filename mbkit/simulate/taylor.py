@@ -14,6 +14,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.taylor import Precision, TaylorSystem, precision, taylor_system
+from mbkit.engines.clock import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
@@ -217,7 +218,9 @@ class TaylorSteps:
     def _jumped(self, h: float, force: Array) -> bool:
         """Return whether the rates at the end of a step of length h are others than the series says."""
         nq, state = self._system.rates.size1_in(0), _rounded(self._integrator.state)
-        behind = [_rounded(self._behind)] if self._system.rates.n_in() > 3 else []
+        behind = [_rounded(self._behind).copy()] if self._system.rates.n_in() > 3 else []
+        if self._system.clock is not None:
+            behind[0][self._system.clock] = float(self._integrator.time)
         found = self._system.rates(state[:nq], state[nq:], force, *behind)
         rate = np.concatenate([np.asarray(x).ravel() for x in found])
         series = _rounded(self._integrator.tc)
@@ -310,7 +313,7 @@ class _Run:
             try:
                 q, v = _state(self._dyn.model, y)
                 # One of a batch with parameters of its own is a batch of one.
-                self._dyn.forward_dynamics(q, v, force)
+                at_time(self._dyn, self._steps.t).forward_dynamics(q, v, force)
             except NumericalError as error:
                 return str(error)
         return RAN_AWAY
