@@ -30,7 +30,6 @@ from mbkit.derivation.equations import Equations
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.program import Operation, program
 from mbkit.errors import UnsupportedError
-from mbkit.model import Model
 
 __all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
 
