@@ -3,9 +3,9 @@
 The equation itself holds f̈ = 0 only, so that f and ḟ drift off as any other error of a
 method does. One-step methods go on from each state's foot on the constraints, by
 Newton's iteration with the mass matrix as the weight; it moves a state by what the step's
-own error is, so that their order stays. Explicit ones evaluate their stages on the constraints too: f̈ = 0 alone
-divides what a stage is off by J's smallest singular value, which is zero at a singular pose, through which the
-motion on the constraints is smooth as a rule. Multistep methods (BDF, LSODA, CVODES) have a
+own error is, so that their order stays. Near a singular pose explicit ones evaluate their stages on the constraints
+too: f̈ = 0 alone divides what a stage is off by J's smallest singular value, which is zero at the pose, through which
+the motion on the constraints is smooth as a rule. Multistep methods (BDF, LSODA, CVODES) have a
 history that a move would spoil: of them the states that are kept are brought back.
 """
 
@@ -22,8 +22,10 @@ from mbkit.engines.clock import at_times
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.simulate.outcome import Outcome
 
-__all__ = ["SingularPoses", "along_constraints", "beside", "from_consistent", "refuse_constraints", "settled"]
+__all__ = ["Approach", "SingularPoses", "along_constraints", "beside", "from_consistent", "refuse_constraints", "settled"]
 
+#: Steps ahead in which a pose would be singular at the present pace.
+_AHEAD: Final = 4
 #: A sign change of the smallest singular value makes its third differences smaller than this part of those without.
 _SMOOTHER: Final = 0.5
 #: Steps' ends that decide on one interval.
@@ -71,6 +73,29 @@ def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
 
     q, v, *_ = manifold_of(dyn).at(t).call("constraint_step", q, v)
     return q[..., 0], v[..., 0]
+
+
+class Approach:
+    """Whether a run comes near a singular pose, by the smallest singular value of J at the ends of its last two steps.
+
+    Attributes
+    ----------
+    near : bool
+        Whether it would be zero within a few steps, of any state of a batch. True until two steps have shown the pace.
+    """
+
+    def __init__(self) -> None:
+        self.near = True
+        self._size = np.inf
+
+    def saw(self, dyn: Dynamics, t: float, q: Array) -> None:
+        """Take in the end of a step."""
+        from mbkit.lagrangian.constraints import manifold_of
+
+        J = manifold_of(dyn).at(t).jacobian(q)
+        size = float(np.linalg.svd(J, compute_uv=False)[..., -1].min()) if np.isfinite(J).all() else np.inf
+        self.near = not size >= _AHEAD * abs(size - self._size)
+        self._size = size
 
 
 class SingularPoses:

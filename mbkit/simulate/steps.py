@@ -21,7 +21,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_time
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.space import Space
-from mbkit.simulate.consistent import beside, settled
+from mbkit.simulate.consistent import Approach, beside, settled
 from mbkit.simulate.grid import Indices
 from mbkit.simulate.tableau import RK4, Tableau
 from mbkit.simulate.torque import Force
@@ -72,14 +72,19 @@ class Field:
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.clock is not None
+        self._approach = Approach()
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
-        return settled(self._own, t, q, w) if self._own.model.constrained else (q, w)
+        if not self._own.model.constrained:
+            return q, w
+        q, w = settled(self._own, t, q, w)
+        self._approach.saw(self._own, t, q)
+        return q, w
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
-        """Return ẇ at the state on the constraints that is beside an explicit method's stage."""
-        if self._own.model.constrained:
+        """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
+        if self._own.model.constrained and self._approach.near:
             q, w = beside(self._own, t, q, w)
         return self(t, q, w, force)
 
