@@ -22,8 +22,10 @@ from mbkit.engines.clock import at_times
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.simulate.outcome import Outcome
 
-__all__ = ["Approach", "SingularPoses", "along_constraints", "beside", "from_consistent", "refuse_constraints", "settled"]
+__all__ = ["LOOSEST", "Approach", "SingularPoses", "along_constraints", "beside", "from_consistent", "refuse_constraints", "settled"]
 
+#: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
+LOOSEST: Final = 1e-9
 #: Steps ahead in which a pose would be singular at the present pace.
 _AHEAD: Final = 4
 #: A sign change of the smallest singular value makes its third differences smaller than this part of those without.
@@ -150,7 +152,7 @@ class SingularPoses:
         rows = " and ".join(f"constraints[{k}]" for k in self._rows)
         return (
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
-            "there, and the run followed the smooth one"
+            f"there, and the run followed the smooth one; a step there may have an error of {LOOSEST:g} whatever the tolerance"
         )
 
 

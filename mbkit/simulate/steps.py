@@ -74,6 +74,11 @@ class Field:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.clock is not None
         self._approach = Approach()
 
+    @property
+    def near_singular(self) -> bool:
+        """Whether constraints may soon depend on each other."""
+        return self._own.model.constrained and self._approach.near
+
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
         if not self._own.model.constrained:
@@ -84,7 +89,7 @@ class Field:
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
-        if self._own.model.constrained and self._approach.near:
+        if self.near_singular:
             q, w = beside(self._own, t, q, w)
         return self(t, q, w, force)
 
