@@ -216,3 +216,16 @@ def test_errors_that_add_up_over_many_steps_are_told():
     told = doubts(hinge(1e6), "radau", [0.1], duration=1.0, rtol=1e-4, save=[0.0, 1.0])[1]
     assert any("errors of" in x and "add up" in x for x in told)
     assert not doubts(hinge(1e2), "radau", [0.1], duration=1.0, rtol=1e-8, save=[0.0, 1.0])[1]
+
+
+def test_a_run_that_crawls_ends_and_names_the_joint():
+    # A point on a massless rod: where the second axis has turned the rod along the first one, nothing turns about it.
+    b = mb.ModelBuilder("rod")
+    b.add_body("rod", mass=1.0, com=(0, 0, -1))
+    b.add_joint("hook", "universal", parent="world", child="rod", axis=(1, 0, 0), axis2=(0, 1, 0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    with pytest.warns(mb.errors.MbkitWarning, match="'hook'.*gimbal lock"):
+        run = mb.simulate(dyn, [0.0, 0.3], [1e-7, 7.0], 10.0, "rk853", rtol=1e-10, save=[0.5, 10.0])
+    assert run.stats.ended == "step_too_small"
+    assert run.stats.steps + run.stats.rejected < 100_000
+    assert run.t.tolist() == [0.5]

@@ -50,6 +50,7 @@ class Balance:
         self.rows = 0
         if self.model.constrained:
             from mbkit.lagrangian.constraints import manifold_of
+
             self._manifold = manifold_of(dyn).at(t)
             self.rows = len(self._manifold.value(self.model.neutral()))
         self._zero = np.zeros(self.model.nv)

@@ -164,7 +164,9 @@ def _check(model: Model) -> None:
     bound = model.needs.loops or model.needs.time
     most = _MOST_BOUND if bound else _MOST
     if model.nv > most:
-        other = "leave out bodies" if bound else 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+        other = (
+            "leave out bodies" if bound else 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+        )
         raise UnsupportedError(
             f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of {model.name}; {other}"
         )

@@ -144,16 +144,16 @@ def _explain(manifold: Manifold, written: list[str], q: Array, beside: list[Arra
     flat = np.flatnonzero((np.max([np.linalg.norm(J, axis=1) for J in slopes], axis=0) < _FLAT) & (sizes > _ROUNDED))
     if len(flat):
         raise InputError(
-            f"constraints: {_named(flat, written)} has no slope where it holds, so that no force can hold it; "
-            "write it without the square, as f = 0 instead of f**2 = 0"
+            f"constraints: {_named(flat, written)} has no slope where it holds, here and at the poses found around, so "
+            "that no force can hold it; write a square as f = 0 instead of f**2 = 0, or start from another pose"
         )
     ranks = [_dependent(J) for J in slopes]
     if all(len(needless) for needless, _ in ranks):
         needless, others = min(ranks, key=lambda pair: len(pair[0]))
         why = f"follows from {_named(others, written)}" if len(others) else "holds by itself"
         raise InputError(
-            f"constraints: the set is redundant; {_named(needless, written)} {why}; leave it out, as its multiplier "
-            "is not determined"
+            f"constraints: the set is redundant, here and at the poses found around; {_named(needless, written)} {why}; "
+            "leave it out, as its multiplier is not determined, or start from another pose"
         )
 
 

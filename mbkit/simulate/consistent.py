@@ -22,7 +22,16 @@ from mbkit.engines.clock import at_times
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.simulate.outcome import Outcome
 
-__all__ = ["LOOSEST", "Approach", "SingularPoses", "along_constraints", "beside", "from_consistent", "refuse_constraints", "settled"]
+__all__ = [
+    "LOOSEST",
+    "Approach",
+    "SingularPoses",
+    "along_constraints",
+    "beside",
+    "from_consistent",
+    "refuse_constraints",
+    "settled",
+]
 
 #: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
 LOOSEST: Final = 1e-9
