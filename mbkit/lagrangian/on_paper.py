@@ -168,7 +168,8 @@ def _check(model: Model) -> None:
             "leave out bodies" if bound else 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
         )
         raise UnsupportedError(
-            f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of {model.name}; {other}"
+            f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of "
+            f"{model.name}; {other}"
         )
 
 

@@ -152,7 +152,7 @@ def _explain(manifold: Manifold, written: list[str], q: Array, beside: list[Arra
         needless, others = min(ranks, key=lambda pair: len(pair[0]))
         why = f"follows from {_named(others, written)}" if len(others) else "holds by itself"
         raise InputError(
-            f"constraints: the set is redundant, here and at the poses found around; {_named(needless, written)} {why}; "
+            f"constraints: the set is redundant, here and at poses found around; {_named(needless, written)} {why}; "
             "leave it out, as its multiplier is not determined, or start from another pose"
         )
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -259,8 +259,13 @@ def _adaptive(
 
 
 def _passes(system: Embedded) -> bool:
-    """Return whether a run goes through singular poses: the choice of coordinates is open, and nothing moves in time."""
+    """Return whether a run goes through singular poses: the choice is open, and nothing is moved in time."""
     return system.independent is None and system.model.clock is None
+
+
+def _later(event: Event, t: float) -> Callable[[float, Array, Array], float]:
+    """Return an event's function of a part that begins at t."""
+    return lambda s, q, v: event.function(t + s, q, v)
 
 
 def _behind(system: Embedded, chart: Chart, q: Array, v: Array, t: float) -> float:
@@ -289,7 +294,7 @@ def _begun(
         def acting(s: float, q: Array, v: Array) -> Array:
             return np.asarray(force(t + s, q, v))  # type: ignore[operator]  # of a function
 
-        shifted = [replace(e, function=lambda s, q, v, f=e.function: f(t + s, q, v)) for e in events]
+        shifted = [replace(e, function=_later(e, t)) for e in events]
         acts = force if isinstance(force, np.ndarray) else acting
         return None, _Whole(), system.dynamics, acts, shifted
     dyn = system.on(chart, q, t)
@@ -397,6 +402,7 @@ def _stepped(
     k, chart, was_near = 0, None, False
     while k < grid.steps:
         t = grid.time(k)
+        progress.update(k / grid.steps)
         if chart is None:
             chart = system.chart(q, t)
             run.hits.append(Hit(f"independent: {system.names(chart)}", t, q.copy(), v.copy()))

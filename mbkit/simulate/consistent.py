@@ -161,7 +161,7 @@ class SingularPoses:
         rows = " and ".join(f"constraints[{k}]" for k in self._rows)
         return (
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
-            f"there, and the run followed the smooth one; a step there may have an error of {LOOSEST:g} whatever the tolerance"
+            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
         )
 
 

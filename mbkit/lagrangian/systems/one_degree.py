@@ -69,7 +69,8 @@ def slider_crank(
     """Return a piston driven by a massless crank and rod: J(θ) = m r² sin²(θ + φ)/cos² φ, sin φ = (r/l) sin θ.
 
     One coordinate, ``theta``, the crank's angle from the dead centre at which the piston is farthest from the crank's
-    axis, x = r cos θ + l cos φ; it is positive counterclockwise with the piston along +x. ``tau`` is the torque on the crank, along θ; ``F`` the force on the piston, towards
+    axis, x = r cos θ + l cos φ; it is positive counterclockwise with the piston along +x. ``tau`` is the torque on
+    the crank, along θ; ``F`` the force on the piston, towards
     the crank's axis as that of a gas. J θ̈ + ½ J′ θ̇² = τ + F r sin(θ + φ)/cos φ.
 
     At the dead centres, θ = 0 and π, J is zero: a massless crank carries nothing there, no
@@ -102,7 +103,8 @@ def rigid_slider_crank(
 
     One coordinate, ``theta``, the crank's angle from the dead centre at which the piston is farthest; it is positive
     from there towards +y, counterclockwise with the piston along +x. The parameter ``tau`` is a constant torque on the
-    crank. It adds to the ``torque=`` of `mbkit.simulate`; with ``torque=0`` here, that is the whole input. J = J1 + m1 L1²/4 + m2 (x2′² + y2′²) + J2 ψ′² + m3 x3′², never zero: dead centres are
+    crank. It adds to the ``torque=`` of `mbkit.simulate`; with ``torque=0`` here, that is the whole input. J = J1 +
+    m1 L1²/4 + m2 (x2′² + y2′²) + J2 ψ′² + m3 x3′², never zero: dead centres are
     passed.
 
     References
