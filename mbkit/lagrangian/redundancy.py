@@ -19,7 +19,7 @@ from mbkit.errors import InputError, NumericalError
 from mbkit.lagrangian.constraints import Manifold, least_change, manifold_of
 from mbkit.model import Model
 
-__all__ = ["is_judged", "refuse_unreachable", "require_independent"]
+__all__ = ["is_judged", "refuse_unreachable", "require_few", "require_independent"]
 
 #: Random starts from which a consistent configuration is searched.
 _STARTS: Final = 12
@@ -47,6 +47,15 @@ def is_judged(model: Model) -> bool:
     return _values(model) in _JUDGED.get(model.system, ())  # type: ignore[attr-defined]  # of a written model
 
 
+def require_few(model: Model) -> None:
+    """Refuse more constraints than coordinates."""
+    rows = len(model.system.constraints)  # type: ignore[attr-defined]  # of a written model
+    if rows > model.nv:
+        raise InputError(
+            f"constraints: {rows} of them for {model.nv} coordinates; at most {model.nv} can be independent"
+        )
+
+
 def _values(model: Model) -> tuple[float, ...]:
     return tuple(float(x or 0.0) for n, x in model.parameters.items() if n != model.clock)
 
@@ -72,10 +81,7 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     model = dyn.model
     known = _JUDGED.setdefault(model.system, set())  # type: ignore[attr-defined]  # of a written model
     written = [str(c) for c in model.system.constraints]  # type: ignore[attr-defined]
-    if len(written) > model.nv:
-        raise InputError(
-            f"constraints: {len(written)} of them for {model.nv} coordinates; at most {model.nv} can be independent"
-        )
+    require_few(model)
     manifold = manifold_of(dyn)
     rng = np.random.default_rng(0)
     beside = [q + _ASIDE * rng.standard_normal(q.shape) for _ in range(_BESIDE)]
