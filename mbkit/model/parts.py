@@ -13,7 +13,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.model.kinds import JointKind, kind_of
 
-__all__ = ["Body", "Frame", "Joint", "Loop", "Mimic", "PointSpring", "Prescribed"]
+__all__ = ["Body", "Frame", "Joint", "JointCoupling", "Loop", "Mimic", "PointSpring", "Prescribed"]
 
 
 class _Frozen:
@@ -152,6 +152,32 @@ class PointSpring(_Frozen):
     stiffness: float
     rest_length: float
     damping: float
+
+
+@dataclass(frozen=True, eq=False)
+class JointCoupling(_Frozen):
+    """A spring, a viscous damper and a rotor on a sum of joint coordinates: MuJoCo's fixed tendon.
+
+    With the length l = Σ factor q it has the potential energy ½ stiffness (l - rest_length)², dissipates
+    damping (dl/dt)² and has the kinetic energy ½ armature (dl/dt)².
+
+    Attributes
+    ----------
+    name : str
+    joints : tuple of str
+        Joints of one velocity.
+    factors : (k,) array
+        One for each joint.
+    stiffness, rest_length, damping, armature : float
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    factors: Array
+    stiffness: float
+    rest_length: float
+    damping: float
+    armature: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,4 +128,7 @@ def sample_mass_matrix(model: Model) -> Array:
         at_com = J[:3] - skew(body.com) @ J[3:]
         M += body.mass * at_com.T @ at_com + J[3:].T @ body.inertia @ J[3:]
         M[part[1], part[1]] += np.diag(joint.armature)
+    for coupling in model.couplings:
+        row = model.layout.coupling_row(coupling)
+        M += coupling.armature * np.outer(row, row)
     return np.asarray(model.layout.G.T @ M @ model.layout.G)
