@@ -1,0 +1,399 @@
+"""Tendons, actuators and equality constraints of an MJCF: what acts linearly in q and v, and the names of the rest.
+
+The length of a fixed tendon is l = Σ coef q. Its spring, damper and armature become a `JointCoupling`, or numbers of
+the joint where there is only one. The length of an actuator is gear times a joint's coordinate or a tendon's length.
+Its armature and damping act always. Its force at zero control and activation is b0 + b1 l + b2 dl/dt with `biasprm`
+(b0, b1, b2): a spring of stiffness -b1 and rest length -b0/b1, and a damper of -b2 (XML reference of MuJoCo 4.0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit.load.attributes import Reader
+from mbkit.load.mjcf_scene import MjcfJoint, Scene
+from mbkit.load.xml import Element
+from mbkit.model import Joint, JointCoupling, Model
+from mbkit.model.physical import sample_mass_matrix
+
+__all__ = ["Transmissions", "coupled"]
+
+_ACTUATORS: Final = (
+    "general",
+    "motor",
+    "position",
+    "velocity",
+    "intvelocity",
+    "damper",
+    "cylinder",
+    "muscle",
+    "adhesion",
+    "dcmotor",
+    "pid",
+    "plugin",
+)
+#: Limits and losses, whose forces are not linear.
+_TENDON_LIMITS: Final = ("range", "frictionloss", "springyield", "actuatorfrcrange")
+
+
+@dataclass(frozen=True)
+class _Actuator:
+    """An actuator as its default classes and its element have it, in the words of MuJoCo's `mjsActuator`.
+
+    Gain, bias and their types are inherited from a <general> and from an element of the same tag only. `tag` is that
+    of the last element of a class, and `parent` what the class inherits.
+    """
+
+    tag: str = "general"
+    parent: _Actuator | None = None
+    gear: float = 1.0
+    armature: float = 0.0
+    damping: tuple[float, ...] = (0.0,)
+    gain: float = 1.0
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gaintype: str = "fixed"
+    biastype: str = "none"
+    group: float = 0.0
+    forcerange: tuple[float, ...] = ()
+
+    def with_element(self, element: Element, who: str, read: Reader) -> _Actuator:
+        """Return these settings, changed by what an element says."""
+        given = element.attributes
+
+        def number(name: str, default: float) -> float:
+            return read.number(element, name, who, default)
+
+        base = self
+        while element.tag != "general" and base.tag not in (element.tag, "general"):
+            base = base.parent or _Actuator()
+        out = replace(
+            self,
+            tag=element.tag,
+            gain=base.gain,
+            bias=base.bias,
+            gaintype=base.gaintype,
+            biastype=base.biastype,
+            gear=read.numbers(element, "gear", who, count=6, least=1, default=(self.gear,))[0],
+            armature=number("armature", self.armature),
+            damping=read.numbers(element, "damping", who, count=3, least=1, default=self.damping),
+            group=number("group", self.group),
+            forcerange=read.numbers(element, "forcerange", who, count=2, default=self.forcerange),
+        )
+        gain, (b0, b1, b2) = out.gain, out.bias
+        if element.tag == "general":
+            if "gainprm" in given:
+                gain = read.numbers(element, "gainprm", who, count=10, least=1)[0]
+            if "biasprm" in given:
+                read_ = read.numbers(element, "biasprm", who, count=10, least=1)[:3]
+                b0, b1, b2 = (*read_, *out.bias[len(read_) :])
+            gaintype, biastype = given.get("gaintype", out.gaintype), given.get("biastype", out.biastype)
+            return replace(out, gain=gain, bias=(b0, b1, b2), gaintype=gaintype, biastype=biastype)
+        if element.tag in ("position", "intvelocity"):
+            gain = number("kp", gain)
+            # MuJoCo keeps a damping ratio as a positive b2.
+            b2 = number("dampratio", -number("kv", -b2))
+            return replace(out, gain=gain, bias=(0.0, -gain, b2), gaintype="fixed", biastype="affine")
+        if element.tag == "velocity":
+            gain = number("kv", gain)
+            return replace(out, gain=gain, bias=(0.0, 0.0, -gain), gaintype="fixed", biastype="affine")
+        if element.tag == "cylinder":
+            bias = read.numbers(element, "bias", who, count=3, default=out.bias)
+            return replace(out, gain=number("area", gain), bias=(bias[0], bias[1], bias[2]), biastype="affine")
+        if element.tag in ("motor", "damper", "adhesion"):
+            return replace(out, gain=1.0, bias=(0.0, 0.0, 0.0), gaintype="fixed", biastype="none")
+        return replace(out, gaintype=element.tag, biastype=element.tag)
+
+
+@dataclass
+class _Acting:
+    """What a tendon or an actuator does.
+
+    Attributes
+    ----------
+    who : str
+        Its name, or its number and its line.
+    name : str
+        Of the coupling.
+    factors : dict
+        Joint -> dl/dq; empty where l is no sum of coordinates.
+    dampratio : float
+        What is to be the damping, of the critical one at the pose that is drawn.
+    left_out : list of str
+    """
+
+    who: str
+    name: str
+    factors: dict[str, float]
+    stiffness: float = 0.0
+    rest_length: float = 0.0
+    damping: float = 0.0
+    armature: float = 0.0
+    dampratio: float = 0.0
+    left_out: list[str] = field(default_factory=list)
+
+    @property
+    def acts(self) -> bool:
+        return bool(self.stiffness or self.damping or self.armature or self.dampratio)
+
+    def linear(self) -> None:
+        """Move to `left_out` what is no spring, damper or rotor on a sum of coordinates."""
+        for name in ("stiffness", "damping", "armature", "dampratio"):
+            value = getattr(self, name)
+            if value < 0 or (value and not self.factors):
+                self.left_out.append(f"{name} {value:g}" + (", which is negative" if value < 0 else ""))
+                setattr(self, name, 0.0)
+
+    def coupling(self) -> JointCoupling:
+        numbers = self.stiffness, self.rest_length, self.damping, self.armature
+        return JointCoupling(self.name, tuple(self.factors), np.array([*self.factors.values()]), *numbers)
+
+    def told(self) -> str:
+        given = [f"{n.replace('_', ' ')} {x:g}" for n in ("stiffness", "damping", "armature") if (x := getattr(self, n))]
+        given += [f"rest length {self.rest_length:g}"] if self.stiffness else []
+        given += [f"damping ratio {self.dampratio:g}"] if self.dampratio else []
+        total = " + ".join(f"{factor:g} {joint}" for joint, factor in self.factors.items())
+        return f"{self.who} on {total}: {', '.join(given)}"
+
+
+class Transmissions:
+    """Reads the tendons, actuators and equality constraints of a file.
+
+    Parameters
+    ----------
+    mujoco : Element
+    scene : Scene
+        With the bodies and joints. Faults go to its reader.
+    disabled : set of str
+        Option flags that the file switches off.
+    """
+
+    def __init__(self, mujoco: Element, scene: Scene, disabled: set[str]) -> None:
+        self._scene, self._read = scene, scene.read
+        self._joints: dict[str, MjcfJoint] = {j.name: j for body in scene.bodies for j in body.joints}
+        self._names: set[str] = set()
+        self._springs, self._dampers = "spring" not in disabled, "damper" not in disabled
+        if "passive" in disabled:
+            self._springs = self._dampers = False
+        self._actuation = "actuation" not in disabled
+        self._groups = _disabled_groups(mujoco, scene.read)
+        self._classes = {"main": _Actuator()}
+        for element in mujoco.all("default"):
+            self._collect(element, "main")
+        tendons = [e for section in mujoco.all("tendon") for e in section.children]
+        actuators = [e for section in mujoco.all("actuator") for e in section.children]
+        self._tendons = [self._tendon(e, k) for k, e in enumerate(tendons)]
+        self._of_tendon = {
+            e.attributes.get("name", ""): (t, e) for t, e in zip(self._tendons, tendons, strict=True)
+        }
+        self._actuators = [self._actuator(e, k) for k, e in enumerate(actuators)]
+        equalities = (e for section in mujoco.all("equality") for e in section.children)
+        self._equalities = [self._who(e, k) + f" ({_connected(e)})" for k, e in enumerate(equalities)]
+
+    def _collect(self, element: Element, name: str) -> None:
+        """Read the actuator defaults of a class and of the classes in it."""
+        for child in element.children:
+            if child.tag in _ACTUATORS:
+                self._classes[name] = self._classes[name].with_element(child, f"default class {name!r}", self._read)
+        for child in element.all("default"):
+            inner = child.attributes.get("class", "")
+            self._classes[inner] = replace(self._classes[name], parent=self._classes[name])
+            self._collect(child, inner)
+
+    def _who(self, element: Element, number: int) -> str:
+        name = element.attributes.get("name", "")
+        return repr(name) if name else f"number {number + 1} ({element.tag}, {element.place})"
+
+    def _name(self, element: Element, kind: str, number: int) -> str:
+        name = element.attributes.get("name") or f"{kind}{number + 1}"
+        while name in self._names:
+            name += "_"
+        self._names.add(name)
+        return name
+
+    # Tendons
+
+    def _tendon(self, element: Element, number: int) -> _Acting:
+        read = self._read
+        full = replace(self._scene.defaults.filled(replace(element, tag="tendon"), None), tag=element.tag)
+        who = f"tendon {self._who(element, number)}"
+        out = _Acting(self._who(element, number), self._name(element, "tendon", number), {})
+        for joint in element.all("joint") if element.tag == "fixed" else []:
+            name = joint.attributes.get("joint", "")
+            if self._scalar(name, who, joint):
+                out.factors[name] = out.factors.get(name, 0.0) + read.number(joint, "coef", who)
+        out.factors = {joint: factor for joint, factor in out.factors.items() if factor}
+        for name in ("stiffness", "damping"):
+            first, *higher = read.numbers(full, name, who, count=3, least=1, default=(0.0,))
+            setattr(out, name, first)
+            if any(higher):
+                setattr(out, name, 0.0)
+                out.left_out.append(f"{name} that depends on the length or its rate")
+        out.armature = read.number(full, "armature", who, 0.0)
+        first, *second = read.numbers(full, "springlength", who, count=2, least=1, default=(-1.0,))
+        out.rest_length = first
+        if first == -1.0 and all(x == -1.0 for x in second):
+            out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
+        elif out.stiffness and second and second[0] != first:
+            out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {second[0]:g}")
+            out.stiffness = 0.0
+        out.stiffness *= self._springs
+        out.damping *= self._dampers
+        out.linear()
+        out.left_out += [f"{n} {full.attributes[n]}" for n in _TENDON_LIMITS if n in full.attributes]
+        return out
+
+    def _scalar(self, name: str, who: str, element: Element) -> bool:
+        """Return whether a joint has one coordinate; a fault if it has not, or is not there."""
+        joint = self._joints.get(name)
+        if joint is None or joint.kind not in ("hinge", "slide"):
+            what = f"joint {name!r} is not in the file" if joint is None else f"joint {name!r} is a {joint.kind} joint"
+            self._read.fault(f"{who}: expected the name of a hinge or slide, {what}", element)
+            return False
+        return True
+
+    def _spring_reference(self, name: str) -> float:
+        joint = self._joints[name]
+        angle = self._scene.compiler.angle if joint.kind == "hinge" else 1.0
+        return angle * self._read.number(joint.element, "springref", f"joint {name!r}", 0.0)
+
+    # Actuators
+
+    def _actuator(self, element: Element, number: int) -> _Acting:
+        who = f"actuator {self._who(element, number)}"
+        class_ = self._scene.defaults.known(element.attributes.get("class"), element) or "main"
+        made = self._classes.get(class_, _Actuator()).with_element(element, who, self._read)
+        out = _Acting(self._who(element, number), self._name(element, "actuator", number), {})
+        out.armature = made.armature
+        out.factors = {joint: made.gear * c for joint, c in self._driven(element, who).items() if made.gear * c}
+        damping, *higher = made.damping
+        out.damping = damping * self._dampers
+        if any(higher):
+            out.left_out.append("damping that depends on the rate")
+            out.damping = 0.0
+        if self._actuation and made.group not in self._groups:
+            self._bias(made, out)
+        out.linear()
+        return out
+
+    def _driven(self, element: Element, who: str) -> dict[str, float]:
+        """Return the factors of the length before the gear; none where it is no sum of coordinates."""
+        given = element.attributes
+        name = given.get("joint", given.get("jointinparent", ""))
+        if name:
+            joint = self._joints.get(name)
+            if joint is None:
+                self._read.fault(f"{who}: joint {name!r} is not in the file", element)
+            return {name: 1.0} if joint is not None and joint.kind in ("hinge", "slide") else {}
+        if "tendon" in given:
+            if given["tendon"] not in self._of_tendon:
+                self._read.fault(f"{who}: tendon {given['tendon']!r} is not in the file", element)
+                return {}
+            return self._of_tendon[given["tendon"]][0].factors
+        return {}
+
+    def _bias(self, made: _Actuator, out: _Acting) -> None:
+        """Add the force at zero control and activation."""
+        if made.biastype == "none":
+            return
+        if made.biastype != "affine":
+            out.left_out.append(f"the force of a {made.biastype}")
+            return
+        b0, b1, b2 = made.bias
+        if b1:
+            out.stiffness, out.rest_length = -b1, -b0 / b1
+        elif b0:
+            out.left_out.append(f"the constant force {b0:g}")
+        if b2 > 0 and made.gain == -b1 and made.gaintype == "fixed":
+            out.dampratio = b2
+        elif b2 <= 0:
+            out.damping -= b2
+        else:
+            out.left_out.append(f"the force {b2:g} times the rate")
+        if made.forcerange and any((b0, b1, b2)):
+            out.left_out.append(f"force range {' '.join(f'{x:g}' for x in made.forcerange)}")
+
+    # What becomes of them
+
+    def applied(self, model: Model) -> Model:
+        """Return the model with what acts, and with notes that name it and what was left out."""
+        acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
+        out = coupled(model, [x.coupling() for x in acting])
+        ratios = []
+        for x in acting:
+            if x.dampratio:
+                # Of the critical damping at the pose that is drawn, with the inertia that the actuator moves there.
+                inertia = self._reflected(out, x.coupling())
+                damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * inertia))
+                ratios.append(replace(x.coupling(), stiffness=0.0, armature=0.0, damping=damping))
+        return replace(coupled(out, ratios), notes=(*model.notes, *self._notes()))
+
+    def _reflected(self, model: Model, coupling: JointCoupling) -> float:
+        q = model.neutral()
+        for name, joint in self._joints.items():
+            if joint.kind in ("hinge", "slide"):
+                q[model.layout.q[name]] = joint.ref
+        row = model.layout.coupling_row(coupling) @ model.layout.G
+        return float(1 / (row @ np.linalg.solve(sample_mass_matrix(model, q), row)))
+
+    def _notes(self) -> Iterator[str]:
+        for what, some in (("tendons", self._tendons), ("actuators", self._actuators)):
+            acting = "; ".join(x.told() for x in some if x.acts)
+            at = ", at zero control" if what == "actuators" else ""
+            if acting:
+                yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
+            lost = "; ".join(f"{x.who}: {', '.join(x.left_out)}" for x in some if x.left_out)
+            if lost:
+                yield f"left out of {what}: {lost}"
+            idle = ", ".join(x.who for x in some if not x.acts and not x.left_out)
+            if idle:
+                yield f"{what} that exert no force of their own: {idle}"
+        if self._actuators:
+            yield "controls of actuators were left out; give their forces as tau"
+        if self._equalities:
+            yield f"equality constraints left out: {'; '.join(self._equalities)}"
+
+
+def coupled(model: Model, couplings: Iterable[JointCoupling]) -> Model:
+    """Return the model with more couplings; one of a single joint becomes numbers of that joint.
+
+    One that is there already gets the damping of another of its name. The sum of two springs on a joint is one spring; the constant by which its energy differs is left out.
+    """
+    joints: dict[str, Joint] = {j.name: j for j in model.joints}
+    kept = {c.name: c for c in model.couplings}
+    for c in couplings:
+        if len(c.joints) > 1:
+            there = kept.get(c.name)
+            kept[c.name] = c if there is None else replace(there, damping=there.damping + c.damping)
+            continue
+        joint, factor = joints[c.joints[0]], float(c.factors[0])
+        stiffness = joint.stiffness + factor**2 * c.stiffness
+        pull = joint.stiffness * joint.rest + factor * c.stiffness * c.rest_length
+        joints[joint.name] = replace(
+            joint,
+            stiffness=stiffness,
+            rest=np.divide(pull, stiffness, out=np.array(joint.rest), where=stiffness > 0),
+            damping=joint.damping + factor**2 * c.damping,
+            armature=joint.armature + factor**2 * c.armature,
+        )
+    return replace(model, joints=tuple(joints.values()), couplings=tuple(kept.values()))
+
+
+def _disabled_groups(mujoco: Element, read: Reader) -> set[float]:
+    out: set[float] = set()
+    for option in mujoco.all("option"):
+        if "actuatorgroupdisable" in option.attributes:
+            out |= set(read.numbers(option, "actuatorgroupdisable", "the file", count=31, least=0))
+    return out
+
+
+def _connected(element: Element) -> str:
+    """Return what an equality constraint binds."""
+    ends: Any = (f"{k} {v!r}" for k, v in element.attributes.items() if k.rstrip("12") in _ENDS)
+    return ", ".join([element.tag, *ends])
+
+
+_ENDS: Final = ("joint", "body", "tendon", "site", "flex")
