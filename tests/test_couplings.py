@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import mujoco
@@ -72,7 +71,9 @@ def random_transmissions(seed: int) -> str:
 
     def default(name: str, depth: int) -> str:
         tendon = f'<tendon damping="{number(rng.uniform(0, 2))}"/>' if rng.random() < 0.5 else ""
-        own = "".join(f"<{t}{random_attributes(rng, t, in_class=True)}/>" for t in rng.choice(tags[:5], 2, replace=False))
+        own = "".join(
+            f"<{t}{random_attributes(rng, t, in_class=True)}/>" for t in rng.choice(tags[:5], 2, replace=False)
+        )
         inner = default("inner", depth + 1) if not depth else ""
         return f'<default class="{name}">{tendon}{own}{inner}</default>'
 
@@ -95,7 +96,8 @@ def random_transmissions(seed: int) -> str:
         actuators += f"<{tag} {at}{class_()}{random_attributes(rng, tag, in_class=False)}/>"
     flags = "".join(f' {name}="disable"' for name in ("spring", "damper", "actuation") if rng.random() < 0.15)
     return (
-        f'<mujoco><compiler angle="{rng.choice(["degree", "radian"])}"/><option><flag constraint="disable"{flags}/></option>'
+        f'<mujoco><compiler angle="{rng.choice(["degree", "radian"])}"/>'
+        f'<option><flag constraint="disable"{flags}/></option>'
         f"<default>{default('outer', 0)}</default><worldbody>{bodies}</worldbody><tendon>{tendons}</tendon>"
         f"<actuator>{actuators}</actuator></mujoco>"
     )

@@ -38,7 +38,7 @@ def elimination_size(model: Model) -> int:
             before[i] |= {j for j in moving[joint.child] if rank[j] <= rank[i]}
     rotors = [c for c in model.couplings if c.armature or any(b.part == c.name for b in model.bindings)]
     for coupling in rotors:
-        row = np.flatnonzero(model.layout.coupling_row(coupling) @ model.layout.G)
+        row = np.flatnonzero(model.layout.coupling_row(coupling) @ model.layout.G).tolist()
         for i in row:
             before[i] |= {j for j in row if rank[j] <= rank[i]}
     if rotors:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import warnings
+from collections.abc import Iterator
 from typing import Any, Final
 
 import mujoco
@@ -23,7 +24,8 @@ from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel
 from mbkit.errors import UnsupportedError
 from mbkit.load.floating import BASE_JOINT
-from mbkit.model import Body, Joint, Model
+from mbkit.load.mjcf_couplings import coupled
+from mbkit.model import Body, Joint, JointCoupling, Model
 from mbkit.model.kinds import kind_of
 
 __all__ = ["ImportedMujoco", "read"]
@@ -85,7 +87,7 @@ def _beside(m: Any) -> list[str]:
         out.append(f"{what} ({kinds.count(kind)}), outside M and nle")
     for count, what in ((m.ntendon, "tendons"), (m.nu, "actuators")):
         if count:
-            out.append(f"{count} {what}, outside M and nle")
+            out.append(f"{count} {what}: their armature is part of M, their springs and dampers are outside M and nle")
     if np.any(m.body_gravcomp):
         out.append(f"gravity compensation on {int(np.count_nonzero(m.body_gravcomp))} bodies, outside nle")
     return out
@@ -109,6 +111,7 @@ class _Description:
         self.model = Model(
             name="mujoco", gravity=np.array(m.opt.gravity), bodies=tuple(self.bodies), joints=tuple(self.joints)
         )
+        self.model = coupled(self.model, self._couplings())
         self.made = self._mapped()
 
     def _new(self, what: str, name: str) -> str:
@@ -193,6 +196,46 @@ class _Description:
                 rest=rest,
             )
         )
+
+    def _couplings(self) -> Iterator[JointCoupling]:
+        """Yield what tendons and actuators do as springs, dampers and rotors on sums of joint coordinates."""
+        m, taken = self.m, set[str]()
+        disabled = {x for x in mujoco.mjtDisableBit.__members__.values() if m.opt.disableflags & int(x)}
+        springs, dampers, actuation = (
+            mujoco.mjtDisableBit.__members__[f"mjDSBL_{x}"] not in disabled for x in ("SPRING", "DAMPER", "ACTUATION")
+        )
+        names = {j: joint.name for j, joint in zip(self.numbers, self.joints, strict=True)}
+
+        def made(name: str, factors: dict[int, float], k: float, rest: float, d: float, a: float) -> JointCoupling:
+            taken.add(name := unused(name, taken))
+            joints = tuple(names[j] for j in factors)
+            return JointCoupling(name, joints, np.array([*factors.values()]), max(k, 0.0), rest, max(d, 0.0), a)
+
+        tendons: dict[int, dict[int, float]] = {}
+        for t in range(m.ntendon):
+            part = range(int(m.tendon_adr[t]), int(m.tendon_adr[t]) + int(m.tendon_num[t]))
+            if all(m.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT for w in part):
+                tendons[t] = {int(m.wrap_objid[w]): float(m.wrap_prm[w]) for w in part}
+                low, high = (float(x) for x in m.tendon_lengthspring[t])
+                k = float(np.ravel(m.tendon_stiffness[t])[0]) * springs * (low == high)
+                d = float(np.ravel(m.tendon_damping[t])[0]) * dampers
+                yield made(m.tendon(t).name or f"tendon{t + 1}", tendons[t], k, low, d, float(m.tendon_armature[t]))
+        of_joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        for i in range(m.nu):
+            target, factors = int(m.actuator_trnid[i, 0]), dict[int, float]()
+            if m.actuator_trntype[i] in of_joint and _KINDS[int(m.jnt_type[target])] in ("prismatic", "revolute"):
+                factors = {target: 1.0}
+            elif m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
+                factors = tendons.get(target, {})
+            factors = {j: float(m.actuator_gear[i, 0]) * x for j, x in factors.items()}
+            b0, b1, b2 = m.actuator_biasprm[i, :3].tolist()
+            if not actuation or m.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_AFFINE:
+                b0 = b1 = b2 = 0.0
+            if factors:
+                d = float(np.ravel(m.actuator_damping[i])[0]) * dampers - min(b2, 0.0)
+                rest = -b0 / b1 if b1 else 0.0
+                name = m.actuator(i).name or f"actuator{i + 1}"
+                yield made(name, factors, -b1, rest, d, float(m.actuator_armature[i]))
 
     def _mapped(self) -> MujocoModel:
         m, layout = self.m, self.model.layout

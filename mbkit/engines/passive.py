@@ -48,12 +48,12 @@ class JointPassive:
         rows = np.array([layout.coupling_row(c) for c in couplings]).reshape(-1, layout.sizes[3])
         # The couplings' lengths are self._lengths q, the rates self._rates v.
         self._rates, self._lengths = rows[:, v_order], np.zeros((len(couplings), layout.sizes[2]))
-        for joint in {name for c in couplings for name in c.joints}:
-            iq, iv = layout.full_q[joint].start, layout.full_v[joint].start
+        for name in {name for c in couplings for name in c.joints}:
+            iq, iv = layout.full_q[name].start, layout.full_v[name].start
             self._lengths[:, q_place[iq]] = rows[:, iv]
         stiffness, rest, damping, armature = (
-            np.array([getattr(c, name) for c in couplings])
-            for name in ("stiffness", "rest_length", "damping", "armature")
+            np.array([getattr(c, field) for c in couplings])
+            for field in ("stiffness", "rest_length", "damping", "armature")
         )
         self._coupled = (stiffness, rest, damping)
         self.armature = (self._rates.T * armature) @ self._rates if armature.any() else None

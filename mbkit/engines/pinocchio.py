@@ -117,7 +117,8 @@ class PinocchioDynamics(Dynamics):
         return self._matrix(self._full_mass_matrix(self._full_q(q)))
 
     def _full_mass_matrix(self, q: Array) -> Array:
-        M, rotors = pin.crba(self._m, self._d, q), self._joint_passive.armature
+        M: Array = pin.crba(self._m, self._d, q)
+        rotors = self._joint_passive.armature
         return M if rotors is None else M + rotors
 
     def _one_gravity(self, q: Array) -> Array:

@@ -136,7 +136,12 @@ def _usual(name: str) -> str:
 def _form(model: Model) -> Any:
     """Return what a description has beside numbers."""
     joints = [(j.name, j.kind, j.parent, j.child, j.mimic is None) for j in model.joints]
-    return [b.name for b in model.bodies], joints, [s.name for s in (*model.springs, *model.couplings)], len(model.loops)
+    return (
+        [b.name for b in model.bodies],
+        joints,
+        [*(s.name for s in model.springs), *(c.name for c in model.couplings)],
+        len(model.loops),
+    )
 
 
 def _solved(made: Model, model: Model) -> dict[str, float]:

@@ -36,8 +36,13 @@ _ACTUATORS: Final = (
     "pid",
     "plugin",
 )
-#: Limits and losses, whose forces are not linear.
-_TENDON_LIMITS: Final = ("range", "frictionloss", "springyield", "actuatorfrcrange")
+#: Limits and losses, whose forces are not linear, and what switches each on.
+_TENDON_LIMITS: Final = {
+    "range": "limited",
+    "frictionloss": "",
+    "springyield": "",
+    "actuatorfrcrange": "actuatorfrclimited",
+}
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,7 @@ class _Actuator:
     biastype: str = "none"
     group: float = 0.0
     forcerange: tuple[float, ...] = ()
+    forcelimited: str = "auto"
 
     def with_element(self, element: Element, who: str, read: Reader) -> _Actuator:
         """Return these settings, changed by what an element says."""
@@ -82,6 +88,7 @@ class _Actuator:
             damping=read.numbers(element, "damping", who, count=3, least=1, default=self.damping),
             group=number("group", self.group),
             forcerange=read.numbers(element, "forcerange", who, count=2, default=self.forcerange),
+            forcelimited=given.get("forcelimited", self.forcelimited),
         )
         gain, (b0, b1, b2) = out.gain, out.bias
         if element.tag == "general":
@@ -152,10 +159,12 @@ class _Acting:
         return JointCoupling(self.name, tuple(self.factors), np.array([*self.factors.values()]), *numbers)
 
     def told(self) -> str:
-        given = [f"{n.replace('_', ' ')} {x:g}" for n in ("stiffness", "damping", "armature") if (x := getattr(self, n))]
+        given = [
+            f"{n.replace('_', ' ')} {x:g}" for n in ("stiffness", "damping", "armature") if (x := getattr(self, n))
+        ]
         given += [f"rest length {self.rest_length:g}"] if self.stiffness else []
         given += [f"damping ratio {self.dampratio:g}"] if self.dampratio else []
-        total = " + ".join(f"{factor:g} {joint}" for joint, factor in self.factors.items())
+        total = " + ".join(f"{factor:g} {joint}" for joint, factor in self.factors.items()).replace("+ -", "- ")
         return f"{self.who} on {total}: {', '.join(given)}"
 
 
@@ -186,9 +195,7 @@ class Transmissions:
         tendons = [e for section in mujoco.all("tendon") for e in section.children]
         actuators = [e for section in mujoco.all("actuator") for e in section.children]
         self._tendons = [self._tendon(e, k) for k, e in enumerate(tendons)]
-        self._of_tendon = {
-            e.attributes.get("name", ""): (t, e) for t, e in zip(self._tendons, tendons, strict=True)
-        }
+        self._of_tendon = {e.attributes.get("name", ""): (t, e) for t, e in zip(self._tendons, tendons, strict=True)}
         self._actuators = [self._actuator(e, k) for k, e in enumerate(actuators)]
         equalities = (e for section in mujoco.all("equality") for e in section.children)
         self._equalities = [self._who(e, k) + f" ({_connected(e)})" for k, e in enumerate(equalities)]
@@ -243,7 +250,10 @@ class Transmissions:
         out.stiffness *= self._springs
         out.damping *= self._dampers
         out.linear()
-        out.left_out += [f"{n} {full.attributes[n]}" for n in _TENDON_LIMITS if n in full.attributes]
+        given = full.attributes
+        out.left_out += [
+            f"{n} {given[n]}" for n, on in _TENDON_LIMITS.items() if n in given and given.get(on) != "false"
+        ]
         return out
 
     def _scalar(self, name: str, who: str, element: Element) -> bool:
@@ -313,7 +323,7 @@ class Transmissions:
             out.damping -= b2
         else:
             out.left_out.append(f"the force {b2:g} times the rate")
-        if made.forcerange and any((b0, b1, b2)):
+        if made.forcerange and made.forcelimited != "false" and any((b0, b1, b2)):
             out.left_out.append(f"force range {' '.join(f'{x:g}' for x in made.forcerange)}")
 
     # What becomes of them
@@ -360,7 +370,8 @@ class Transmissions:
 def coupled(model: Model, couplings: Iterable[JointCoupling]) -> Model:
     """Return the model with more couplings; one of a single joint becomes numbers of that joint.
 
-    One that is there already gets the damping of another of its name. The sum of two springs on a joint is one spring; the constant by which its energy differs is left out.
+    A coupling that is there already gets the damping of another of its name. Two springs on one joint become one; the
+    constant by which its energy differs from theirs is left out.
     """
     joints: dict[str, Joint] = {j.name: j for j in model.joints}
     kept = {c.name: c for c in model.couplings}

@@ -271,7 +271,7 @@ class ModelBuilder:
             The kinetic energy is ½ armature (dl/dt)².
         """
         who = f"coupling {name!r}"
-        if not isinstance(factors, Mapping):
+        if not hasattr(factors, "items"):
             self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {factors!r}")
             return
         numbers = self._numbers(

@@ -51,14 +51,15 @@ class Needs:
         """
         joints, bound = tuple(joints), frozenset(bound)
         couplings = tuple(couplings)
-        between = (*springs, *couplings)
+        between: tuple[PointSpring | JointCoupling, ...] = (*springs, *couplings)
         return cls(
             gravity="gravity" in bound or bool(np.any(gravity)),
             springs="stiffness" in bound
             or any(np.any(j.stiffness) for j in joints)
             or any(s.stiffness for s in between),
             damping="damping" in bound or any(np.any(j.damping) for j in joints) or any(s.damping for s in between),
-            armature="armature" in bound or any(np.any(j.armature) for j in joints)
+            armature="armature" in bound
+            or any(np.any(j.armature) for j in joints)
             or any(c.armature for c in couplings),
             friction=any(np.any(j.friction) for j in joints),
             limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),

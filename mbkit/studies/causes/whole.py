@@ -1,4 +1,4 @@
-"""Usual mistakes with what belongs to no single body or joint: gravity, springs between points, joint couplings, the ground."""
+"""Usual mistakes with what belongs to no single body or joint: gravity, point springs, joint couplings, the ground."""
 
 from __future__ import annotations
 
