@@ -220,10 +220,10 @@ class _Description:
                 k = float(np.ravel(m.tendon_stiffness[t])[0]) * springs * (low == high)
                 d = float(np.ravel(m.tendon_damping[t])[0]) * dampers
                 yield made(m.tendon(t).name or f"tendon{t + 1}", tendons[t], k, low, d, float(m.tendon_armature[t]))
-        of_joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        of_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
         for i in range(m.nu):
             target, factors = int(m.actuator_trnid[i, 0]), dict[int, float]()
-            if m.actuator_trntype[i] in of_joint and _KINDS[int(m.jnt_type[target])] in ("prismatic", "revolute"):
+            if int(m.actuator_trntype[i]) in of_joint and _KINDS[int(m.jnt_type[target])] in ("prismatic", "revolute"):
                 factors = {target: 1.0}
             elif m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
                 factors = tendons.get(target, {})

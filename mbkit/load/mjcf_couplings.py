@@ -159,13 +159,8 @@ class _Acting:
         return JointCoupling(self.name, tuple(self.factors), np.array([*self.factors.values()]), *numbers)
 
     def told(self) -> str:
-        given = [
-            f"{n.replace('_', ' ')} {x:g}" for n in ("stiffness", "damping", "armature") if (x := getattr(self, n))
-        ]
-        given += [f"rest length {self.rest_length:g}"] if self.stiffness else []
-        given += [f"damping ratio {self.dampratio:g}"] if self.dampratio else []
-        total = " + ".join(f"{factor:g} {joint}" for joint, factor in self.factors.items()).replace("+ -", "- ")
-        return f"{self.who} on {total}: {', '.join(given)}"
+        ratio = f", damping ratio {self.dampratio:g}" if self.dampratio else ""
+        return f"{self.who}{str(self.coupling()).removeprefix(f'coupling {self.name!r}')}{ratio}"
 
 
 class Transmissions:

@@ -422,7 +422,8 @@ class Model:
     # Reading
 
     def __repr__(self) -> str:
-        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._told_mass()}; {self.needs}>"
+        between = f"; joint couplings {', '.join(c.name for c in self.couplings)}" if self.couplings else ""
+        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._told_mass()}; {self.needs}{between}>"
 
     def _told_mass(self) -> str:
         unknown = any(np.isnan(b.mass) for b in self.bodies)
@@ -436,7 +437,7 @@ class Model:
             for j in self.tree
         )
         head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
-        notes = "".join(f"<li>{html.escape(n)}</li>" for n in self.notes)
+        notes = "".join(f"<li>{html.escape(n)}</li>" for n in (*map(str, self.couplings), *self.notes))
         return (
             f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._told_mass()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")

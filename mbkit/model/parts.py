@@ -6,7 +6,7 @@ All lengths are metres, masses kilograms, angles radians. Arrays are read-only.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -154,6 +154,9 @@ class PointSpring(_Frozen):
     damping: float
 
 
+_OF_COUPLING: Final = ("stiffness", "rest_length", "damping", "armature")
+
+
 @dataclass(frozen=True, eq=False)
 class JointCoupling(_Frozen):
     """A spring, a viscous damper and a rotor on a sum of joint coordinates: MuJoCo's fixed tendon.
@@ -178,6 +181,11 @@ class JointCoupling(_Frozen):
     rest_length: float
     damping: float
     armature: float
+
+    def __str__(self) -> str:
+        length = " + ".join(f"{c:g} {joint}" for c, joint in zip(self.factors, self.joints, strict=True))
+        given = [f"{n.replace('_', ' ')} {x:g}" for n in _OF_COUPLING if (x := getattr(self, n))]
+        return f"coupling {self.name!r} on {length.replace('+ -', '- ')}: {', '.join(given) or 'no force'}"
 
 
 @dataclass(frozen=True, eq=False)
