@@ -45,7 +45,7 @@ def mjcf_tree(rng: np.random.Generator, count: int) -> tuple[str, list[list[str]
         for name in ("armature", "stiffness", "damping", "springref"):
             if rng.random() < 0.4:
                 joint += f' {name}="{number(rng.uniform(0.1, 2))}"'
-        inside = "".join(body(c) for c in children.get(k, []))
+        inside = f'<site name="s{k}" pos="{com}"/>' + "".join(body(c) for c in children.get(k, []))
         inertial = f'<inertial pos="{com}" mass="{number(rng.uniform(0.5, 2))}" diaginertia=".3 .4 .5"/>'
         return f'<body pos="{pos}"><joint {joint}/>{inertial}{inside}</body>'
 
@@ -105,11 +105,15 @@ def random_transmissions(seed: int) -> str:
         tag = str(rng.choice(tags))
         at = f'tendon="t{rng.integers(3)}"' if rng.random() < 0.5 else f'joint="j{rng.integers(6)}"'
         actuators += f"<{tag} {at}{class_()}{random_attributes(rng, tag, in_class=False)}/>"
+    a, b = rng.choice(6, 2, replace=False)
+    tendons += f'<spatial name="line" stiffness="2" damping=".3" springlength=".7"><site site="s{a}"/><site site="s{b}"/></spatial>'
+    tendons += f'<spatial stiffness="3" springlength="0"><site site="ground"/><site site="s{a}"/></spatial>'
+    ground = '<frame pos="1 2 3"><site name="ground" pos="0 0 1"/></frame>'
     flags = "".join(f' {name}="disable"' for name in ("spring", "damper", "actuation") if rng.random() < 0.15)
     return (
         f'<mujoco><compiler angle="{rng.choice(["degree", "radian"])}"/>'
         f'<option><flag constraint="disable"{flags}/></option>'
-        f"<default>{default('outer', 0)}</default><worldbody>{bodies}</worldbody><tendon>{tendons}</tendon>"
+        f"<default>{default('outer', 0)}</default><worldbody>{ground}{bodies}</worldbody><tendon>{tendons}</tendon>"
         f"<actuator>{actuators}</actuator></mujoco>"
     )
 

@@ -1,9 +1,10 @@
 """Tendons, actuators and equality constraints of an MJCF: what acts linearly in q and v, and the names of the rest.
 
 The length of a fixed tendon is l = Σ coef q. Its spring, damper and armature become a `JointCoupling`, or numbers of
-the joint where there is only one. The length of an actuator is gear times a joint's coordinate or a tendon's length.
-Its armature and damping act always. Its force at zero control and activation is b0 + b1 l + b2 dl/dt with `biasprm`
-(b0, b1, b2): a spring of stiffness -b1 and rest length -b0/b1, and a damper of -b2 (XML reference of MuJoCo 4.0).
+the joint where there is only one. A spatial tendon straight between two sites is a `PointSpring`. The length of an
+actuator is gear times a joint's coordinate or a tendon's length. Its armature and damping act always. Its force at zero
+control and activation is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of stiffness -b1 and rest length
+-b0/b1, and a damper of -b2 (XML reference of MuJoCo 4.0).
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from mbkit._check import Array
 from mbkit.load.attributes import Reader
-from mbkit.load.mjcf_scene import MjcfJoint, Scene
+from mbkit.load.mjcf_scene import MjcfJoint, Scene, unfolded
+from mbkit.load.mjcf_values import HERE, pose
 from mbkit.load.xml import Element
-from mbkit.model import Joint, JointCoupling, Model
+from mbkit.model import Joint, JointCoupling, Model, PointSpring
 from mbkit.model.physical import sample_mass_matrix
 
 __all__ = ["Transmissions", "coupled"]
@@ -127,6 +130,8 @@ class _Acting:
         Of the coupling.
     factors : dict
         Joint -> dl/dq; empty where l is no sum of coordinates.
+    ends : tuple of (str, array)
+        Bodies and points that l is the distance of; empty where it is none.
     dampratio : float
         What is to be the damping, of the critical one at the pose that is drawn.
     left_out : list of str
@@ -140,6 +145,7 @@ class _Acting:
     damping: float = 0.0
     armature: float = 0.0
     dampratio: float = 0.0
+    ends: tuple[tuple[str, Array], ...] = ()
     left_out: list[str] = field(default_factory=list)
 
     @property
@@ -147,10 +153,11 @@ class _Acting:
         return bool(self.stiffness or self.damping or self.armature or self.dampratio)
 
     def linear(self) -> None:
-        """Move to `left_out` what is no spring, damper or rotor on a sum of coordinates."""
+        """Move to `left_out` what is no spring, damper or rotor on a sum of coordinates, or spring between points."""
+        between = ("damping", "stiffness")[: 1 + (self.rest_length >= 0)] if self.ends else ()
         for name in ("stiffness", "damping", "armature", "dampratio"):
             value = getattr(self, name)
-            if value < 0 or (value and not self.factors):
+            if value < 0 or (value and not self.factors and name not in between):
                 self.left_out.append(f"{name} {value:g}" + (", which is negative" if value < 0 else ""))
                 setattr(self, name, 0.0)
 
@@ -158,7 +165,14 @@ class _Acting:
         numbers = self.stiffness, self.rest_length, self.damping, self.armature
         return JointCoupling(self.name, tuple(self.factors), np.array([*self.factors.values()]), *numbers)
 
+    def point_spring(self) -> PointSpring:
+        (a, at_a), (b, at_b) = self.ends
+        return PointSpring(self.name, a, at_a, b, at_b, self.stiffness, self.rest_length, self.damping)
+
     def told(self) -> str:
+        if self.ends:
+            spring = f"stiffness {self.stiffness:g}, rest length {self.rest_length:g}, " if self.stiffness else ""
+            return f"{self.who} between {self.ends[0][0]!r} and {self.ends[1][0]!r}: {spring}damping {self.damping:g}"
         ratio = f", damping ratio {self.dampratio:g}" if self.dampratio else ""
         return f"{self.who}{str(self.coupling()).removeprefix(f'coupling {self.name!r}')}{ratio}"
 
@@ -187,10 +201,12 @@ class Transmissions:
         self._classes = {"main": _Actuator()}
         for element in mujoco.all("default"):
             self._collect(element, "main")
+        self._sites = {site: (body.name, X.p - body.anchor) for body in scene.bodies for site, X in body.sites}
+        self._sites |= _ground_sites(mujoco, scene)
         tendons = [e for section in mujoco.all("tendon") for e in section.children]
         actuators = [e for section in mujoco.all("actuator") for e in section.children]
         self._tendons = [self._tendon(e, k) for k, e in enumerate(tendons)]
-        self._of_tendon = {e.attributes.get("name", ""): (t, e) for t, e in zip(self._tendons, tendons, strict=True)}
+        self._factors = {e.attributes.get("name", ""): t.factors for e, t in zip(tendons, self._tendons, strict=True)}
         self._actuators = [self._actuator(e, k) for k, e in enumerate(actuators)]
         equalities = (e for section in mujoco.all("equality") for e in section.children)
         self._equalities = [self._who(e, k) + f" ({_connected(e)})" for k, e in enumerate(equalities)]
@@ -228,6 +244,8 @@ class Transmissions:
             if self._scalar(name, who, joint):
                 out.factors[name] = out.factors.get(name, 0.0) + read.number(joint, "coef", who)
         out.factors = {joint: factor for joint, factor in out.factors.items() if factor}
+        if element.tag == "spatial":
+            out.ends = self._ends(element)
         for name in ("stiffness", "damping"):
             first, *higher = read.numbers(full, name, who, count=3, least=1, default=(0.0,))
             setattr(out, name, first)
@@ -239,6 +257,8 @@ class Transmissions:
         out.rest_length = first
         if first == -1.0 and all(x == -1.0 for x in second):
             out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
+            # Where the file draws the two points is not followed.
+            out.rest_length = -1.0 if out.ends else out.rest_length
         elif out.stiffness and second and second[0] != first:
             out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {second[0]:g}")
             out.stiffness = 0.0
@@ -250,6 +270,14 @@ class Transmissions:
             f"{n} {given[n]}" for n, on in _TENDON_LIMITS.items() if n in given and given.get(on) != "false"
         ]
         return out
+
+    def _ends(self, element: Element) -> tuple[tuple[str, Array], ...]:
+        """Return the two points that a tendon goes straight between, if it does."""
+        if [e.tag for e in element.children] != ["site", "site"]:
+            return ()
+        found = [self._sites.get(e.attributes.get("site", "")) for e in element.children]
+        ends = tuple(x for x in found if x is not None)
+        return ends if len({body for body, _ in ends}) == 2 else ()
 
     def _scalar(self, name: str, who: str, element: Element) -> bool:
         """Return whether a joint has one coordinate; a fault if it has not, or is not there."""
@@ -294,10 +322,10 @@ class Transmissions:
                 self._read.fault(f"{who}: joint {name!r} is not in the file", element)
             return {name: 1.0} if joint is not None and joint.kind in ("hinge", "slide") else {}
         if "tendon" in given:
-            if given["tendon"] not in self._of_tendon:
+            if given["tendon"] not in self._factors:
                 self._read.fault(f"{who}: tendon {given['tendon']!r} is not in the file", element)
                 return {}
-            return self._of_tendon[given["tendon"]][0].factors
+            return self._factors[given["tendon"]]
         return {}
 
     def _bias(self, made: _Actuator, out: _Acting) -> None:
@@ -326,7 +354,8 @@ class Transmissions:
     def applied(self, model: Model) -> Model:
         """Return the model with what acts, and with notes that name it and what was left out."""
         acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
-        out = coupled(model, [x.coupling() for x in acting])
+        springs = tuple(x.point_spring() for x in acting if x.ends)
+        out = coupled(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
         ratios = []
         for x in acting:
             if x.dampratio:
@@ -386,6 +415,18 @@ def coupled(model: Model, couplings: Iterable[JointCoupling]) -> Model:
             armature=joint.armature + factor**2 * c.armature,
         )
     return replace(model, joints=tuple(joints.values()), couplings=tuple(kept.values()))
+
+
+def _ground_sites(mujoco: Element, scene: Scene) -> dict[str, tuple[str, Array]]:
+    """Return the sites of the world itself."""
+    out: dict[str, tuple[str, Array]] = {}
+    for world in mujoco.all("worldbody"):
+        for element, X, class_ in unfolded(world, HERE, None, scene, "the world"):
+            site = scene.defaults.filled(element, class_) if element.tag == "site" else element
+            if element.tag == "site" and "fromto" not in site.attributes:
+                place = X @ pose(site, scene.compiler, scene.read, "site in the world")
+                out[element.attributes.get("name", "")] = ("world", place.p)
+    return out
 
 
 def _disabled_groups(mujoco: Element, read: Reader) -> set[float]:
