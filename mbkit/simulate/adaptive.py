@@ -218,10 +218,12 @@ class _Solve:
             member.rejected += 1
             solver = again
             _stepped(solver)
-        if solver.status == "failed" and self.rates.why:
+        stuck = solver.status == "failed" or _below_rounding(solver, duration)
+        if stuck and self.rates.why:
+            # Steps became this short because the engine failed just ahead of them.
             member.stop("diverged", f"diverged: {self.rates.why}")
             return None
-        if solver.status == "failed" or _below_rounding(solver, duration):
+        if stuck:
             rtol, atol = self._tolerances
             own = "" if atol == rtol else f", atol = {atol:g}"
             told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
