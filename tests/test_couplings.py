@@ -15,9 +15,12 @@ import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit.derivation import Equations
+from mbkit.derivation.factorize import elimination_order, elimination_size
 from mbkit.engines import import_mujoco
 from mbkit.errors import KnownDefectWarning, ModelError, UnsupportedError
 from mbkit.model import JointCoupling, Model, ModelBuilder
+from mbkit.model.physical import sample_mass_matrix
 from mbkit.studies.baseline.description import described
 from tests.random_trees import ALL, SOUND, random_tree
 
@@ -271,6 +274,7 @@ def test_terms_are_those_of_the_definition(engine, kinds, deep, mimic, seed):
     passive = -G.T @ (k * (x - rest) + d * (G @ v))
     M = bare.mass_matrix(q) + G.T @ np.diag(rotor) @ G
     assert_near(dyn.mass_matrix(q), M)
+    assert_near(sample_mass_matrix(model, q), M)
     assert_near(dyn.passive(q, v), bare.passive(q, v) + passive)
     assert_near(dyn.nle(q, v), bare.nle(q, v))
     assert_near(dyn.inverse_dynamics(q, v, a), M @ a + bare.nle(q, v) - bare.passive(q, v) - passive)
@@ -307,19 +311,49 @@ def test_drake_has_no_couplings():
         mb.dynamics(two_pendulums(stiffness=1.0).build(), "drake")
 
 
-def test_a_badly_scaled_model_keeps_its_digits():
+def light_cart(factor: float) -> Model:
     b = mb.ModelBuilder("cart")
     b.add_body("cart", mass=1e-9)
     b.add_body("pole", mass=1.0, com=(0, 0, 1.0))
     b.add_joint("slide", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
     b.add_joint("hinge", "revolute", parent="cart", child="pole", axis=(0, 1, 0))
-    b.add_coupling("c", {"slide": 2e-6, "hinge": 3e-6}, armature=1.0, stiffness=2.0, damping=0.3)
-    model = b.build()
+    b.add_coupling("c", {"slide": 2 * factor, "hinge": 3 * factor}, armature=1.0, stiffness=2.0, damping=0.3)
+    return b.build()
+
+
+def test_a_badly_scaled_model_keeps_its_digits():
+    model = light_cart(1e-6)
     dyn, oracle = mb.dynamics(model, "lagrangian", compile=False), mb.dynamics(model, "oracle")
     assert dyn.elimination == "least constraint"
     q, v = np.array([0.2, 1e-3]), np.array([0.3, 0.4])
     exact = oracle.forward_dynamics(q, v, np.zeros(2))
     np.testing.assert_allclose(dyn.forward_dynamics(q, v, np.zeros(2)), exact, rtol=1e-13)
+    # A large rotor leaves enough of M.
+    assert mb.dynamics(light_cart(1.0), "lagrangian", compile=False).elimination == "mass matrix"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_size_of_an_elimination_counts_what_couplings_fill_in(seed):
+    model, _ = coupled_tree(seed, ("revolute", "ball", "prismatic"))
+    order = elimination_order(model)
+    filled = np.array(Equations(model).mass_matrix.sparsity().get_triplet()).T
+    pattern = np.zeros((model.nv, model.nv), bool)
+    pattern[tuple(filled.T)] = True
+    pattern = pattern[np.ix_(order, order)]
+    count = 0
+    for k in reversed(range(model.nv)):
+        row = pattern[k, : k + 1]
+        count += int(row.sum()) ** 2
+        pattern[: k + 1, : k + 1] |= np.outer(row, row)
+    assert elimination_size(model) == count
+
+
+def test_a_rotor_may_be_all_that_a_joint_moves():
+    b = two_pendulums(armature=0.5)
+    b.add_body("idle")
+    b.add_joint("j2", "revolute", parent="b1", child="idle", axis=(1, 0, 0))
+    b.add_coupling("d", {"j1": 1.0, "j2": 1.0}, armature=0.5)
+    assert not b.build().nonphysical
 
 
 @pytest.mark.parametrize("method", ["rk4", "implicit_midpoint", "rodas5"])
@@ -406,6 +440,15 @@ def test_a_difference_in_a_coupling_is_named():
     assert cause.acts
     assert "'c'" in cause.subject
     assert described(model)["couplings"]["c"]["armature"] == 0.5
+
+
+def test_a_coupling_of_a_joint_that_the_other_model_lacks():
+    b = two_pendulums(armature=0.5)
+    b.add_body("b2", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("j2", "revolute", parent="b1", child="b2", axis=(1, 0, 0))
+    b.add_coupling("d", {"j1": 1.0, "j2": 1.0}, stiffness=1.0)
+    found = mb.explain(b.build(), two_pendulums(armature=0.5).build())
+    assert any("'j2'" in cause.subject for cause in found.acting)
 
 
 def test_the_importer_of_mujoco_has_the_same_armature(tmp_path):

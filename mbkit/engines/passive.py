@@ -45,7 +45,7 @@ class JointPassive:
         self._stiffness = np.array([s[2] for s in springs])
         self._rest = np.array([s[3] for s in springs])
         couplings = model.couplings
-        rows = np.array([layout.coupling_row(c) for c in couplings]).reshape(-1, layout.sizes[3])
+        rows = np.array([layout.coupling_row(c) for c in couplings]).reshape(len(couplings), layout.sizes[3])
         # The couplings' lengths are self._lengths q, the rates self._rates v.
         self._rates, self._lengths = rows[:, v_order], np.zeros((len(couplings), layout.sizes[2]))
         for name in {name for c in couplings for name in c.joints}:
