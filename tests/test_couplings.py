@@ -21,6 +21,7 @@ from mbkit.engines import import_mujoco
 from mbkit.errors import KnownDefectWarning, ModelError, UnsupportedError
 from mbkit.model import JointCoupling, Model, ModelBuilder
 from mbkit.model.physical import sample_mass_matrix
+from mbkit.simulate.balance import is_damped
 from mbkit.studies.baseline.description import described
 from tests.random_trees import ALL, SOUND, random_tree
 
@@ -286,12 +287,12 @@ def test_terms_are_those_of_the_definition(engine, kinds, deep, mimic, seed):
         assert_near(dyn.kinetic_energy(q, v), bare.kinetic_energy(q, v) + 0.5 * np.sum(rotor * (G @ v) ** 2))
 
 
-def two_pendulums(**numbers: Any) -> ModelBuilder:
+def two_pendulums(joint: str = "j", **numbers: Any) -> ModelBuilder:
     b = mb.ModelBuilder("pair")
     for k in range(2):
-        b.add_body(f"b{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
-        b.add_joint(f"j{k}", "revolute", parent="world", child=f"b{k}", axis=(0, 1, 0))
-    b.add_coupling("c", {"j0": 1.0, "j1": -2.0}, **numbers)
+        b.add_body(f"b{k}", mass=1.0 + k, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(f"{joint}{k}", "revolute", parent="world", child=f"b{k}", axis=(0, 1, 0))
+    b.add_coupling("c", {f"{joint}0": 1.0, f"{joint}1": -2.0}, **numbers)
     return b
 
 
@@ -332,9 +333,16 @@ def test_a_badly_scaled_model_keeps_its_digits():
     assert mb.dynamics(light_cart(1.0), "lagrangian", compile=False).elimination == "mass matrix"
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_size_of_an_elimination_counts_what_couplings_fill_in(seed):
-    model, _ = coupled_tree(seed, ("revolute", "ball", "prismatic"))
+@pytest.mark.parametrize("deep", [False, True])
+def test_the_size_of_an_elimination_counts_what_couplings_fill_in(deep):
+    model, _ = coupled_tree(1, ("revolute", "ball", "prismatic"))
+    if deep:
+        leaves = two_pendulums()
+        for k in range(2):
+            leaves.add_body(f"leaf{k}", mass=1.0, com=(0.1, 0, 0.1), inertia=(0.1, 0.1, 0.1))
+            leaves.add_joint(f"leaf{k}", "revolute", parent=f"b{k}", child=f"leaf{k}", axis=(0, 1, 0))
+        leaves.add_coupling("leaves", {"leaf0": 1.0, "leaf1": 1.0}, armature=1.0)
+        model = leaves.build()
     order = elimination_order(model)
     filled = np.array(Equations(model).mass_matrix.sparsity().get_triplet()).T
     pattern = np.zeros((model.nv, model.nv), bool)
@@ -365,8 +373,14 @@ def test_methods_that_eliminate_by_themselves_keep_the_energy(method):
     assert np.abs(run.v[-1]).min() > 0.1
 
 
-def test_on_paper():
+@pytest.mark.parametrize("catalogued", [False, True])
+def test_on_paper(catalogued):
     model = two_pendulums(stiffness=3.0, rest_length=0.25, damping=0.5, armature=0.5).build()
+    if catalogued:
+        # A system of the catalog has symbols of its own, which do not hold for what was added.
+        plain = mb.catalog.double_pendulum()
+        names = tuple(j.name for j in plain.joints)
+        model = replace(plain, couplings=(JointCoupling("c", names, np.array([1.0, -2.0]), 3.0, 0.25, 0.5, 0.5),))
     paper, dyn = mb.lagrangian.from_model(model).dynamics(), mb.dynamics(model, "pinocchio")
     q, v, tau = np.random.default_rng(0).normal(size=(3, 2))
     assert_near(paper.mass_matrix(q), dyn.mass_matrix(q))
@@ -392,6 +406,8 @@ def test_features_and_identity():
     model = two_pendulums(stiffness=3.0, damping=0.5, armature=0.5).build()
     bare = replace(model, couplings=())
     needs = model.needs
+    assert is_damped(model)
+    assert not is_damped(model.without("damping"))
     assert needs.springs
     assert needs.damping
     assert needs.armature
@@ -440,6 +456,21 @@ def test_a_difference_in_a_coupling_is_named():
     assert cause.acts
     assert "'c'" in cause.subject
     assert described(model)["couplings"]["c"]["armature"] == 0.5
+
+
+def test_couplings_of_renamed_joints_are_the_same():
+    model, other = (two_pendulums(joint=name, stiffness=2.0, armature=0.5).build() for name in ("j", "hinge"))
+    found = mb.explain(model, other)
+    assert found.agree
+    assert not found.acting
+
+
+def test_a_rotor_that_an_engine_loses_is_named():
+    model = two_pendulums(stiffness=3.0, damping=0.1, armature=0.5).build()
+    found = mb.explain(mb.dynamics(model, "lagrangian", compile=False), mb.dynamics(model, "mujoco"))
+    (cause,) = found.causes
+    assert cause.kind == "joint coupling"
+    assert "branches" in str(cause)
 
 
 def test_a_coupling_of_a_joint_that_the_other_model_lacks():

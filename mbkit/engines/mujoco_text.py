@@ -103,11 +103,7 @@ def _unsayable(model: Model) -> Iterator[str]:
 
 def _branched(model: Model, coupling: JointCoupling) -> bool:
     """Return whether two joints of a coupling are on different branches."""
-    above: dict[str, frozenset[str]] = {}
-    moved: dict[str, frozenset[str]] = {"world": frozenset()}
-    for joint in model.tree:
-        above[joint.name] = moved[joint.child] = moved[joint.parent] | {joint.name}
-    chains = sorted((above[name] for name in coupling.joints), key=len)
+    chains = sorted((model.chains[name] for name in coupling.joints), key=len)
     return not all(a <= b for a, b in pairwise(chains))
 
 

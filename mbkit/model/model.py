@@ -209,6 +209,15 @@ class Model:
         return tuple(out)
 
     @cached_property
+    def chains(self) -> Mapping[str, frozenset[str]]:
+        """Of each joint the names of the joints from the ground to it, itself included."""
+        below: dict[str, frozenset[str]] = {"world": frozenset()}
+        out = {}
+        for joint in self.tree:
+            out[joint.name] = below[joint.child] = below[joint.parent] | {joint.name}
+        return MappingProxyType(out)
+
+    @cached_property
     def quaternions(self) -> tuple[tuple[int, str], ...]:
         """(start in q, joint name) of every quaternion."""
         return tuple(
