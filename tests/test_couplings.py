@@ -68,6 +68,7 @@ def random_attributes(rng: np.random.Generator, tag: str, *, in_class: bool) -> 
         "damping": u[1],
         **{
             "general": {"gainprm": u[2], "biastype": str(rng.choice(["none", "affine"])), "biasprm": f"{u[0]} -{u[1]}"},
+            "pid": {"kp": u[2], "kv": u[3]},
             "position": {"kp": u[2], **({"kv": u[3]} if in_class or rng.random() < 0.5 else {"dampratio": u[3]})},
             "intvelocity": {"kp": u[2], "kv": u[3], "actrange": "-1 1"},
             "velocity": {"kv": u[2]},
@@ -82,7 +83,7 @@ def random_attributes(rng: np.random.Generator, tag: str, *, in_class: bool) -> 
 def random_transmissions(seed: int) -> str:
     rng = np.random.default_rng(seed)
     bodies, chains = mjcf_tree(rng, 6)
-    tags = ("general", "motor", "position", "velocity", "cylinder", "intvelocity", "damper")
+    tags = ("general", "motor", "position", "velocity", "cylinder", "pid", "intvelocity", "damper")
 
     def default(name: str, depth: int) -> str:
         tendon = f'<tendon damping="{number(rng.uniform(0, 2))}"/>' if rng.random() < 0.5 else ""
@@ -287,6 +288,10 @@ def test_terms_are_those_of_the_definition(engine, kinds, deep, mimic, seed):
         assert_near(dyn.kinetic_energy(q, v), bare.kinetic_energy(q, v) + 0.5 * np.sum(rotor * (G @ v) ** 2))
 
 
+APART = f'<worldbody><body><joint name="a" axis="0 1 0"/>{BODY}</body><body><joint name="b" axis="0 1 0"/>{BODY}</body></worldbody>'
+SUM = '<joint joint="a" coef="1"/><joint joint="b" coef="1"/>'
+
+
 def two_pendulums(joint: str = "j", **numbers: Any) -> ModelBuilder:
     b = mb.ModelBuilder("pair")
     for k in range(2):
@@ -296,7 +301,7 @@ def two_pendulums(joint: str = "j", **numbers: Any) -> ModelBuilder:
     return b
 
 
-def test_mujoco_loses_a_rotor_between_branches_and_says_so():
+def test_mujoco_loses_a_rotor_between_branches_and_says_so(tmp_path):
     model = two_pendulums(armature=0.5).build()
     with pytest.warns(KnownDefectWarning, match="'c'"):
         M = mb.dynamics(model, "mujoco").mass_matrix(model.neutral())
@@ -304,6 +309,10 @@ def test_mujoco_loses_a_rotor_between_branches_and_says_so():
     assert mb.dynamics(model, "pinocchio").mass_matrix(model.neutral())[0, 1] == -1.0
     with pytest.raises(UnsupportedError, match="'c'"):
         mb.convert(model, "mjcf")
+    text = f'<mujoco>{APART}<tendon><fixed name="c" armature="1">{SUM}</fixed></tendon></mujoco>'
+    read = loaded(tmp_path, text)
+    assert read.branched(read.couplings[0])
+    assert any("armature of 'c'" in note for note in read.notes)
 
 
 @pytest.mark.skipif(find_spec("pydrake") is None, reason="Drake is not installed")

@@ -6,7 +6,6 @@ MuJoCo's writer keeps six digits. Here numbers are the shortest decimals that gi
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import pairwise
 from typing import Any, Final
 from xml.sax.saxutils import quoteattr
 
@@ -18,7 +17,7 @@ from mbkit.engines.import_mujoco import ImportedMujoco
 from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.engines.mujoco_model import Placed, mapped, specified
 from mbkit.errors import UnsupportedError
-from mbkit.model import Joint, JointCoupling, Model
+from mbkit.model import Joint, Model
 
 __all__ = ["mjcf_text", "read_back"]
 
@@ -94,17 +93,11 @@ def _unsayable(model: Model) -> Iterator[str]:
         elif joint.kind == "free" and joint.parent == "world" and np.ptp(joint.damping) > 0:
             yield f"{who} is damped differently in turning and in moving"
     for coupling in model.couplings:
-        if coupling.armature and _branched(model, coupling):
+        if coupling.armature and model.branched(coupling):
             yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
     yield from (f"loop {x.name!r} (MuJoCo's would be soft)" for x in model.loops)
     yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
-
-
-def _branched(model: Model, coupling: JointCoupling) -> bool:
-    """Return whether two joints of a coupling are on different branches."""
-    chains = sorted((model.chains[name] for name in coupling.joints), key=len)
-    return not all(a <= b for a, b in pairwise(chains))
 
 
 def _told(**attributes: Any) -> str:

@@ -43,7 +43,7 @@ _REFUSED: Final = {
 # Sections that are read, or that say nothing about the motion.
 _READ: Final = ("compiler", "default", "option", "worldbody", "size", "visual", "statistic", "asset")
 # Sections with notes of their own.
-_TOLD: Final = ("tendon", "actuator", "equality")
+_NOTED: Final = ("tendon", "actuator", "equality")
 
 
 # Option flags that change the smooth equations; the others steer an engine.
@@ -214,7 +214,7 @@ def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
     files = list(dict.fromkeys(e.file for e in mujoco.walk() if e.file))
     if files:
         out.append(f"included: {', '.join(files)}")
-    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in (*_READ, *_TOLD))
+    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in (*_READ, *_NOTED))
     if sections:
         told = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
         out.append(f"sections left out, with whatever they do to the motion: {told}")

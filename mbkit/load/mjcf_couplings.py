@@ -52,8 +52,8 @@ _TENDON_LIMITS: Final = {
 class _Actuator:
     """An actuator as its default classes and its element have it, in the words of MuJoCo's `mjsActuator`.
 
-    Gain, bias and their types are inherited from a <general> and from an element of the same tag only. `tag` is that
-    of the last element of a class, and `parent` what the class inherits.
+    Gain, bias and their types are inherited from a <general> and from an element of the same tag only, those of <pid>
+    from a <pid> only. `tag` is that of the last element of a class, and `parent` what the class inherits.
     """
 
     tag: str = "general"
@@ -77,8 +77,9 @@ class _Actuator:
             return read.number(element, name, who, default)
 
         base = self
-        while element.tag != "general" and base.tag not in (element.tag, "general"):
-            base = base.parent or _Actuator()
+        heirs = ("pid",) if element.tag == "pid" else (element.tag, "general")
+        while element.tag != "general" and base.tag not in heirs:
+            base = base.parent or _Actuator(tag=element.tag)
         out = replace(
             self,
             tag=element.tag,
@@ -98,15 +99,16 @@ class _Actuator:
             if "gainprm" in given:
                 gain = read.numbers(element, "gainprm", who, count=10, least=1)[0]
             if "biasprm" in given:
-                read_ = read.numbers(element, "biasprm", who, count=10, least=1)[:3]
-                b0, b1, b2 = (*read_, *out.bias[len(read_) :])
+                written = read.numbers(element, "biasprm", who, count=10, least=1)[:3]
+                b0, b1, b2 = (*written, *out.bias[len(written) :])
             gaintype, biastype = given.get("gaintype", out.gaintype), given.get("biastype", out.biastype)
             return replace(out, gain=gain, bias=(b0, b1, b2), gaintype=gaintype, biastype=biastype)
-        if element.tag in ("position", "intvelocity"):
+        if element.tag in ("position", "intvelocity", "pid"):
             gain = number("kp", gain)
             # MuJoCo keeps a damping ratio as a positive b2.
             b2 = number("dampratio", -number("kv", -b2))
-            return replace(out, gain=gain, bias=(0.0, -gain, b2), gaintype="fixed", biastype="affine")
+            gaintype = "pid" if element.tag == "pid" else "fixed"
+            return replace(out, gain=gain, bias=(0.0, -gain, b2), gaintype=gaintype, biastype="affine")
         if element.tag == "velocity":
             gain = number("kv", gain)
             return replace(out, gain=gain, bias=(0.0, 0.0, -gain), gaintype="fixed", biastype="affine")
@@ -150,6 +152,7 @@ class _Acting:
 
     @property
     def acts(self) -> bool:
+        """Whether anything of it is a spring, damper or rotor."""
         return bool(self.stiffness or self.damping or self.armature or self.dampratio)
 
     def linear(self) -> None:
@@ -162,14 +165,17 @@ class _Acting:
                 setattr(self, name, 0.0)
 
     def coupling(self) -> JointCoupling:
+        """Return it as a coupling of joints; its damping ratio is not in it."""
         numbers = self.stiffness, self.rest_length, self.damping, self.armature
         return JointCoupling(self.name, tuple(self.factors), np.array([*self.factors.values()]), *numbers)
 
     def point_spring(self) -> PointSpring:
+        """Return it as a spring between two points."""
         (a, at_a), (b, at_b) = self.ends
         return PointSpring(self.name, a, at_a, b, at_b, self.stiffness, self.rest_length, self.damping)
 
-    def told(self) -> str:
+    def description(self) -> str:
+        """Return who it is and what it does, for a note."""
         if self.ends:
             spring = f"stiffness {self.stiffness:g}, rest length {self.rest_length:g}, " if self.stiffness else ""
             return f"{self.who} between {self.ends[0][0]!r} and {self.ends[1][0]!r}: {spring}damping {self.damping:g}"
@@ -338,9 +344,9 @@ class Transmissions:
         b0, b1, b2 = made.bias
         if b1:
             out.stiffness, out.rest_length = -b1, -b0 / b1
-        elif b0:
+        if b0 and b1 >= 0:
             out.left_out.append(f"the constant force {b0:g}")
-        if b2 > 0 and made.gain == -b1 and made.gaintype == "fixed":
+        if b2 > 0 and made.gain == -b1 and made.gaintype in ("fixed", "pid"):
             out.dampratio = b2
         elif b2 <= 0:
             out.damping -= b2
@@ -363,19 +369,26 @@ class Transmissions:
                 inertia = self._reflected(out, x.coupling())
                 damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * inertia))
                 ratios.append(replace(x.coupling(), stiffness=0.0, armature=0.0, damping=damping))
-        return replace(coupled(out, ratios), notes=(*model.notes, *self._notes()))
+        out = coupled(out, ratios)
+        torn = ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c))
+        own = [*self._notes()]
+        if torn:
+            own.append(f"the armature of {torn} acts between branches; MuJoCo 4.0 leaves it out of M there")
+        return replace(out, notes=(*model.notes, *own))
 
     def _reflected(self, model: Model, coupling: JointCoupling) -> float:
+        """Return the inertia that a coupling's length moves in the pose that is drawn; 0 where M is singular for it."""
         q = model.neutral()
         for name, joint in self._joints.items():
             if joint.kind in ("hinge", "slide"):
                 q[model.layout.q[name]] = joint.ref
         row = model.layout.coupling_row(coupling) @ model.layout.G
-        return float(1 / (row @ np.linalg.solve(sample_mass_matrix(model, q), row)))
+        mobility = float(row @ np.linalg.pinv(sample_mass_matrix(model, q)) @ row)
+        return 1 / mobility if mobility > 0 else 0.0
 
     def _notes(self) -> Iterator[str]:
         for what, some in (("tendons", self._tendons), ("actuators", self._actuators)):
-            acting = "; ".join(x.told() for x in some if x.acts)
+            acting = "; ".join(x.description() for x in some if x.acts)
             at = ", at zero control" if what == "actuators" else ""
             if acting:
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"

@@ -6,6 +6,7 @@ import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -216,6 +217,11 @@ class Model:
         for joint in self.tree:
             out[joint.name] = below[joint.child] = below[joint.parent] | {joint.name}
         return MappingProxyType(out)
+
+    def branched(self, coupling: JointCoupling) -> bool:
+        """Return whether two joints of a coupling are on different branches of the tree."""
+        chains = sorted((self.chains[name] for name in coupling.joints), key=len)
+        return not all(a <= b for a, b in pairwise(chains))
 
     @cached_property
     def quaternions(self) -> tuple[tuple[int, str], ...]:
