@@ -188,8 +188,8 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
     for name, words in {"sum": "range -1 2", "slack": "stiffness 8", "3 (fixed, line 1)": "9", "string": "6"}.items():
         assert name in note("left out of tendons")
         assert words in note("left out of tendons")
-    assert "'sum' on 1 a - 2 b: stiffness 7" in note("tendons that act")
-    assert "'servo' on 1 b: stiffness 5" in note("actuators that act")
+    assert "'sum' on a - 2 b: stiffness 7" in note("tendons that act")
+    assert "'servo' on b: stiffness 5" in note("actuators that act")
     for name, words in {
         "servo": "force range -4 4",
         "spherical": "stiffness 12",
@@ -200,8 +200,8 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
         assert f"'{name}': " in note("left out of actuators")
         assert words in note("left out of actuators")
     assert "14" in note("left out of actuators")
-    assert "'drive'" in note("actuators that exert no force")
-    assert "'off'" in note("actuators that exert no force")
+    for words in ("'drive' (motor, gain 1) on a", "'off' (position, gain 11) on a", "'biceps' (muscle, muscle gain"):
+        assert words in note("controls")
     assert "'tie' (joint, joint1 'a', joint2 'b')" in note("equality")
     assert "connect" in note("equality")
 

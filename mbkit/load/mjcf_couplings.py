@@ -68,6 +68,7 @@ class _Actuator:
     group: float = 0.0
     forcerange: tuple[float, ...] = ()
     forcelimited: str = "auto"
+    ctrlrange: tuple[float, ...] = ()
 
     def with_element(self, element: Element, who: str, read: Reader) -> _Actuator:
         """Return these settings, changed by what an element says."""
@@ -93,6 +94,7 @@ class _Actuator:
             group=number("group", self.group),
             forcerange=read.numbers(element, "forcerange", who, count=2, default=self.forcerange),
             forcelimited=given.get("forcelimited", self.forcelimited),
+            ctrlrange=read.numbers(element, "ctrlrange", who, count=2, default=self.ctrlrange),
         )
         gain, (b0, b1, b2) = out.gain, out.bias
         if element.tag == "general":
@@ -116,7 +118,8 @@ class _Actuator:
             bias = read.numbers(element, "bias", who, count=3, default=out.bias)
             return replace(out, gain=number("area", gain), bias=(bias[0], bias[1], bias[2]), biastype="affine")
         if element.tag in ("motor", "damper", "adhesion"):
-            return replace(out, gain=1.0, bias=(0.0, 0.0, 0.0), gaintype="fixed", biastype="none")
+            gaintype = "affine" if element.tag == "damper" else "fixed"
+            return replace(out, gain=number("gain", 1.0), bias=(0.0, 0.0, 0.0), gaintype=gaintype, biastype="none")
         return replace(out, gaintype=element.tag, biastype=element.tag)
 
 
@@ -136,6 +139,8 @@ class _Acting:
         Bodies and points that l is the distance of; empty where it is none.
     dampratio : float
         What is to be the damping, of the critical one at the pose that is drawn.
+    control : str
+        What is done with an actuator's control, which is left out.
     left_out : list of str
     """
 
@@ -148,6 +153,7 @@ class _Acting:
     armature: float = 0.0
     dampratio: float = 0.0
     ends: tuple[tuple[str, Array], ...] = ()
+    control: str = ""
     left_out: list[str] = field(default_factory=list)
 
     @property
@@ -313,6 +319,10 @@ class Transmissions:
         if any(higher):
             out.left_out.append("damping that depends on the rate")
             out.damping = 0.0
+        gain = f"gain {made.gain:g}" if made.gaintype == "fixed" else f"{made.gaintype} gain"
+        limits = f", range {made.ctrlrange[0]:g} {made.ctrlrange[1]:g}" if made.ctrlrange else ""
+        at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
+        out.control = f"{out.who} ({element.tag}, {gain}{limits}) on {at}"
         if self._actuation and made.group not in self._groups:
             self._bias(made, out)
         out.linear()
@@ -395,11 +405,12 @@ class Transmissions:
             lost = "; ".join(f"{x.who}: {', '.join(x.left_out)}" for x in some if x.left_out)
             if lost:
                 yield f"left out of {what}: {lost}"
-            idle = ", ".join(x.who for x in some if not x.acts and not x.left_out)
+            idle = ", ".join(x.who for x in some if not (x.acts or x.left_out or x.control))
             if idle:
                 yield f"{what} that exert no force of their own: {idle}"
         if self._actuators:
-            yield "controls of actuators were left out; give their forces as tau"
+            controls = "; ".join(x.control for x in self._actuators)
+            yield f"controls of actuators were left out, give their forces as tau: {controls}"
         if self._equalities:
             yield f"equality constraints left out: {'; '.join(self._equalities)}"
 

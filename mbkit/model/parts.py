@@ -182,10 +182,15 @@ class JointCoupling(_Frozen):
     damping: float
     armature: float
 
+    @property
+    def length(self) -> str:
+        """The sum as text, such as ``"j1 - 2 j2"``."""
+        terms = [joint if c == 1 else f"{c:g} {joint}" for c, joint in zip(self.factors, self.joints, strict=True)]
+        return " + ".join(terms).replace("+ -", "- ")
+
     def __str__(self) -> str:
-        length = " + ".join(f"{c:g} {joint}" for c, joint in zip(self.factors, self.joints, strict=True))
         given = [f"{n.replace('_', ' ')} {x:g}" for n in _OF_COUPLING if (x := getattr(self, n))]
-        return f"coupling {self.name!r} on {length.replace('+ -', '- ')}: {', '.join(given) or 'no force'}"
+        return f"coupling {self.name!r} on {self.length}: {', '.join(given) or 'no force'}"
 
 
 @dataclass(frozen=True, eq=False)
