@@ -433,7 +433,7 @@ def test_runs_end_exactly(method: str, duration: float, dt: float, steps: int) -
 
 def test_equal_steps_are_not_split_by_rounding() -> None:
     for duration, dt in ((1.0, 1e-3), (10.0, 1e-3), (0.7, 0.1), (1.0, 1 / 3), (2.4, 0.8), (1e4, 1e-3)):
-        grid = Grid.of(duration, dt)
+        grid = Grid.of(0.0, duration, dt)
         assert grid.steps == round(duration / dt)
         assert grid.last == dt
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import ellipj, ellipk, ellipkm1, ellipkinc
+from scipy.special import ellipj, ellipk, ellipkinc, ellipkm1
 
 Array = NDArray[np.float64]
 
