@@ -351,7 +351,7 @@ def _stepped(
     kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
     read = Torque(torque, model, batch, grid.steps)
     if method.kind == "native":
-        outcome = run_native(dyn, method, q, v, grid, kept, read)
+        outcome = run_native(dyn, method, q, v, grid, kept, read, bar)
         bar.update(1.0)
     else:
         outcome = fixed_runner(method, dyn, read)(dyn, method.name, q, v, grid, kept, read, bar)
