@@ -14,6 +14,7 @@ from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
 from mbkit.engines.expected import no_dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, UnsupportedError
+from mbkit.model import Model
 from mbkit.simulate.applied import Applied, TorqueFunction
 from mbkit.simulate.asked import Asked
 from mbkit.simulate.consistent import along_constraints, from_consistent
@@ -187,6 +188,7 @@ def simulate(
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
     if callable(torque) and not chosen.callables:
         _refuse("torque functions", chosen, ["rk4", "rk853", "dop853"])
+    _warn_beyond_limits(model, q)
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
     arguments: dict[str, Any] = {"batch": batch, "torque": torque, "save": save, "bar": bar}
     started = time.perf_counter()
@@ -235,6 +237,26 @@ def _times(
     if 4 * np.finfo(float).eps * abs(start) > shortest > 0:
         raise InputError(f"t0: expected times that differ after {shortest:g} s, got {start:g} s; shift the time's zero")
     return start, duration, step
+
+
+def _warn_beyond_limits(model: Model, q: Array) -> None:
+    """Warn of a start beyond a joint's limits, which do not act: degrees are a common reason."""
+    low, high = model.lower, model.upper
+    room = 1e-9 * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
+    rows = np.atleast_2d(q)
+    beyond = (rows < low - room) | (rows > high + room)
+    if beyond.any():
+        row, i = np.argwhere(beyond)[0]
+        which = f"trajectory {row}: " if q.ndim == 2 else ""
+        more = np.count_nonzero(beyond) - 1
+        warnings.warn(
+            f"{model.name}: q0: {which}{model.coordinate_names[i]} = {rows[row, i]:g} is beyond its limits "
+            f"[{low[i]:g}, {high[i]:g}]"
+            + (f", and {more} more" if more else "")
+            + "; limits do not act in a run, and angles are in radians",
+            MbkitWarning,
+            stacklevel=3,
+        )
 
 
 def _held_time(dyn: Dynamics) -> float:
