@@ -110,10 +110,10 @@ def simulate(
     doubt : bool
         Whether a finished run is looked at for signs that it is wrong: energy from nowhere, a step
         too long for the fastest mode, a singular mass matrix, coordinates beyond the digits of a
-        double. Some 0.4 ms for a small robot, whatever the length of the run; a method of first order
-        without torques, up to 20,000 steps, is also held against itself at twice the step, for half
-        the time of a run (of a batch, of its first trajectory). What is found is warned of, and in
-        ``Trajectory.stats.doubts``.
+        double. That takes 0.2 to 2 ms for a small robot, whatever the length of the run. A method of
+        first order without torques, up to 20,000 steps, is also compared with itself at twice the step,
+        which takes up to half a run more (of a batch, of its first trajectory). What is found is warned of,
+        and in ``Trajectory.stats.doubts``.
 
     t0 : float, optional
         Time of the first state, s. When not given, the time that `dyn` holds where time enters the
