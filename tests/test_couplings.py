@@ -491,14 +491,15 @@ def test_a_coupling_of_a_joint_that_the_other_model_lacks():
     assert any("'j2'" in cause.subject for cause in found.acting)
 
 
-def test_the_importer_of_mujoco_has_the_same_armature(tmp_path):
-    text = (
-        f'<mujoco>{PLAIN}<tendon><fixed name="t" armature="2" stiffness="3"><joint joint="a" coef="1"/><joint joint="b" '
-        'coef="-1"/></fixed></tendon><actuator><motor joint="a" armature=".5"/><position tendon="t" kp="2" kv="1"/>'
-        "</actuator></mujoco>"
-    )
-    model = loaded(tmp_path, text)
-    imported = import_mujoco.read(text, "mjcf")
-    found = mb.explain(model, imported.model)
-    assert found.agree
-    assert not found.acting
+@pytest.mark.parametrize("seed", range(6))
+def test_the_importer_of_mujoco_reads_the_same(seed, tmp_path):
+    text = random_transmissions(seed)
+    model, imported = loaded(tmp_path, text), import_mujoco.read(text, "mjcf").model
+    q, v = model.random_state(np.random.default_rng(seed))
+    one, other = (mb.dynamics(m, "pinocchio") for m in (model.without("springs", "damping"), imported))
+    assert_near(one.mass_matrix(q), other.mass_matrix(q))
+    if not any(f'{part}="disable"' in text for part in ("spring", "damper")):
+        # The importer does not look at what flags do to joints.
+        assert_near(mb.dynamics(model, "pinocchio").passive(q, v), other.passive(q, v))
+    assert [c.name for c in model.couplings] == [c.name for c in imported.couplings]
+    assert [s.name for s in model.springs] == [s.name for s in imported.springs]
