@@ -173,7 +173,8 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
         '<actuator><position name="servo" joint="b" kp="5" forcerange="-4 4"/><motor name="drive" joint="a"/>'
         '<position name="off" joint="a" kp="11" group="3"/><position name="spherical" joint="c" kp="12"/>'
         '<muscle name="biceps" joint="a"/><general name="runaway" joint="a" biastype="affine" biasprm="0 13 14"/>'
-        '<general name="weight" joint="a" biastype="affine" biasprm="15"/></actuator>'
+        '<general name="weight" joint="a" biastype="affine" biasprm="15"/>'
+        '<general name="soft" joint="a" biastype="affine" biasprm="1e30 -1e-300"/></actuator>'
         '<equality><joint name="tie" joint1="a" joint2="b"/><connect body1="world" body2="world" anchor="0 0 0"/></equality>'
         "</mujoco>"
     )
@@ -196,6 +197,7 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
         "biceps": "muscle",
         "runaway": "stiffness -13",
         "weight": "15",
+        "soft": "constant force 1e+30",
     }.items():
         assert f"'{name}': " in note("left out of actuators")
         assert words in note("left out of actuators")

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.load.attributes import Reader
+from mbkit.load.attributes import LARGEST, Reader
 from mbkit.load.mjcf_scene import MjcfJoint, Scene, unfolded
 from mbkit.load.mjcf_values import HERE, pose
 from mbkit.load.xml import Element
@@ -46,6 +46,8 @@ _TENDON_LIMITS: Final = {
     "springyield": "",
     "actuatorfrcrange": "actuatorfrclimited",
 }
+#: What equality constraints bind.
+_ENDS: Final = ("joint", "body", "tendon", "site", "flex")
 
 
 @dataclass(frozen=True)
@@ -352,9 +354,10 @@ class Transmissions:
             out.left_out.append(f"the force of a {made.biastype}")
             return
         b0, b1, b2 = made.bias
-        if b1:
-            out.stiffness, out.rest_length = -b1, -b0 / b1
-        if b0 and b1 >= 0:
+        rest = -b0 / b1 if b1 else 0.0
+        if abs(rest) <= LARGEST:
+            out.stiffness, out.rest_length = -b1, rest
+        if b0 and (b1 >= 0 or abs(rest) > LARGEST):
             out.left_out.append(f"the constant force {b0:g}")
         if b2 > 0 and made.gain == -b1 and made.gaintype in ("fixed", "pid"):
             out.dampratio = b2
@@ -465,6 +468,3 @@ def _connected(element: Element) -> str:
     """Return what an equality constraint binds."""
     ends: Any = (f"{k} {v!r}" for k, v in element.attributes.items() if k.rstrip("12") in _ENDS)
     return ", ".join([element.tag, *ends])
-
-
-_ENDS: Final = ("joint", "body", "tendon", "site", "flex")
