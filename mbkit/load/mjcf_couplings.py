@@ -396,7 +396,13 @@ class Transmissions:
             if joint.kind in ("hinge", "slide"):
                 q[model.layout.q[name]] = joint.ref
         row = model.layout.coupling_row(coupling) @ model.layout.G
-        mobility = float(row @ np.linalg.pinv(sample_mass_matrix(model, q)) @ row)
+        M = sample_mass_matrix(model, q)
+        root = np.sqrt(np.diag(M))
+        if not root.all():
+            return 0.0
+        # Scaled to a unit diagonal, so that masses of very different sizes keep their digits.
+        row = row / root
+        mobility = float(row @ np.linalg.lstsq(M / np.outer(root, root), row, rcond=None)[0])
         return 1 / mobility if mobility > 0 else 0.0
 
     def _notes(self) -> Iterator[str]:
