@@ -23,6 +23,7 @@ from mbkit.model import JointCoupling, Model, ModelBuilder
 from mbkit.model.physical import sample_mass_matrix
 from mbkit.simulate.balance import is_damped
 from mbkit.studies.baseline.description import described
+from mbkit.studies.causes.subtree import part
 from tests.random_trees import ALL, SOUND, random_tree
 
 EPS = np.finfo(float).eps
@@ -491,6 +492,8 @@ def test_a_coupling_of_a_joint_that_the_other_model_lacks():
     b.add_coupling("d", {"j1": 1.0, "j2": 1.0}, stiffness=1.0)
     found = mb.explain(b.build(), two_pendulums(armature=0.5).build())
     assert any("'j2'" in cause.subject for cause in found.acting)
+    # A part keeps the couplings whose joints it has.
+    assert [c.name for c in part(b.build(), {"j1", "j2"}).couplings] == ["d"]
 
 
 @pytest.mark.parametrize("seed", range(6))
