@@ -113,14 +113,15 @@ def idle_joints(model: Model) -> tuple[list[str], bool]:
     return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()], alone
 
 
-def sample_mass_matrix(model: Model) -> Array:
-    """Return M at one fixed random state, by its definition; slow and only for checks."""
-    return _sample(model)[0]
+def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
+    """Return M at a pose, or at one fixed random state, by its definition; slow, for checks and for loading."""
+    return _sample(model, q)[0]
 
 
-def _sample(model: Model) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """Return M at that state, and each body's Jacobian in its own axes and rotation to world axes."""
-    q, _ = model.random_state(np.random.default_rng(0))
+def _sample(model: Model, q: Array | None = None) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    """Return M there, and each body's Jacobian in its own axes and rotation to world axes."""
+    if q is None:
+        q, _ = model.random_state(np.random.default_rng(0))
     q_full = model.layout.expand_q(q)
     n = model.layout.sizes[3]
     jacobians = {"world": np.zeros((6, n))}
@@ -142,6 +143,9 @@ def _sample(model: Model) -> tuple[Array, dict[str, Array], dict[str, Array]]:
         at_com = J[:3] - skew(body.com) @ J[3:]
         M += body.mass * at_com.T @ at_com + J[3:].T @ body.inertia @ J[3:]
         M[part[1], part[1]] += np.diag(joint.armature)
+    for coupling in model.couplings:
+        row = model.layout.coupling_row(coupling)
+        M += coupling.armature * np.outer(row, row)
     return np.asarray(model.layout.G.T @ M @ model.layout.G), jacobians, turned
 
 

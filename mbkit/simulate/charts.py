@@ -20,14 +20,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array, real
+from mbkit._check import Array, finite_array
 from mbkit.engines import Dynamics
 from mbkit.errors import DoubtfulRunWarning, FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.lagrangian.embedding import SINGULAR, Chart, Embedded, EmbeddedDynamics
 from mbkit.simulate.applied import TorqueFunction
 from mbkit.simulate.consistent import SingularPoses, from_consistent
 from mbkit.simulate.events import Event, Hit
-from mbkit.simulate.grid import Grid, save_times
+from mbkit.simulate.grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.methods import Method
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.stats import Stats
@@ -82,8 +82,9 @@ def run_on_charts(
     method: Method,
     q0: ArrayLike,
     v0: ArrayLike,
+    t0: float,
     duration: float,
-    dt: float,
+    dt: float | None,
     rtol: float | None,
     atol: float | None,
     torque: ArrayLike | TorqueFunction | None,
@@ -99,23 +100,22 @@ def run_on_charts(
             f"use {', '.join(METHODS_ON_CHARTS)}, or the form with multipliers, lag.dynamics()"
         )
     q, v = finite_array("q0", q0, (model.nq,)), finite_array("v0", v0, (model.nv,))
-    duration = real("duration", duration, nonnegative=True)
-    q, v = from_consistent(system.dynamics, q, v)
+    q, v = from_consistent(system.dynamics, q, v, t0)
     read = Torque(torque, model, None, None)
     run = _Run(SingularPoses(system.dynamics))
     force = read.of_member(None)(0)
     if method.kind == "adaptive":
         if isinstance(save, (int, np.integer)):
             raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
-        times = None if save is None else save_times(save, duration)
+        times = None if save is None else save_times(save, t0, t0 + duration)
         with progress:
             given = {"rtol": rtol, "atol": atol}
-            _adaptive(system, run, q, v, duration, method.name, given, force, times, events, progress)
+            _adaptive(system, run, q, v, t0, t0 + duration, method.name, given, force, times, events, progress)
     else:
-        grid = Grid.of(duration, real("dt", dt, positive=True))
+        grid = Grid.of(t0, duration, DEFAULT_STEP if dt is None else dt)
         with progress:
             _stepped(system, run, q, v, grid, method.name, force, save, progress)
-    out = _finished(system, run, method, read, duration, time.perf_counter() - started)
+    out = _finished(system, run, method, read, t0, t0 + duration, time.perf_counter() - started)
     for t, value in run.near:
         warnings.warn(
             f"{model.name}: {_NEAR} at t = {t:.6g} s: the smallest singular value there is {value:.3g} of the largest",
@@ -132,8 +132,10 @@ def run_on_charts(
     return out
 
 
-def _finished(system: Embedded, run: _Run, method: Method, read: Torque, duration: float, seconds: float) -> Trajectory:
-    reached = duration if run.ended == "finished" else run.t[-1] if run.t else 0.0
+def _finished(
+    system: Embedded, run: _Run, method: Method, read: Torque, start: float, end: float, seconds: float
+) -> Trajectory:
+    reached = end if run.ended == "finished" else run.t[-1] if run.t else start
     told = (run.poses.told(),) if run.poses.times else ()
     stats = Stats(run.steps, run.evaluations, seconds, run.ended, reached, run.message, run.rejected, doubts=told)
     n = system.model.nq
@@ -203,7 +205,7 @@ def _part(dyn: Dynamics, q: Array, v: Array, chart: Chart | None, *given: Any, *
         warnings.simplefilter("ignore", MbkitWarning)
         start = (q, v) if chart is None else (q[chart.independent], v[chart.independent])
         try:
-            return simulate(dyn, *start, *given, **more), None
+            return simulate(dyn, *start, *given, **{"t0": 0.0, **more}), None
         except FunctionError as error:
             return error.trajectory, error
 
@@ -213,7 +215,8 @@ def _adaptive(
     run: _Run,
     q: Array,
     v: Array,
-    duration: float,
+    t: float,
+    end: float,
     method: str,
     tolerances: dict[str, Any],
     force: Force,
@@ -221,9 +224,10 @@ def _adaptive(
     events: Sequence[Event],
     progress: Progress,
 ) -> None:
-    across, t, left = False, 0.0, None if times is None else list(times)
-    if left is None or (left and left[0] == 0.0):
-        run.keep(0.0, q, v)
+    across, start = False, t
+    left = None if times is None else list(times)
+    if left is None or (left and left[0] == t):
+        run.keep(t, q, v)
         left = left and left[1:]
     for _ in range(_MOST):
         first = system.chart(q, t)
@@ -233,7 +237,7 @@ def _adaptive(
             if not (run.near and run.near[-1][0] == t):
                 run.near.append((t, near))
         chart, way, dyn, acts, watched = _begun(system, run, None if across else first, q, v, t, force, events)
-        rest = duration - t
+        rest = end - t
         # Steps end behind the pose, where their errors are not those of a state within a step.
         span = min(rest, _behind(system, first, q, v, t)) if across else rest
         ends = [span] if left is None else sorted({*(s - t for s in left if s - t < span), span})
@@ -242,7 +246,7 @@ def _adaptive(
             torque=acts,
             save=None if left is None else ends,
             events=watched,
-            progress=lambda done, t=t, span=span: progress.update((t + done * span) / duration),
+            progress=lambda done, t=t, span=span: progress.update((t + done * span - start) / (end - start or 1.0)),
             **tolerances,
         )
         ended = _take(system, run, part, way, first, t, left)
@@ -398,7 +402,7 @@ def _stepped(
 ) -> None:
     kept = set(grid.kept(save, 2 * len(q)).tolist())
     if 0 in kept:
-        run.keep(0.0, q, v)
+        run.keep(grid.start, q, v)
     k, chart, was_near = 0, None, False
     while k < grid.steps:
         t = grid.time(k)
@@ -408,7 +412,9 @@ def _stepped(
             run.hits.append(Hit(f"independent: {system.names(chart)}", t, q.copy(), v.copy()))
         dyn = system.on(chart, q, t)
         end = min(k + _BLOCK, grid.steps)
-        part, run.error = _part(*(dyn, q, v, chart, grid.time(end) - t, method, grid.dt), torque=_pulled(dyn, force, t))
+        part, run.error = _part(
+            *(dyn, q, v, chart, grid.time(end) - t, method), dt=grid.dt, torque=_pulled(dyn, force, t)
+        )
         run.count(part)
         dyn.remember(q)
         begin, worn = k, False

@@ -45,8 +45,8 @@ _WINDOW: Final = 4
 _TAKES_PART: Final = 0.1
 
 
-def from_consistent(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return initial states freed of rounding.
+def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array, Array]:
+    """Return initial states, at a time, freed of rounding.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
     from mbkit.lagrangian.constraints import manifold_of
     from mbkit.lagrangian.redundancy import refuse_unreachable, require_independent
 
-    manifold = manifold_of(dyn).at(0.0)
+    manifold = manifold_of(dyn).at(t)
     try:
         manifold.check(q, v)
     except InputError:

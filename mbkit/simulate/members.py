@@ -109,7 +109,7 @@ class Member:
         self.ended, self.message, self.error = "function_failed", str(error), error
 
 
-def member_of(dyn: Dynamics, which: int | None, duration: float) -> Member:
+def member_of(dyn: Dynamics, which: int | None, start: float, duration: float) -> Member:
     """Return what comes of one trajectory that has not begun.
 
     Parameters
@@ -117,12 +117,11 @@ def member_of(dyn: Dynamics, which: int | None, duration: float) -> Member:
     dyn : Dynamics
     which : int or None
         Its place in a batch.
-    duration : float
+    start, duration : float
         s.
     """
-    if not dyn.model.constrained:
-        return Member(duration=duration)
-    return Member(duration=duration, poses=SingularPoses(dyn if which is None else dyn.of_samples([which])))
+    poses = SingularPoses(dyn if which is None else dyn.of_samples([which])) if dyn.model.constrained else None
+    return Member(reached=start, duration=duration, poses=poses, _look=(0, start))
 
 
 def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
@@ -135,11 +134,11 @@ def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
         check_room(len(save) * (1 if batch is None else batch), numbers)
 
 
-def reporter(bar: Progress, i: int, count: int, duration: float) -> Callable[[float], None]:
+def reporter(bar: Progress, i: int, count: int, start: float, duration: float) -> Callable[[float], None]:
     """Return what tells how far the i-th trajectory is, by its time."""
 
     def done(t: float) -> None:
-        bar.update((i + t / duration) / count)
+        bar.update((i + (t - start) / duration) / count)
 
     return done
 
