@@ -362,6 +362,15 @@ def test_two_robots_are_explained_to_the_last_digit(one: str, two: str, read: Ca
 _PART = ("body", "link")
 
 
+def test_a_mass_counts_whichever_side_shows_it() -> None:
+    # With its centre of mass on the hinge, the mass of a body is in no term.
+    a = random_tree(0, 1, kinds=("revolute",), springs=False)
+    a = with_body(a, "b0", com=np.zeros(3))
+    b = with_body(a, "b0", mass=2.0 * a.body("b0").mass, com=np.array([0.1, 0.2, 0.3]))
+    for one, two in ((a, b), (b, a)):
+        assert {c.kind for c in mb.explain(one, two).acting} == {"mass", "centre of mass"}
+
+
 def test_a_loop_is_no_difference_that_changes_nothing() -> None:
     open_chain = random_tree(0, 3, kinds=("revolute",))
     loop = Loop("close", "point", "b2", np.eye(3), np.zeros(3), "world", np.eye(3), np.ones(3))

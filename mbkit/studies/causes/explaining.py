@@ -42,12 +42,13 @@ def explain(
 ) -> Explanation:
     """Say why two descriptions, or two engines, differ.
 
-    Every difference between the descriptions is named: armature, damping, friction, springs, gravity, a lost, fused or changed body, inertia about
-    the wrong point or in the wrong axes, a joint's place, axis, zero or pitch, quaternion and joint order,
-    mimic joints, velocity frames, a known defect of an engine. Joints are matched by structure and name,
-    and frames that are only drawn elsewhere are no difference. What each difference does is measured: it is
-    put alone into the first description, and taken alone out of the second. What remains with all of them
-    put into the first is measured too.
+    Every difference between the descriptions is named: armature, damping, friction, springs, gravity, a
+    lost, fused or changed body, inertia about the wrong point or in the wrong axes, a joint's place, axis,
+    zero or pitch, quaternion and joint order, mimic joints, velocity frames, a known defect of an engine.
+    Joints are matched by structure and name, and frames that are only drawn elsewhere are no difference.
+
+    What each difference does is measured: it is put alone into the first description, and taken alone out of
+    the second. What remains with all of them put into the first is measured too.
 
     Parameters
     ----------

@@ -137,8 +137,8 @@ class Explanation:
         if not self.explained:
             where = f"; the smallest part that still differs: {', '.join(self.subtree)}" if self.subtree else ""
             rest = f": {self.remainder:.1e} remains" if self.left else ""
-            found = f"{_counted(count, 'cause')} found do not explain it all{rest}" if count else "no usual cause does it"
-            return f"{head}, and {found}{where}"
+            some = f"{_counted(count, 'cause')} found do not explain it all" if count else "no usual cause does it"
+            return f"{head}, and {some}{rest}{where}"
         left = f"; with {'it' if count == 1 else 'all of them'} applied the terms agree to {self.remainder:.1e}"
         return f"{head}, for {_counted(count, 'reason')}{left}{beside}"
 
