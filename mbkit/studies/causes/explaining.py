@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -325,7 +326,7 @@ def _body(one: Compact, joint: Joint, other: Compact, near: Near) -> list[Hypoth
             _matter(
                 g,
                 f"link {name!r}, fixed to {body!r}" if name != body else f"link {name!r}",
-                lambda x, fields, name=name: with_link(x, body, name, fields),
+                partial(_put_link, body, name),
                 own[name],
                 there[name],
             )
@@ -333,6 +334,10 @@ def _body(one: Compact, joint: Joint, other: Compact, near: Near) -> list[Hypoth
         ]
     guesses = bodies.named(members, joint.rotation, b, near, base=_base(joint))
     return [_matter(g, f"body {body!r}", lambda x, fields: with_matter(x, body, fields), a, b) for g in guesses]
+
+
+def _put_link(body: str, link: str, x: Compact, fields: Mapping[str, Any]) -> Compact:
+    return with_link(x, body, link, fields)
 
 
 def _matter(g: Guess, subject: str, put: Callable[[Compact, Any], Compact], a: Lump, b: Lump) -> Hypothesis:
