@@ -116,9 +116,10 @@ AGREEING = Comparison(
     rollouts=(rollout(1e-13, 1e-12), rollout(0.5, math.inf, note="for information")),
     precision=STUDY,
     omissions=(
-        Omission("contacts", False, "collision detection", 1200.0, NAN, 0.0, True, "± 3 ns"),
-        Omission("gravity", True, "needed, so it is on", NAN, NAN, NAN, True),
-        Omission("dry friction", True, "dry friction", 20.0, NAN, 0.7, True, "off in every engine"),
+        Omission("contacts", False, "collision detection", 1200.0, 3.0, NAN, 0.0, True),
+        Omission("damping", False, "dampers", -25.6, 40.0, NAN, 0.0, True),
+        Omission("gravity", True, "needed, so it is on", NAN, NAN, NAN, NAN, True),
+        Omission("dry friction", True, "dry friction", 20.0, 3.0, NAN, 0.7, True, "off in every engine"),
     ),
     refusals=(
         Refusal("mujoco", "g", "cannot"),
@@ -134,7 +135,7 @@ DIFFERING = replace(
     AGREEING,
     rows=(*AGREEING.rows, row("kinetic energy", "pinocchio", 0.3, "differs by 3.0e-01; pinocchio#2053", joint="")),
     rollouts=(rollout(1e-6, 1e-12, passed=False),),
-    omissions=(Omission("limits", False, "limits", 1.0, NAN, 0.1, False),),
+    omissions=(Omission("limits", False, "limits", 1.0, 0.1, NAN, 0.1, False),),
 )
 NASTY_STUDY = replace(
     STUDY,
@@ -163,7 +164,7 @@ NASTY = replace(
     ),
     rollouts=(rollout(NAN, 1e-12, passed=False, note=HOSTILE), rollout(NAN, math.inf, note=HOSTILE)),
     precision=NASTY_STUDY,
-    omissions=(Omission(HOSTILE, True, HOSTILE, NAN, NAN, math.inf, False, HOSTILE),),
+    omissions=(Omission(HOSTILE, True, HOSTILE, NAN, NAN, NAN, math.inf, False, HOSTILE),),
     refusals=(Refusal("drake", HOSTILE, HOSTILE),),
     processor=HOSTILE,
 )
@@ -257,7 +258,17 @@ def test_refusals_of_one_reason_are_one_notice():
 
 
 def test_an_omission_by_choice_is_not_called_unchanged():
-    assert [omission_state(o) for o in AGREEING.omissions] == ["same", "on", "chosen"]
+    assert [omission_state(o) for o in AGREEING.omissions] == ["same", "same", "on", "chosen"]
+
+
+def test_a_saving_within_its_spread_is_not_measurable_anywhere():
+    # −25.6 ns ± 40 ns is noise, 1200 ns ± 3 ns is not.
+    for text in (printed(tables.comparison(AGREEING), 160), Tags(check_page(AGREEING)).text):
+        assert "not measurable" in text
+        assert "25.6" not in text
+        assert "1.20 µs ± 3.00 ns" in text
+    data = {o["need"]: o["measurable"] for o in json.loads(AGREEING.to_json())["omissions"]}
+    assert data == {"contacts": True, "damping": False, "gravity": False, "dry friction": True}
 
 
 @pytest.mark.parametrize("width", [80, 100, 140])

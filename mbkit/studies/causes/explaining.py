@@ -131,8 +131,9 @@ class _Descriptions:
         causes += [self._measured(h, one, target) for h in hypotheses]
         causes += self._ground(one, target, near)
         constrained = any(c.kind in whole.CONSTRAINTS for c in causes)
-        agree = not structural and not constrained and before.worst <= self.tolerance
-        explained = after.worst <= self.tolerance and (agree or any(c.acts for c in causes))
+        massless = bool(one.model.nv) and self._massless(one.model) and self._massless(target.model)
+        agree = not (structural or constrained or massless) and before.worst <= self.tolerance
+        explained = after.worst <= self.tolerance and (agree or massless or any(c.acts for c in causes))
         return Explanation(
             a=self.names[0],
             b=self.names[1],
@@ -150,7 +151,12 @@ class _Descriptions:
             samples=self.samples,
             seed=self.seed,
             tolerance=self.tolerance,
+            massless=massless,
         )
+
+    def _massless(self, model: Model) -> bool:
+        M = model_terms(model, states_of(model, self.samples, self.seed)).get("M")
+        return M is not None and not M.any()
 
     def _aligned(self, theirs: Compact, like: Model, near: Near) -> Aligned:
         """Return a description with its frames where the other has them, if no term changes with that."""

@@ -86,6 +86,8 @@ class Explanation:
     samples, seed : int
     tolerance : float
         Relative difference of a term above which two sides differ.
+    massless : bool
+        Whether M is zero on both sides at every state, so that equal terms are no agreement.
     """
 
     a: str
@@ -104,6 +106,7 @@ class Explanation:
     samples: int
     seed: int
     tolerance: float
+    massless: bool = False
 
     @property
     def acting(self) -> tuple[Cause, ...]:
@@ -132,6 +135,8 @@ class Explanation:
         if self.comparable:
             apart = f"by {self.worst:.1e}" if self.worst > self.tolerance else "in its constraints"
         head = f"{self.b} differs from {self.a} {apart}"
+        if self.massless:
+            return f"{self.b} and {self.a} are not compared: the mass matrix is zero on both sides{beside}"
         if not self.matches:
             return f"{head}; they have no joint in common, so no term was compared"
         if not self.explained:
