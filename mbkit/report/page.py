@@ -110,7 +110,7 @@ def _study(result: WorkPrecision) -> dict[str, Any]:
         "result": result,
         "figure": Markup(precision.error_against_time(result)) if result.front else None,
         "front": precision.front_names(result),
-        "levels": precision.levels(result),
+        "leads": precision.leads(result),
         "lines": precision.curve_lines(result),
         "order_tolerance": precision.ORDER_TOLERANCE,
         "notices": notices(result.refusals),

@@ -50,10 +50,8 @@ def headline(result: Comparison) -> str:
     """Return the verdict in one sentence that stays short however much differs."""
     if result.nothing:
         return result.verdict
-    absent = [r.engine for r in result.refusals if not r.term and r.engine not in result.engines]
-    without = f"; {', '.join(dict.fromkeys(absent))} left out, see the notes" if absent else ""
     if result.passed or result.only_known_defects:
-        return result.verdict + without
+        return result.verdict
     parts = []
     for some, all_, what in (
         (sum(not r.passed for r in result.rows), len(result.rows), "comparisons of terms"),
@@ -66,8 +64,9 @@ def headline(result: Comparison) -> str:
     who = dict.fromkeys([*(r.engine for r in rows), *(r.engine for r in result.rollouts if not r.passed)])
     known = len([r for r in rows if r.defect])
     by_defect = f" ({known} by a known defect of {_engines(r for r in rows if r.defect)})" if known else ""
+    missing = "".join(f"; {x}" for x in result.shortened)
     subject = f"{', '.join(who)} differ{'s' * (len(who) == 1)}: " if who else ""
-    return f"{subject}{', '.join(parts)}{by_defect}{without}"
+    return f"{subject}{', '.join(parts)}{by_defect}{missing}"
 
 
 def _engines(rows: Iterable[Row]) -> str:

@@ -28,7 +28,7 @@ __all__ = ["COMPARABLE", "compare"]
 COMPARABLE: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
 Progress = Callable[[float, str], None]
 
-#: What a comparison shows of `work_precision`: a few methods, and the time that takes, s.
+#: What a comparison shows of `work_precision`: a few methods, runs of little work, and seconds at the most.
 _METHODS: Final = {
     "pinocchio": ("rk4", "semi_implicit_euler", "dop853"),
     "lagrangian": ("rk853", "rk4"),
@@ -36,7 +36,8 @@ _METHODS: Final = {
 }
 _HORIZON: Final = 0.5
 _REPEATS: Final = 3
-_SECONDS: Final = 6.0
+_WORK: Final = 24_000
+_SECONDS: Final = 60.0
 
 
 def compare(
@@ -146,6 +147,7 @@ def _beyond_terms(
             seed=seed,
             repeats=_REPEATS,
             seconds=_SECONDS,
+            work=_WORK,
             progress=lambda fraction, text: tell(0.6 + 0.3 * fraction, text),
         )
 

@@ -116,6 +116,8 @@ class RolloutRow:
     note : str
     judged : bool
         False where too few steps are well conditioned to say anything.
+    asked : float
+        The horizon that was to be compared, s.
     """
 
     method: str
@@ -132,6 +134,12 @@ class RolloutRow:
     passed: bool
     note: str = ""
     judged: bool = True
+    asked: float = math.nan
+
+    @property
+    def cut(self) -> bool:
+        """Whether the compared horizon is shorter than the one asked for."""
+        return self.duration < self.asked * (1 - 1e-9)
 
 
 @dataclass(frozen=True)
@@ -237,21 +245,21 @@ class Comparison:
         """One sentence: agree, and to how many digits, or who differs in what, and by which known defect."""
         if self.nothing:
             return f"nothing compared: {self.nothing}"
+        missing = "".join(f"; {x}" for x in self.shortened)
         if self.passed:
-            left = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
-            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits{left}"
+            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits{missing}"
         known: dict[tuple[str, str], list[str]] = {}
         for r in self.rows:
             if r.defect:
                 known.setdefault((r.engine, r.defect), []).append(r.term)
         parts = [f"{engine} differs in {', '.join(terms)}: {defect}" for (engine, defect), terms in known.items()]
         if self.only_known_defects:
-            return f"{'; '.join(parts)}; all else agrees to {self.digits:.1f} digits"
+            return f"{'; '.join(parts)}; all else agrees to {self.digits:.1f} digits{missing}"
         failed = [r for r in self.rows if not r.passed and not r.defect]
         parts += [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
         parts += [f"rollout {r.method} on {r.engine} differs" for r in self.rollouts if not r.passed]
         parts += [f"leaving out {o.need} changes the accelerations" for o in self.omissions if not o.unchanged]
-        return "; ".join(parts)
+        return "; ".join(parts) + missing
 
     @property
     def nothing(self) -> str:
@@ -272,6 +280,23 @@ class Comparison:
         return bool(failed) and all(r.defect for r in failed) and beyond
 
     @property
+    def shortened(self) -> tuple[str, ...]:
+        """What is missing: terms, engines, whole studies, curves, and horizons that were cut."""
+        out = [f"not compared: {', '.join(self.not_compared)}"] if self.not_compared else []
+        absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
+        out += [f"{', '.join(absent)} left out"] if absent else []
+        out += [f"no {r.term}" for r in self.refusals if not r.engine]
+        unjudged = [r for r in self.rollouts if not r.judged]
+        cut = [r for r in self.rollouts if r.judged and r.cut]
+        out += [f"{len(unjudged)} of {len(self.rollouts)} rollouts not judged"] if unjudged else []
+        if cut:
+            least = min(r.duration for r in cut)
+            out.append(f"{len(cut)} of {len(self.rollouts)} rollouts cut, to {least:.3g} s at the least")
+        if self.precision is not None:
+            out += [f"error against run time: {x}" for x in self.precision.shortened]
+        return tuple(out)
+
+    @property
     def not_compared(self) -> tuple[str, ...]:
         """Terms that no engine could give, as where M is singular; `refusals` has the reasons."""
         given = {r.term for r in self.rows}
@@ -289,6 +314,7 @@ class Comparison:
         """Return everything as plain data."""
         precision = self.precision.to_dict() if self.precision is not None else None
         judged = {"passed": self.passed, "verdict": self.verdict, "digits": self.digits}
+        judged["shortened"] = list(self.shortened)
         omissions = [asdict(o) | {"measurable": o.measurable} for o in self.omissions]
         return asdict(self) | {"precision": precision, "omissions": omissions} | judged
 
