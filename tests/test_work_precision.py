@@ -162,8 +162,12 @@ def test_a_slow_machine_measures_the_same_points(monkeypatch):
         return study(("pinocchio", "mujoco"), ("rk4", "rk853", "mujoco_rk4"), steps=None, tolerances=None, work=4000)
 
     quick = few_runs()
-    begun = time.perf_counter()
-    slow = SimpleNamespace(perf_counter=lambda: begun + 40 * (time.perf_counter() - begun))
+    clocks = {name: getattr(time, name) for name in ("perf_counter", "process_time")}
+    starts = {name: clock() for name, clock in clocks.items()}
+    slow = SimpleNamespace(
+        perf_counter=lambda: 40 * clocks["perf_counter"]() - 39 * starts["perf_counter"],
+        process_time=lambda: 40 * clocks["process_time"]() - 39 * starts["process_time"],
+    )
     for module in ("walk", "sweeping"):
         monkeypatch.setattr(sys.modules[f"mbkit.studies.{module}"], "time", slow)
     assert errors(few_runs()) == errors(quick)

@@ -42,7 +42,7 @@ _USUAL: Final[dict[str, Any]] = {"repeats": 5, "work": None}
 @click.option("--duration", default=1.0, show_default=True, type=float, help="Horizon of the motion, s.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Of the start.")
 @click.option("--repeats", type=click.IntRange(min=1), help="Timings of each setting.  [default: 5; quick: 3]")
-@click.option("--seconds", type=float, help="What the study may take, s.  [default: its work is bounded, not its time]")
+@click.option("--seconds", type=float, help="Of the processor, at the most, s.  [default: work is bounded, not time]")
 @click.option("--jobs", type=click.IntRange(min=1), help="Measure in so many processes: sooner done, times less sure.")
 @click.option("--quick", is_flag=True, help="Seven methods, fewer repetitions and shorter runs.")
 @model_options

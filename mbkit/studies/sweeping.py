@@ -31,14 +31,14 @@ _AT_LEAST: Final = 0.2
 
 @dataclass(frozen=True)
 class Allowance:
-    """What a sweep may take.
+    """What a sweep may take, in seconds of the processor: a machine that does other things too ends no sweep.
 
     Attributes
     ----------
     seconds : float
         After which nothing is begun, counted from when this is made.
     usual : float
-        Seconds after which runs are not timed again.
+        After which runs are not timed again.
     work : float
         Counted work of a run of our own grid; see `Plan.work`.
     """
@@ -46,15 +46,15 @@ class Allowance:
     seconds: float
     usual: float
     work: float
-    begun: float = field(default_factory=time.perf_counter)
+    begun: float = field(default_factory=time.process_time)
 
     def until(self, part: float, least: float = 0.0) -> float:
         """Return when a part of the seconds is over, and not before there was a least part for what follows."""
-        return max(self.begun + part * self.seconds, time.perf_counter() + least * self.seconds)
+        return max(self.begun + part * self.seconds, time.process_time() + least * self.seconds)
 
     def timed_until(self, least: float) -> float:
         """Return when to stop timing runs again, and not before there was a least part of the usual time for it."""
-        return max(self.begun + self.usual, time.perf_counter() + least * self.usual)
+        return max(self.begun + self.usual, time.process_time() + least * self.usual)
 
 
 class Sweeping(Protocol):
@@ -94,14 +94,14 @@ class Alone:
         # What takes long to derive, Jacobians most of all, must not keep the others from having any time at all.
         for k, walk in enumerate(sorted(self._walks, key=_how_long_to_derive)):
             yield 0.2 * k / len(self._walks), f"compiling {walk.plan.method} on {walk.plan.engine}"
-            if k and time.perf_counter() > until:
+            if k and time.process_time() > until:
                 walk.give_up(OUT_OF_TIME)
             elif not walk.over:
                 walk.make_ready()
-        begun, until = time.perf_counter(), self._allowance.until(_EXPLORED, _AT_LEAST)
+        begun, until = time.process_time(), self._allowance.until(_EXPLORED, _AT_LEAST)
         for walk in explore(self._walks, until, self._allowance.work):
             # Cheap settings are done in no time: the root of the time shows how far it is.
-            done = ((time.perf_counter() - begun) / (until - begun)) ** 0.5
+            done = ((time.process_time() - begun) / (_EXPLORED * self._allowance.usual)) ** 0.5
             yield 0.2 + 0.4 * min(done, 1.0), f"{walk.plan.method} on {walk.plan.engine}"
         yield 0.6, "timing"
         for k in repeat(self._walks, self._repeats, self._allowance.timed_until(_AT_LEAST), self._seed):
@@ -133,7 +133,7 @@ class Shared:
         allowance: Allowance,
     ) -> None:
         self._executor, self._wanted = executor, wanted
-        left = allowance.until(1.0, 2 * _AT_LEAST) - time.perf_counter()
+        left = allowance.until(1.0, 2 * _AT_LEAST) - time.process_time()
         each = 1 / max(len(wanted), 1)
         part = replace(allowance, seconds=left * each, usual=min(allowance.usual, left) * each)
         self._calls = {str(i): partial(_one, scene, plan, repeats, seed, part) for i, plan in enumerate(wanted)}
@@ -160,7 +160,7 @@ class Shared:
 
 def _one(scene: Scene, plan: Plan, repeats: int, seed: int, allowance: Allowance) -> Found:
     """Measure one curve, wherever this is."""
-    alone = Alone(scene, [plan], repeats, seed, replace(allowance, begun=time.perf_counter()))
+    alone = Alone(scene, [plan], repeats, seed, replace(allowance, begun=time.process_time()))
     for _ in alone.steps():
         pass
     return alone.found()[0]

@@ -382,13 +382,13 @@ def explore(walks: Sequence[Walk], until: float, most: float) -> Iterator[Walk]:
     ----------
     walks : sequence of Walk
     until : float
-        On `time.perf_counter`; nothing is begun that would probably not be done by then.
+        On `time.process_time`; nothing is begun that would probably not be done by then.
     most : float
         Counted work that a run of our own grid may take, so that the curves are the same on a slow machine.
     """
     while going := [w for w in walks if not w.over]:
         walk = min(going, key=lambda w: w.expected)
-        left = until - time.perf_counter()
+        left = until - time.process_time()
         if walk.ahead > left:
             for other in going:
                 other.give_up(OUT_OF_TIME)
@@ -409,11 +409,11 @@ def repeat(walks: Sequence[Walk], repeats: int, until: float, seed: int) -> Iter
     times.
     """
     runs = [x for walk in walks for x in walk.timed]
-    counts = shares([max(once, _SHORT) for once, _ in runs], repeats, until - time.perf_counter())
+    counts = shares([max(once, _SHORT) for once, _ in runs], repeats, until - time.process_time())
     rng = np.random.default_rng(seed)
     for k in range(repeats):
         for i in rng.permutation(len(runs)):
-            if k < counts[i] and time.perf_counter() + runs[i][0] < until:
+            if k < counts[i] and time.process_time() + runs[i][0] < until:
                 runs[i][1]()
         yield k
 

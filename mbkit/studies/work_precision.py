@@ -97,10 +97,10 @@ def work_precision(
         Timings of each setting, in rounds over all of them; fewer of long ones where
         time is short.
     seconds : float, optional
-        What the study may take at the most, the reference and all compiling included. What is left out for
-        that is told first, in the repr and the reports. Nothing that is being compiled is broken off, and a
-        part is always left to the runs. When not given, `work` alone decides on the settings, and five times the
-        usual 60 to 120 s end the study of a model that takes too long to derive.
+        What the study may take of the processor's time at the most, the reference and all compiling included.
+        What is left out for that is told first, in the repr and the reports. Nothing that is being compiled is
+        broken off, and a part is always left to the runs. When not given, `work` alone decides on the settings,
+        and five times the usual 60 to 120 s end the study of a model that takes too long to derive.
     work : int, optional
         Evaluations of the forward dynamics that a run of the study's own steps and tolerances may take; one
         that is called from Python counts eight. So the curves do not depend on the machine's speed. By default
@@ -158,6 +158,7 @@ def work_precision(
     >>> round(curve.order), len(curve.points)
     (4, 3)
     """
+    begun = time.perf_counter()
     _check_model(model)
     usual = min(_USUAL + _EACH * model.nv, _MOST)
     limit = _AT_THE_LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
@@ -218,7 +219,7 @@ def work_precision(
             complete=complete,
             versions=stamp.versions(),
             processor=stamp.processor(),
-            seconds=time.perf_counter() - allowance.begun,
+            seconds=time.perf_counter() - begun,
             settings=settings,
         )
 
