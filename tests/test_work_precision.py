@@ -377,6 +377,7 @@ def test_a_tolerance_that_no_run_takes_is_said():
             r"methods\['pinocchio'\]: taylor is not on pinocchio; it is on lagrangian",
         ),
         ({"steps": []}, InputError, "steps: expected at least one"),
+        ({"q0": [0.0], "v0": [0.0], "reference": None}, InputError, "q0, v0: .*something moves"),
         ({"steps": [0.1, -0.1]}, InputError, r"steps\[1\]: expected a number above 0"),
         ({"steps": 0.1}, InputError, "steps: expected several numbers"),
         ({"tolerances": [0.0]}, InputError, r"tolerances\[0\]"),

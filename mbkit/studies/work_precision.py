@@ -181,6 +181,11 @@ def work_precision(
         lambda done: keeper.tell(0.1 * done, "reference"),
         _FOR_REFERENCE * allowance.usual,
     )
+    if scene.motion == 0.0:
+        raise InputError(
+            "q0, v0: expected a start from which something moves, got one at rest in equilibrium, where every method "
+            "is exact; choose another start"
+        )
     wanted = plans(wanted_pairs, float(scene.times[1]), *grids)
     sweeping: Sweeping
     if executor is None:
