@@ -15,6 +15,7 @@ in the world.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -25,6 +26,7 @@ from mbkit._check import Array
 from mbkit.errors import ModelError
 from mbkit.load.attributes import Reader
 from mbkit.load.floating import floated
+from mbkit.load.mjcf_compiled import infer_inertias, infer_springs
 from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
 from mbkit.load.snap import Snapper
@@ -54,8 +56,9 @@ def model_of_mjcf(
     floating_base: bool,
     nonphysical: Literal["error", "warn"],
     gravity: ArrayLike | None,
+    meshes: Literal["auto", "never"] = "never",
 ) -> Model:
-    """Describe the bodies and joints of a <mujoco> element."""
+    """Describe the bodies and joints of a <mujoco> element; for the arguments see `mbkit.load.load`."""
     read = Reader()
     _refuse(mujoco, read)
     if floating_base:
@@ -68,16 +71,23 @@ def model_of_mjcf(
             if element.tag == "body":
                 walk(element, "world", X, childclass, scene)
     own_gravity = _gravity(mujoco, read)
+    for body, geoms in scene.inferred.items() if meshes == "never" else ():
+        read.fault(
+            f"body {body!r}: its inertia would come from a mesh or a shell, and none is opened; "
+            'add <inertial>, or load with meshes="auto"',
+            geoms[0][0],
+        )
+    inferred = infer_inertias(mujoco, path, scene)
     if not scene.bodies:
         read.fault("no bodies; expected <worldbody> with <body> elements")
     elif not any(b.joints for b in scene.bodies):
         read.fault("no joints, so nothing moves (nq = 0); add a joint, or load with floating_base=True")
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=own_gravity if gravity is None else gravity)
     scale, snap = _total_scale(scene), Snapper()
-    _describe(b, scene, scale, snap)
+    _describe(b, scene, scale, snap, infer_springs(mujoco, path, scene))
     if read.faults:
         raise ModelError(str(path), read.faults)
-    for note in (*_notes(mujoco, scene, scale), snap.note):
+    for note in (*_notes(mujoco, scene, scale), inferred, snap.note):
         if note:
             b.note(note)
     try:
@@ -116,7 +126,9 @@ def _total_scale(scene: Scene) -> float:
 # Describing it.
 
 
-def _describe(b: ModelBuilder, scene: Scene, scale: float, snap: Snapper) -> None:
+def _describe(
+    b: ModelBuilder, scene: Scene, scale: float, snap: Snapper, springs: Mapping[str, tuple[float, float]]
+) -> None:
     anchors: dict[str, Array] = {"world": np.zeros(3)}
     for body in scene.bodies:
         anchors[body.name] = body.anchor
@@ -134,7 +146,7 @@ def _describe(b: ModelBuilder, scene: Scene, scale: float, snap: Snapper) -> Non
                 R, p = np.eye(3), np.zeros(3)
             else:
                 p = p + R @ (joint.anchor - before)
-            _add_joint(b, joint, parent, child, R, p, scene, snap)
+            _add_joint(b, joint, parent, child, R, p, scene, snap, springs)
             if not last:
                 b.add_body(child)
             R, p, parent, before = np.eye(3), np.zeros(3), child, joint.anchor
@@ -148,7 +160,15 @@ def _describe(b: ModelBuilder, scene: Scene, scale: float, snap: Snapper) -> Non
 
 
 def _add_joint(
-    b: ModelBuilder, joint: MjcfJoint, parent: str, child: str, R: Array, p: Array, scene: Scene, snap: Snapper
+    b: ModelBuilder,
+    joint: MjcfJoint,
+    parent: str,
+    child: str,
+    R: Array,
+    p: Array,
+    scene: Scene,
+    snap: Snapper,
+    springs: Mapping[str, tuple[float, float]],
 ) -> None:
     who, element, read = f"joint {joint.name!r}", joint.element, scene.read
     angle = scene.compiler.angle if joint.kind in ("hinge", "ball") else 1.0
@@ -167,14 +187,14 @@ def _add_joint(
         force = _range(element, "actuatorfrcrange", "actuatorfrclimited", who, scene)
         if force:
             given["effort_limit"] = max(abs(x) for x in force)
-    elif _range(element, "range", "limited", who, scene):
+    elif joint.kind == "ball" and _range(element, "range", "limited", who, scene, ordered=False):
         scene.left_out["limit of a ball joint"] += 1
     for name in ("stiffness", "damping"):
         given[name], *higher = read.numbers(element, name, who, count=3, least=1, default=(0.0,))
         if any(higher):
             read.fault(f"{who}: {name} that depends on the position or speed; only constants are read", element)
-    if any(read.numbers(element, "springdamper", who, count=2, default=(0.0, 0.0))):
-        read.fault(f"{who}: springdamper is not read; write stiffness and damping", element)
+    if joint.name in springs:
+        given["stiffness"], given["damping"] = springs[joint.name]
     if not given["stiffness"]:
         given.pop("rest", None)
     b.add_joint(
@@ -190,15 +210,17 @@ def _add_joint(
     )
 
 
-def _range(element: Element, range_: str, limited: str, who: str, scene: Scene) -> tuple[float, float] | None:
+def _range(
+    element: Element, range_: str, limited: str, who: str, scene: Scene, *, ordered: bool = True
+) -> tuple[float, float] | None:
     """Return a range that applies, or None."""
     low, high = scene.read.numbers(element, range_, who, count=2, default=(0.0, 0.0), bounded=False)
     said = element.attributes.get(limited, "auto")
-    if said == "auto" and range_ in element.attributes and not scene.compiler.autolimits:
+    if said == "auto" and (low or high) and not scene.compiler.autolimits:
         scene.read.fault(f"{who}: {range_} without {limited}, and autolimits is off; write {limited}", element)
     if said == "false" or (said == "auto" and not low < high):
         return None
-    if not low < high:
+    if ordered and not low < high:
         scene.read.fault(f"{who}: {range_} {low:g} {high:g}; expected the lower limit first", element)
     return low, high
 
@@ -227,6 +249,10 @@ def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
     if scene.unnamed:
         told = " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items()))
         out.append(f"names were made up for what has none ({told})")
+    for setting, bodies in scene.bounded.items():
+        what = "mass" if setting == "boundmass" else "inertia"
+        some = ", ".join(bodies[:6]) + (f" and {len(bodies) - 6} more" if len(bodies) > 6 else "")
+        out.append(f"compiler {setting} changed the {what} of {some}")
     if scale != 1:
         out.append(f"compiler settotalmass: all masses and inertias times {scale:.9g}")
     for body in scene.bodies:

@@ -47,6 +47,7 @@ class Compiler:
         None: only where there is no <inertial>.
     groups : (float, float)
         First and last geom group that has mass.
+    balanceinertia : bool
     boundmass, boundinertia, settotalmass : float
     """
 
@@ -55,6 +56,7 @@ class Compiler:
     autolimits: bool = True
     inertiafromgeom: bool | None = None
     groups: tuple[float, float] = (0.0, 5.0)
+    balanceinertia: bool = False
     boundmass: float = 0.0
     boundinertia: float = 0.0
     settotalmass: float = -1.0
@@ -85,6 +87,7 @@ class Compiler:
                 _choice(merged, "inertiafromgeom", ("auto", "true", "false"), read)
             ],
             groups=(low, high),
+            balanceinertia=_choice(merged, "balanceinertia", ("false", "true"), read) == "true",
             boundmass=read.number(merged, "boundmass", who, 0.0),
             boundinertia=read.number(merged, "boundinertia", who, 0.0),
             settotalmass=read.number(merged, "settotalmass", who, -1.0),
