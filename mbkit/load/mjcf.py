@@ -28,6 +28,7 @@ from mbkit.load.attributes import Reader
 from mbkit.load.floating import floated
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs
 from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
+from mbkit.load.mjcf_schema import check_names
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
 from mbkit.load.snap import Snapper
 from mbkit.load.xml import Element
@@ -46,7 +47,7 @@ _READ: Final = ("compiler", "default", "option", "worldbody", "size", "visual", 
 
 
 # Option flags that change the smooth equations; the others steer an engine.
-_HONOURED: Final = frozenset({"gravity", "spring", "damper", "passive"})
+_HONOURED: Final = frozenset({"gravity", "spring", "damper"})
 
 
 def model_of_mjcf(
@@ -61,6 +62,7 @@ def model_of_mjcf(
     """Describe the bodies and joints of a <mujoco> element; for the arguments see `mbkit.load.load`."""
     read = Reader()
     _refuse(mujoco, read)
+    misspelt = check_names(mujoco, read)
     if floating_base:
         mujoco = floated(mujoco, read)
     scene = Scene(Compiler.of(mujoco, read), Defaults(mujoco, read), read)
@@ -87,7 +89,7 @@ def model_of_mjcf(
     _describe(b, scene, scale, snap, infer_springs(mujoco, path, scene))
     if read.faults:
         raise ModelError(str(path), read.faults)
-    for note in (*_notes(mujoco, scene, scale), inferred, snap.note):
+    for note in (*_notes(mujoco, scene, scale), inferred, misspelt, snap.note):
         if note:
             b.note(note)
     try:
@@ -95,8 +97,8 @@ def model_of_mjcf(
     except ModelError as error:
         raise ModelError(str(path), error.faults) from None
     off = _disabled(mujoco)
-    features = {"spring": ("springs",), "damper": ("damping",), "passive": ("springs", "damping")}
-    return model.without(*(f for flag, names in features.items() if flag in off for f in names))
+    features = {"spring": "springs", "damper": "damping"}
+    return model.without(*(feature for flag, feature in features.items() if flag in off))
 
 
 def _refuse(mujoco: Element, read: Reader) -> None:

@@ -177,7 +177,7 @@ class _Text:
             full = self.scene.defaults.filled(element, childclass).attributes
             if "mesh" in full or full.get("type") in ("mesh", "sdf", "hfield"):
                 return ""
-        childclass = given.get("childclass", childclass)
+        childclass = given.get("childclass", given.get("class", childclass) if tag == "frame" else childclass)
         given |= self.needed.get(id(element), {})
         if id(element) in self.scene.called:
             given["name"] = self.scene.called[id(element)]

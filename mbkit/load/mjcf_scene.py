@@ -134,7 +134,9 @@ def unfolded(
         if child.tag != "frame":
             yield child, X, childclass
             continue
-        inner = scene.defaults.known(child.attributes.get("childclass"), child) or childclass
+        # MuJoCo takes a frame's class for its childclass.
+        own = child.attributes.get("childclass", child.attributes.get("class"))
+        inner = scene.defaults.known(own, child) or childclass
         yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, who), inner, scene, who)
 
 
