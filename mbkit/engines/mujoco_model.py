@@ -21,6 +21,7 @@ from mbkit._check import Array
 from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
+from mbkit.model.physical import static_bodies
 
 __all__ = ["MujocoModel", "Placed", "build", "mapped", "specified"]
 
@@ -107,12 +108,15 @@ class Placed:
     joints : dict
         Joint name -> names of MuJoCo's joints.
     absorbed : set of str
+    static : set of str
+        Bodies that are fixed to the world.
     """
 
     bodies: dict[str, Any]
     degenerate: dict[str, Array]
     joints: dict[str, list[str]]
     absorbed: set[str]
+    static: set[str]
 
 
 def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
@@ -176,7 +180,7 @@ def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
 
 
 def _add_tree(spec: Any, description: Model) -> Placed:
-    placed = Placed({"world": spec.worldbody}, {}, {}, set())
+    placed = Placed({"world": spec.worldbody}, {}, {}, set(), static_bodies(description.joints))
     children: dict[str, list[Joint]] = {}
     for joint in description.joints:
         children.setdefault(joint.parent, []).append(joint)
@@ -231,10 +235,12 @@ def _give_inertia(made: Any, body: Body, description: Model, placed: Placed) -> 
     made.inertia = moments
     listed = {name for name, _ in description.nonphysical}
     low, middle, high = np.sort(moments)
-    if body.mass > 0 and body.name not in listed and (low < _SMALLEST or low + middle < high):
-        # A point mass, a thin rod or a plate is a fair idealization, which the
-        # compiler refuses though the dynamics needs no such rule: it is compiled
-        # with a placeholder and gets its own moments afterwards.
+    harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
+    if harmless and (low < _SMALLEST or low + middle < high):
+        # A point mass, a thin rod or a plate is a fair idealization, and what is fixed
+        # to the world may have any inertia. The compiler refuses them though the dynamics
+        # needs no such rule: they are compiled with a placeholder and get their own
+        # moments afterwards.
         placed.degenerate[body.name] = moments
         made.inertia = np.ones(3)
 

@@ -72,7 +72,8 @@ def model_of_mjcf(
         for element, X, childclass in unfolded(world, HERE, None, scene, "the world"):
             if element.tag == "body":
                 walk(element, "world", X, childclass, scene)
-    own_gravity = _gravity(mujoco, read)
+    flags = _flags(mujoco, read)
+    own_gravity = _gravity(mujoco, flags, read)
     for body, geoms in scene.inferred.items() if meshes == "never" else ():
         read.fault(
             f"body {body!r}: its inertia would come from a mesh or a shell, and none is opened; "
@@ -89,16 +90,15 @@ def model_of_mjcf(
     _describe(b, scene, scale, snap, infer_springs(mujoco, path, scene))
     if read.faults:
         raise ModelError(str(path), read.faults)
-    for note in (*_notes(mujoco, scene, scale), inferred, misspelt, snap.note):
+    for note in (*_notes(mujoco, path, scene, flags, scale), inferred, misspelt, snap.note):
         if note:
             b.note(note)
     try:
         model = b.build(nonphysical=nonphysical, point_masses=False)
     except ModelError as error:
         raise ModelError(str(path), error.faults) from None
-    off = _disabled(mujoco)
     features = {"spring": "springs", "damper": "damping"}
-    return model.without(*(feature for flag, feature in features.items() if flag in off))
+    return model.without(*(feature for flag, feature in features.items() if flags.get(flag) == "disable"))
 
 
 def _refuse(mujoco: Element, read: Reader) -> None:
@@ -107,17 +107,22 @@ def _refuse(mujoco: Element, read: Reader) -> None:
             read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
 
 
-def _disabled(mujoco: Element) -> set[str]:
-    """Return the names of the flags that switch a part of the smooth motion off."""
-    flags = [flag.attributes for option in mujoco.all("option") for flag in option.all("flag")]
-    return {name for attributes in flags for name, value in attributes.items() if value == "disable"} & _HONOURED
+def _flags(mujoco: Element, read: Reader) -> dict[str, str]:
+    """Return the option flags; later ones win."""
+    out: dict[str, str] = {}
+    for flag in (f for option in mujoco.all("option") for f in option.all("flag")):
+        for name, value in flag.attributes.items():
+            if value not in ("enable", "disable"):
+                read.fault(f"option flag {name}: expected 'enable' or 'disable', got {value[:40]!r}", flag)
+        out.update(flag.attributes)
+    return out
 
 
-def _gravity(mujoco: Element, read: Reader) -> tuple[float, ...]:
+def _gravity(mujoco: Element, flags: Mapping[str, str], read: Reader) -> tuple[float, ...]:
     out: tuple[float, ...] = (0.0, 0.0, -9.81)
     for option in mujoco.all("option"):
         out = read.numbers(option, "gravity", "the file", count=3, default=out)
-    return (0.0, 0.0, 0.0) if "gravity" in _disabled(mujoco) else out
+    return (0.0, 0.0, 0.0) if flags.get("gravity") == "disable" else out
 
 
 def _total_scale(scene: Scene) -> float:
@@ -197,6 +202,16 @@ def _add_joint(
             read.fault(f"{who}: {name} that depends on the position or speed; only constants are read", element)
     if joint.name in springs:
         given["stiffness"], given["damping"] = springs[joint.name]
+    armature = read.number(element, "armature", who, 0.0)
+    if joint.kind in ("ball", "free"):
+        # They may come from a default class that was meant for hinges.
+        for name, value in (("stiffness", given["stiffness"]), ("armature", armature)):
+            if value:
+                why = "a joint of one coordinate" if name == "stiffness" else "a joint of one velocity"
+                read.fault(f"{who}: {name} {value:g} on a {joint.kind} joint; expected {why}; set it to 0", element)
+        given["stiffness"] = armature = 0.0
+    if read.number(element, "springyield", who, 0.0) and given["stiffness"]:
+        scene.left_out["yield of a spring"] += 1
     if not given["stiffness"]:
         given.pop("rest", None)
     b.add_joint(
@@ -206,7 +221,7 @@ def _add_joint(
         child=child,
         translation=p,
         rotation=snap(R),
-        armature=read.number(element, "armature", who, 0.0),
+        armature=armature,
         friction=read.number(element, "frictionloss", who, 0.0),
         **given,
     )
@@ -217,7 +232,7 @@ def _range(
 ) -> tuple[float, float] | None:
     """Return a range that applies, or None."""
     low, high = scene.read.numbers(element, range_, who, count=2, default=(0.0, 0.0), bounded=False)
-    said = element.attributes.get(limited, "auto")
+    said = scene.read.choice(element, limited, ("auto", "true", "false"))
     if said == "auto" and (low or high) and not scene.compiler.autolimits:
         scene.read.fault(f"{who}: {range_} without {limited}, and autolimits is off; write {limited}", element)
     if said == "false" or (said == "auto" and not low < high):
@@ -227,12 +242,15 @@ def _range(
     return low, high
 
 
-def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
+def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], scale: float) -> list[str]:
     """Say what was decided and what was left out."""
     out = []
     files = list(dict.fromkeys(e.file for e in mujoco.walk() if e.file))
     if files:
         out.append(f"included: {', '.join(files)}")
+        outside = [f for f in files if not (path.parent / f).resolve().is_relative_to(path.parent.resolve())]
+        if outside:
+            out.append(f"included from outside the folder of {path.name}: {', '.join(outside)}")
     sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in _READ)
     if sections:
         told = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
@@ -240,14 +258,10 @@ def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
     if scene.left_out:
         told = ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()))
         out.append(f"not represented here, and left out: {told}")
-    for option in mujoco.all("option"):
-        fluid = [a for a in ("density", "viscosity", "wind") if a in option.attributes]
-        if fluid:
-            out.append(f"the forces of a fluid (option {', '.join(fluid)}) were left out")
-        for flag in option.all("flag"):
-            told = ", ".join(f"{k}={v}" for k, v in sorted(flag.attributes.items()) if k not in _HONOURED)
-            if told:
-                out.append(f"option flags are an engine's, and were left out: {told}")
+    out += _fluid_note(mujoco, scene)
+    told = ", ".join(f"{k}={v}" for k, v in sorted(flags.items()) if k not in _HONOURED)
+    if told:
+        out.append(f"option flags are an engine's, and were left out: {told}")
     if scene.unnamed:
         told = " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items()))
         out.append(f"names were made up for what has none ({told})")
@@ -264,3 +278,15 @@ def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
         if len(body.joints) > 1:
             out.append(f"body {body.name!r} has {len(body.joints)} joints: massless bodies stand between them")
     return out
+
+
+def _fluid_note(mujoco: Element, scene: Scene) -> list[str]:
+    """Say that the forces of a fluid act in MuJoCo, where its medium has density or viscosity."""
+    option: dict[str, str] = {}
+    for element in mujoco.all("option"):
+        option |= {k: v for k, v in element.attributes.items() if k in ("density", "viscosity", "wind")}
+    medium = Element("option", option, 0)
+    if not any(scene.read.number(medium, name, "the file", 0.0) for name in ("density", "viscosity")):
+        return []
+    told = ", ".join(f"{k} {v}" for k, v in sorted(option.items()))
+    return [f"the forces of a fluid were left out (option {told}), with fluidshape and fluidcoef of geoms"]

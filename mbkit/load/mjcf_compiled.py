@@ -47,8 +47,10 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
     for body in scene.bodies:
         if body.name in scene.inferred:
             body.lump = _lump(made.body(body.name))
-    files = f"; mesh files read: {', '.join(text.opened)}" if text.opened else ""
-    return f"{who} was inferred from meshes or shells by MuJoCo's compiler{files}"
+    bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
+    within = f", within {' and '.join(bounds)}" if bounds else ""
+    files = f"; mesh files read: {_listed(text.opened)}" if text.opened else ""
+    return f"{who} was inferred from meshes or shells by MuJoCo's compiler{within}{files}"
 
 
 def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[float, float]]:

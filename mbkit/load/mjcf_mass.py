@@ -65,11 +65,11 @@ def _bounded(lump: Lump, compiler: Compiler, slack: float = 0.0) -> tuple[Lump, 
     `slack` is the relative rounding of the principal moments.
     """
     mass, inertia, changed = lump.mass, lump.inertia, list[str]()
-    if mass < compiler.boundmass:
+    if mass < compiler.boundmass > 0:
         mass = compiler.boundmass
         changed.append("boundmass")
     moments, axes = np.linalg.eigh(inertia)
-    if moments[0] < compiler.boundinertia:
+    if moments[0] < compiler.boundinertia > 0:
         moments = np.maximum(moments, compiler.boundinertia)
         inertia = axes @ np.diag(moments) @ axes.T
         changed.append("boundinertia")

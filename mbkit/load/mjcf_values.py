@@ -80,27 +80,18 @@ class Compiler:
             seq = "xyz"
         low, high = read.numbers(merged, "inertiagrouprange", who, count=2, default=(0.0, 5.0))
         return cls(
-            angle={"degree": np.pi / 180, "radian": 1.0}[_choice(merged, "angle", ("degree", "radian"), read)],
+            angle={"degree": np.pi / 180, "radian": 1.0}[read.choice(merged, "angle", ("degree", "radian"))],
             eulerseq=seq,
-            autolimits=_choice(merged, "autolimits", ("true", "false"), read) == "true",
+            autolimits=read.choice(merged, "autolimits", ("true", "false")) == "true",
             inertiafromgeom={"auto": None, "true": True, "false": False}[
-                _choice(merged, "inertiafromgeom", ("auto", "true", "false"), read)
+                read.choice(merged, "inertiafromgeom", ("auto", "true", "false"))
             ],
             groups=(low, high),
-            balanceinertia=_choice(merged, "balanceinertia", ("false", "true"), read) == "true",
+            balanceinertia=read.choice(merged, "balanceinertia", ("false", "true")) == "true",
             boundmass=read.number(merged, "boundmass", who, 0.0),
             boundinertia=read.number(merged, "boundinertia", who, 0.0),
             settotalmass=read.number(merged, "settotalmass", who, -1.0),
         )
-
-
-def _choice(element: Element, attribute: str, choices: tuple[str, ...], read: Reader) -> str:
-    """Return one of the choices, the first where the attribute is absent."""
-    value = element.attributes.get(attribute, choices[0])
-    if value in choices:
-        return value
-    read.fault(f"{element.tag} {attribute}: expected one of {', '.join(choices)}, got {value[:40]!r}", element)
-    return choices[0]
 
 
 class Defaults:
