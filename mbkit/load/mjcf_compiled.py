@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
@@ -116,7 +117,9 @@ class _Text:
         # Its warnings would be printed, and kept in a file of the working folder.
         mujoco.set_mju_user_warning(lambda _: None)
         try:
-            return mujoco.MjModel.from_xml_string(text, assets=self.assets)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                return mujoco.MjModel.from_xml_string(text, assets=self.assets)
         except ValueError as error:
             # The line is one of the shortened text.
             told = re.sub(r",? line -?\d+", "", " ".join(str(error).split()))
