@@ -923,10 +923,9 @@ RICH = (
 
 
 def test_a_misspelt_name_is_never_lost(tmp_path):
-    """Whatever MuJoCo refuses for an unknown element or attribute, mbkit refuses, with the right name."""
+    """Every element and attribute in turn has a name that MuJoCo's schema does not know."""
     load(write(tmp_path, RICH, "r.xml"))
     places = [(i, key) for i, e in enumerate(ET.fromstring(RICH).iter()) for key in (None, *e.attrib)]
-    refused = 0
     for i, key in places[1:]:
         tree = ET.fromstring(RICH)
         element = list(tree.iter())[i]
@@ -937,18 +936,14 @@ def test_a_misspelt_name_is_never_lost(tmp_path):
         else:
             element.attrib = {wrong if k == key else k: v for k, v in element.attrib.items()}
         text = ET.tostring(tree, encoding="unicode")
-        try:
-            mujoco.MjSpec.from_string(text)
-        except ValueError:
-            refused += 1
-            with pytest.raises(ModelError, match=re.escape(repr(wrong))):
-                load(write(tmp_path, text, "r.xml"))
-    assert refused > 50
+        with pytest.raises(ModelError, match=re.escape(repr(wrong))):
+            load(write(tmp_path, text, "r.xml"))
+        # MuJoCo refuses it too, but for what stands in a <frame>, where it does not look.
+        if "frame" not in text or element.tag not in ("frame", "body", "inertial", "joint", "geom", "site"):
+            with pytest.raises(ValueError, match="XML Error"):
+                mujoco.MjSpec.from_string(text)
     with pytest.raises(ModelError, match="did you mean 'damping'"):
         load(write(tmp_path, RICH.replace("stiffness", "dampnig"), "r.xml"))
-    # MuJoCo itself does not look at the attributes of a frame.
-    with pytest.raises(ModelError, match="'POS'"):
-        load(write(tmp_path, RICH.replace("<frame pos", "<frame POS"), "r.xml"))
 
 
 def test_an_unknown_name_beside_the_motion_is_a_note(tmp_path):
