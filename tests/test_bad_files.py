@@ -323,6 +323,10 @@ MJCFS = {
         ["body 'b'", "'m'", "no such <mesh>"],
     ),
     "unknown_class": (mjcf('<body childclass="k"><joint/></body>'), ["unknown default class 'k'; there are: main"]),
+    "renamed_main": (
+        mjcf(BODY, '<default class="k"><joint damping="1"/></default>'),
+        ["<default>", "'main'", "line 1"],
+    ),
     "same_names": (mjcf(BODY + BODY.replace('"b"', '"c"')), ["joint 'j': declared more than once"]),
     "called_world": (mjcf(BODY.replace('"b"', '"world"')), ["body 'world': that name is the ground's"]),
     "unknown_type": (mjcf(BODY.replace('name="j"', 'name="j" type="screw"')), ["joint 'j': type 'screw'"]),

@@ -182,6 +182,9 @@ class _Text:
             full = self.scene.defaults.filled(element, childclass).attributes
             if "mesh" in full or full.get("type") in ("mesh", "sdf", "hfield"):
                 return ""
+        if id(element) in self.counted:
+            # What does not collide needs no convex hull.
+            given |= {"contype": "0", "conaffinity": "0"}
         childclass = given.get("childclass", given.get("class", childclass) if tag == "frame" else childclass)
         given |= self.needed.get(id(element), {})
         if id(element) in self.scene.called:

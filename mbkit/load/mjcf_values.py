@@ -101,6 +101,8 @@ class Defaults:
         self.read = read
         self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for element in mujoco.all("default"):
+            if element.attributes.get("class", "main") != "main":
+                read.fault("the outermost <default> has another class than 'main'; put a <default> around it", element)
             self._collect(element, self.classes["main"], "main")
 
     def _collect(self, element: Element, values: dict[str, dict[str, str]], name: str) -> None:
