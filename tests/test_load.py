@@ -23,6 +23,7 @@ import mbkit as mb
 from mbkit import spatial
 from mbkit.errors import InputError, LoadError, ModelError, NonPhysicalWarning, UnknownNameError
 from mbkit.load import load, robots
+from mbkit.load.mjcf_schema import rules as mjcf_rules
 from mbkit.load.names import find
 from mbkit.load.snap import Snapper
 from mbkit.load.solids import solid
@@ -944,6 +945,80 @@ def test_a_misspelt_name_is_never_lost(tmp_path):
                 mujoco.MjSpec.from_string(text)
     with pytest.raises(ModelError, match="did you mean 'damping'"):
         load(write(tmp_path, RICH.replace("stiffness", "dampnig"), "r.xml"))
+
+
+def all_attributes(given):
+    """An MJCF with one of each element that acts, and the attributes that are given."""
+
+    def put(tag, **attributes):
+        return f"<{tag} " + " ".join(f'{k}="{v}"' for k, v in (attributes | given.get(tag, {})).items())
+
+    inner = (
+        f'<body name="b" pos="1 0 0"><joint name="h" axis="0 1 0" stiffness="2" springref="30"/>'
+        f"{put('inertial', pos='1 0 0', mass='2', diaginertia='1 1.2 1.5')}/>"
+        '<geom size=".1" type="capsule" fromto="0 0 0 1 0 0"/><geom size=".1 .1 .2" type="box" euler="10 20 30"/>'
+        f'<geom type="mesh" mesh="m"/>{put("site", name="s", size=".1")}/></body>'
+    )
+    return (
+        f"<mujoco>{put('compiler')}/>{put('option')}>{put('flag')}/></option><default>"
+        '<default class="k"><joint damping="5"/><geom density="7"/></default></default><asset>'
+        f"{put('mesh', name='m', vertex='0 0 0 1 0 0 0 1 0 0 0 1')}/></asset><worldbody>{put('frame')}>"
+        f"{put('body', name='a')}>{put('joint', name='j', axis='1 1 0')}/>"
+        f"{put('geom', name='g', size='.1 .2 .3', type='box', pos='.1 .2 .3')}/>{inner}</body></frame></worldbody></mujoco>"
+    )
+
+
+def motion(compiled):
+    """M, nle, passive forces and the site's place, at a state off the drawn one; only hinges and slides."""
+    data = mujoco.MjData(compiled)
+    rng = np.random.default_rng(0)
+    data.qpos[:] = compiled.qpos0 + 0.3 * rng.random(compiled.nq)
+    data.qvel[:] = rng.random(compiled.nv)
+    mujoco.mj_forward(compiled, data)
+    M = np.zeros((compiled.nv, compiled.nv))
+    mujoco.mj_fullM(compiled, data, M)
+    return data, np.concatenate([M.ravel(), data.qfrc_bias, data.qfrc_passive, data.site_xpos[0]])
+
+
+VALUES = "2|true|.1 1|.1 .2 .3|.5 .5 .5 .5|1 2 3 4 5 6|disable|radian|zyx|slide|m|k|1 5|false"
+
+
+def test_no_attribute_changes_the_motion_in_silence(tmp_path):
+    """What MuJoCo's motion feels is as in MuJoCo, refused, or noted, for every attribute of its schema."""
+    plain = load(write(tmp_path, all_attributes({}), "r.xml"))
+    _, before = motion(mujoco.MjModel.from_xml_string(all_attributes({})))
+    body = mjcf_rules().children["worldbody"].children["body"]
+    option = mjcf_rules().children["option"]
+    rules = {tag: body.children[tag] for tag in ("joint", "geom", "inertial", "site", "frame")}
+    rules |= {"body": body, "option": option, "flag": option.children["flag"]}
+    rules |= {"compiler": mjcf_rules().children["compiler"], "mesh": mjcf_rules().children["asset"].children["mesh"]}
+    frame = {"scale", "massscale", "scaling"}
+    felt = set()
+    for tag, rule in rules.items():
+        for name, value in itertools.product(
+            sorted(rule.attributes | (frame if tag == "frame" else set())), VALUES.split("|")
+        ):
+            if (tag, name) in felt:
+                continue
+            text = all_attributes({tag: {name: value}})
+            try:
+                data, after = motion(mujoco.MjModel.from_xml_string(text))
+            except ValueError:
+                continue
+            if after.shape == before.shape and np.abs(after - before).max() < 1e-10:
+                continue
+            felt.add((tag, name))
+            try:
+                model = load(write(tmp_path, text, "r.xml"))
+            except ModelError:
+                continue
+            dyn = mb.dynamics(model, "pinocchio")
+            q, v = data.qpos, data.qvel
+            p = dyn.pose(q, model.frames[-1].name)[:3, 3]
+            ours = np.concatenate([dyn.mass_matrix(q).ravel(), dyn.nle(q, v), dyn.passive(q, v), p])
+            agrees = np.abs(ours - after).max() < 1e-9 * max(1, np.abs(after).max())
+            assert agrees or set(model.notes) - set(plain.notes), (tag, name, value)
+    assert len(felt) > 40
 
 
 def test_an_unknown_name_beside_the_motion_is_a_note(tmp_path):

@@ -16,7 +16,7 @@ from mbkit.load.attributes import Reader
 from mbkit.load.mjcf_values import ORIENTATIONS
 from mbkit.load.xml import Element
 
-__all__ = ["check_names"]
+__all__ = ["check_names", "rules"]
 
 # Where nothing acts on the smooth motion, an unknown name is a note.
 _ASIDE: Final = frozenset(
@@ -31,25 +31,25 @@ _MOST_NOTED: Final = 6
 
 
 @dataclass(frozen=True)
-class _Rule:
+class Rule:
     """What an element may hold; `once` says that its parent has one at most."""
 
     attributes: frozenset[str] = frozenset()
-    children: dict[str, _Rule] = field(default_factory=dict)
+    children: dict[str, Rule] = field(default_factory=dict)
     once: bool = False
 
 
 def check_names(mujoco: Element, read: Reader) -> str:
     """Keep a fault for each unknown name that could act on the motion, and return a note about the others."""
     aside: list[str] = []
-    _check(mujoco, _schema(), read, aside)
+    _check(mujoco, rules(), read, aside)
     if not aside:
         return ""
     more = f" and {len(aside) - _MOST_NOTED} more" if len(aside) > _MOST_NOTED else ""
     return f"unknown to MuJoCo's schema, and ignored: {', '.join(aside[:_MOST_NOTED])}{more}"
 
 
-def _check(element: Element, rule: _Rule, read: Reader, aside: list[str], acts: bool = True) -> None:
+def _check(element: Element, rule: Rule, read: Reader, aside: list[str], acts: bool = True) -> None:
     """Check an element and all inside; without effect on the motion (not `acts`), names go into `aside`."""
 
     def unknown(what: str, name: str, known: frozenset[str], where: Element) -> None:
@@ -87,14 +87,14 @@ def _hint(name: str, known: frozenset[str]) -> str:
 
 
 @lru_cache(maxsize=1)
-def _schema() -> _Rule:
-    """Return the rule for <mujoco>."""
+def rules() -> Rule:
+    """Return the rule for <mujoco>, from MuJoCo's schema."""
     # The first MJCF that is loaded pays for the import.
     import mujoco
 
     # Lines are "name (how often)   attribute attribute", indented by level; longer ones go on below.
-    root = _Rule()
-    open_rules: list[tuple[int, _Rule]] = [(-1, root)]
+    root = Rule()
+    open_rules: list[tuple[int, Rule]] = [(-1, root)]
     found: list[tuple[int, str, str, list[str]]] = []
     for line in mujoco.mj_printSchema(False, False).splitlines():
         begun = re.fullmatch(r"( *)(\S+) \((.)\)(.*)", line)
@@ -104,7 +104,7 @@ def _schema() -> _Rule:
         elif found:
             found[-1][3].extend(line.split())
     for level, tag, often, names in found:
-        rule = _Rule(frozenset(names), once=often in "!?")
+        rule = Rule(frozenset(names), once=often in "!?")
         while open_rules[-1][0] >= level:
             open_rules.pop()
         open_rules[-1][1].children[tag] = rule
@@ -116,6 +116,6 @@ def _schema() -> _Rule:
     frame_attributes = frozenset({"name", "class", "childclass", "pos", *ORIENTATIONS})
     world = {tag: rule for tag, rule in body.children.items() if tag not in ("inertial", "joint", "freejoint")}
     for children in (body.children, world):
-        children["frame"] = _Rule(frame_attributes, children)
-    whole.children["worldbody"] = _Rule(frozenset(), world)
+        children["frame"] = Rule(frame_attributes, children)
+    whole.children["worldbody"] = Rule(frozenset(), world)
     return whole
