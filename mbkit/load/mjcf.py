@@ -26,7 +26,7 @@ from mbkit._check import Array
 from mbkit.errors import ModelError
 from mbkit.load.attributes import Reader
 from mbkit.load.floating import floated
-from mbkit.load.mjcf_compiled import infer_inertias, infer_springs
+from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, listed
 from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
 from mbkit.load.mjcf_schema import check_names
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
@@ -87,10 +87,12 @@ def model_of_mjcf(
         read.fault("no joints, so nothing moves (nq = 0); add a joint, or load with floating_base=True")
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=own_gravity if gravity is None else gravity)
     scale, snap = _total_scale(scene), Snapper()
-    _describe(b, scene, scale, snap, infer_springs(mujoco, path, scene))
+    springs = infer_springs(mujoco, path, scene)
+    _describe(b, scene, scale, snap, springs)
     if read.faults:
         raise ModelError(str(path), read.faults)
-    for note in (*_notes(mujoco, path, scene, flags, scale), inferred, misspelt, snap.note):
+    sprung = f"springdamper made stiffness and damping, by MuJoCo's compiler: {listed(springs)}" if springs else ""
+    for note in (*_notes(mujoco, path, scene, flags, scale), inferred, sprung, misspelt, snap.note):
         if note:
             b.note(note)
     try:
@@ -267,16 +269,16 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
         out.append(f"names were made up for what has none ({told})")
     for setting, bodies in scene.bounded.items():
         what = "mass" if setting == "boundmass" else "inertia"
-        some = ", ".join(bodies[:6]) + (f" and {len(bodies) - 6} more" if len(bodies) > 6 else "")
-        out.append(f"compiler {setting} changed the {what} of {some}")
+        out.append(f"compiler {setting} changed the {what} of {listed(bodies)}")
     if scale != 1:
         out.append(f"compiler settotalmass: all masses and inertias times {scale:.9g}")
-    for body in scene.bodies:
-        drawn = np.any(body.pose.p) or not np.array_equal(body.pose.R, np.eye(3))
-        if body.joints and body.joints[0].kind == "free" and drawn:
-            out.append(f"free body {body.name!r}: q is its pose in the world; where the file draws it was left out")
-        if len(body.joints) > 1:
-            out.append(f"body {body.name!r} has {len(body.joints)} joints: massless bodies stand between them")
+    drawn = [b for b in scene.bodies if np.any(b.pose.p) or not np.array_equal(b.pose.R, np.eye(3))]
+    free = [b.name for b in drawn if b.joints and b.joints[0].kind == "free"]
+    if free:
+        out.append(f"q of a free body is its pose in the world; where the file draws it was left out: {listed(free)}")
+    stacked = [b.name for b in scene.bodies if len(b.joints) > 1]
+    if stacked:
+        out.append(f"massless bodies stand between the joints of bodies with several: {listed(stacked)}")
     return out
 
 

@@ -21,7 +21,7 @@ from mbkit.load.mjcf_scene import Scene
 from mbkit.load.solids import Lump
 from mbkit.load.xml import MOST_BYTES, Element
 
-__all__ = ["infer_inertias", "infer_springs"]
+__all__ = ["infer_inertias", "infer_springs", "listed"]
 
 _BODIES: Final = ("default", "asset", "worldbody")
 _BODIES_AND_FORCES: Final = (*_BODIES, "tendon", "actuator")
@@ -40,7 +40,7 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
     """
     if not scene.inferred or scene.read.faults:
         return ""
-    who = f"the inertia of {_listed(scene.inferred)}"
+    who = f"the inertia of {listed(scene.inferred)}"
     text = _Text(mujoco, path, scene)
     made = text.compiled(_BODIES, who, scaled=False)
     if made is None:
@@ -50,7 +50,7 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
             body.lump = _lump(made.body(body.name))
     bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
     within = f", within {' and '.join(bounds)}" if bounds else ""
-    files = f"; mesh files read: {_listed(text.opened)}" if text.opened else ""
+    files = f"; mesh files read: {listed(text.opened)}" if text.opened else ""
     return f"{who} was inferred from meshes or shells by MuJoCo's compiler{within}{files}"
 
 
@@ -71,7 +71,7 @@ def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[
             )
     if not joints or scene.read.faults:
         return {}
-    made = _Text(mujoco, path, scene).compiled(_BODIES_AND_FORCES, f"springdamper of {_listed(joints)}", scaled=True)
+    made = _Text(mujoco, path, scene).compiled(_BODIES_AND_FORCES, f"springdamper of {listed(joints)}", scaled=True)
     if made is None:
         return {}
     views = {name: made.joint(name) for name in joints}
@@ -209,6 +209,7 @@ def _lump(body: Any) -> Lump:
     return Lump(float(body.mass[0]), np.array(body.ipos), axes @ np.diag(body.inertia) @ axes.T)
 
 
-def _listed(names: Iterable[str]) -> str:
+def listed(names: Iterable[str]) -> str:
+    """Return the first names, and how many more there are."""
     every = list(names)
     return ", ".join(map(repr, every[:6])) + (f" and {len(every) - 6} more" if len(every) > 6 else "")
