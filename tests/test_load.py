@@ -687,7 +687,8 @@ MJCF = {
     "from_geom": f'<compiler inertiafromgeom="true"/><worldbody><body name="a"><joint name="j"/>{INERTIA}<geom size=".1"/>'
     f'<body name="b" pos="1 0 0">{INERTIA}</body></body></worldbody>',
     "bounds": f'<compiler boundmass="2.5" boundinertia=".14"/><worldbody><body name="a"><joint name="j"/>{INERTIA}<body '
-    f'name="b" euler="10 20 30"><joint name="k"/>{INERTIA}<geom size=".3"/><body name="c"/></body></body></worldbody>',
+    f'name="b" euler="10 20 30"><joint name="k"/>{INERTIA}<geom size=".3"/><frame pos="1 2 3" euler="0 40 0">'
+    '<body name="c" pos="1 1 0" euler="0 0 9"/></frame></body></body></worldbody>',
     "balance": '<compiler balanceinertia="true" boundinertia=".15"/><worldbody><body name="a"><joint name="j"/><inertial '
     'pos="1 0 0" mass="1" diaginertia=".1 .2 .5"/><body name="b"><joint name="k"/><inertial pos="0 0 0" mass="1" fullinertia='
     '"1 .5 3 .1 .2 .3"/><body name="c" euler="10 20 30"><inertial pos="0 0 0" mass="1" euler="30 20 10" diaginertia="1 2 3"/>'

@@ -8,10 +8,12 @@ counts, and ``inertiafromgeom`` is "true", or "auto" without an <inertial>, the 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from mbkit._check import Array
 from mbkit.load.attributes import Reader
 from mbkit.load.mjcf_values import ORIENTATIONS, Compiler, Pose, pose, z_to
 from mbkit.load.solids import NOTHING, SIZES, Lump, solid, together
@@ -26,6 +28,7 @@ _LEAST_MASS: Final = 1e-14
 def body_lump(
     inertials: list[tuple[Element, Pose]],
     geoms: list[tuple[Element, Pose]],
+    place: Array,
     compiler: Compiler,
     read: Reader,
     who: str,
@@ -38,6 +41,8 @@ def body_lump(
     ----------
     inertials, geoms : list of (Element, Pose)
         With the pose of the <frame> they stand in; defaults filled in. Geoms are those that `counts` lets through.
+    place : (3,) array
+        Of the body in its parent or <frame>, as it is written.
     compiler, read, who
         Settings, where faults go, and whom they blame.
     """
@@ -53,7 +58,9 @@ def body_lump(
             # A flat body's A + B and C differ by rounding.
             return _bounded(together(heavy), compiler, slack=1e-14)
     if not inertials:
-        return _bounded(NOTHING, compiler)
+        lump, changed = _bounded(NOTHING, compiler)
+        # MuJoCo takes that place for the centre of mass in the body.
+        return replace(lump, com=place) if changed else lump, changed
     principal, placed = _written(*inertials[0], compiler, read, who)
     lump, changed = _bounded(principal, compiler, slack=1e-14 if "fullinertia" in inertials[0][0].attributes else 0.0)
     return lump.moved(placed.R, placed.p), changed

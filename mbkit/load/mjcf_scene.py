@@ -146,7 +146,7 @@ def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: 
     who = f"body {name!r}"
     read, compiler = scene.read, scene.compiler
     childclass = scene.defaults.known(element.attributes.get("childclass"), element) or childclass
-    placed = X @ pose(element, compiler, read, who)
+    own = pose(element, compiler, read, who)
     if read.number(element, "gravcomp", who, 0.0):
         scene.left_out["gravity compensation"] += 1
     if element.attributes.get("mocap") == "true":
@@ -157,12 +157,12 @@ def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: 
     inertials = [(e, Y) for e, Y, _ in parts if e.tag == "inertial"]
     geoms = [(e, scene.defaults.filled(e, c), Y) for e, Y, c in parts if e.tag == "geom"]
     geoms = [(e, full, Y) for e, full, Y in geoms if counts(full, compiler, read, who)]
-    lump, changed = body_lump(inertials, [(full, Y) for _, full, Y in geoms], compiler, read, who)
+    lump, changed = body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, who)
     if lump is None:
         scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
     for setting in changed:
         scene.bounded.setdefault(setting, []).append(name)
-    body = MjcfBody(name, parent, placed, joints, lump or NOTHING, [])
+    body = MjcfBody(name, parent, X @ own, joints, lump or NOTHING, [])
     scene.bodies.append(body)
     for e, Y, c in parts:
         if e.tag == "site":
