@@ -1,7 +1,7 @@
 """Elements and attributes that MuJoCo's schema does not have: misspelt names, whose values would be lost.
 
-The schema is MuJoCo's own, printed by `mujoco.mj_printSchema`. It leaves out <frame>, of which MuJoCo
-checks no attribute at all.
+The schema is MuJoCo's own, printed by `mujoco.mj_printSchema`. It leaves out <frame>, in which MuJoCo
+4.0.0 checks no names at all: there mbkit is stricter.
 """
 
 from __future__ import annotations
