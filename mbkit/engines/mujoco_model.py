@@ -210,6 +210,10 @@ def _add_tree(spec: Any, description: Model) -> Placed:
         made = placed.bodies[owner].add_body(name=body.name, pos=p, quat=_wxyz(R))
         placed.bodies[body.name] = made
         _give_inertia(made, body, description, placed)
+        if len(stack) > 1 and any(stacked.kind == "prismatic" for stacked, _, _ in stack):
+            # MuJoCo 4.0.0 takes the mass matrix of several slides of a "simple" body for diagonal, even
+            # where they are parallel.
+            made.simple = 0
         at_origin = owner == "world" and np.array_equal(R, np.eye(3)) and not p.any()
         for stacked, R_PJ, p_PJ in stack:
             _add_joint(made, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin=at_origin)
