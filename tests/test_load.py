@@ -723,6 +723,9 @@ def test_mjcf_is_what_mujoco_makes_of_it(name, tmp_path):
     assert model.name == name
     # Free joints have no limits in MuJoCo, whatever they inherit.
     assert any("ball joint (1)" in note for note in model.notes) == (name in ("inherited_ranges", "unordered_ranges"))
+    # What a setting or the compiler changed is said.
+    for setting in ("boundmass", "boundinertia", "balanceinertia", "settotalmass", "springdamper"):
+        assert any(setting in note for note in model.notes) == (f"{setting}=" in text)
     check_against_mujoco(model, mujoco.MjModel.from_xml_string(text))
 
 
