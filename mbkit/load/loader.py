@@ -32,7 +32,8 @@ def load(
 
     Of other files, those that an MJCF includes are opened, and the meshes that give a body of an MJCF its
     inertia; no others. What was decided on the way (mimic joints, parts left out, rounded zeros, files that
-    were opened) stands in the model's ``notes``.
+    were opened) stands in the model's ``notes``. Tendons and actuators of an MJCF act as springs, dampers and
+    rotors where their forces at zero control are linear.
 
     Parameters
     ----------

@@ -27,6 +27,7 @@ from mbkit.errors import ModelError
 from mbkit.load.attributes import Reader
 from mbkit.load.floating import floated
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, listed
+from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
 from mbkit.load.mjcf_schema import check_names
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
@@ -44,10 +45,12 @@ _REFUSED: Final = {
 }
 # Sections that are read, or that say nothing about the motion.
 _READ: Final = ("compiler", "default", "option", "worldbody", "size", "visual", "statistic", "asset")
+# Sections with notes of their own.
+_NOTED: Final = ("tendon", "actuator", "equality")
 
 
 # Option flags that change the smooth equations; the others steer an engine.
-_HONOURED: Final = frozenset({"gravity", "spring", "damper"})
+_HONOURED: Final = frozenset({"gravity", "spring", "damper", "actuation"})
 
 
 def model_of_mjcf(
@@ -89,6 +92,8 @@ def model_of_mjcf(
     scale, snap = _total_scale(scene), Snapper()
     springs = infer_springs(mujoco, path, scene)
     _describe(b, scene, scale, snap, springs)
+    off = {name for name, value in flags.items() if value == "disable"}
+    transmissions = Transmissions(mujoco, scene, off)
     if read.faults:
         raise ModelError(str(path), read.faults)
     sprung = f"springdamper made stiffness and damping, by MuJoCo's compiler: {listed(springs)}" if springs else ""
@@ -100,7 +105,8 @@ def model_of_mjcf(
     except ModelError as error:
         raise ModelError(str(path), error.faults) from None
     features = {"spring": "springs", "damper": "damping"}
-    return model.without(*(feature for flag, feature in features.items() if flags.get(flag) == "disable"))
+    model = model.without(*(feature for flag, feature in features.items() if flag in off))
+    return transmissions.applied(model)
 
 
 def _refuse(mujoco: Element, read: Reader) -> None:
@@ -253,7 +259,7 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
         outside = [f for f in files if not (path.parent / f).resolve().is_relative_to(path.parent.resolve())]
         if outside:
             out.append(f"included from outside the folder of {path.name}: {', '.join(outside)}")
-    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in _READ)
+    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in (*_READ, *_NOTED))
     if sections:
         told = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
         out.append(f"sections left out, with whatever they do to the motion: {told}")
