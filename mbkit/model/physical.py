@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.parts import Body
+from mbkit.model.parts import Body, Joint
 from mbkit.spatial import skew
 
 if TYPE_CHECKING:
     from mbkit.model.model import Model
 
-__all__ = ["body_fault", "body_faults", "idle_joints", "sample_mass_matrix", "suspects"]
+__all__ = ["body_fault", "body_faults", "idle_joints", "sample_mass_matrix", "static_bodies", "suspects"]
 
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
@@ -48,6 +48,21 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
         return f"inertia violates A + B >= C: principal moments {_told(eigenvalues)} kg m²"
     return None
+
+
+def static_bodies(joints: Iterable[Joint]) -> set[str]:
+    """Return the bodies that are fixed to the world, whose inertia cannot act."""
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        if joint.kind == "fixed":
+            below.setdefault(joint.parent, []).append(joint.child)
+    found: set[str] = set()
+    waiting = ["world"]
+    while waiting:
+        new = [child for child in below.get(waiting.pop(), ()) if child not in found]
+        found.update(new)
+        waiting += new
+    return found
 
 
 def _told(values: Array) -> str:
@@ -105,9 +120,10 @@ def idle_joints(model: Model) -> list[str]:
     return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()]
 
 
-def sample_mass_matrix(model: Model) -> Array:
-    """Return M at one fixed random state, by its definition; slow and only for checks."""
-    q, _ = model.random_state(np.random.default_rng(0))
+def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
+    """Return M at a pose, or at one fixed random state, by its definition; slow, for checks and for loading."""
+    if q is None:
+        q, _ = model.random_state(np.random.default_rng(0))
     q_full = model.layout.expand_q(q)
     n = model.layout.sizes[3]
     jacobians = {"world": np.zeros((6, n))}
@@ -128,4 +144,7 @@ def sample_mass_matrix(model: Model) -> Array:
         at_com = J[:3] - skew(body.com) @ J[3:]
         M += body.mass * at_com.T @ at_com + J[3:].T @ body.inertia @ J[3:]
         M[part[1], part[1]] += np.diag(joint.armature)
+    for coupling in model.couplings:
+        row = model.layout.coupling_row(coupling)
+        M += coupling.armature * np.outer(row, row)
     return np.asarray(model.layout.G.T @ M @ model.layout.G)
