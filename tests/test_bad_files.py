@@ -13,8 +13,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mbkit import errors
 from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
-from mbkit.load import load
+from mbkit.load import load, xml
 from mbkit.load.names import find
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
@@ -87,6 +88,45 @@ def test_texts_that_are_no_description(case, tmp_path, capfd):
     assert isinstance(error, LoadError)
     assert re.search(expected, str(error)), str(error)
     assert capfd.readouterr() == ("", "")
+
+
+def test_text_is_written_once_however_often_elements_interrupt_it(monkeypatch):
+    written = []
+
+    class Counted(xml.Element):
+        def __setattr__(self, name, value):
+            if name == "text":
+                written.append(len(value))
+            super().__setattr__(name, value)
+
+    monkeypatch.setattr(xml, "Element", Counted)
+    content = b"<robot>" + b"<a/>word" * 1000 + b"</robot>"
+    assert xml.parse(content, "x").text == "word" * 1000
+    assert sum(written) < len(content)
+
+
+def test_more_elements_than_any_robot_has_are_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(xml, "MOST_ELEMENTS", 100)
+    error = raised(tmp_path, b'<robot name="r">' + b"<a/>" * 100 + b"</robot>")
+    assert isinstance(error, LoadError)
+    assert "100 elements" in str(error)
+
+
+@pytest.mark.parametrize("inside", [LIMIT, LIMIT + '<mimic joint="unknown_{i}"/>'])
+def test_few_unknown_names_are_compared_with_all_known_ones(monkeypatch, tmp_path, inside):
+    calls = []
+    monkeypatch.setattr(errors.difflib, "get_close_matches", lambda *given, **_: calls.append(given) or [])
+    text = robot(links("a") + "".join(joint(f"j{i}", "a", f"b{i}", inside.replace("{i}", str(i))) for i in range(50)))
+    error = raised(tmp_path, text)
+    assert sum("unknown" in fault for fault in error.faults) >= 50
+    assert len(calls) <= 10
+
+
+def test_a_message_of_many_or_long_faults_can_be_read(tmp_path):
+    error = raised(tmp_path, robot("<link/>" * 5000 + f'<link name="a"/><link name="{"b" * 100_000}"/>'))
+    assert len(error.faults) > 5000
+    assert len(str(error)) < 300_000
+    assert str(len(error.faults)) in str(error)
 
 
 # URDF. Each names the culprit, and what to do where that is not plain.

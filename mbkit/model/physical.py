@@ -19,6 +19,8 @@ __all__ = ["body_fault", "body_faults", "idle_joints", "sample_mass_matrix", "su
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
 _TRIANGLE = 1e-6
+# The largest coordinate at which M is sampled.
+_FAR = 1e6
 
 
 def body_fault(body: Body, *, point_masses: bool) -> str | None:
@@ -106,26 +108,56 @@ def idle_joints(model: Model) -> list[str]:
 
 
 def sample_mass_matrix(model: Model) -> Array:
-    """Return M at one fixed random state, by its definition; slow and only for checks."""
+    """Return M at one fixed random state: off the diagonal by composite inertias, on it by its definition Σ Jᵀ I J.
+
+    The definition gives the diagonal as a sum of squares, which stays small where a mass is on its own axis; it alone
+    takes the square of the number of joints, as does M itself.
+    """
     q, _ = model.random_state(np.random.default_rng(0))
-    q_full = model.layout.expand_q(q)
+    # Limits may be as wide as doubles go; the squares of lengths must not overflow.
+    q_full = model.layout.expand_q(np.clip(q, -_FAR, _FAR))
     n = model.layout.sizes[3]
-    jacobians = {"world": np.zeros((6, n))}
-    M = np.zeros((n, n))
     bodies = {b.name: b for b in model.bodies}
+    # Motion of the child's frame for that of the parent's, and for the joint's velocities; linear above angular.
+    steps: dict[str, tuple[Array, Array, slice]] = {}
+    carried: dict[str, list[str]] = {}
+    diagonal = np.zeros(n)
+    jacobians: dict[str, tuple[list[int], Array]] = {"world": ([], np.zeros((6, 0)))}
     for joint in model.tree:
-        part = model.layout.full_q[joint.name], model.layout.full_v[joint.name]
-        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, list(q_full[part[0]])))
+        carried.setdefault(joint.parent, []).append(joint.name)
+        part = model.layout.full_v[joint.name]
+        at = list(q_full[model.layout.full_q[joint.name]])
+        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, at))
         R, p = joint.rotation @ R_JC, joint.translation + joint.rotation @ p_JC
-        parent = jacobians[joint.parent]
-        J = np.vstack([R.T @ (parent[:3] - skew(p) @ parent[3:]), R.T @ parent[3:]])
+        X = np.block([[R.T, -R.T @ skew(p)], [np.zeros((3, 3)), R.T]])
+        S = np.zeros((6, joint.type.nv))
         for k in range(joint.type.nv):
             unit = [float(i == k) for i in range(joint.type.nv)]
-            linear, angular = joint.type.twist(np, joint, list(q_full[part[0]]), unit)
-            J[:, part[1].start + k] += np.array([*linear, *angular], dtype=float)
-        jacobians[joint.child] = J
+            S[:, k] = np.array([x for half in joint.type.twist(np, joint, at, unit) for x in half], dtype=float)
+        steps[joint.name] = X, S, part
+        moving, above = jacobians[joint.parent]
+        moving, J = [*moving, *range(part.start, part.stop)], np.hstack([X @ above, S])
+        jacobians[joint.child] = moving, J
         body = bodies[joint.child]
         at_com = J[:3] - skew(body.com) @ J[3:]
-        M += body.mass * at_com.T @ at_com + J[3:].T @ body.inertia @ J[3:]
-        M[part[1], part[1]] += np.diag(joint.armature)
-    return np.asarray(model.layout.G.T @ M @ model.layout.G)
+        diagonal[moving] += body.mass * (at_com**2).sum(axis=0) + (J[3:] * (body.inertia @ J[3:])).sum(axis=0)
+    M = np.zeros((n, n))
+    composite: dict[str, Array] = {}
+    # Momentum of the bodies beyond a joint for a unit velocity of each joint there, and which velocities those are.
+    momenta: dict[str, tuple[list[int], Array]] = {}
+    for joint in reversed(model.tree):
+        X, S, part = steps[joint.name]
+        body = bodies[joint.child]
+        c = skew(body.com)
+        inertia = np.block([[body.mass * np.eye(3), -body.mass * c], [body.mass * c, body.inertia - body.mass * c @ c]])
+        beyond = [momenta.pop(name) for name in carried.get(joint.child, ())]
+        inertia = inertia + sum((composite.pop(name) for name in carried.get(joint.child, ())), np.zeros((6, 6)))
+        moving = [*range(part.start, part.stop), *(k for several, _ in beyond for k in several)]
+        F = np.hstack([inertia @ S, *(f for _, f in beyond)])
+        M[part, moving] = S.T @ F
+        M[moving, part] = M[part, moving].T
+        composite[joint.name] = X.T @ inertia @ X
+        momenta[joint.name] = moving, X.T @ F
+        diagonal[part] += joint.armature
+    np.fill_diagonal(M, diagonal)
+    return np.asarray(model.layout.G.T @ M @ model.layout.G) if model.layout.reduced else M
