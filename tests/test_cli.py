@@ -243,6 +243,36 @@ def test_bad_input_is_one_message_and_exit_2(here, arguments, told):
     assert not (here / "mbkit-report").exists()
 
 
+IMPOSSIBLE = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="9"/></inertial></link>
+<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "check FILE",
+        "diff FILE FILE --mimic reduce",
+        "baseline record FILE r.toml",
+        "baseline check b.toml --nonphysical error --target FILE",
+        "derive FILE",
+        "bench FILE",
+        "convert FILE --to urdf",
+        "export FILE",
+    ],
+)
+def test_every_command_says_how_to_take_impossible_bodies_in_its_own_options(here, command):
+    (here / "r.urdf").write_text(IMPOSSIBLE)
+    if "b.toml" in command:
+        assert call("baseline", "record", "pendulum", "b.toml").exit_code == 0
+    result = call(*command.replace("FILE", "r.urdf").split())
+    assert result.exit_code == 2, result.output
+    assert "'b'" in result.stderr
+    assert "--nonphysical warn" in result.stderr
+    assert 'nonphysical="warn"' not in result.stderr
+    assert "--nonphysical" in call(*command.split()[: 2 if "baseline" in command else 1], "--help").output
+
+
 @pytest.mark.usefixtures("here")
 def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     def full(*_: object) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
 
@@ -93,7 +94,7 @@ def load(
         urdf = examine(
             root, str(path), floating_base=floating_base, mimic_matters=mimic == "reduce", lenient=policy == "warn"
         )
-        return model_of(
+        made = model_of(
             urdf,
             str(path),
             floating_base=floating_base,
@@ -101,12 +102,14 @@ def load(
             nonphysical=policy,
             gravity=_GRAVITY if gravity is None else gravity,
         )
-    if root.tag == "mujoco":
+    elif root.tag == "mujoco":
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = expanded(root, path)
-        return model_of_mjcf(whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
-    raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+        made = model_of_mjcf(whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
+    else:
+        raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    return replace(made, notes=(*root.notes, *made.notes)) if root.notes else made
 
 
 def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:

@@ -17,7 +17,7 @@ from mbkit.model.kinds import KINDS, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameter import Number
 from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
-from mbkit.model.physical import body_faults, suspects
+from mbkit.model.physical import body_faults, grouped, suspects
 from mbkit.model.structure import structure_faults
 
 __all__ = ["ModelBuilder"]
@@ -316,7 +316,13 @@ class ModelBuilder:
         """Keep a sentence for whoever reads the model."""
         self._notes.append(text)
 
-    def build(self, *, nonphysical: Literal["error", "warn"] = "error", point_masses: bool = True) -> Model:
+    def build(
+        self,
+        *,
+        nonphysical: Literal["error", "warn"] = "error",
+        point_masses: bool = True,
+        parts: Mapping[str, Sequence[tuple[str, str]]] | None = None,
+    ) -> Model:
         """Check everything and return the frozen model.
 
         Parameters
@@ -327,6 +333,9 @@ class ModelBuilder:
             inertia): raise, or keep them as written and warn.
         point_masses : bool
             Whether a mass without inertia is meant that way.
+        parts : mapping of str to sequence of (str, str), optional
+            Of bodies that were merged from several links: the links that are at fault, each with the
+            reason. Messages name them instead of the body.
 
         Raises
         ------
@@ -344,19 +353,18 @@ class ModelBuilder:
         found = body_faults(self._bodies, point_masses=point_masses)
         if not faults:
             found = suspects(self._assemble(()), point_masses=point_masses)
-        strict = nonphysical == "error"
-        remedy = '; correct it, or take it as written with nonphysical="warn"'
         negative = {b.name for b in self._bodies if b.mass < 0}
-        faults += [f"body {n!r}: {why}{remedy}" for n, why in found if strict and n not in negative]
-        faults += [f"body {n!r}: {why}" for n, why in found if n in negative]
+        refused = [(n, why) for n, why in found if n not in negative]
+        if nonphysical == "error" and refused:
+            faults += grouped(refused, parts or {})
+            faults[-1] += '; correct it, or take it as written with nonphysical="warn"'
+        faults += grouped([(n, why) for n, why in found if n in negative], parts or {})
         if faults:
             raise ModelError(self._name, faults)
         model = self._assemble(found)
         if found:
-            told = "; ".join(f"{n!r}: {why}" for n, why in found[:5])
-            more = f" and {len(found) - 5} more" if len(found) > 5 else ""
             warnings.warn(
-                f"{self._name}: taken as written, though no matter is like this: {told}{more}",
+                f"{self._name}: physically impossible, used as written: {'; '.join(grouped(found, parts or {}))}",
                 NonPhysicalWarning,
                 stacklevel=2,
             )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,11 +15,14 @@ from mbkit.spatial import skew
 if TYPE_CHECKING:
     from mbkit.model.model import Model
 
-__all__ = ["body_fault", "body_faults", "idle_joints", "sample_mass_matrix", "suspects"]
+__all__ = ["body_fault", "body_faults", "grouped", "idle_joints", "sample_mass_matrix", "suspects"]
 
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
 _TRIANGLE = 1e-6
+# Bodies in one sentence.
+_MOST_TOLD = 20
+_JOINT = re.compile(r"joint '.*?'(?=, so)")
 # The largest coordinate at which M is sampled.
 _FAR = 1e6
 
@@ -40,7 +44,7 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     if body.mass < 0:
         return f"mass {body.mass:g} is negative"
     if body.mass == 0:
-        return f"no mass but inertia up to {largest:.3g} kg m²" if largest else None
+        return f"no mass but inertia: up to {largest:.3g} kg m²" if largest else None
     if largest == 0:
         return None if point_masses else "mass without inertia: give the inertia, however small"
     if eigenvalues[0] < -1e-12 * largest:
@@ -82,6 +86,40 @@ def suspects(model: Model, *, point_masses: bool) -> tuple[tuple[str, str], ...]
                 f"no mass moves with joint {name!r}, so M is singular: give mass, inertia or armature",
             )
     return tuple(found.items())
+
+
+def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
+    """Return one sentence per kind of fault, with every body that has it.
+
+    Parameters
+    ----------
+    found : iterable of (str, str)
+        Bodies with the reason.
+    parts : mapping of str to sequence of (str, str)
+        Of a body that was merged from links: the links at fault, each with the reason. They are named instead.
+    """
+    kinds: dict[str, list[tuple[str, str, str, str]]] = {}
+    for body, why in found:
+        moved = _JOINT.search(why)
+        named = [("link", *part) for part in parts.get(body, ())] if not moved else []
+        for what, name, reason in named or [("body", body, why)]:
+            sentence, _, detail = reason.partition(": ")
+            if moved:
+                sentence, detail = sentence.replace(moved[0], "their joints"), moved[0]
+            if what == "link" and name != body:
+                detail = ", ".join(x for x in (detail, f"part of {body!r}") if x)
+            kinds.setdefault(sentence, []).append((what, name, reason, detail))
+    out = []
+    for sentence, members in kinds.items():
+        if len(members) == 1:
+            what, name, reason, _ = members[0]
+            out.append(f"{what} {name!r}: {reason}")
+            continue
+        plural = "links" if all(what == "link" for what, *_ in members) else "bodies"
+        told = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members[:_MOST_TOLD]]
+        more = f" and {len(members) - _MOST_TOLD} more" if len(members) > _MOST_TOLD else ""
+        out.append(f"{len(members)} {plural}: {sentence}: {', '.join(told)}{more}")
+    return out
 
 
 def idle_joints(model: Model) -> list[str]:
