@@ -102,7 +102,7 @@ class UnknownNameError(MbkitError, LookupError):
             advice = f"there are: {', '.join(self.known) or 'none'}"
         else:
             advice = f"none of the {len(self.known)} known names is near"
-        super().__init__(f"unknown {what} {name!r}; {advice}" + (f" {hint}" if hint else ""))
+        super().__init__(f"unknown {what} {_shortened(repr(name), 200)}; {advice}" + (f" {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[type, tuple[object, ...]]:
         return type(self), (self.what, self.name, self.known, self.hint)
@@ -204,5 +204,5 @@ class Suggestions:
         return self._found[name]
 
 
-def _shortened(text: str) -> str:
-    return text if len(text) <= _MOST_CHARACTERS else text[: _MOST_CHARACTERS - 4] + " ..."
+def _shortened(text: str, most: int = _MOST_CHARACTERS) -> str:
+    return text if len(text) <= most else text[: most - 4] + " ..."

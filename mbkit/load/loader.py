@@ -7,8 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from mbkit._check import shown
 from mbkit.errors import InputError, LoadError
 from mbkit.load import names, xml
 from mbkit.load.includes import expanded
@@ -80,10 +82,12 @@ def load(
     >>> mb.load("panda", mimic="free").nv
     9
     """
-    if mimic not in ("reduce", "free"):
-        raise InputError(f"mimic: expected 'reduce' or 'free', got {mimic!r}")
-    if nonphysical not in ("error", "warn", None):
-        raise InputError(f"nonphysical: expected 'error', 'warn' or None, got {nonphysical!r}")
+    if not isinstance(mimic, str) or mimic not in ("reduce", "free"):
+        raise InputError(f"mimic: expected 'reduce' or 'free', got {shown(mimic)}")
+    if nonphysical is not None and (not isinstance(nonphysical, str) or nonphysical not in ("error", "warn")):
+        raise InputError(f"nonphysical: expected 'error', 'warn' or None, got {shown(nonphysical)}")
+    if not isinstance(floating_base, (bool, np.bool_)):
+        raise InputError(f"floating_base: expected True or False, got {shown(floating_base)}")
     path, by_name = _resolved(source)
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml.read(path)
@@ -115,10 +119,10 @@ def load(
 def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
     """Return the file, and whether it was asked for by a robot's name."""
     if not isinstance(source, (str, os.PathLike)):
-        raise InputError(f"source: expected a robot's name or a path, got {source!r}")
+        raise InputError(f"source: expected a robot's name or a path, got {shown(source)}")
     text = os.fspath(source)
     if not isinstance(text, str):
-        raise InputError(f"source: expected a path of characters, got bytes {text!r}")
+        raise InputError(f"source: expected a path of characters, got bytes {shown(text)}")
     if not text:
         raise InputError("source: expected a robot's name or a path, got an empty text")
     if isinstance(source, str):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.errors import InputError
 from mbkit.model.parts import Body
 from mbkit.spatial import skew
 
@@ -130,8 +131,13 @@ def idle_joints(model: Model) -> list[str]:
     """
     if not model.nv:
         return []
-    M = sample_mass_matrix(model)
+    with np.errstate(over="ignore", invalid="ignore"):
+        M = sample_mass_matrix(model)
     diagonal = np.diag(M)
+    if not np.isfinite(M).all():
+        wild = [j.name for j in model.independent_joints if not np.isfinite(diagonal[model.layout.v[j.name]]).all()]
+        told = ", ".join(repr(n) for n in wild[:_MOST_TOLD]) or "all joints together"
+        raise InputError(f"{model.name}: the mass matrix overflows at {told}; give smaller masses and lengths")
     # What is left of a mass on its own axis is the square of a rounded length.
     zero = diagonal <= 1e-28 * float(diagonal.max())
     if not zero.any():
