@@ -217,11 +217,12 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
 
 def _name(target: str) -> str:
     """Return what a target's file is called in a folder: as the robot, the file or the function."""
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
     from mbkit.report.folder import file_stem
 
-    path = not find(target) and (Path(target).is_file() or "/" in target)
-    return f"{file_stem(Path(target).stem if path else target.rpartition(':')[2])}.toml"
+    robot = canonical(target)
+    path = robot is None and (Path(target).is_file() or "/" in target)
+    return f"{file_stem(Path(target).stem if path else robot or target.rpartition(':')[2])}.toml"
 
 
 def _again(file: Path, target: str | None) -> str:

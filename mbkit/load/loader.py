@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
@@ -19,6 +20,8 @@ from mbkit.model import Model
 
 __all__ = ["load"]
 
+# A path has lost one of the strokes.
+_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _GRAVITY: Final = (0.0, 0.0, -9.81)
 
 
@@ -125,13 +128,15 @@ def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
         raise InputError(f"source: expected a path of characters, got bytes {shown(text)}")
     if not text:
         raise InputError("source: expected a robot's name or a path, got an empty text")
+    if _URL.match(text) and not os.path.exists(text):
+        raise LoadError(f"{text}: this is a URL, and mbkit reads local files; download it and give its path")
     if isinstance(source, str):
         looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf"))
         robot = None if looks_like_path else names.find(text)
         if robot is not None:
             return robot.path, True
         separated = "/" in text or os.sep in text
-        if not looks_like_path and not separated and not os.path.isfile(text):
+        if not looks_like_path and not separated and not os.path.exists(text):
             raise names.unknown(text)
         if separated and not looks_like_path and not os.path.exists(text):
             raise names.unknown(text)

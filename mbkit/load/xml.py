@@ -7,6 +7,7 @@ is looked at. What is left of XML then cannot refer to anything outside the text
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -23,6 +24,8 @@ MOST_BYTES: Final = 64 * 2**20
 MOST_ELEMENTS: Final = 500_000
 MOST_LEVELS: Final = 250
 
+_ENDINGS: Final = (".urdf", ".xml", ".mjcf")
+_MOST_TOLD: Final = 10
 # How far into a file an XML declaration is looked for, and how long it may be.
 _HEAD: Final = 4096
 _COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
@@ -81,7 +84,7 @@ def read(path: Path) -> Element:
         if not path.exists():
             raise LoadError(f"{path}: no such file")
         if not path.is_file():
-            what = "a folder" if path.is_dir() else "not a regular file"
+            what = f"a folder{_descriptions(path)}" if path.is_dir() else "not a regular file"
             raise LoadError(f"{path}: expected a URDF or MJCF file, this is {what}")
         size = path.stat().st_size
         if size > MOST_BYTES:
@@ -93,6 +96,16 @@ def read(path: Path) -> Element:
         # ValueError: a null character in the name.
         raise LoadError(f"{path!s}: cannot be read ({error})") from None
     return parse(content, str(path))
+
+
+def _descriptions(folder: Path) -> str:
+    """Return which descriptions a folder and those below it hold, for a message."""
+    found = sorted(
+        str(p.relative_to(folder)) for p in itertools.islice(folder.rglob("*"), 10_000) if p.suffix in _ENDINGS
+    )
+    if not found:
+        return ", and no .urdf or .xml file is in it"
+    return f"; it holds {', '.join(found[:_MOST_TOLD])}{' and more' * (len(found) > _MOST_TOLD)}"
 
 
 def parse(content: bytes, name: str) -> Element:
