@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
@@ -12,11 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import shown
-from mbkit.errors import InputError, LoadError
+from mbkit.errors import InputError, LoadError, MbkitWarning
 from mbkit.load import names, xml
 from mbkit.load.includes import expanded
 from mbkit.load.urdf_file import examine
 from mbkit.model import Model
+from mbkit.model.physical import scale_doubts
 
 __all__ = ["load"]
 
@@ -76,6 +78,8 @@ def load(
     -----
     NonPhysicalWarning
         Some bodies can be of no matter, and were taken as written.
+    MbkitWarning
+        Masses or lengths are so far apart that engines lose digits in double precision.
 
     Examples
     --------
@@ -116,6 +120,9 @@ def load(
         made = model_of_mjcf(whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
     else:
         raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    doubts = scale_doubts(made)
+    if doubts:
+        warnings.warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning, stacklevel=2)
     return replace(made, notes=(*root.notes, *made.notes)) if root.notes else made
 
 

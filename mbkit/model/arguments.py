@@ -34,7 +34,7 @@ class ArgumentReader:
     def __init__(self) -> None:
         self.faults: list[str] = []
 
-    def name(self, what: str, value: Any) -> str:
+    def name(self, what: str, value: Any, longest: int = _LONGEST_NAME) -> str:
         """Return a name: text that UTF-8 can hold, short enough for a message."""
         if not isinstance(value, str):
             self.faults.append(f"{what}: expected a name, got {shown(value)}")
@@ -42,9 +42,9 @@ class ArgumentReader:
         text = value.encode("utf-8", "backslashreplace").decode()
         if text != value:
             self.faults.append(f"{what}: expected text, got lone surrogates, which UTF-8 cannot hold: {text[:60]!r}")
-        if len(text) > _LONGEST_NAME:
-            self.faults.append(f"{what}: expected up to {_LONGEST_NAME} characters, got {len(text)}")
-        return text[:_LONGEST_NAME]
+        if len(text) > longest:
+            self.faults.append(f"{what}: expected up to {longest} characters, got {len(text)}")
+        return text[:longest]
 
     def vector(self, name: str, value: ArrayLike, n: int) -> Array:
         """Return n finite numbers; a single one is repeated."""
@@ -208,7 +208,7 @@ def _has_expressions(value: Any, depth: int = 3) -> bool:
 def shape_of(value: Any) -> tuple[int, ...] | None:
     """Return the shape, or None of what has none, such as a ragged list."""
     try:
-        return np.shape(value)
+        return tuple(np.shape(value))
     except Exception:
         # Any: objects may bring conversions of their own.
         return None

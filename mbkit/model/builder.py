@@ -332,10 +332,7 @@ class ModelBuilder:
 
     def note(self, text: str) -> None:
         """Keep a sentence for whoever reads the model."""
-        if not isinstance(text, str):
-            self._read.faults.append(f"note: expected text, got {shown(text)}")
-            return
-        self._notes.append(text)
+        self._notes.append(self._read.name("note text", text, longest=1_000_000))
 
     def build(
         self,

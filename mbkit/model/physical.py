@@ -16,7 +16,7 @@ from mbkit.spatial import skew
 if TYPE_CHECKING:
     from mbkit.model.model import Model
 
-__all__ = ["body_fault", "body_faults", "grouped", "idle_joints", "sample_mass_matrix", "suspects"]
+__all__ = ["body_fault", "body_faults", "grouped", "idle_joints", "sample_mass_matrix", "scale_doubts", "suspects"]
 
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
@@ -24,6 +24,10 @@ _TRIANGLE = 1e-6
 # Bodies in one sentence.
 _MOST_TOLD = 20
 _JOINT = re.compile(r"joint '.*?'(?=, so)")
+# Ten times mjMINVAL is left of MuJoCo's smallest numbers, in kg and kg m².
+_LEAST = 1e-14
+# Of two numbers this far apart, the sum keeps five digits of the smaller. Real robots stay below 1e8.
+_APART = 1e11
 # The largest coordinate at which M is sampled.
 _FAR = 1e6
 
@@ -151,12 +155,63 @@ def idle_joints(model: Model) -> list[str]:
     return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()]
 
 
+def scale_doubts(model: Model) -> list[str]:
+    """Return why engines may lose digits: sizes too far apart for double precision, one sentence for each cause.
+
+    For a hinge, the inertia about its axis M_ii stands against m L², with m the mass that it carries and L the
+    extent of the mechanism: an engine whose moments are about a common centre takes M_ii as a difference of numbers
+    of that size. MuJoCo takes inertias below 1e-15 (mjMINVAL) for zero. And a null direction of the scaled M to
+    rounding leaves no digits in accelerations.
+    """
+    if not model.nv or any(x is None for x in model.parameters.values()):
+        return []
+    M, places = _sampled(model)
+    diagonal = np.diag(M)
+    if not (diagonal > 0).all() or not np.isfinite(M).all():
+        return []
+    extent = float(np.max(np.ptp(np.array([*places.values()]), axis=0)))
+    carried: dict[str, float] = {b.name: b.mass for b in model.bodies}
+    small, far = [], []
+    for joint in reversed(model.tree):
+        if joint.parent != "world":
+            carried[joint.parent] += carried[joint.child]
+        if joint.mimic is not None or not joint.type.nv:
+            continue
+        least = float(diagonal[model.layout.v[joint.name]].min())
+        if least < _LEAST:
+            small.append(f"{joint.name!r} ({least:.1e})")
+        elif joint.kind != "prismatic" and carried[joint.child] * extent**2 > _APART * least:
+            far.append(f"{joint.name!r} ({least:.1e} kg m² of {carried[joint.child]:.1e} kg over {extent:.1e} m)")
+    root = np.sqrt(diagonal)
+    values = np.linalg.eigvalsh(M / root[:, None] / root)
+    out = []
+    if small:
+        out.append(f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero: {_listed(small)}")
+    if far:
+        out.append(f"joints whose inertia is lost beside m L² of the whole mechanism: {_listed(far)}")
+    if values[0] * _APART * 10 < values[-1]:
+        out.append(f"M is singular to rounding (condition {values[-1] / max(values[0], 1e-300):.1e}, scaled)")
+    return out
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_TOLD} more" if len(names) > _MOST_TOLD else ""
+    return f"{', '.join(names[:_MOST_TOLD])}{more}"
+
+
 def sample_mass_matrix(model: Model) -> Array:
     """Return M at one fixed random state: off the diagonal by composite inertias, on it by its definition Σ Jᵀ I J.
 
     The definition gives the diagonal as a sum of squares, which stays small where a mass is on its own axis; it alone
     takes the square of the number of joints, as does M itself.
     """
+    return _sampled(model)[0]
+
+
+def _sampled(model: Model) -> tuple[Array, dict[str, Array]]:
+    """Return M at the random state, and where each body with mass has its centre of mass in the world."""
+    places = {"": np.zeros(3)}
+    poses = {"world": (np.eye(3), np.zeros(3))}
     q, _ = model.random_state(np.random.default_rng(0))
     # Limits may be as wide as doubles go; the squares of lengths must not overflow.
     q_full = model.layout.expand_q(np.clip(q, -_FAR, _FAR))
@@ -183,6 +238,10 @@ def sample_mass_matrix(model: Model) -> Array:
         moving, J = [*moving, *range(part.start, part.stop)], np.hstack([X @ above, S])
         jacobians[joint.child] = moving, J
         body = bodies[joint.child]
+        R_W, p_W = poses[joint.parent]
+        poses[joint.child] = R_W @ R, p_W + R_W @ p
+        if body.mass:
+            places[joint.child] = poses[joint.child][1] + poses[joint.child][0] @ body.com
         at_com = J[:3] - skew(body.com) @ J[3:]
         diagonal[moving] += body.mass * (at_com**2).sum(axis=0) + (J[3:] * (body.inertia @ J[3:])).sum(axis=0)
     M = np.zeros((n, n))
@@ -204,4 +263,4 @@ def sample_mass_matrix(model: Model) -> Array:
         momenta[joint.name] = moving, X.T @ F
         diagonal[part] += joint.armature
     np.fill_diagonal(M, diagonal)
-    return np.asarray(model.layout.G.T @ M @ model.layout.G) if model.layout.reduced else M
+    return (np.asarray(model.layout.G.T @ M @ model.layout.G) if model.layout.reduced else M), places

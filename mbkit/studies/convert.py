@@ -6,9 +6,10 @@ import os
 import re
 import tempfile
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -120,7 +121,7 @@ def convert(model: Model, to: str) -> Converted:
 
 def _check_names(model: Model, to: str) -> None:
     """Raise for names that XML 1.0 cannot hold, not even escaped."""
-    parts = (*model.bodies, *model.joints, *model.frames, *model.springs, *model.loops)
+    parts: Sequence[Any] = (*model.bodies, *model.joints, *model.frames, *model.springs, *model.loops)
     bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if _NO_XML.search(name)]
     if bad:
         told = ", ".join(repr(n) for n in bad[:10]) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
