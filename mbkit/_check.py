@@ -16,7 +16,18 @@ _FEW: Final = 64
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
 
-__all__ = ["Array", "all_finite", "batch_of", "count", "finite_array", "real", "require_finite", "rows", "shown"]
+__all__ = [
+    "Array",
+    "all_finite",
+    "batch_of",
+    "count",
+    "finite_array",
+    "generator",
+    "real",
+    "require_finite",
+    "rows",
+    "shown",
+]
 
 
 def all_finite(array: Array) -> bool:
@@ -91,6 +102,15 @@ def count(name: str, value: Any, *, least: int = 0) -> int:
     if not whole or not least <= value < 2**63:
         raise InputError(f"{name}: expected a whole number of at least {least}, got {shown(value)}")
     return int(value)
+
+
+def generator(name: str, value: Any) -> np.random.Generator:
+    """Return a random generator; a whole number is the seed of one."""
+    if isinstance(value, np.random.Generator):
+        return value
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
+        return np.random.default_rng(int(value))
+    raise InputError(f"{name}: expected a numpy Generator or a seed of at least 0, got {shown(value)}")
 
 
 def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = False) -> float:
