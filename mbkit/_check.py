@@ -44,11 +44,11 @@ def _as_float(name: str, value: ArrayLike) -> Array:
         return value
     try:
         raw = np.asarray(value)
-    except Exception as error:
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__} ({error})") from None
+    except Exception:
         # Any: objects may bring conversions of their own.
-        raise InputError(
-            f"{name}: expected an array of numbers, got {type(value).__name__} ({type(error).__name__})"
-        ) from None
+        raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__}") from None
     if raw.dtype.kind not in "fiu":
         raise InputError(f"{name}: expected real numbers, got dtype {raw.dtype}")
     return np.asarray(raw, dtype=np.float64)
