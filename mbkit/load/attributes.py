@@ -10,11 +10,11 @@ from typing import Final
 
 from mbkit.load.xml import Element
 
-__all__ = ["Reader", "misspelt"]
+__all__ = ["LARGEST", "Reader", "misspelt"]
 
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-# Larger than anything that moves, and the products of several still fit a double.
-_LARGEST: Final = 1e30
+#: Larger than anything that moves, and the products of several still fit a double.
+LARGEST: Final = 1e30
 _LONGEST_NAME: Final = 1000
 
 
@@ -89,7 +89,7 @@ class Reader:
             if not math.isfinite(value):
                 self.fault(f"{where}: {_short(word)} is not a finite number{_hint(word)}", element)
                 return neutral
-            if bounded and abs(value) > _LARGEST:
+            if bounded and abs(value) > LARGEST:
                 self.fault(f"{where}: {_short(word)} is too large to compute with", element)
                 return neutral
             values.append(value)
@@ -104,6 +104,14 @@ class Reader:
         """Return a single number; see `numbers`."""
         fallback = None if default is None else (default,)
         return self.numbers(element, attribute, who, count=1, default=fallback, bounded=bounded)[0]
+
+    def choice(self, element: Element, attribute: str, choices: tuple[str, ...]) -> str:
+        """Return one of the choices, the first where the attribute is absent."""
+        value = element.attributes.get(attribute, choices[0])
+        if value in choices:
+            return value
+        self.fault(f"{element.tag} {attribute}: expected one of {', '.join(choices)}, got {value[:40]!r}", element)
+        return choices[0]
 
     def only(self, element: Element, tag: str, who: str) -> Element | None:
         """Return the child of this tag, of which there may be one, or several that are equal."""

@@ -34,11 +34,14 @@ def load(
     mimic: Literal["reduce", "free"] = "reduce",
     nonphysical: Literal["error", "warn"] | None = None,
     gravity: ArrayLike | None = None,
+    meshes: Literal["auto", "never"] = "auto",
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
-    No mesh is opened, and no other file but those that an MJCF includes. What was decided on the way
-    (mimic joints, parts left out, rounded zeros) stands in the model's ``notes``.
+    Of other files, those that an MJCF includes are opened, and the meshes that give a body of an MJCF its
+    inertia; no others. What was decided on the way (mimic joints, parts left out, rounded zeros, files that
+    were opened) stands in the model's ``notes``. Tendons and actuators of an MJCF act as springs, dampers and
+    rotors where their forces at zero control are linear.
 
     Parameters
     ----------
@@ -57,6 +60,9 @@ def load(
         A negative mass is always refused.
     gravity : (3,) array_like, optional
         m/s², in world axes; by default the file's own (MJCF), else (0, 0, -9.81).
+    meshes : {"auto", "never"}
+        Whether an MJCF's meshes are read where a body has no other inertia. MuJoCo's compiler infers it.
+        With "never" such bodies are refused.
 
     Returns
     -------
@@ -95,6 +101,8 @@ def load(
         raise InputError(f"nonphysical: expected 'error', 'warn' or None, got {shown(nonphysical)}")
     if not isinstance(floating_base, (bool, np.bool_)):
         raise InputError(f"floating_base: expected True or False, got {shown(floating_base)}")
+    if not isinstance(meshes, str) or meshes not in ("auto", "never"):
+        raise InputError(f"meshes: expected 'auto' or 'never', got {shown(meshes)}")
     path, by_name = _resolved(source)
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml.read(path)
@@ -117,7 +125,9 @@ def load(
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = expanded(root, path)
-        made = model_of_mjcf(whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
+        made = model_of_mjcf(
+            whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity, meshes=meshes
+        )
     else:
         raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
     doubts = scale_doubts(made)

@@ -17,8 +17,8 @@ from mbkit.model.binding import Binding, split
 from mbkit.model.kinds import KINDS, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameter import Number
-from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
-from mbkit.model.physical import body_faults, grouped, suspects
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
+from mbkit.model.physical import body_faults, grouped, static_bodies, suspects
 from mbkit.model.structure import structure_faults
 
 __all__ = ["ModelBuilder"]
@@ -58,6 +58,7 @@ class ModelBuilder:
         self._joints: list[Joint] = []
         self._frames: list[Frame] = []
         self._springs: list[PointSpring] = []
+        self._couplings: list[JointCoupling] = []
         self._loops: list[Loop] = []
         self._prescribed: list[Prescribed] = []
         self._notes: list[str] = []
@@ -260,6 +261,49 @@ class ModelBuilder:
             )
         )
 
+    def add_coupling(
+        self,
+        name: str,
+        factors: Mapping[str, Number],
+        *,
+        stiffness: Number = 0.0,
+        rest_length: Number = 0.0,
+        damping: Number = 0.0,
+        armature: Number = 0.0,
+    ) -> None:
+        """Add a spring, damper and rotor on a weighted sum of joint coordinates, l = Σ factor q.
+
+        Parameters
+        ----------
+        name : str
+        factors : mapping of str to float
+            Joint name -> factor; joints of one velocity.
+        stiffness, rest_length : float
+            The potential energy is ½ stiffness (l - rest_length)².
+        damping : float
+            The power lost is damping (dl/dt)².
+        armature : float
+            The kinetic energy is ½ armature (dl/dt)².
+        """
+        name = self._read.name("coupling name", name)
+        who = f"coupling {name!r}"
+        if not isinstance(factors, Mapping):
+            told = shown(factors)
+            self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {told}")
+            return
+        numbers = self._numbers(
+            "couplings",
+            name,
+            factors=self._read.quantities(f"{who}: factors", list(factors.values()), len(factors)),
+            stiffness=self._read.quantity(f"{who}: stiffness", stiffness, nonnegative=True),
+            rest_length=self._read.quantity(f"{who}: rest_length", rest_length),
+            damping=self._read.quantity(f"{who}: damping", damping, nonnegative=True),
+            armature=self._read.quantity(f"{who}: armature", armature, nonnegative=True),
+        )
+        self._couplings.append(
+            JointCoupling(name, tuple(self._read.name(f"{who}: factors", j) for j in factors), **numbers)
+        )
+
     def add_loop(
         self,
         name: str,
@@ -348,7 +392,8 @@ class ModelBuilder:
         nonphysical : {"error", "warn"}
             What to do about bodies that no matter can have (an inertia that is
             not positive or violates the triangle inequality, joints that move no
-            inertia): raise, or keep them as written and warn.
+            inertia): raise, or keep them as written and warn. Of a body that is fixed
+            to the world only a negative mass counts; the rest is noted.
         point_masses : bool
             Whether a mass without inertia is meant that way.
         parts : mapping of str to sequence of (str, str), optional
@@ -368,7 +413,13 @@ class ModelBuilder:
             raise InputError(f"parts: expected a mapping from bodies to links, got {shown(parts)}")
         faults = list(self._read.faults)
         faults += structure_faults(
-            self._bodies, self._joints, self._frames, self._springs, self._loops, self._prescribed
+            self._bodies,
+            self._joints,
+            self._frames,
+            self._springs,
+            self._couplings,
+            self._loops,
+            self._prescribed,
         )
         faults += self._two_valued()
         # Joints that move nothing can only be found in a tree that holds together.
@@ -376,6 +427,10 @@ class ModelBuilder:
         if not faults:
             found = suspects(self._assemble(()), point_masses=point_masses)
         negative = {b.name for b in self._bodies if b.mass < 0}
+        still = static_bodies(self._joints) - negative
+        idle = grouped([(n, why) for n, why in found if n in still], parts or {})
+        notes = [f"never moves, so this cannot act: {text}" for text in idle]
+        found = tuple((n, why) for n, why in found if n not in still)
         refused = [(n, why) for n, why in found if n not in negative]
         if nonphysical == "error" and refused:
             faults += grouped(refused, parts or {})
@@ -383,7 +438,7 @@ class ModelBuilder:
         faults += grouped([(n, why) for n, why in found if n in negative], parts or {})
         if faults:
             raise ModelError(self._name, faults)
-        model = self._assemble(found)
+        model = self._assemble(found, notes)
         if found:
             warnings.warn(
                 f"{self._name}: physically impossible, used as written: {'; '.join(grouped(found, parts or {}))}",
@@ -406,7 +461,7 @@ class ModelBuilder:
             if values.setdefault(p.name, p.value) != p.value
         ]
 
-    def _assemble(self, suspects: tuple[tuple[str, str], ...]) -> Model:
+    def _assemble(self, suspects: tuple[tuple[str, str], ...], notes: Iterable[str] = ()) -> Model:
         joints, bindings = _resolved(self._joints, self._bindings)
         return Model(
             name=self._name,
@@ -415,9 +470,10 @@ class ModelBuilder:
             joints=joints,
             frames=tuple(self._frames),
             springs=tuple(self._springs),
+            couplings=tuple(self._couplings),
             loops=tuple(self._loops),
             prescribed=tuple(self._prescribed),
-            notes=tuple(self._notes),
+            notes=(*self._notes, *notes),
             nonphysical=suspects,
             bindings=bindings,
         )

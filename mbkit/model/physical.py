@@ -10,13 +10,22 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import InputError
-from mbkit.model.parts import Body
+from mbkit.model.parts import Body, Joint
 from mbkit.spatial import skew
 
 if TYPE_CHECKING:
     from mbkit.model.model import Model
 
-__all__ = ["body_fault", "body_faults", "grouped", "idle_joints", "sample_mass_matrix", "scale_doubts", "suspects"]
+__all__ = [
+    "body_fault",
+    "body_faults",
+    "grouped",
+    "idle_joints",
+    "sample_mass_matrix",
+    "scale_doubts",
+    "static_bodies",
+    "suspects",
+]
 
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
@@ -59,6 +68,21 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
         return f"inertia violates A + B >= C: principal moments {_told(eigenvalues)} kg m²"
     return None
+
+
+def static_bodies(joints: Iterable[Joint]) -> set[str]:
+    """Return the bodies that are fixed to the world, whose inertia cannot act."""
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        if joint.kind == "fixed":
+            below.setdefault(joint.parent, []).append(joint.child)
+    found: set[str] = set()
+    waiting = ["world"]
+    while waiting:
+        new = [child for child in below.get(waiting.pop(), ()) if child not in found]
+        found.update(new)
+        waiting += new
+    return found
 
 
 def _told(values: Array) -> str:
@@ -200,20 +224,21 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:_MOST_TOLD])}{more}"
 
 
-def sample_mass_matrix(model: Model) -> Array:
-    """Return M at one fixed random state: off the diagonal by composite inertias, on it by its definition Σ Jᵀ I J.
+def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
+    """Return M at a pose, or at one fixed random state: composite inertias give it, and Σ Jᵀ I J its diagonal.
 
     The definition gives the diagonal as a sum of squares, which stays small where a mass is on its own axis; it alone
     takes the square of the number of joints, as does M itself.
     """
-    return _sampled(model)[0]
+    return _sampled(model, q)[0]
 
 
-def _sampled(model: Model) -> tuple[Array, dict[str, Array]]:
-    """Return M at the random state, and where each body with mass has its centre of mass in the world."""
+def _sampled(model: Model, q: Array | None = None) -> tuple[Array, dict[str, Array]]:
+    """Return M at a pose or the random state, and where each body with mass has its centre of mass in the world."""
     places = {"": np.zeros(3)}
     poses = {"world": (np.eye(3), np.zeros(3))}
-    q, _ = model.random_state(np.random.default_rng(0))
+    if q is None:
+        q, _ = model.random_state(np.random.default_rng(0))
     # Limits may be as wide as doubles go; the squares of lengths must not overflow.
     q_full = model.layout.expand_q(np.clip(q, -_FAR, _FAR))
     n = model.layout.sizes[3]
@@ -264,4 +289,7 @@ def _sampled(model: Model) -> tuple[Array, dict[str, Array]]:
         momenta[joint.name] = moving, X.T @ F
         diagonal[part] += joint.armature
     np.fill_diagonal(M, diagonal)
+    for coupling in model.couplings:
+        row = model.layout.coupling_row(coupling)
+        M += coupling.armature * np.outer(row, row)
     return (np.asarray(model.layout.G.T @ M @ model.layout.G) if model.layout.reduced else M), places
