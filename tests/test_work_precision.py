@@ -675,7 +675,7 @@ def test_results_survive_json_and_csv(result):
 def test_what_is_no_result_is_refused(change, few):
     data = json.loads(few.to_json())
     change(data)
-    for text in (json.dumps(data), "", "[]", few.to_json()[:200], None):
+    for text in (json.dumps(data), "", "[]", "[" * 100_000, few.to_json()[:200], None):
         with pytest.raises(InputError, match="text: expected the JSON of a WorkPrecision"):
             WorkPrecision.from_json(text)
 

@@ -71,7 +71,7 @@ def bench(
     TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written.
     Ctrl-C ends the study early, and what is finished is written.
     """
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
     from mbkit.report.folder import check_writable, file_stem
     from mbkit.report.progress import Bar
     from mbkit.simulate.methods import METHODS, method_of
@@ -105,7 +105,7 @@ def bench(
     except InterruptedSweepError as stopped:
         result = stopped.result
     # Several robots' files hold the same name.
-    stem = f"{file_stem(target if find(target) else model.name)}-bench"
+    stem = f"{file_stem(canonical(target) or model.name)}-bench"
     written = _show(result, target, stem, out, as_json)
     if not result.complete:
         settings, curves = sum(len(c.points) for c in result.curves), len(result.curves)

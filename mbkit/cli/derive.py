@@ -128,11 +128,12 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     from mbkit.derivation.export import c_identifier, export_c
     from mbkit.lagrangian.textbook import in_symbols
     from mbkit.lagrangian.written import WrittenModel
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
 
     if not isinstance(model, WrittenModel):
         model = in_symbols(model) or model
-    made = export_c(model, name=c_identifier(name) if find(name) else None)
+    robot = canonical(name)
+    made = export_c(model, name=None if robot is None else c_identifier(robot))
     paths = made.write(out, force=force)
     for function in made.functions:
         click.echo(f"{function.signature}: {function.operations} operations")

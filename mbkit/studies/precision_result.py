@@ -224,7 +224,7 @@ class WorkPrecision:
         """
         try:
             return cls._from_plain(json.loads(text))
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
             raise InputError(
                 f"text: expected the JSON of a WorkPrecision, such as Path(...).read_text() of a file "
                 f"that to_json wrote; it has no such content ({type(error).__name__}: {error})"
