@@ -26,7 +26,8 @@ MOST_LEVELS: Final = 250
 class Element:
     """An element as it was written: tag, attributes, line, children, and what text is in it, joined.
 
-    `file` is the included file that it stands in, and empty in the file that was asked for.
+    `file` is the included file that it stands in, and empty in the file that was asked for; `included_at`
+    is then the line of the <include> there, else 0.
     """
 
     tag: str
@@ -35,6 +36,7 @@ class Element:
     children: list[Element] = field(default_factory=list)
     text: str = ""
     file: str = ""
+    included_at: int = 0
 
     @property
     def place(self) -> str:
