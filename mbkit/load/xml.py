@@ -22,6 +22,12 @@ MOST_BYTES: Final = 64 * 2**20
 MOST_LEVELS: Final = 250
 
 
+#: What expat says of any character that it cannot take: "syntax error", "not well-formed (invalid token)".
+_VAGUE: Final = (2, 4)
+#: Characters of the line that a message repeats.
+_SHOWN: Final = 30
+
+
 @dataclass
 class Element:
     """An element as it was written: tag, attributes, line, children, and what text is in it, joined.
@@ -120,10 +126,36 @@ def parse(content: bytes, name: str) -> Element:
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        why = expat.errors.messages.get(error.code, str(error))
+        why = _unexpected(content, parser.ErrorByteIndex)
+        if error.code not in _VAGUE or not why:
+            why = expat.errors.messages.get(error.code, str(error))
         raise LoadError(f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}") from None
     except (LookupError, ValueError) as error:
         if isinstance(error, LoadError):
             raise
         raise LoadError(f"{name}: not readable as XML: {error}; save it as UTF-8") from None
     return roots[0]
+
+
+def _unexpected(content: bytes, at: int) -> str:
+    """Say which character of a text ends its reading, and what stands before it; empty at the text's end."""
+    if not 0 <= at < len(content):
+        return ""
+    byte = content[at]
+    try:
+        found = content[at : at + 4].decode("utf-8", "ignore")[:1] if byte < 0x80 else content[at:].decode()[:1]
+    except UnicodeDecodeError:
+        return f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8"
+    before = content[:at].splitlines()[-1:] if content[:at][-1:] not in (b"\n", b"\r") else []
+    told = b"".join(before).decode("utf-8", "replace").replace("\0", "").lstrip()[-_SHOWN:]
+    after = f" after {told!r}" if told else ""
+    if not found.isprintable() and not found.isspace():
+        return f"control character 0x{byte:02x}{after}; remove it"
+    hint = ""
+    if told.endswith("&"):
+        hint = "; write &amp; for &"
+    elif found == "<":
+        hint = "; write &lt; for < in a value"
+    elif not told:
+        hint = "; expected <"
+    return f"unexpected {found!r}{after}{hint}"
