@@ -40,19 +40,9 @@ from validation import newton_euler
 from validation.plain_model import plain
 
 HERE = Path(__file__).parent
-URDFS = [
-    "double_pendulum",
-    "asr_twodof",
-    "finger_edu",
-    "so100",
-    "ur5",
-    "panda",
-    "borinot",
-    "hextilt",
-    "simple_humanoid",
-    "kinova",
-]
-WRITTEN = ["ur5", "z1", "solo12"]
+URDFS = ("double_pendulum", "asr_twodof", "finger_edu", "so100", "ur5", "panda", "borinot", "hextilt")
+URDFS += ("simple_humanoid", "kinova")
+WRITTEN = ("ur5", "z1", "solo12")
 GENERATED = (11, 12, 14, 16, 20)
 #: In units of eps times the number of velocities and the largest entry.
 ROUNDING = 1e3
@@ -237,6 +227,8 @@ def tree_outcome(seed: int) -> str:
 def serve(connection, part: str, folder: str) -> None:
     """Answer seeds with outcomes."""
     os.chdir(folder)
+    # Pinocchio's parser writes to the error stream what it does not like in shapes and colours.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     files = bases() if part == "mutants" else {}
     calls = {
         "mutants": lambda seed: mutant_outcome(seed, Path(folder), files),
