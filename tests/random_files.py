@@ -218,6 +218,9 @@ class Reference:
     M, nle, passive : arrays
     scale : (N,) array
         |nle|'s largest entry, or what could cancel in it: |M| |v|² and |g| |M| / length.
+    rounding : (N,) array
+        The sums of absolute values of which MuJoCo makes M's diagonal, over M's largest entry: how many
+        eps M is off where they cancel.
     """
 
     q: np.ndarray
@@ -226,6 +229,7 @@ class Reference:
     nle: np.ndarray
     passive: np.ndarray
     scale: np.ndarray
+    rounding: np.ndarray
 
 
 def mujoco_terms(text: str, samples: int, seed: int) -> Reference:
@@ -242,7 +246,7 @@ def mujoco_terms(text: str, samples: int, seed: int) -> Reference:
 def _terms(m: mujoco.MjModel, samples: int, seed: int) -> Reference:
     m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
     d, rng = mujoco.MjData(m), np.random.default_rng([seed, 7])
-    out: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "M", "nle", "passive", "scale")}
+    out: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "M", "nle", "passive", "scale", "rounding")}
     for _ in range(samples):
         q, v = rng.uniform(-2, 2, m.nq), rng.standard_normal(m.nv)
         T, slip = np.eye(m.nv), np.zeros(m.nv)
@@ -265,10 +269,23 @@ def _terms(m: mujoco.MjModel, samples: int, seed: int) -> Reference:
         mujoco.mj_fullM(m, d, M)
         size = np.abs(M).max()
         scale = max(np.abs(d.qfrc_bias).max(), size * (v @ v), np.linalg.norm(m.opt.gravity) * size)
+        lost = np.array(_sums(m, d) / size)
         forces = T.T @ (d.qfrc_bias + M @ slip), T.T @ d.qfrc_passive
-        for name, x in zip(out, (q, v, T.T @ M @ T, *forces, np.array(scale)), strict=True):
+        for name, x in zip(out, (q, v, T.T @ M @ T, *forces, np.array(scale), lost), strict=True):
             out[name].append(x)
     return Reference(**{name: np.array(x) for name, x in out.items()})
+
+
+def _sums(m: mujoco.MjModel, d: mujoco.MjData) -> float:
+    """Return the largest sum of absolute values, of composite inertias about the tree's centre of mass."""
+    worst = 0.0
+    for dof in range(m.nv):
+        xx, yy, zz, xy, xz, yz, hx, hy, hz, mass = np.abs(d.crb[m.dof_bodyid[dof]])
+        w, v = np.abs(d.cdof[dof][:3]), np.abs(d.cdof[dof][3:])
+        turning = w @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ w
+        mixed = w @ np.array([[0, hz, hy], [hz, 0, hx], [hy, hx, 0]]) @ v
+        worst = max(worst, float(turning + 2 * mixed + mass * (v @ v)))
+    return worst
 
 
 def errors(reference: Reference, M: np.ndarray, nle: np.ndarray, passive: np.ndarray) -> dict[str, float]:
