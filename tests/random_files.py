@@ -66,9 +66,11 @@ class _Author:
         return {"class": str(self.rng.choice(self.classes))} if self.classes and self.chance(0.3) else {}
 
     def geom(self, owner: ET.Element, *, heavy: bool) -> None:
-        shape = str(self.rng.choice(SHAPES))
+        shape = str(self.rng.choice((*SHAPES, "mesh")))
         given = {"type": shape, **self.of_class()}
-        if shape != "sphere" and self.chance(0.3):
+        if shape == "mesh":
+            given |= {"mesh": str(self.rng.choice(["hull", "ball"])), **self.pose()}
+        elif shape != "sphere" and self.chance(0.3):
             given |= {"fromto": self.numbers(6, 0.4), "size": self.positive(1)}
         else:
             given |= {"size": self.positive(3 if shape in ("box", "ellipsoid") else 2), **self.pose()}
@@ -78,7 +80,7 @@ class _Author:
             given |= {"mass": self.positive(1, 0.1, 3)} if self.chance(0.6) else {"density": self.positive(1, 50, 2000)}
         elif self.chance(0.3):
             given |= {"mass": "0"} if self.chance(0.5) else {"density": "0"}
-        if self.chance(0.1):
+        if self.chance(0.1) and shape != "mesh":
             given["shellinertia"] = "true"
         if self.chance(0.2):
             given["group"] = str(self.rng.integers(0, 3 if heavy else 6))
@@ -187,6 +189,11 @@ class _Author:
             for name in ("one", "two"):
                 self.default(ET.SubElement(main, "default", {"class": name}))
                 self.classes.append(name)
+        asset = ET.SubElement(root, "asset")
+        ET.SubElement(asset, "mesh", {"name": "hull", "vertex": self.numbers(24, 0.2)})
+        ET.SubElement(
+            asset, "mesh", {"name": "ball", "vertex": self.numbers(36, 0.2), "scale": self.positive(3, 0.5, 2)}
+        )
         world = ET.SubElement(root, "worldbody")
         ET.SubElement(world, "geom", {"type": "plane", "size": "1 1 1"})
         for _ in range(self.rng.integers(1, 4)):
