@@ -1,7 +1,8 @@
 """Random and damaged files, and random trees: what becomes of each, counted by outcome.
 
-Run ``python -m validation.fuzz [count [trees]]``; it writes ``validation/fuzz.json``. By default there are 10,000
-damaged copies of 18 robots' files, 10,000 random MJCFs and 165 random trees, in about half an hour of one core.
+Run ``python -m validation.fuzz [count [trees [minutes]]]``; it writes ``validation/fuzz.json``. By default there are
+10,000 damaged copies of 18 robots' files, 10,000 random MJCFs and 165 random trees, in about ten minutes of one core.
+With a number of minutes each of the three parts ends after a third of them, and the table holds how many were done.
 
 - A damaged file is refused with an error of mbkit's, or its model is that of the engine whose format it is, where
   that engine reads the same bytes: MuJoCo's compiler for MJCF, Pinocchio's parser for URDF.
@@ -76,11 +77,13 @@ def mjcf_outcome(seed: int, folder: Path) -> str:
     """Return what becomes of a random MJCF."""
     text, path = random_mjcf(seed), folder / "random.xml"
     path.write_text(text, encoding="utf-8")
-    try:
-        mujoco_terms(text, 1, seed)
-    except ValueError:
-        return "MuJoCo refuses"
-    return mjcf_judged(path, "error", seed, ROUNDING)
+    made = mjcf_judged(path, "error", seed, ROUNDING)
+    if made.startswith("refused"):
+        try:
+            mujoco_terms(text, 1, seed)
+        except ValueError:
+            return "MuJoCo refuses"
+    return made
 
 
 def mutant_outcome(seed: int, folder: Path, files: dict[str, bytes]) -> str:
@@ -243,14 +246,16 @@ def serve(connection, part: str, folder: str) -> None:
         connection.send(calls[part](seed))
 
 
-def counted(part: str, count: int) -> tuple[Counter[str], dict[str, list[int]]]:
-    """Return how often each outcome came, and the seeds of the failures."""
+def counted(part: str, count: int, seconds: float) -> tuple[Counter[str], dict[str, list[int]]]:
+    """Return how often each outcome came, and the seeds of the failures; no seed is begun after `seconds`."""
     found: Counter[str] = Counter()
     failures: dict[str, list[int]] = {}
     context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
-        process = None
+        process, begun = None, time.perf_counter()
         for seed in range(count):
+            if time.perf_counter() - begun > seconds:
+                break
             if process is None:
                 ours, theirs = context.Pipe()
                 process = context.Process(target=serve, args=(theirs, part, folder), daemon=True)
@@ -283,18 +288,21 @@ def main() -> int:
     """Run and write."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000
     trees = int(sys.argv[2]) if len(sys.argv) > 2 else 165
+    seconds = float(sys.argv[3]) * 20 if len(sys.argv) > 3 else float("inf")
     os.environ.setdefault("MBKIT_COMPILE", "0")
     table = {}
     for part, n in (("mutants", count), ("random MJCFs", count), ("random trees", trees)):
         begun = time.perf_counter()
-        found, failures = counted(part, n)
+        found, failures = counted(part, n, seconds)
         table[part] = {
-            "count": n,
+            "count": found.total(),
             "failures": sum(map(len, failures.values())),
             "outcomes": dict(sorted(found.items(), key=lambda x: -x[1])),
             "seeds of failures": {k: x[:20] for k, x in failures.items()},
         }
-        print(f"{part}: {n} in {time.perf_counter() - begun:.0f} s; {json.dumps(table[part]['outcomes'], indent=1)}")
+        print(
+            f"{part}: {found.total()} in {time.perf_counter() - begun:.0f} s; {json.dumps(table[part]['outcomes'], indent=1)}"
+        )
     versions = {name: metadata.version(name) for name in ("mujoco", "pin", "numpy", "casadi")}
     told = {"versions": versions | {"python": platform.python_version()}, **table}
     (HERE / "fuzz.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
