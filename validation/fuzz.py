@@ -300,9 +300,8 @@ def main() -> int:
             "outcomes": dict(sorted(found.items(), key=lambda x: -x[1])),
             "seeds of failures": {k: x[:20] for k, x in failures.items()},
         }
-        print(
-            f"{part}: {found.total()} in {time.perf_counter() - begun:.0f} s; {json.dumps(table[part]['outcomes'], indent=1)}"
-        )
+        print(f"{part}: {found.total()} in {time.perf_counter() - begun:.0f} s")
+        print(json.dumps(table[part]["outcomes"], indent=1), flush=True)
     versions = {name: metadata.version(name) for name in ("mujoco", "pin", "numpy", "casadi")}
     told = {"versions": versions | {"python": platform.python_version()}, **table}
     (HERE / "fuzz.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
