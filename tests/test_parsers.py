@@ -249,13 +249,16 @@ def test_meshes_that_give_inertia_are_handed_over(tmp_path: Path) -> None:
     assert any("box.obj" in note for note in result.notes)
     # Pinocchio 4.1 gives a mesh the mass of 1 kg.
     assert not result.importers[0].agrees
+    assert not stripped.shapeless
     if result.reference == "mujoco":
+        assert "from the reading of mujoco" in result.verdict
         assert not result.importers[1].stages
         assert "mujoco agrees" not in result.verdict
     missing = mb.compare_parsers(
         write(tmp_path, text.replace('file="box', 'name="box" file="gone'), "gone.xml"), samples=1
     )
     assert any("gone.obj" in note for note in missing.notes)
+    assert any("whose meshes" in note for note in missing.notes)
     assert missing.importers[1].refused
     assert not missing.reference
     outside = strip(write(tmp_path, text.replace('file="box.obj"', 'name="box" file="/etc/hostname"'), "out.xml"))

@@ -140,13 +140,17 @@ class _Meshes:
         self.unread: list[str] = []
         #: Asset's name -> file's name in `files`, empty where its vertices stand in the MJCF; None: not readable.
         self._given: dict[str, str | None] = {}
-        #: Geoms that need a file, by identity; and whether they are left out.
+        #: Geoms that need a file and are left out, by identity; and whether their body has lost mass by that.
         self._lost: dict[int, bool] = {}
         for world in mujoco.all("worldbody"):
             self._body(world, None)
 
     def lost(self, geom: Element) -> bool:
         """Return whether a geom is taken out."""
+        return id(geom) in self._lost
+
+    def heavy(self, geom: Element) -> bool:
+        """Return whether a geom that is taken out would have given its body mass."""
         return self._lost.get(id(geom), False)
 
     def written(self, asset: Element) -> dict[str, str] | None:
@@ -172,7 +176,8 @@ class _Meshes:
             full = self._defaults.filled(geom, within).attributes
             if "mesh" in full or full.get("type") in _FROM_FILES:
                 needed = owner.tag == "body" and inferred and self._heavy(full) and full.get("type") != "hfield"
-                self._lost[id(geom)] = not (needed and self._read(full.get("mesh", "")))
+                if not (needed and self._read(full.get("mesh", ""))):
+                    self._lost[id(geom)] = needed
         for body, within in list(_parts(owner, childclass, "body")):
             self._body(body, within)
 
@@ -245,9 +250,8 @@ class _Writer:
     def write(self, element: Element) -> None:
         """Write an element and what is kept of its children."""
         kept = list(self._kept(element))
-        if element.tag in ("link", "body") and element.first("inertial") is None and len(kept) < len(element.children):
-            lost = [c for c in element.children if c not in kept and c.tag in ("geom", "collision", "visual")]
-            self.shapeless += [element.attributes.get("name", "?")] if lost else []
+        if self._shapeless(element, kept):
+            self.shapeless.append(element.attributes.get("name", "?"))
         below = (element.included_at or element.line) - self._line
         if below > 0:
             self.parts.append("\n" * below)
@@ -261,6 +265,13 @@ class _Writer:
         for child in kept:
             self.write(child)
         self.parts.append(f"</{element.tag}>")
+
+    def _shapeless(self, element: Element, kept: list[Element]) -> bool:
+        """Return whether a body has lost shapes from which MuJoCo would have taken its inertia."""
+        if self._meshes is not None:
+            return element.tag == "body" and any(self._meshes.heavy(e) for e in element.all("geom"))
+        lost = any(e.tag in ("collision", "visual") and e not in kept for e in element.children)
+        return element.tag == "link" and element.first("inertial") is None and lost
 
     def _attributes(self, element: Element) -> dict[str, str]:
         own = element.attributes

@@ -125,9 +125,10 @@ class ParserComparison:
         same = [p.engine for p in self.importers if p.agrees]
         differ = [p.engine for p in self.importers if p.stages and not p.agrees]
         refuse = [p.engine for p in self.importers if p.refused]
+        against = "" if self.reference == "file" else f" from the {self.against}"
         alone = [p.engine for p in self.importers if not p.stages and not p.refused]
         parts = [f"{_listed(same)} agree{_s(same)} with the {self.against.split(',')[0]}"] if same else []
-        parts += [f"{_listed(differ)} differ{_s(differ)}"] if differ else []
+        parts += [f"{_listed(differ)} differ{_s(differ)}{against}"] if differ else []
         parts += [f"{_listed(refuse)} refuse{_s(refuse)}"] if refuse else []
         if not self.reference and alone:
             parts.insert(0, f"not compared: mbkit does not read the file; {_listed(alone)} read{_s(alone)} it")
