@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit.engines import import_mujoco
 from tests.random_files import errors, mujoco_terms, mutant, random_mjcf
 from validation import fuzz
 
@@ -39,6 +40,17 @@ def test_random_mjcfs_are_those_of_mujocos_compiler(tmp_path: Path, monkeypatch:
     found = {seed: fuzz.mjcf_outcome(seed, tmp_path) for seed in range(MJCFS)}
     assert not {seed: x for seed, x in found.items() if not fuzz.is_good("random MJCFs", x)}
     assert sum(x == "agrees" for x in found.values()) > 0.9 * MJCFS
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_mujocos_importer_describes_what_mujoco_computes(seed: int) -> None:
+    text = random_mjcf(seed)
+    reference = mujoco_terms(text, 2, seed)
+    made = import_mujoco.read(text, "mjcf")
+    own = made.terms(reference.q, reference.v, ())
+    assert max(errors(reference, own["M"], own["nle"], own["passive"]).values()) < 10
+    found = fuzz.values(made.model, reference.q, reference.v)
+    assert max(errors(reference, *found).values()) < fuzz.ROUNDING
 
 
 def test_the_same_seed_gives_the_same_file_and_a_small_change_is_seen(tmp_path: Path) -> None:

@@ -31,6 +31,8 @@ _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
 #: What changes no smooth term, and may take long or leave a part of the tree out.
 _OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _ASLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+#: Names that a note lists.
+_FEW: Final = 6
 
 
 def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
@@ -141,11 +143,15 @@ class _Terms:
 
 def _constraints(m: Any) -> list[str]:
     """Name the constraints, which are outside of all terms."""
+    kinds: dict[str, list[str]] = {}
+    for i, type_ in enumerate(m.eq_type):
+        kind = mujoco.mjtEq(int(type_)).name.removeprefix("mjEQ_").lower()
+        kinds.setdefault(kind, []).append(_called(m.eq(i), i))
     out = []
-    kinds = [mujoco.mjtEq(int(t)).name.removeprefix("mjEQ_").lower() for t in m.eq_type]
-    for kind in dict.fromkeys(kinds):
+    for kind, names in kinds.items():
         what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
-        out.append(f"{what} ({kinds.count(kind)}), outside M and nle")
+        some = ", ".join(names[:_FEW]) + (f" and {len(names) - _FEW} more" if len(names) > _FEW else "")
+        out.append(f"{what} ({some}), in none of the terms")
     return out
 
 
