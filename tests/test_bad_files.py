@@ -133,6 +133,10 @@ URDFS = {
         with_joint('<limit lower="0" upper="1" effort="-1" velocity="1"/>'),
         ["joint 'j': limit effort is negative"],
     ),
+    "negative_friction": (
+        with_joint(LIMIT + '<dynamics friction="-1"/>'),
+        ["joint 'j': friction", "negative", "line 1"],
+    ),
     "negative_damping": (with_joint(LIMIT + '<dynamics damping="-1"/>'), ["joint 'j': damping", "negative"]),
     "zero_axis": (with_joint('<axis xyz="0 0 0"/>' + LIMIT), ["joint 'j': axis is zero"]),
     "short_axis": (with_joint('<axis xyz="0 1"/>' + LIMIT), ["joint 'j': axis xyz: expected 3 numbers, got '0 1'"]),
@@ -334,6 +338,14 @@ MJCFS = {
     "unknown_type": (mjcf(BODY.replace('name="j"', 'name="j" type="screw"')), ["joint 'j': type 'screw'"]),
     "zero_axis": (mjcf(BODY.replace('name="j"', 'name="j" axis="0 0 0"')), ["joint 'j': axis is zero"]),
     "zero_quaternion": (mjcf(BODY.replace('"b"', '"b" quat="0 0 0 0"')), ["body 'b': body quat: expected directions"]),
+    "vanishing_quaternion": (
+        mjcf(BODY.replace('"b"', '"b" quat="1e-200 0 0 0"')),
+        ["body 'b': body quat: expected directions"],
+    ),
+    "vanishing_zaxis": (
+        mjcf(BODY.replace('"b"', '"b" zaxis="0 1e-320 0"')),
+        ["body 'b': body zaxis: expected directions"],
+    ),
     "two_orientations": (mjcf(BODY.replace('"b"', '"b" quat="1 0 0 0" euler="1 2 3"')), ["quat and euler; keep one"]),
     "negative_mass": (mjcf(BODY.replace('mass="1"', 'mass="-1"')), ["body 'b': mass -1 kg is negative"]),
     "negative_density": (
