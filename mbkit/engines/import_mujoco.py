@@ -163,7 +163,8 @@ def _extras(m: Any) -> list[_Extra]:
         if numbers:
             says = f"tendon {_called(m.tendon(i), i)} has {numbers}"
             out.append(_Extra(Beside(f"tendon {i}", "tendon", says), _cleared("tendon", i)))
-    for i in range(m.nu):
+    # An actuator may have several controls, which nu counts.
+    for i in range(len(m.actuator_trntype)):
         numbers = _numbers(m, "actuator", i, ("gear", "armature", "damping", "dampingpoly", "gainprm", "biasprm"))
         says = f"actuator {_called(m.actuator(i), i)}{_driven(m, i)} has {numbers or 'no numbers'}"
         out.append(_Extra(Beside(f"actuator {i}", "actuator", says), _silent(i)))
