@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import mujoco
@@ -22,7 +22,8 @@ from mbkit.engines.imported import Beside, Imported, checked, unused
 from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
 from mbkit.errors import UnsupportedError
 from mbkit.load.floating import BASE_JOINT
-from mbkit.model import Body, Joint, Model
+from mbkit.load.mjcf_couplings import coupled
+from mbkit.model import Body, Joint, JointCoupling, Model, PointSpring
 from mbkit.model.kinds import kind_of
 
 __all__ = ["read"]
@@ -54,7 +55,11 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     described = _Description(made)
     terms = _Terms(checked("mujoco", described.model), made, described.numbers)
     notes = (*_constraints(made), *(" ".join(w.split()) for w in heard))
-    return Imported(described.model, terms, notes, tuple(x.beside for x in terms.extras))
+    beside = tuple(
+        x.beside._replace(without=described.without(x.beside.key)) if x.beside.key in described.parts else x.beside
+        for x in terms.extras
+    )
+    return Imported(described.model, terms, notes, beside)
 
 
 def _floating(text: str) -> Any:
@@ -257,7 +262,16 @@ class _Description:
         for i in range(1, m.nbody):
             self._body(i)
         gravity = np.zeros(3) if self._off("GRAVITY") else np.array(m.opt.gravity)
-        self.model = Model(name="mujoco", gravity=gravity, bodies=tuple(self.bodies), joints=tuple(self.joints))
+        self._tree = Model(name="mujoco", gravity=gravity, bodies=tuple(self.bodies), joints=tuple(self.joints))
+        #: By key of `Beside`: what is described of tendons and actuators.
+        self.parts: dict[str, PointSpring | JointCoupling] = {**dict(self._point_springs()), **dict(self._couplings())}
+        self.model = self.without("")
+
+    def without(self, key: str) -> Model:
+        """Return the description less what it has of one tendon or actuator."""
+        kept = [part for name, part in self.parts.items() if name != key]
+        springs = tuple(x for x in kept if isinstance(x, PointSpring))
+        return coupled(replace(self._tree, springs=springs), [x for x in kept if isinstance(x, JointCoupling)])
 
     def _off(self, flag: str) -> bool:
         return bool(self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))
@@ -344,6 +358,67 @@ class _Description:
                 rest=rest,
             )
         )
+
+    def _spring(self, t: int) -> tuple[float, float, float]:
+        """Return a tendon's stiffness, rest length and damping; a spring with a range of rest lengths is left out."""
+        m, (low, high) = self.m, self.m.tendon_lengthspring[t].tolist()
+        stiffness = float(np.ravel(m.tendon_stiffness[t])[0]) if low == high and not self._off("SPRING") else 0.0
+        return max(stiffness, 0.0), low, float(np.ravel(m.tendon_damping[t])[0]) * (not self._off("DAMPER"))
+
+    def _point_springs(self) -> Iterator[tuple[str, PointSpring]]:
+        """Yield the tendons that are springs between two sites, with their keys."""
+        m = self.m
+        for t in range(m.ntendon):
+            wraps = range(int(m.tendon_adr[t]), int(m.tendon_adr[t]) + int(m.tendon_num[t]))
+            if [int(m.wrap_type[w]) for w in wraps] == [int(mujoco.mjtWrap.mjWRAP_SITE)] * 2:
+                sites = [int(m.wrap_objid[w]) for w in wraps]
+                bodies = [int(m.site_bodyid[k]) for k in sites]
+                (a, at_a), (b, at_b) = (
+                    (self.names[i], m.site_pos[k] - self.anchors[i]) for i, k in zip(bodies, sites, strict=True)
+                )
+                stiffness, rest, damping = self._spring(t)
+                if a != b and (stiffness or damping):
+                    name = m.tendon(t).name or f"tendon{t + 1}"
+                    yield f"tendon {t}", PointSpring(name, a, at_a, b, at_b, stiffness, rest, damping)
+
+    def _couplings(self) -> Iterator[tuple[str, JointCoupling]]:
+        """Yield what tendons and actuators do as springs, dampers and rotors on sums of joint coordinates."""
+        m, taken = self.m, set[str]()
+        names = {j: joint.name for j, joint in zip(self.numbers, self.joints, strict=True)}
+
+        def made(key: str, name: str, row: dict[int, float], *numbers: float) -> Iterator[tuple[str, JointCoupling]]:
+            taken.add(name := unused(name, taken))
+            row = {j: x for j, x in row.items() if x}
+            if row and (numbers[0] or any(numbers[2:])):
+                factors = np.array([*row.values()])
+                yield key, JointCoupling(name, tuple(names[j] for j in row), factors, *numbers)
+
+        tendons: dict[int, dict[int, float]] = {}
+        for t in range(m.ntendon):
+            wraps = range(int(m.tendon_adr[t]), int(m.tendon_adr[t]) + int(m.tendon_num[t]))
+            row = dict.fromkeys((int(m.wrap_objid[w]) for w in wraps), 0.0)
+            if all(m.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
+                for w in wraps:
+                    row[int(m.wrap_objid[w])] += float(m.wrap_prm[w])
+                tendons[t] = row
+                name = m.tendon(t).name or f"tendon{t + 1}"
+                yield from made(f"tendon {t}", name, row, *self._spring(t), float(m.tendon_armature[t]))
+        of_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+        for i in range(len(m.actuator_trntype)):
+            target, row = int(m.actuator_trnid[i, 0]), {}
+            if int(m.actuator_trntype[i]) in of_joint and _KINDS[int(m.jnt_type[target])] in ("prismatic", "revolute"):
+                row = {target: 1.0}
+            elif m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
+                row = tendons.get(target, {})
+            row = {j: float(m.actuator_gear[i, 0]) * x for j, x in row.items()}
+            affine = m.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and not self._off("ACTUATION")
+            b0, b1, b2 = m.actuator_biasprm[i, :3].tolist() if affine else (0.0, 0.0, 0.0)
+            rest = -b0 / b1 if b1 else 0.0
+            damping = float(np.ravel(m.actuator_damping[i])[0]) * (not self._off("DAMPER")) - min(b2, 0.0)
+            name = m.actuator(i).name or f"actuator{i + 1}"
+            yield from made(
+                f"actuator {i}", name, row, max(-b1, 0.0), rest, max(damping, 0.0), float(m.actuator_armature[i])
+            )
 
 
 def _matrix(wxyz: Array) -> Array:

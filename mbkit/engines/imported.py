@@ -51,7 +51,7 @@ _LARGEST: Final = 1e30
 
 
 class Beside(NamedTuple):
-    """What may act in an importer's model beside its bodies and joints.
+    """What may act in an importer's model beside its bodies and joints: described, or not.
 
     Attributes
     ----------
@@ -61,11 +61,14 @@ class Beside(NamedTuple):
         Such as ``"tendon"``, ``"actuator"`` or ``"fluid"``.
     says : str
         Its name and its numbers.
+    without : Model or None
+        The description less what it has of this; None where it has nothing of it.
     """
 
     key: str
     kind: str
     says: str
+    without: Model | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ class Imported:
     notes : tuple of str
         What the importer said, and what it holds that is in none of the terms.
     beside : tuple of Beside
-        What the terms may hold and `model` does not.
+        What the terms may hold beside bodies and joints.
     """
 
     model: Model

@@ -261,22 +261,34 @@ def own_terms(engine: str, made: Imported, samples: int, seed: int, tolerance: f
     """
     at = states_of(made.model, samples, seed)
     owners = [j.name for j in made.model.independent_joints for _ in range(j.type.nv)]
-    whole = made.terms(at.q, at.v, ())
+    whole, described = made.terms(at.q, at.v, ()), model_terms(made.model, at)
+    bare = made.terms(at.q, at.v, tuple(x.key for x in made.beside)) if made.beside else whole
     causes, idle = [], []
     for extra in made.beside:
-        found = gaps(whole, made.terms(at.q, at.v, (extra.key,)), at.v, owners)
-        if found.worst <= tolerance:
+        without = made.terms(at.q, at.v, (extra.key,))
+        part = {} if extra.without is None else _less(described, model_terms(extra.without, at))
+        bare = _with(bare, part)
+        if gaps(whole, without, at.v, owners).worst <= tolerance:
             idle.append(extra.says)
-        else:
-            says = f"{engine}: {extra.says}"
+            continue
+        found = gaps(whole, _with(without, part), at.v, owners)
+        if not found.worst <= tolerance:
+            says = f"{engine}: {extra.says}{', and acts otherwise than described' if part else ''}"
             causes.append(Cause(extra.kind, extra.says, says, None, None, _effects(found), acts=True))
-    bare = made.terms(at.q, at.v, tuple(x.key for x in made.beside)) if made.beside else whole
-    found = gaps(bare, model_terms(made.model, at), at.v, owners)
+    found = gaps(bare, described, at.v, owners)
     held = found.worst <= tolerance
     if not held:
         says = f"{engine}: its own terms are not those of its bodies and joints, most at {found.joint or 'no joint'}"
         causes.append(Cause("own terms", engine, says, None, None, _effects(found), acts=True))
     return OwnTerms(tuple(causes), tuple(idle), held)
+
+
+def _less(a: Values, b: Values) -> Values:
+    return {name: x - b[name] for name, x in a.items() if name in b}
+
+
+def _with(a: Values, b: Values) -> Values:
+    return {name: x + b[name] if name in b else x for name, x in a.items()}
 
 
 def _effects(found: Gaps) -> dict[str, float]:
