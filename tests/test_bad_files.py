@@ -323,16 +323,20 @@ MJCFS = {
         mjcf(
             '<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'
         ),
-        ["body 'b'", "meshes are not opened", "add <inertial>"],
+        ["body 'b'", "'m'", "m.stl"],
     ),
     "mesh_inertia_by_default": (
         mjcf(
             '<body name="b" childclass="v"><joint/><geom mesh="m"/></body>',
             '<default><default class="v"><geom type="mesh"/></default></default>',
         ),
-        ["body 'b'", "add <inertial>"],
+        ["body 'b'", "'m'", "no such <mesh>"],
     ),
     "unknown_class": (mjcf('<body childclass="k"><joint/></body>'), ["unknown default class 'k'; there are: main"]),
+    "renamed_main": (
+        mjcf(BODY, '<default class="k"><joint damping="1"/></default>'),
+        ["<default>", "'main'", "line 1"],
+    ),
     "same_names": (mjcf(BODY + BODY.replace('"b"', '"c"')), ["joint 'j': declared more than once"]),
     "called_world": (mjcf(BODY.replace('"b"', '"world"')), ["body 'world': that name is the ground's"]),
     "unknown_type": (mjcf(BODY.replace('name="j"', 'name="j" type="screw"')), ["joint 'j': type 'screw'"]),
@@ -358,7 +362,26 @@ MJCFS = {
         mjcf('<body name="b"><joint/><geom type="cone" size="1"/></body>'),
         ["body 'b': geom type 'cone'"],
     ),
-    "shell": (mjcf('<body name="b"><joint/><geom size="1" shellinertia="true"/></body>'), ["body 'b'", "shell"]),
+    "compiler": (
+        mjcf('<body name="b"><joint/><geom size="1" shellinertia="maybe"/></body>'),
+        ["'b'", "MuJoCo's compiler"],
+    ),
+    "flag": (mjcf(BODY, '<option><flag gravity="off"/></option>'), ["gravity", "'off'"]),
+    "limited": (mjcf(BODY.replace('name="j"', 'name="j" limited="yes"')), ["limited", "'yes'"]),
+    "springdamper": (mjcf(BODY.replace('name="j"', 'name="j" springdamper="1 0"')), ["joint 'j'", "springdamper"]),
+    "inherited": (
+        mjcf(
+            '<body name="b"><joint name="j" type="free"/><geom size="1"/></body>',
+            '<default><joint armature="1"/></default>',
+        ),
+        ["joint 'j': armature 1 on a free joint", "line 1"],
+    ),
+    "world_attribute": (
+        mjcf(BODY).replace("<worldbody", '<worldbody childclass="main"'),
+        ["worldbody", "'childclass'"],
+    ),
+    "world_joint": (mjcf(BODY + "<joint/>"), ["worldbody", "'joint'"]),
+    "scaled_frame": (mjcf(f'<frame scale="2">{BODY}</frame>'), ["frame", "'scale'"]),
     "triangle": (mjcf(BODY.replace("1 1 1", "1 1 3")), ["'b'", "A + B >= C", 'nonphysical="warn"']),
     "no_mass": (mjcf('<body name="b"><joint name="j"/></body>'), ["'b'", "no mass moves with joint 'j'"]),
     "free_below": (
@@ -371,11 +394,11 @@ MJCFS = {
     ),
     "armature_on_ball": (
         mjcf(BODY.replace('name="j"', 'name="j" type="ball" armature="1"')),
-        ["joint 'j': armature on a ball joint"],
+        ["joint 'j': armature 1 on a ball joint", "line 1"],
     ),
     "spring_on_ball": (
         mjcf(BODY.replace('name="j"', 'name="j" type="ball" stiffness="1"')),
-        ["joint 'j': joint spring on a ball joint"],
+        ["joint 'j': stiffness 1 on a ball joint", "line 1"],
     ),
     "curved_spring": (
         mjcf(BODY.replace('name="j"', 'name="j" stiffness="1 2"')),
@@ -387,11 +410,6 @@ MJCFS = {
     ),
     "degenerate_axes": (mjcf(BODY.replace('"b"', '"b" xyaxes="1 0 0 2 0 0"')), ["body 'b': body xyaxes"]),
     "old_coordinates": (mjcf(BODY, '<compiler coordinate="global"/>'), ["compiler coordinate"]),
-    "raised_mass": (
-        mjcf(BODY, '<compiler boundmass="2"/>'),
-        ["body 'b': compiler boundmass would raise its mass 1 kg"],
-    ),
-    "raised_inertia": (mjcf(BODY, '<compiler boundinertia="2"/>'), ["body 'b': compiler boundinertia"]),
     "range_without_limited": (
         mjcf(BODY.replace('name="j"', 'name="j" range="0 1"'), '<compiler autolimits="false"/>'),
         ["joint 'j': range without limited"],

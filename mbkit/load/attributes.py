@@ -92,6 +92,14 @@ class Reader:
         fallback = None if default is None else (default,)
         return self.numbers(element, attribute, who, count=1, default=fallback, bounded=bounded)[0]
 
+    def choice(self, element: Element, attribute: str, choices: tuple[str, ...]) -> str:
+        """Return one of the choices, the first where the attribute is absent."""
+        value = element.attributes.get(attribute, choices[0])
+        if value in choices:
+            return value
+        self.fault(f"{element.tag} {attribute}: expected one of {', '.join(choices)}, got {value[:40]!r}", element)
+        return choices[0]
+
     def only(self, element: Element, tag: str, who: str) -> Element | None:
         """Return the child of this tag, of which there may be one."""
         found = element.all(tag)

@@ -26,12 +26,14 @@ def load(
     mimic: Literal["reduce", "free"] = "reduce",
     nonphysical: Literal["error", "warn"] | None = None,
     gravity: ArrayLike | None = None,
+    meshes: Literal["auto", "never"] = "auto",
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
-    No mesh is opened, and no other file but those that an MJCF includes. What was decided on the way
-    (mimic joints, parts left out, rounded zeros) stands in the model's ``notes``. Tendons and actuators of an
-    MJCF act as springs, dampers and rotors where their forces at zero control are linear.
+    Of other files, those that an MJCF includes are opened, and the meshes that give a body of an MJCF its
+    inertia; no others. What was decided on the way (mimic joints, parts left out, rounded zeros, files that
+    were opened) stands in the model's ``notes``. Tendons and actuators of an MJCF act as springs, dampers and
+    rotors where their forces at zero control are linear.
 
     Parameters
     ----------
@@ -50,6 +52,9 @@ def load(
         A negative mass is always refused.
     gravity : (3,) array_like, optional
         m/s², in world axes; by default the file's own (MJCF), else (0, 0, -9.81).
+    meshes : {"auto", "never"}
+        Whether an MJCF's meshes are read where a body has no other inertia. MuJoCo's compiler infers it.
+        With "never" such bodies are refused.
 
     Returns
     -------
@@ -84,6 +89,8 @@ def load(
         raise InputError(f"mimic: expected 'reduce' or 'free', got {mimic!r}")
     if nonphysical not in ("error", "warn", None):
         raise InputError(f"nonphysical: expected 'error', 'warn' or None, got {nonphysical!r}")
+    if meshes not in ("auto", "never"):
+        raise InputError(f"meshes: expected 'auto' or 'never', got {meshes!r}")
     path, by_name = _resolved(source)
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml.read(path)
@@ -106,7 +113,9 @@ def load(
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = expanded(root, path)
-        return model_of_mjcf(whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
+        return model_of_mjcf(
+            whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity, meshes=meshes
+        )
     raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
 
 

@@ -17,7 +17,7 @@ from mbkit.model.kinds import KINDS, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameter import Number
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
-from mbkit.model.physical import body_faults, suspects
+from mbkit.model.physical import body_faults, static_bodies, suspects
 from mbkit.model.structure import structure_faults
 
 __all__ = ["ModelBuilder"]
@@ -364,7 +364,8 @@ class ModelBuilder:
         nonphysical : {"error", "warn"}
             What to do about bodies that no matter can have (an inertia that is
             not positive or violates the triangle inequality, joints that move no
-            inertia): raise, or keep them as written and warn.
+            inertia): raise, or keep them as written and warn. Of a body that is fixed
+            to the world only a negative mass counts; the rest is noted.
         point_masses : bool
             Whether a mass without inertia is meant that way.
 
@@ -393,11 +394,14 @@ class ModelBuilder:
         strict = nonphysical == "error"
         remedy = '; correct it, or take it as written with nonphysical="warn"'
         negative = {b.name for b in self._bodies if b.mass < 0}
+        still = static_bodies(self._joints) - negative
+        notes = [f"body {n!r} never moves, so this cannot act: {why}" for n, why in found if n in still]
+        found = tuple((n, why) for n, why in found if n not in still)
         faults += [f"body {n!r}: {why}{remedy}" for n, why in found if strict and n not in negative]
         faults += [f"body {n!r}: {why}" for n, why in found if n in negative]
         if faults:
             raise ModelError(self._name, faults)
-        model = self._assemble(found)
+        model = self._assemble(found, notes)
         if found:
             told = "; ".join(f"{n!r}: {why}" for n, why in found[:5])
             more = f" and {len(found) - 5} more" if len(found) > 5 else ""
@@ -422,7 +426,7 @@ class ModelBuilder:
             if values.setdefault(p.name, p.value) != p.value
         ]
 
-    def _assemble(self, suspects: tuple[tuple[str, str], ...]) -> Model:
+    def _assemble(self, suspects: tuple[tuple[str, str], ...], notes: Iterable[str] = ()) -> Model:
         joints, bindings = _resolved(self._joints, self._bindings)
         return Model(
             name=self._name,
@@ -434,7 +438,7 @@ class ModelBuilder:
             couplings=tuple(self._couplings),
             loops=tuple(self._loops),
             prescribed=tuple(self._prescribed),
-            notes=tuple(self._notes),
+            notes=(*self._notes, *notes),
             nonphysical=suspects,
             bindings=bindings,
         )

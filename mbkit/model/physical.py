@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.parts import Body
+from mbkit.model.parts import Body, Joint
 from mbkit.spatial import skew
 
 if TYPE_CHECKING:
     from mbkit.model.model import Model
 
-__all__ = ["body_fault", "body_faults", "idle_joints", "sample_mass_matrix", "suspects"]
+__all__ = ["body_fault", "body_faults", "idle_joints", "sample_mass_matrix", "static_bodies", "suspects"]
 
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
@@ -48,6 +48,21 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
         return f"inertia violates A + B >= C: principal moments {_told(eigenvalues)} kg m²"
     return None
+
+
+def static_bodies(joints: Iterable[Joint]) -> set[str]:
+    """Return the bodies that are fixed to the world, whose inertia cannot act."""
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        if joint.kind == "fixed":
+            below.setdefault(joint.parent, []).append(joint.child)
+    found: set[str] = set()
+    waiting = ["world"]
+    while waiting:
+        new = [child for child in below.get(waiting.pop(), ()) if child not in found]
+        found.update(new)
+        waiting += new
+    return found
 
 
 def _told(values: Array) -> str:
