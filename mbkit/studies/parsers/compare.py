@@ -189,7 +189,9 @@ def _written(stripped: Stripped, floating_base: bool) -> Model:
         warnings.simplefilter("ignore", MbkitWarning)
         if stripped.format == "urdf":
             return urdf_links(stripped.root, str(stripped.path), floating_base=floating_base)
-        return model_of_mjcf(stripped.root, stripped.path, floating_base=False, nonphysical="warn", gravity=None)
+        return model_of_mjcf(
+            stripped.root, stripped.path, floating_base=False, nonphysical="warn", gravity=None, meshes="auto"
+        )
 
 
 def _reference(
