@@ -117,7 +117,9 @@ def _check_one(
     written = show(data, table, files, out, as_json=as_json)
     if not result.rows:
         say("error", f"{result.verdict}; two engines that hold the model are needed")
-    leave(MISUSE if not written or not result.rows else AGREE if result.passed else DIFFER)
+    elif result.nothing:
+        say("error", result.verdict)
+    leave(MISUSE if not written or result.nothing else AGREE if result.passed else DIFFER)
 
 
 def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, out: Path) -> None:

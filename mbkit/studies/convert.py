@@ -173,11 +173,13 @@ def _to_urdf(model: Model) -> Converted:
             back = load(path, gravity=model.gravity, nonphysical="warn")
     found = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
     acting: tuple[Cause, ...] = found.acting
-    if not found.agree or acting:
+    if acting or not (found.agree or found.massless):
         told = "; ".join(str(c) for c in acting) or found.verdict
         raise MbkitError(
             f"convert: what was written of {model.name} reads back otherwise: {told}; please report this model"
         )
+    if found.massless:
+        notes.append("no body has mass, so that reading back compares no forces, but bodies and joints alone")
     order = [c.says for c in found.causes if c.kind == "joint order"]
     return Converted(model.name, "urdf", text, found.gaps, (*notes, *order))
 
