@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.parts import Body, Joint
+from mbkit.model.parts import Body, Joint, Loop
 from mbkit.spatial import skew
 
 if TYPE_CHECKING:
@@ -89,24 +89,31 @@ def suspects(model: Model, *, point_masses: bool) -> tuple[tuple[str, str], ...]
     found = dict(body_faults(model.bodies, point_masses=point_masses))
     # A negative mass makes M indefinite, and joints look idle that are not.
     if all(x is not None for x in model.parameters.values()) and not any(b.mass < 0 for b in model.bodies):
-        for name in idle_joints(model):
-            found.setdefault(
-                model.joint(name).child,
-                f"no mass moves with joint {name!r}, so M is singular: give mass, inertia or armature",
-            )
+        idle, alone = idle_joints(model)
+        for name in idle:
+            others = ", ".join(repr(n) for n in idle if n != name)
+            why = f"no mass moves with joint {name!r}" if alone else f"joints {name!r} and {others} move the same mass"
+            if not alone and not others:
+                why = f"two velocities of joint {name!r} move the same mass"
+            found.setdefault(model.joint(name).child, f"{why}, so M is singular: give mass, inertia or armature")
     return tuple(found.items())
 
 
-def idle_joints(model: Model) -> list[str]:
-    """Return the joints whose motion costs no kinetic energy, so that M is singular.
+def idle_joints(model: Model) -> tuple[list[str], bool]:
+    """Return the joints whose motion costs no kinetic energy, so that M is singular, and whether each alone costs none.
 
     M is formed at one random state from the definition, Σ Jᵀ I J, and scaled to
-    a unit diagonal; a null vector names its joints.
+    a unit diagonal; a null vector names its joints. Motions that loops do not allow count as if they moved mass.
     """
     if not model.nv:
-        return []
-    M = sample_mass_matrix(model)
-    diagonal = np.diag(M)
+        return [], True
+    M, jacobians, turned = _sample(model)
+    rows = [_held(loop, jacobians, turned) @ model.layout.G for loop in model.loops]
+    if rows and (size := float(np.trace(M))):
+        held = np.concatenate(rows)
+        # M need have an inverse only on what loops allow.
+        M = M + size / len(M) * held.T @ held
+    diagonal, alone = np.diag(M), True
     # What is left of a mass on its own axis is the square of a rounded length.
     zero = diagonal <= 1e-28 * float(diagonal.max())
     if not zero.any():
@@ -115,18 +122,25 @@ def idle_joints(model: Model) -> list[str]:
         scaled = M / root[:, None] / root
         values, vectors = np.linalg.eigh(scaled)
         if values[0] > 4 * model.nv * np.finfo(float).eps:
-            return []
+            return [], True
+        alone = False
         zero = np.abs(vectors[:, 0]) > 0.3 * np.abs(vectors[:, 0]).max()
-    return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()]
+    return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()], alone
 
 
 def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
     """Return M at a pose, or at one fixed random state, by its definition; slow, for checks and for loading."""
+    return _sample(model, q)[0]
+
+
+def _sample(model: Model, q: Array | None = None) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    """Return M there, and each body's Jacobian in its own axes and rotation to world axes."""
     if q is None:
         q, _ = model.random_state(np.random.default_rng(0))
     q_full = model.layout.expand_q(q)
     n = model.layout.sizes[3]
     jacobians = {"world": np.zeros((6, n))}
+    turned = {"world": np.eye(3)}
     M = np.zeros((n, n))
     bodies = {b.name: b for b in model.bodies}
     for joint in model.tree:
@@ -139,7 +153,7 @@ def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
             unit = [float(i == k) for i in range(joint.type.nv)]
             linear, angular = joint.type.twist(np, joint, list(q_full[part[0]]), unit)
             J[:, part[1].start + k] += np.array([*linear, *angular], dtype=float)
-        jacobians[joint.child] = J
+        jacobians[joint.child], turned[joint.child] = J, turned[joint.parent] @ R
         body = bodies[joint.child]
         at_com = J[:3] - skew(body.com) @ J[3:]
         M += body.mass * at_com.T @ at_com + J[3:].T @ body.inertia @ J[3:]
@@ -147,4 +161,14 @@ def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
     for coupling in model.couplings:
         row = model.layout.coupling_row(coupling)
         M += coupling.armature * np.outer(row, row)
-    return np.asarray(model.layout.G.T @ M @ model.layout.G)
+    return np.asarray(model.layout.G.T @ M @ model.layout.G), jacobians, turned
+
+
+def _held(loop: Loop, jacobians: dict[str, Array], turned: dict[str, Array]) -> Array:
+    """Return the rows of what a loop holds at rest, in world axes."""
+    ends = []
+    for body, point in ((loop.body_a, loop.translation_a), (loop.body_b, loop.translation_b)):
+        J = jacobians[body]
+        moved = [turned[body] @ (J[:3] - skew(np.asarray(point)) @ J[3:]), turned[body] @ J[3:]]
+        ends.append(np.concatenate(moved if loop.kind == "frame" else moved[:1]))
+    return np.asarray(ends[0] - ends[1])
