@@ -25,7 +25,7 @@ ROBOT = (
 PLANTED = """
 import os, re, signal, sys, time
 
-def read(text, format_, floating_base):
+def read(text, format_, floating_base, files):
     name = re.search('robot name="(\\w+)"', text)[1]
     if name == "segfault":
         print("the last thing that it said", flush=True)
@@ -42,9 +42,9 @@ def read(text, format_, floating_base):
     if name == "fault":
         raise IndexError("list index out of range")
     from mbkit.engines.import_pinocchio import read as sound
-    made = sound(text, format_, floating_base)
+    made = sound(text, format_, floating_base, files)
     if name == "later":
-        return type(made)(made.model, lambda q, v: os.abort(), ("a note",))
+        return type(made)(made.model, lambda q, v, without: os.abort(), ("a note",))
     return type(made)(made.model, made.terms, (str(os.getpid()),))
 """
 

@@ -6,18 +6,22 @@ import json
 import re
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.engines import imported
+from mbkit.engines import import_mujoco, imported
 from mbkit.errors import InputError, LoadError, ModelError, UnknownNameError
+from mbkit.load import xml
 from mbkit.load.stripped import strip
 from mbkit.load.urdf_links import urdf_links
+from mbkit.load.xml import Element
 from mbkit.report.causes import meaning
 from mbkit.report.page import importers_page
+from mbkit.studies.parsers.result import TERMS
 
 LINK = (
     '<link name="{0}"><inertial><origin xyz="0 0.01 0.1" rpy="0.1 0 0"/><mass value="{1}"/>'
@@ -153,12 +157,151 @@ def test_an_mjcf_through_three_importers(tmp_path: Path) -> None:
     assert any("drawn elsewhere" in note for note in drake.notes)
 
 
+#: What changes MuJoCo's smooth terms: flags, an attribute of a body, sections, options.
+ACTING = {
+    "nothing": ("", "", "", ""),
+    "gravity off": ("<flag gravity='disable'/>", "", "", ""),
+    "springs off": ("<flag spring='disable'/>", "", "", ""),
+    "dampers off": ("<flag damper='disable'/>", "", "", ""),
+    "asleep": ("<flag sleep='enable'/>", "", "", ""),
+    "steps of its own": ("", "", "", "integrator='discrete'"),
+    "fluid": ("", "", "", "density='1.2' viscosity='0.1' wind='1 0 0'"),
+    "held": ("", "gravcomp='0.7'", "", ""),
+    "tendon armature": ("", "", "<tendon><fixed armature='2'>{t}</fixed></tendon>", ""),
+    "tendon spring": ("", "", "<tendon><fixed stiffness='5' damping='1'>{t}</fixed></tendon>", ""),
+    "motor armature": ("", "", "<actuator><motor joint='j1' armature='0.5' gear='2'/></actuator>", ""),
+    "motor": ("", "", "<actuator><motor name='m' joint='j1'/></actuator>", ""),
+    "motor damping": ("", "", "<actuator><motor joint='j1' damping='0.5'/></actuator>", ""),
+    "servo": ("", "", "<actuator><position joint='j1' kp='20' kv='1'/></actuator>", ""),
+    "servo off": ("<flag actuation='disable'/>", "", "<actuator><position joint='j1' kp='20'/></actuator>", ""),
+    "clamped": ("", "", "<actuator><motor joint='j1' ctrllimited='true' ctrlrange='0.5 1'/></actuator>", ""),
+}
+
+
+def acting(case: str) -> str:
+    flags, body, section, options = ACTING[case]
+    section = section.format(t="<joint joint='j1' coef='1'/><joint joint='j2' coef='-0.5'/>")
+    return f"""<mujoco model="m"><option {options}>{flags}</option><worldbody>
+      <body name="a" {body}><joint name="j1" axis="0 1 0" stiffness="3" springref="20" damping="0.4"/>
+        <geom type="box" size="0.1 0.2 0.3" pos="0 0 0.2"/>
+        <body name="b" pos="0 0 0.5"><joint name="j2" axis="1 1 0" damping="0.1"/><geom size="0.1" pos="0 0 0.2"/>
+          <body name="c" pos="0.1 0 0.5"><joint name="j3" type="ball"/><geom size="0.1" pos="0.1 0 0.2"/></body>
+      </body></body>
+      <body name="d" pos="0 0 3"><freejoint name="f"/><geom type="capsule" size="0.1 0.2" pos="0.1 0.2 0.3"/></body>
+      </worldbody>{section}</mujoco>"""
+
+
+@pytest.mark.parametrize("case", ACTING)
+def test_the_verdict_on_mujoco_is_that_of_its_own_terms(case: str, tmp_path: Path) -> None:
+    path = write(tmp_path, acting(case), "m.xml")
+    made = mujoco.MjModel.from_xml_path(str(path))
+    model = mb.load(path)
+    pinocchio = mb.dynamics(model)
+    data, M = mujoco.MjData(made), np.empty((made.nv, made.nv))
+    worst = 0.0
+    read = import_mujoco.read(path.read_text(encoding="utf-8"), "mjcf")
+    for q, v in zip(*model.random_state(np.random.default_rng(1), 3), strict=True):
+        # The free joint's turn is left out, so that its velocities are MuJoCo's.
+        q[9:], v[8:] = (0, 0, 0, 1), 0
+        data.qpos[:], data.qvel[:] = np.r_[q[:2], q[5], q[2:5], q[6:9], 1, 0, 0, 0], v
+        mujoco.mj_forward(made, data)
+        mujoco.mj_fullM(made, data, M)
+        own = {"M": M, "nle": data.qfrc_bias, "passive": data.qfrc_passive + data.qfrc_actuator}
+        ours = {"M": pinocchio.mass_matrix(q), "nle": pinocchio.nle(q, v), "passive": pinocchio.passive(q, v)}
+        theirs = read.terms(q[None], v[None], ())
+        for name, x in own.items():
+            scale = np.abs(x).max() + 1
+            assert np.abs(theirs[name][0] - x).max() < 1e-12 * scale, name
+            worst = max(worst, np.abs(theirs[name][0] - ours[name]).max() / scale)
+    result = mb.compare_parsers(path, ("mujoco",))
+    told = result.importers[0]
+    assert told.agrees == (worst < 1e-9) == ("agrees" in result.verdict)
+    assert told.explanation is not None
+    assert told.explanation.agree == told.agrees
+    assert told.explanation.worst == max(s.worst for s in told.stages if s.name in TERMS)
+    assert told.explanation.explained
+    assert bool(told.explanation.acting) != told.agrees
+    if case == "motor":
+        assert any("'m'" in note for note in told.notes)
+
+
+def test_meshes_that_give_inertia_are_handed_over(tmp_path: Path) -> None:
+    corners = [(x, y, z) for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (-0.3, 0.3)]
+    faces = ["1 2 4", "1 4 3", "5 7 8", "5 8 6", "1 5 6", "1 6 2", "3 4 8", "3 8 7", "1 3 7", "1 7 5", "2 6 8", "2 8 4"]
+    lines = [*("v {} {} {}".format(*c) for c in corners), *(f"f {f}" for f in faces)]
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "box.obj").write_text("\n".join(lines), encoding="utf-8")
+    text = """<mujoco model="m"><compiler meshdir="meshes"/>
+      <asset><mesh file="box.obj"/><mesh name="seen" file="nowhere.obj"/><texture file="none.png" type="2d"/></asset>
+      <default><default class="look"><geom type="mesh" density="0" group="2"/></default></default>
+      <worldbody><body name="a"><joint name="j" axis="0 1 0"/><geom type="mesh" mesh="box"/>
+        <geom class="look" mesh="seen"/><geom class="look" type="box" size="1 1 1"/></body></worldbody></mujoco>"""
+    path = write(tmp_path, text, "m.xml")
+    stripped = strip(path)
+    assert list(stripped.meshes) == ["box.obj"]
+    assert "nowhere" not in stripped.text
+    # The default class keeps its density, so that the massless box has none.
+    made = mujoco.MjModel.from_xml_string(stripped.text, stripped.meshes)
+    assert made.body_mass[1] == pytest.approx(48, rel=1e-6)
+    assert made.ngeom == 2
+    result = mb.compare_parsers(path, samples=1)
+    assert not any(p.refused for p in result.importers)
+    assert any("box.obj" in note for note in result.notes)
+    # Pinocchio 4.1 gives a mesh the mass of 1 kg.
+    assert not result.importers[0].agrees
+    assert not stripped.shapeless
+    if result.reference == "mujoco":
+        assert "from the reading of mujoco" in result.verdict
+        assert not result.importers[1].stages
+        assert "mujoco agrees" not in result.verdict
+    missing = mb.compare_parsers(
+        write(tmp_path, text.replace('file="box', 'name="box" file="gone'), "gone.xml"), samples=1
+    )
+    assert any("gone.obj" in note for note in missing.notes)
+    assert any("whose meshes" in note for note in missing.notes)
+    assert missing.importers[1].refused
+    assert not missing.reference
+    outside = strip(write(tmp_path, text.replace('file="box.obj"', 'name="box" file="/etc/hostname"'), "out.xml"))
+    assert not outside.meshes
+    assert "hostname" in outside.unread[0]
+
+
+def test_lines_in_messages_are_those_of_the_file(tmp_path: Path) -> None:
+    def lines(root: Element) -> list[tuple[str, str, int]]:
+        return [(e.tag, e.attributes.get("name", ""), e.included_at or e.line) for e in root.walk()]
+
+    (tmp_path / "part.xml").write_text("<mujocoinclude>\n\n\n<body name='p'/></mujocoinclude>", encoding="utf-8")
+    bad = "<!-- one -->\n" + MJCF.replace(
+        '<body name="ball"', '<include file="part.xml"/>\n<!-- two\n -->\n<geom\n type="ball"/><body name="ball"'
+    ).replace("<worldbody>", "<asset>\n<texture file='t.png'/>\n</asset><worldbody>")
+    tall = arm('<transmission name="t">\n<type> a\n b </type>\n<joint name="elbow"/></transmission>').replace(
+        "><", ">\n<"
+    )
+    for name, text in (("bad.xml", bad), ("tall.urdf", tall)):
+        stripped = strip(write(tmp_path, text, name))
+        kept = lines(xml.parse(stripped.text.encode(), name))
+        assert set(kept) <= set(lines(stripped.root))
+        assert len(kept) > 20
+    line = bad[: bad.index("<geom\n")].count("\n") + 1
+    refused = mb.compare_parsers(tmp_path / "bad.xml", ("mujoco",)).importers[0].refused
+    assert f"line {line}" in refused or f"Line number={line}" in refused
+    broken = tall.replace('<mass value="2"/>', '<mass value="two"/>')
+    line = broken[: broken.index('"two"')].count("\n") + 1
+    drake = mb.compare_parsers(write(tmp_path, broken, "broken.urdf"), ("drake",)).importers[0]
+    assert f":{line}:" in " ".join((drake.refused, *drake.notes))
+
+
 def test_refusals_are_told_and_the_rest_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # mbkit itself does not read it: the first importer that does is the reference.
+    # mbkit itself does not read it, and no importer's reading of a URDF is the standard: nothing is compared.
     loose = arm().replace("<axis", "<axs/><axis")
     result = mb.compare_parsers(write(tmp_path, loose))
-    assert result.reference == "pinocchio"
+    assert result.reference == ""
     assert "axs" in result.faults
+    assert not result.agree
+    assert not any(p.agrees or p.stages for p in result.importers)
+    assert "agree" not in result.verdict
+    assert "not compared" in result.verdict
+    assert "Nothing is compared" in importers_page(result)
     monkeypatch.setitem(imported.IMPORTERS, "drake", DRAKE._replace(library="nothing_of_this_name"))
     result = mb.compare_parsers(write(tmp_path, arm()))
     assert "pip install mbkit[drake]" in result.importers[2].refused
@@ -261,7 +404,7 @@ def test_the_page_tells_it_all_and_obeys_nothing(tmp_path: Path) -> None:
     # Whoever reads nothing is told with the reason, in the place of a column.
     result = mb.compare_parsers(write(tmp_path, arm(tool=LINK.format("tool", 0.3, 1e-3, 1e-3, 9e-3, ""))), samples=1)
     page = importers_page(result)
-    assert 'class="refuses" rowspan="17"' in page
+    assert 'class="refuses" rowspan="18"' in page
     assert page.count("A + B &gt;= C") == 2
     nobody = mb.compare_parsers(write(tmp_path, urdf('<link name="a"/>')))
     assert "and none reads it" in importers_page(nobody)

@@ -143,7 +143,7 @@ def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, o
     data = result.to_json()
     files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
     written = show(data, table, files, out, as_json=as_json)
-    read = any(p.stages for p in result.importers)
+    read = any(not p.refused for p in result.importers)
     if not read:
         say("error", f"no importer reads {target}")
     leave(MISUSE if not written or not read else AGREE if result.agree else DIFFER)

@@ -16,12 +16,13 @@ from typing import Any, Final
 import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyForces
 
 from mbkit._check import Array
-from mbkit.engines.base import Dynamics
+from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.drake import DrakeDynamics
 from mbkit.engines.drake_model import DrakeModel
-from mbkit.engines.imported import Imported, checked, unused
+from mbkit.engines.imported import Imported, checked, unused, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.floating import BASE_JOINT
 from mbkit.model import Body, Joint, Model
@@ -44,17 +45,20 @@ _TURN: Final = 2 * np.pi
 _IDLE: Final = ("safety_controller", "calibration")
 
 
-def read(text: str, format_: str, floating_base: bool = False) -> Imported:
+def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
     """Return what Drake's parser makes of a text, its base welded to the world unless it is to float."""
     plant = MultibodyPlant(0.0)
-    with _heard() as heard:
+    with _heard() as heard, written(text, files or {}) as path:
         try:
-            models = Parser(plant).AddModelsFromString(text, "urdf" if format_ == "urdf" else "xml")
+            if files:
+                models = Parser(plant).AddModels(str(path))
+            else:
+                models = Parser(plant).AddModelsFromString(text, "urdf" if format_ == "urdf" else "xml")
             welded = _weld(plant, models) if format_ == "urdf" and not floating_base else ""
             plant.Finalize()
         except (Exception, SystemExit) as error:
             # A demand of Drake's that fails comes as SystemExit.
-            raise UnsupportedError(f"drake: {' '.join(str(error).split())}") from None
+            raise UnsupportedError(f"drake: {' '.join(str(error).replace(f'{path.parent}/', '').split())}") from None
     described = _Description(plant, floating_base)
     dyn = _Read(checked("drake", described.model), described.made)
     notes = [f"the base {welded!r} floats by itself; welded to the world here"] if welded else []
@@ -105,9 +109,21 @@ class _Read(DrakeDynamics):
         self._lock = threading.RLock()
         self._rotations: list[tuple[Array, int, int | None]] = []
 
-    def terms(self, q: Array, v: Array) -> dict[str, Array]:
-        """Return M, g and nle at a batch of states."""
-        return {"M": self.mass_matrix(q), "g": self.gravity(q), "nle": self.nle(q, v)}
+    def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:  # noqa: ARG002
+        """Return M, g, nle and passive at a batch of states."""
+        return {"M": self.mass_matrix(q), "g": self.gravity(q), "nle": self.nle(q, v), "passive": self.passive(q, v)}
+
+    def _passive(self, q: Array, v: Array) -> Array:
+        plant, context, forces = self.plant, self._context, MultibodyForces(self.plant)
+
+        def one(q: Array, v: Array) -> Array:
+            self._set(q, v)
+            plant.CalcForceElementsContribution(context, forces)
+            # Gravity is among Drake's force elements.
+            weight = plant.CalcGravityGeneralizedForces(context)
+            return self._force(plant.CalcGeneralizedForces(context, forces) - weight)
+
+        return per_sample(one, q, v)
 
 
 class _Description:

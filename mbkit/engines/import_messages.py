@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mbkit._check import Array
+from mbkit.engines.imported import Beside
 from mbkit.model import Model
 
 __all__ = ["Answer", "Ask", "Hello", "Made", "Read", "Refused", "Request"]
@@ -18,6 +19,8 @@ class Read:
     ----------
     module, text, format : str
     floating_base : bool
+    files : dict
+        The meshes that the text names: name -> content.
     seconds : float
         After which the process ends itself, should nobody be there to end it.
     """
@@ -26,6 +29,7 @@ class Read:
     text: str
     format: str
     floating_base: bool
+    files: dict[str, bytes]
     seconds: float
 
 
@@ -36,11 +40,14 @@ class Ask:
     Attributes
     ----------
     q, v : (N, nq) and (N, nv) arrays
+    without : tuple of str
+        Keys of what is left out; see `mbkit.engines.imported.Imported`.
     seconds : float
     """
 
     q: Array
     v: Array
+    without: tuple[str, ...]
     seconds: float
 
 
@@ -55,6 +62,7 @@ class Made:
 
     model: Model
     notes: tuple[str, ...]
+    beside: tuple[Beside, ...]
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ their own, and quaternions are w, x, y, z.
 
 from __future__ import annotations
 
-import threading
+import copy
 import warnings
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import mujoco
@@ -18,37 +18,48 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import Dynamics
-from mbkit.engines.imported import Imported, checked, unused
-from mbkit.engines.mujoco import MujocoDynamics
-from mbkit.engines.mujoco_api import heard_warnings
-from mbkit.engines.mujoco_model import MujocoModel
+from mbkit.engines.imported import Beside, Imported, checked, unused
+from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
 from mbkit.errors import UnsupportedError
 from mbkit.load.floating import BASE_JOINT
 from mbkit.load.mjcf_couplings import coupled
 from mbkit.model import Body, Joint, JointCoupling, Model, PointSpring
 from mbkit.model.kinds import kind_of
 
-__all__ = ["ImportedMujoco", "read"]
+__all__ = ["read"]
 
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
+#: What changes no smooth term, and may take long or leave a part of the tree out.
+_OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
+_ASLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+#: Names that a note lists.
+_FEW: Final = 6
 
 
-def read(text: str, format_: str, floating_base: bool = False) -> Imported:
+def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
     """Return what MuJoCo's parser and compiler make of a text; an MJCF says by itself that its base floats."""
     # A singular M at the zero configuration is a warning, and no refusal.
     with heard_warnings() as heard, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
-            made = _floating(text) if floating_base and format_ == "urdf" else mujoco.MjModel.from_xml_string(text)
+            made = (
+                _floating(text)
+                if floating_base and format_ == "urdf"
+                else mujoco.MjModel.from_xml_string(text, files or {})
+            )
         except UnsupportedError:
             raise
         except Exception as error:
             lines = " ".join(str(error).split())
             raise UnsupportedError(f"mujoco: {lines.removeprefix('XML Error: ').removeprefix('Error: ')}") from None
     described = _Description(made)
-    dyn = ImportedMujoco(checked("mujoco", described.model), described.made)
-    return Imported(described.model, dyn.terms, (*_beside(made), *(" ".join(w.split()) for w in heard)))
+    terms = _Terms(checked("mujoco", described.model), made, described.numbers)
+    notes = (*_constraints(made), *(" ".join(w.split()) for w in heard))
+    beside = tuple(
+        x.beside._replace(without=described.without(x.beside.key)) if x.beside.key in described.parts else x.beside
+        for x in terms.extras
+    )
+    return Imported(described.model, terms, notes, beside)
 
 
 def _floating(text: str) -> Any:
@@ -62,36 +73,177 @@ def _floating(text: str) -> Any:
     return spec.compile()
 
 
-class ImportedMujoco(MujocoDynamics):
-    """MuJoCo on its own model."""
+@dataclass(frozen=True)
+class _Extra:
+    """What may act beside bodies and joints, and how it is taken out of a compiled model."""
 
-    def __init__(self, model: Model, made: MujocoModel) -> None:
-        Dynamics.__init__(self, model)
-        self._made = made
-        self.mj_model = self._m = made.model
-        self.disabled = ()
-        self._d = mujoco.MjData(self._m)
-        self._reduced = model.layout.reduced
-        self._lock = threading.RLock()
-
-    def terms(self, q: Array, v: Array) -> dict[str, Array]:
-        """Return M, g and nle at a batch of states."""
-        return {"M": self.mass_matrix(q), "g": self.gravity(q), "nle": self.nle(q, v)}
+    beside: Beside
+    remove: Callable[[Any], None]
 
 
-def _beside(m: Any) -> list[str]:
-    """Say what acts in the model beside its bodies and joints."""
+class _Terms:
+    """MuJoCo's own terms of its own model, with all that acts in it at zero control and activation."""
+
+    def __init__(self, model: Model, m: Any, numbers: list[int]) -> None:
+        self._m = copy.copy(m)
+        self._m.opt.disableflags |= _OFF
+        self._m.opt.enableflags &= ~_ASLEEP
+        self.extras = _extras(m)
+        #: (joint's kind, start in qpos, start in qvel, slices of q and v) of each that moves.
+        self._moving = [
+            (
+                joint.kind,
+                int(m.jnt_qposadr[j]),
+                int(m.jnt_dofadr[j]),
+                model.layout.q[joint.name],
+                model.layout.v[joint.name],
+            )
+            for joint, j in zip(model.joints, numbers, strict=True)
+            if j >= 0
+        ]
+
+    def __call__(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:
+        """Return M, g, nle and passive at a batch of states.
+
+        passive is qfrc_passive, and qfrc_actuator where all controls and activations are zero.
+        """
+        m = copy.copy(self._m) if without else self._m
+        for extra in self.extras:
+            if extra.beside.key in without:
+                extra.remove(m)
+        data = mujoco.MjData(m)
+        with heard_warnings():
+            made = [self._one(m, data, *x) for x in zip(q, v, strict=True)]
+        return {name: np.array([x[name] for x in made]) for name in ("M", "g", "nle", "passive")}
+
+    def _one(self, m: Any, d: Any, q: Array, v: Array) -> dict[str, Array]:
+        T, slip, qvel = np.zeros((m.nv, m.nv)), np.zeros(m.nv), np.zeros(m.nv)
+        mujoco.mj_resetData(m, d)
+        for kind, iq, iv, at_q, at_v in self._moving:
+            x, n = q[at_q].copy(), at_v.stop - at_v.start
+            T[iv : iv + n, at_v] = np.eye(n)
+            if kind in ("free", "ball"):
+                x[-4:] = np.roll(x[-4:], 1)
+            if kind == "free":
+                # Its linear velocity is in the world's axes: v_mj = R v, and v̇_mj = R (v̇ + ω × v).
+                R = _matrix(x[-4:])
+                T[iv : iv + 3, at_v.start : at_v.start + 3] = R
+                slip[iv : iv + 3] = R @ np.cross(v[at_v][3:], v[at_v][:3])
+            d.qpos[iq : iq + len(x)] = x
+        qvel[:] = T @ v
+        mujoco.mj_fwdPosition(m, d)
+        mujoco.mj_fwdVelocity(m, d)
+        g = d.qfrc_bias.copy()
+        M = full_mass_matrix(m, d)
+        d.qvel[:] = qvel
+        mujoco.mj_fwdVelocity(m, d)
+        mujoco.mj_fwdActuation(m, d)
+        return {
+            "M": T.T @ M @ T,
+            "g": T.T @ g,
+            "nle": T.T @ (d.qfrc_bias + M @ slip),
+            "passive": T.T @ (d.qfrc_passive + d.qfrc_actuator),
+        }
+
+
+def _constraints(m: Any) -> list[str]:
+    """Name the constraints, which are outside of all terms."""
+    kinds: dict[str, list[str]] = {}
+    for i, type_ in enumerate(m.eq_type):
+        kind = mujoco.mjtEq(int(type_)).name.removeprefix("mjEQ_").lower()
+        kinds.setdefault(kind, []).append(_called(m.eq(i), i))
     out = []
-    kinds = [mujoco.mjtEq(int(t)).name.removeprefix("mjEQ_").lower() for t in m.eq_type]
-    for kind in dict.fromkeys(kinds):
+    for kind, names in kinds.items():
         what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
-        out.append(f"{what} ({kinds.count(kind)}), outside M and nle")
-    for count, what in ((m.ntendon, "tendons"), (len(m.actuator_trntype), "actuators")):
-        if count:
-            out.append(f"{count} {what}: their armature is part of M, their springs and dampers are outside M and nle")
-    if np.any(m.body_gravcomp):
-        out.append(f"gravity compensation on {int(np.count_nonzero(m.body_gravcomp))} bodies, outside nle")
+        some = ", ".join(names[:_FEW]) + (f" and {len(names) - _FEW} more" if len(names) > _FEW else "")
+        out.append(f"{what} ({some}), in none of the terms")
     return out
+
+
+def _extras(m: Any) -> list[_Extra]:
+    """Return what may act in a compiled model beside its bodies and joints, with its numbers."""
+    out = []
+    for i in range(m.ntendon):
+        numbers = _numbers(m, "tendon", i, ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature"))
+        if numbers:
+            says = f"tendon {_called(m.tendon(i), i)} has {numbers}"
+            out.append(_Extra(Beside(f"tendon {i}", "tendon", says), _cleared("tendon", i)))
+    # An actuator may have several controls, which nu counts.
+    for i in range(len(m.actuator_trntype)):
+        numbers = _numbers(m, "actuator", i, ("gear", "armature", "damping", "dampingpoly", "gainprm", "biasprm"))
+        says = f"actuator {_called(m.actuator(i), i)}{_driven(m, i)} has {numbers or 'no numbers'}"
+        out.append(_Extra(Beside(f"actuator {i}", "actuator", says), _silent(i)))
+    for b in map(int, np.flatnonzero(m.body_gravcomp)):
+        says = f"body {_called(m.body(b), b)} has gravity compensation {m.body_gravcomp[b]:g}"
+        out.append(_Extra(Beside(f"body {b}", "gravity compensation", says), _zeroed("body_gravcomp", b)))
+    if m.opt.density or m.opt.viscosity:
+        wind = " ".join(f"{x:g}" for x in m.opt.wind)
+        says = f"a fluid acts (density {m.opt.density:g}, viscosity {m.opt.viscosity:g}, wind {wind})"
+        out.append(_Extra(Beside("fluid", "fluid", says), _dry))
+    for j in range(m.njnt):
+        turning = m.jnt_type[j] <= int(mujoco.mjtJoint.mjJNT_BALL)
+        names = ("jnt_stiffness", "jnt_stiffnesspoly") if turning else ("jnt_stiffnesspoly",)
+        if any(np.any(getattr(m, name)[j]) for name in names):
+            what = "a spring on its rotation" if turning else "a spring that is not linear"
+            says = f"joint {_called(m.joint(j), j)} has {what}"
+            out.append(_Extra(Beside(f"joint {j}", "spring", says), _zeroed_all(names, j)))
+        dofs = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + kind_of(_KINDS[int(m.jnt_type[j])]).nv)
+        if np.any(m.dof_dampingpoly[dofs]):
+            says = f"joint {_called(m.joint(j), j)} has a damper that is not linear"
+            out.append(_Extra(Beside(f"damper {j}", "damping", says), _zeroed("dof_dampingpoly", dofs)))
+    return out
+
+
+def _driven(m: Any, i: int) -> str:
+    """Return the joint or tendon that an actuator drives, for a message; empty where it drives neither."""
+    kind, target = mujoco.mjtTrn(int(m.actuator_trntype[i])), int(np.ravel(m.actuator_trnid[i])[0])
+    if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        return f" on joint {_called(m.joint(target), target)}"
+    return f" on tendon {_called(m.tendon(target), target)}" if kind == mujoco.mjtTrn.mjTRN_TENDON else ""
+
+
+def _called(element: Any, index: int) -> str:
+    return repr(element.name) if element.name else f"number {index}"
+
+
+def _numbers(m: Any, what: str, i: int, names: tuple[str, ...]) -> str:
+    told = []
+    for name in names:
+        values = np.ravel(getattr(m, f"{what}_{name}")[i])
+        if np.any(values):
+            last = int(np.flatnonzero(values)[-1]) + 1
+            told.append(f"{name} {' '.join(f'{x:g}' for x in values[:last])}")
+    return ", ".join(told)
+
+
+def _zeroed(name: str, at: Any) -> Callable[[Any], None]:
+    return _zeroed_all((name,), at)
+
+
+def _zeroed_all(names: tuple[str, ...], at: Any) -> Callable[[Any], None]:
+    def remove(m: Any) -> None:
+        for name in names:
+            getattr(m, name)[at] = 0.0
+
+    return remove
+
+
+def _cleared(what: str, i: int) -> Callable[[Any], None]:
+    names = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature")
+    return _zeroed_all(tuple(f"{what}_{name}" for name in names), i)
+
+
+def _silent(i: int) -> Callable[[Any], None]:
+    def remove(m: Any) -> None:
+        _zeroed_all(("actuator_armature", "actuator_damping", "actuator_dampingpoly"), i)(m)
+        m.actuator_forcelimited[i] = 1
+        m.actuator_forcerange[i] = 0.0
+
+    return remove
+
+
+def _dry(m: Any) -> None:
+    m.opt.density = m.opt.viscosity = 0.0
 
 
 class _Description:
@@ -109,11 +261,20 @@ class _Description:
         self.numbers: list[int] = []
         for i in range(1, m.nbody):
             self._body(i)
-        self.model = Model(
-            name="mujoco", gravity=np.array(m.opt.gravity), bodies=tuple(self.bodies), joints=tuple(self.joints)
-        )
-        self.model = coupled(replace(self.model, springs=tuple(self._point_springs())), self._couplings())
-        self.made = self._mapped()
+        gravity = np.zeros(3) if self._off("GRAVITY") else np.array(m.opt.gravity)
+        self._tree = Model(name="mujoco", gravity=gravity, bodies=tuple(self.bodies), joints=tuple(self.joints))
+        #: By key of `Beside`: what is described of tendons and actuators.
+        self.parts: dict[str, PointSpring | JointCoupling] = {**dict(self._point_springs()), **dict(self._couplings())}
+        self.model = self.without("")
+
+    def without(self, key: str) -> Model:
+        """Return the description less what it has of one tendon or actuator."""
+        kept = [part for name, part in self.parts.items() if name != key]
+        springs = tuple(x for x in kept if isinstance(x, PointSpring))
+        return coupled(replace(self._tree, springs=springs), [x for x in kept if isinstance(x, JointCoupling)])
+
+    def _off(self, flag: str) -> bool:
+        return bool(self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))
 
     def _new(self, what: str, name: str) -> str:
         made = unused(name, self.taken[what])
@@ -173,7 +334,7 @@ class _Description:
                 kind = "continuous"
             if m.jnt_actfrclimited[j]:
                 effort = np.array([np.abs(m.jnt_actfrcrange[j]).max()])
-            stiffness = np.array([float(np.ravel(m.jnt_stiffness[j])[0])])
+            stiffness = np.zeros(1) if self._off("SPRING") else np.array([float(np.ravel(m.jnt_stiffness[j])[0])])
             rest = np.array([m.qpos_spring[m.jnt_qposadr[j]]]) if stiffness.any() else rest
         self.numbers.append(j)
         self.joints.append(
@@ -191,25 +352,21 @@ class _Description:
                 velocity_limit=np.full(type_.nv, np.inf),
                 effort_limit=effort,
                 armature=np.array(m.dof_armature[v]),
-                damping=np.array(m.dof_damping[v]),
+                damping=np.zeros(type_.nv) if self._off("DAMPER") else np.array(m.dof_damping[v]),
                 friction=np.array(m.dof_frictionloss[v]),
                 stiffness=stiffness,
                 rest=rest,
             )
         )
 
-    def _on(self, part: str) -> bool:
-        """Return whether no option flag switches springs, dampers or actuation off."""
-        return not self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}"))
-
     def _spring(self, t: int) -> tuple[float, float, float]:
         """Return a tendon's stiffness, rest length and damping; a spring with a range of rest lengths is left out."""
         m, (low, high) = self.m, self.m.tendon_lengthspring[t].tolist()
-        stiffness = float(np.ravel(m.tendon_stiffness[t])[0]) if low == high and self._on("SPRING") else 0.0
-        return max(stiffness, 0.0), low, float(np.ravel(m.tendon_damping[t])[0]) * self._on("DAMPER")
+        stiffness = float(np.ravel(m.tendon_stiffness[t])[0]) if low == high and not self._off("SPRING") else 0.0
+        return max(stiffness, 0.0), low, float(np.ravel(m.tendon_damping[t])[0]) * (not self._off("DAMPER"))
 
-    def _point_springs(self) -> Iterator[PointSpring]:
-        """Yield the tendons that are springs between two sites."""
+    def _point_springs(self) -> Iterator[tuple[str, PointSpring]]:
+        """Yield the tendons that are springs between two sites, with their keys."""
         m = self.m
         for t in range(m.ntendon):
             wraps = range(int(m.tendon_adr[t]), int(m.tendon_adr[t]) + int(m.tendon_num[t]))
@@ -222,18 +379,19 @@ class _Description:
                 stiffness, rest, damping = self._spring(t)
                 if a != b and (stiffness or damping):
                     name = m.tendon(t).name or f"tendon{t + 1}"
-                    yield PointSpring(name, a, at_a, b, at_b, stiffness, rest, damping)
+                    yield f"tendon {t}", PointSpring(name, a, at_a, b, at_b, stiffness, rest, damping)
 
-    def _couplings(self) -> Iterator[JointCoupling]:
+    def _couplings(self) -> Iterator[tuple[str, JointCoupling]]:
         """Yield what tendons and actuators do as springs, dampers and rotors on sums of joint coordinates."""
         m, taken = self.m, set[str]()
         names = {j: joint.name for j, joint in zip(self.numbers, self.joints, strict=True)}
 
-        def made(name: str, row: dict[int, float], *numbers: float) -> Iterator[JointCoupling]:
+        def made(key: str, name: str, row: dict[int, float], *numbers: float) -> Iterator[tuple[str, JointCoupling]]:
             taken.add(name := unused(name, taken))
             row = {j: x for j, x in row.items() if x}
             if row and (numbers[0] or any(numbers[2:])):
-                yield JointCoupling(name, tuple(names[j] for j in row), np.array([*row.values()]), *numbers)
+                factors = np.array([*row.values()])
+                yield key, JointCoupling(name, tuple(names[j] for j in row), factors, *numbers)
 
         tendons: dict[int, dict[int, float]] = {}
         for t in range(m.ntendon):
@@ -243,11 +401,9 @@ class _Description:
                 for w in wraps:
                     row[int(m.wrap_objid[w])] += float(m.wrap_prm[w])
                 tendons[t] = row
-                yield from made(
-                    m.tendon(t).name or f"tendon{t + 1}", row, *self._spring(t), float(m.tendon_armature[t])
-                )
+                name = m.tendon(t).name or f"tendon{t + 1}"
+                yield from made(f"tendon {t}", name, row, *self._spring(t), float(m.tendon_armature[t]))
         of_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-        # An actuator may have several controls, which nu counts.
         for i in range(len(m.actuator_trntype)):
             target, row = int(m.actuator_trnid[i, 0]), {}
             if int(m.actuator_trntype[i]) in of_joint and _KINDS[int(m.jnt_type[target])] in ("prismatic", "revolute"):
@@ -255,31 +411,14 @@ class _Description:
             elif m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
                 row = tendons.get(target, {})
             row = {j: float(m.actuator_gear[i, 0]) * x for j, x in row.items()}
-            affine = m.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and self._on("ACTUATION")
+            affine = m.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and not self._off("ACTUATION")
             b0, b1, b2 = m.actuator_biasprm[i, :3].tolist() if affine else (0.0, 0.0, 0.0)
             rest = -b0 / b1 if b1 else 0.0
-            damping = float(np.ravel(m.actuator_damping[i])[0]) * self._on("DAMPER") - min(b2, 0.0)
+            damping = float(np.ravel(m.actuator_damping[i])[0]) * (not self._off("DAMPER")) - min(b2, 0.0)
             name = m.actuator(i).name or f"actuator{i + 1}"
-            yield from made(name, row, max(-b1, 0.0), rest, max(damping, 0.0), float(m.actuator_armature[i]))
-
-    def _mapped(self) -> MujocoModel:
-        m, layout = self.m, self.model.layout
-        q_index, v_index = np.zeros(m.nq, int), np.zeros(m.nv, int)
-        free = []
-        for joint, j in zip(self.joints, self.numbers, strict=True):
-            if j < 0:
-                continue
-            q, v = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j])
-            ours_q, ours_v = layout.q[joint.name], layout.v[joint.name]
-            order = list(range(ours_q.start, ours_q.stop))
-            if joint.type.quaternion is not None:
-                k = joint.type.quaternion
-                order[k:] = [order[-1], *order[k:-1]]
-            q_index[q : q + joint.type.nq], v_index[v : v + joint.type.nv] = order, range(ours_v.start, ours_v.stop)
-            if joint.kind == "free":
-                free.append((q, v))
-        bodies = {name: i for i, name in enumerate(self.names)}
-        return MujocoModel(m, q_index, v_index, tuple(free), bodies, frozenset(), ())
+            yield from made(
+                f"actuator {i}", name, row, max(-b1, 0.0), rest, max(damping, 0.0), float(m.actuator_armature[i])
+            )
 
 
 def _matrix(wxyz: Array) -> Array:

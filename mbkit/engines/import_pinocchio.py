@@ -7,15 +7,13 @@ is (cos, sin), a planar joint's velocity is in the body's axes.
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit.engines.imported import Imported, checked, unused
+from mbkit.engines.imported import Imported, checked, unused, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.floating import BASE_JOINT
 from mbkit.model import Body, Joint, Model
@@ -37,10 +35,10 @@ _UNALIGNED: Final = {
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
 
 
-def read(text: str, format_: str, floating_base: bool = False) -> Imported:
+def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
     """Return what Pinocchio's parser makes of a text; an MJCF says by itself that its base floats."""
     try:
-        raw = _urdf(text, floating_base) if format_ == "urdf" else _mjcf(text)
+        raw = _urdf(text, floating_base) if format_ == "urdf" else _mjcf(text, files or {})
     except Exception as error:
         raise UnsupportedError(f"pinocchio: {' '.join(str(error).split())}") from None
     described = _Description(raw)
@@ -53,11 +51,9 @@ def _urdf(text: str, floating_base: bool) -> Any:
     return pin.buildModelFromXML(text)
 
 
-def _mjcf(text: str) -> Any:
+def _mjcf(text: str, files: dict[str, bytes]) -> Any:
     # Only files are read as MJCF.
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.xml"
-        path.write_text(text, encoding="utf-8")
+    with written(text, files) as path:
         return pin.buildModelFromMJCF(str(path))
 
 
@@ -112,10 +108,13 @@ class _Description:
 
     # The engine's own values, in the description's coordinates.
 
-    def terms(self, q: Array, v: Array) -> dict[str, Array]:
-        """Return M, g and nle at a batch of states."""
+    def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:  # noqa: ARG002
+        """Return M, g, nle and passive at a batch of states.
+
+        passive is of the damping that Pinocchio read: its algorithms leave that to the caller.
+        """
         made = [self._one(*x) for x in zip(q, v, strict=True)]
-        return {name: np.array([x[name] for x in made]) for name in ("M", "g", "nle")}
+        return {name: np.array([x[name] for x in made]) for name in ("M", "g", "nle", "passive")}
 
     def _one(self, q: Array, v: Array) -> dict[str, Array]:
         raw, layout = self.raw, self.model.layout
@@ -139,7 +138,8 @@ class _Description:
         M = np.triu(M) + np.triu(M, 1).T
         nle = np.array(pin.nonLinearEffects(raw, self.data, theirs, u))
         g = np.array(pin.computeGeneralizedGravity(raw, self.data, theirs))
-        return {"M": T.T @ M @ T, "g": T.T @ g, "nle": T.T @ (nle + M @ slip)}
+        passive = -np.array(raw.damping) * u
+        return {"M": T.T @ M @ T, "g": T.T @ g, "nle": T.T @ (nle + M @ slip), "passive": T.T @ passive}
 
 
 def _kind(joint: Any) -> tuple[str, Array | None]:

@@ -64,9 +64,9 @@ class Server:
     def _read(self, request: Read) -> Made:
         # What was held can be as large.
         self._held = None
-        self._held = made = reader(request.module)(request.text, request.format, request.floating_base)
-        return Made(made.model, made.notes)
+        self._held = made = reader(request.module)(request.text, request.format, request.floating_base, request.files)
+        return Made(made.model, made.notes, made.beside)
 
     def _terms(self, request: Ask) -> dict[str, Any]:
         assert self._held is not None
-        return self._held.terms(request.q, request.v)
+        return self._held.terms(request.q, request.v, request.without)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+import tempfile
+from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,7 +17,7 @@ from mbkit._check import Array
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 
-__all__ = ["IMPORTERS", "Imported", "Importer", "check_installed", "checked", "reader", "unused"]
+__all__ = ["IMPORTERS", "Beside", "Imported", "Importer", "check_installed", "checked", "reader", "unused", "written"]
 
 
 class Importer(NamedTuple):
@@ -47,6 +50,27 @@ IMPORTERS = {
 _LARGEST: Final = 1e30
 
 
+class Beside(NamedTuple):
+    """What may act in an importer's model beside its bodies and joints: described, or not.
+
+    Attributes
+    ----------
+    key : str
+        By which `Imported.terms` leaves it out.
+    kind : str
+        Such as ``"tendon"``, ``"actuator"`` or ``"fluid"``.
+    says : str
+        Its name and its numbers.
+    without : Model or None
+        The description less what it has of this; None where it has nothing of it.
+    """
+
+    key: str
+    kind: str
+    says: str
+    without: Model | None = None
+
+
 @dataclass(frozen=True)
 class Imported:
     """A file as one engine's importer holds it.
@@ -56,15 +80,18 @@ class Imported:
     model : Model
         What the importer made, described: its bodies, joints and numbers, as they are.
     terms : callable
-        (q, v) -> M, g and nle of the imported model by the engine itself, at (N, nq) and (N, nv) in
-        the coordinates of `model`, as a dict.
+        (q, v, without) -> M, g, nle and passive of the imported model by the engine itself, at (N, nq) and
+        (N, nv) in the coordinates of `model`, as a dict. `without` holds keys of `beside` to leave out.
     notes : tuple of str
-        What the importer said, and what it holds that `model` does not.
+        What the importer said, and what it holds that is in none of the terms.
+    beside : tuple of Beside
+        What the terms may hold beside bodies and joints.
     """
 
     model: Model
-    terms: Callable[[Array, Array], dict[str, Array]]
+    terms: Callable[[Array, Array, tuple[str, ...]], dict[str, Array]]
     notes: tuple[str, ...]
+    beside: tuple[Beside, ...] = ()
 
 
 def unused(name: str, taken: Container[str]) -> str:
@@ -117,10 +144,22 @@ def check_installed(engine: str) -> None:
         raise UnsupportedError(f"{engine} is not installed (no module {library!r}); pip install {package}")
 
 
-def reader(module: str) -> Callable[[str, str, bool], Imported]:
-    """Return the function (text, format, floating_base) -> Imported of an importer's module.
+@contextmanager
+def written(text: str, files: Mapping[str, bytes]) -> Iterator[Path]:
+    """Write an MJCF and the meshes that it names into a folder of their own, and remove it afterwards."""
+    with tempfile.TemporaryDirectory(prefix="mbkit-") as folder:
+        path = Path(folder) / "model.xml"
+        for name, content in {path.name: text.encode(), **files}.items():
+            (Path(folder) / name).write_bytes(content)
+        yield path
+
+
+def reader(module: str) -> Callable[[str, str, bool, dict[str, bytes]], Imported]:
+    """Return the function (text, format, floating_base, files) -> Imported of an importer's module.
+
+    `files` holds the meshes that the text names, by name.
 
     It raises `UnsupportedError` where the importer refuses a text.
     """
-    made: Callable[[str, str, bool], Imported] = import_module(module).read
+    made: Callable[[str, str, bool, dict[str, bytes]], Imported] = import_module(module).read
     return made

@@ -5,6 +5,7 @@ MuJoCo's writer keeps six digits. Here numbers are the shortest decimals that gi
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Iterator
 from typing import Any, Final
 from xml.sax.saxutils import quoteattr
@@ -13,13 +14,14 @@ import mujoco
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.import_mujoco import ImportedMujoco
+from mbkit.engines.base import Dynamics
+from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.mujoco_api import heard_warnings
-from mbkit.engines.mujoco_model import Placed, mapped, specified
+from mbkit.engines.mujoco_model import MujocoModel, Placed, mapped, specified
 from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 
-__all__ = ["mjcf_text", "read_back"]
+__all__ = ["ReadBack", "mjcf_text", "read_back"]
 
 _TYPES: Final = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
@@ -29,6 +31,19 @@ _TYPES: Final = {
 }
 # MuJoCo refuses principal moments below 1e-15 kg m².
 _LEAST: Final = 2e-15
+
+
+class ReadBack(MujocoDynamics):
+    """MuJoCo on the model that its own parser made of a text."""
+
+    def __init__(self, model: Model, made: MujocoModel) -> None:
+        Dynamics.__init__(self, model)
+        self._made = made
+        self.mj_model = self._m = made.model
+        self.disabled = ()
+        self._d = mujoco.MjData(self._m)
+        self._reduced = model.layout.reduced
+        self._lock = threading.RLock()
 
 
 def mjcf_text(model: Model, comment: str) -> str:
@@ -64,7 +79,7 @@ def mjcf_text(model: Model, comment: str) -> str:
     return "\n".join([*lines, "</mujoco>"]) + "\n"
 
 
-def read_back(model: Model, text: str) -> ImportedMujoco:
+def read_back(model: Model, text: str) -> ReadBack:
     """Return what MuJoCo's parser makes of a text of `mjcf_text`, in the description's coordinates.
 
     Raises
@@ -79,7 +94,7 @@ def read_back(model: Model, text: str) -> ImportedMujoco:
         except ValueError as error:
             told = " ".join(str(error).split())
             raise UnsupportedError(f"mujoco: refuses what was written of {model.name}: {told}") from None
-    return ImportedMujoco(model, mapped(made, model, placed, ()))
+    return ReadBack(model, mapped(made, model, placed, ()))
 
 
 def _unsayable(model: Model) -> Iterator[str]:

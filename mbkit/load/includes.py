@@ -107,6 +107,7 @@ class _Main:
         told = _told(path, self.path.parent)
         for element in root.walk():
             element.file = told
+            element.included_at = include.included_at or include.line
         return root
 
     def _refuse(self, element: Element, why: str) -> NoReturn:

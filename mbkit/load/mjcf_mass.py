@@ -15,7 +15,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.attributes import Reader
-from mbkit.load.mjcf_values import ORIENTATIONS, Compiler, Pose, pose, z_to
+from mbkit.load.mjcf_values import ORIENTATIONS, Compiler, Pose, has_length, pose, z_to
 from mbkit.load.solids import NOTHING, SIZES, Lump, solid, together
 from mbkit.load.xml import Element
 
@@ -149,7 +149,7 @@ def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, who: 
         if "pos" in element.attributes:
             read.fault(f"{who}: a geom has pos and fromto; keep one", element)
         along = ends[3:] - ends[:3]
-        if not along.any():
+        if not has_length(along):
             read.fault(f"{who}: a geom's fromto has no length", element)
             return size, Pose(np.eye(3), ends[:3])
         half = float(np.linalg.norm(along)) / 2

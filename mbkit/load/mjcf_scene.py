@@ -12,7 +12,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.load.attributes import Reader
 from mbkit.load.mjcf_mass import body_lump, counts
-from mbkit.load.mjcf_values import HERE, Compiler, Defaults, Pose, pose
+from mbkit.load.mjcf_values import HERE, Compiler, Defaults, Pose, has_length, pose
 from mbkit.load.solids import NOTHING, Lump
 from mbkit.load.xml import Element
 
@@ -192,7 +192,7 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
         anchor = X.p + X.R @ np.array(read.numbers(full, "pos", who, count=3, default=(0, 0, 0)))
     if type_ in ("hinge", "slide"):
         axis = np.array(read.numbers(full, "axis", who, count=3, default=(0, 0, 1)))
-        if not axis.any():
+        if not has_length(axis):
             read.fault(f"{who}: axis is zero; expected a direction, such as 0 0 1", element)
             axis = np.array([0.0, 0.0, 1.0])
         axis = X.R @ axis

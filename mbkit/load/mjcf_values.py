@@ -13,7 +13,7 @@ from mbkit._check import Array
 from mbkit.load.attributes import Reader
 from mbkit.load.xml import Element
 
-__all__ = ["HERE", "ORIENTATIONS", "Compiler", "Defaults", "Pose", "about", "pose", "z_to"]
+__all__ = ["HERE", "ORIENTATIONS", "Compiler", "Defaults", "Pose", "about", "has_length", "pose", "z_to"]
 
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
@@ -159,9 +159,9 @@ def pose(element: Element, compiler: Compiler, read: Reader, who: str) -> Pose:
 def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
     """Return the matrix of one of MuJoCo's orientations, or None for a zero vector."""
     if name == "quat":
-        return spatial.matrix_from_quaternion(spatial.normalized(x[[1, 2, 3, 0]])) if x.any() else None
+        return spatial.matrix_from_quaternion(spatial.normalized(x[[1, 2, 3, 0]])) if has_length(x) else None
     if name == "axisangle":
-        return about(x[:3], compiler.angle * x[3]) if x[:3].any() else None
+        return about(x[:3], compiler.angle * x[3]) if has_length(x[:3]) else None
     if name == "euler":
         R = np.eye(3)
         for letter, angle in zip(compiler.eulerseq, compiler.angle * x, strict=True):
@@ -169,9 +169,9 @@ def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
             R = R @ turn if letter.islower() else turn @ R
         return R
     if name == "zaxis":
-        return z_to(x) if x.any() else None
+        return z_to(x) if has_length(x) else None
     first, second = x[:3], x[3:]
-    if not first.any():
+    if not has_length(first):
         return None
     first = spatial.normalized(first)
     second = second - first * (first @ second)
@@ -179,6 +179,11 @@ def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
         return None
     second = spatial.normalized(second)
     return np.column_stack([first, second, np.cross(first, second)])
+
+
+def has_length(x: Array) -> bool:
+    """Return whether a direction can be normalized; the squares of numbers below 1e-162 vanish."""
+    return bool(np.linalg.norm(x) > 0)
 
 
 def about(axis: Array, angle: float) -> Array:

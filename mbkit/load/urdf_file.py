@@ -188,6 +188,8 @@ def _joint(joint: Element, read: Reader) -> tuple[UrdfJoint, str]:
     dynamics = read.only(joint, "dynamics", who)
     if dynamics is not None:
         damping, friction = (read.number(dynamics, a, who, 0.0) for a in ("damping", "friction"))
+        if friction < 0:
+            read.fault(f"{who}: friction {friction:g} is negative; expected 0 or more", dynamics)
         if kind in ("free", "planar") and (damping or friction):
             read.fault(f"{who}: damping or friction on a {type_} joint, which URDF's parsers drop; remove it", dynamics)
         if kind not in ("", "fixed", "free", "planar") and {"damping", "friction"} & dynamics.attributes.keys():

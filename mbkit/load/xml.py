@@ -32,12 +32,18 @@ _COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
 _ENCODING: Final = re.compile(rb"encoding\s*=\s*[\"']([A-Za-z0-9._-]+)[\"']")
 _BLANK: Final = b" \t\r\n\xef\xbb\xbf"
 
+#: What expat says of any character that it cannot take: "syntax error", "not well-formed (invalid token)".
+_VAGUE: Final = (2, 4)
+#: Characters of the line that a message repeats.
+_SHOWN: Final = 30
+
 
 @dataclass(eq=False, slots=True)
 class Element:
     """An element as it was written: tag, attributes, line, children, and what text is in it, joined.
 
-    `file` is the included file that it stands in, and empty in the file that was asked for.
+    `file` is the included file that it stands in, and empty in the file that was asked for; `included_at`
+    is then the line of the <include> there, else 0.
     `notes`, of the root element, say what of the text was passed over.
     """
 
@@ -48,6 +54,7 @@ class Element:
     text: str = ""
     file: str = ""
     notes: tuple[str, ...] = ()
+    included_at: int = 0
 
     @property
     def place(self) -> str:
@@ -152,11 +159,10 @@ def parse(content: bytes, name: str) -> Element:
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        why = expat.errors.messages.get(error.code, str(error))
-        raise LoadError(
-            f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}"
-            f"{_excerpt(content, error.lineno, error.offset)}"
-        ) from None
+        why = _unexpected(content, parser.ErrorByteIndex)
+        if error.code not in _VAGUE or not why:
+            why = expat.errors.messages.get(error.code, str(error))
+        raise LoadError(f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}") from None
     except (LookupError, ValueError) as error:
         if isinstance(error, LoadError):
             raise
@@ -189,10 +195,25 @@ def _readable(content: bytes) -> tuple[bytes, str | None, tuple[str, ...]]:
     return content, encoding.group(1).decode() if encoding else None, tuple(notes)
 
 
-def _excerpt(content: bytes, line: int, column: int) -> str:
-    """Return what stands where the parser stopped, for its message."""
-    lines = content.split(b"\n", line)
-    if len(lines) < line:
+def _unexpected(content: bytes, at: int) -> str:
+    """Say which character of a text ends its reading, and what stands before it; empty at the text's end."""
+    if not 0 <= at < len(content):
         return ""
-    found = lines[line - 1][column : column + 30].decode("utf-8", "backslashreplace").strip()
-    return f", at {found!r}" if found else ""
+    byte = content[at]
+    try:
+        found = content[at : at + 4].decode("utf-8", "ignore")[:1] if byte < 0x80 else content[at:].decode()[:1]
+    except UnicodeDecodeError:
+        return f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8"
+    before = content[:at].splitlines()[-1:] if content[:at][-1:] not in (b"\n", b"\r") else []
+    told = b"".join(before).decode("utf-8", "replace").replace("\0", "").lstrip()[-_SHOWN:]
+    after = f" after {told!r}" if told else ""
+    if not found.isprintable() and not found.isspace():
+        return f"control character 0x{byte:02x}{after}; remove it"
+    hint = ""
+    if told.endswith("&"):
+        hint = "; write &amp; for &"
+    elif found == "<":
+        hint = "; write &lt; for < in a value"
+    elif not told:
+        hint = "; expected <"
+    return f"unexpected {found!r}{after}{hint}"

@@ -12,7 +12,7 @@ from mbkit.report.layout import bullet, columns, right, titled
 from mbkit.report.numbers import error_text, inline
 from mbkit.report.tables import DIFFER, verdict
 from mbkit.studies.causes.result import Cause, Explanation, grouped
-from mbkit.studies.parsers.result import Parsed, ParserComparison, Stage
+from mbkit.studies.parsers.result import TERMS, Parsed, ParserComparison, Stage
 
 __all__ = ["explanation", "importers"]
 
@@ -59,9 +59,8 @@ def importers(result: ParserComparison) -> RenderableType:
         table = columns("stage", *(f"{p.engine} {p.version}" for p in read))
         for k, stage in enumerate(read[0].stages):
             table.add_row(stage.name, *(_cell(p.stages[k]) for p in read))
-        against = "the file as written, link by link" if result.reference == "file" else f"what {result.reference} read"
         base = "; the base floats" if result.floating_base else ""
-        parts += titled(f"Stages, against {against}{base}; mimic joints free in M, g and nle", table)
+        parts += titled(f"Stages, against the {result.against}{base}; mimic joints free in the terms", table)
     for p in result.importers:
         parts += _importer(p)
     notes = [*result.notes, *([result.faults] if result.faults else [])]
@@ -81,7 +80,7 @@ def _importer(p: Parsed) -> list[RenderableType]:
 def _cell(stage: Stage) -> Text:
     mark, style = _MARK[stage.same]
     number = ""
-    if stage.name in ("M", "g", "nle") and math.isfinite(stage.worst):
+    if stage.name in TERMS and math.isfinite(stage.worst):
         number = f" {error_text(stage.worst)}"
     says = f" {inline(stage.says, 44)}" if not number and stage.same is not True else number
     return Text(f"{mark}{says}", style=style)

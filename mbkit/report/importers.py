@@ -11,7 +11,7 @@ from typing import Final, Literal
 from mbkit.report.causes import meaning
 from mbkit.report.numbers import error_text
 from mbkit.studies.causes.result import grouped
-from mbkit.studies.parsers.result import DECIDING, Parsed, ParserComparison, Stage
+from mbkit.studies.parsers.result import DECIDING, TERMS, Parsed, ParserComparison, Stage
 
 __all__ = ["Cell", "Line", "Reason", "cell", "lines", "reasons", "title"]
 
@@ -36,6 +36,7 @@ _GLOSS: Final = {
     "M": "mass matrix, by the engine itself",
     "g": "forces of gravity, by the engine itself",
     "nle": "C v + g, by the engine itself",
+    "passive": "springs, dampers and all else that acts without a command, by the engine itself",
 }
 
 
@@ -99,7 +100,7 @@ def cell(stage: Stage) -> Cell:
     if state == "told" and stage.name in DECIDING:
         state = "differs"
     says = "" if stage.same else stage.says
-    if stage.name in ("M", "g", "nle") and math.isfinite(stage.worst):
+    if stage.name in TERMS and math.isfinite(stage.worst):
         joint = f", most at {stage.where}" if stage.same is False and stage.where else ""
         says = f"to {error_text(stage.worst)}" if stage.same else f"by {error_text(stage.worst)}{joint}"
     return Cell(state, _MARK[state], _WORD[state], says)

@@ -67,6 +67,8 @@ class Reading:
     engine : str
     text, format_ : str
     floating_base : bool
+    files : dict
+        The meshes that the text names: name -> content.
     seconds : float
         What it may take, of the processor's time.
 
@@ -76,10 +78,13 @@ class Reading:
         Its process cannot be started.
     """
 
-    def __init__(self, engine: str, text: str, format_: str, floating_base: bool, seconds: float) -> None:
+    def __init__(
+        self, engine: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes], seconds: float
+    ) -> None:
         self._engine, self._seconds = engine, min(seconds, _MOST_SECONDS)
         self._key = IMPORTERS[engine]
-        self._request = Read(self._key.module, text, format_, floating_base, MOST * self._seconds + _GRACE)
+        patience = MOST * self._seconds + _GRACE
+        self._request = Read(self._key.module, text, format_, floating_base, files, patience)
         kept = _kept.get(self._key)
         # One that was interrupted would answer what nobody asks any more.
         if kept is not None and (kept.owes or not kept.child.alive):
@@ -103,10 +108,10 @@ class Reading:
         ImporterError
         """
         made = self._receive()
-        return Imported(made.model, self._terms, made.notes)
+        return Imported(made.model, self._terms, made.notes, made.beside)
 
-    def _terms(self, q: Array, v: Array) -> dict[str, Array]:
-        self._send(Ask(q, v, self._request.seconds))
+    def _terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:
+        self._send(Ask(q, v, without, self._request.seconds))
         out: dict[str, Array] = self._receive()
         return out
 

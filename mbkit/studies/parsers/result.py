@@ -9,10 +9,12 @@ from typing import Any, Final
 
 from mbkit.studies.causes.result import Explanation, grouped, saved
 
-__all__ = ["DECIDING", "Parsed", "ParserComparison", "Stage"]
+__all__ = ["DECIDING", "TERMS", "Parsed", "ParserComparison", "Stage"]
 
+#: The terms that each engine computes by itself, on its own model.
+TERMS: Final = ("M", "g", "nle", "passive")
 #: The stages that say whether two readings move alike.
-DECIDING: Final = ("joints", "kinds", "M", "g", "nle")
+DECIDING: Final = ("joints", "kinds", *TERMS)
 _MARK: Final = {True: "same", False: "differs", None: "not comparable"}
 
 
@@ -51,6 +53,7 @@ class Parsed:
     refused : str
         Why it does not read the file; empty where it does.
     stages : tuple of Stage
+        Empty for the reference itself, and where there is no reference.
     explanation : Explanation or None
         Why it differs from the reference.
     notes : tuple of str
@@ -82,8 +85,8 @@ class ParserComparison:
         ``"urdf"`` or ``"mjcf"``.
     floating_base : bool
     reference : str
-        What the importers are compared with: ``"file"``, the file as written, link by link; or the
-        first importer that reads it, where mbkit itself does not.
+        What the importers are compared with: ``"file"``, the file as written, link by link. Where mbkit
+        does not read it: ``"mujoco"`` for an MJCF that MuJoCo reads, else empty, and nothing is compared.
     faults : str
         Why mbkit does not read it; empty where it does.
     importers : tuple of Parsed
@@ -114,22 +117,31 @@ class ParserComparison:
     @property
     def agree(self) -> bool:
         """Whether every importer reads the file, and all of them move alike."""
-        return len(self.importers) > 1 and all(p.agrees for p in self.importers)
+        return len(self.importers) > 1 and all(p.agrees for p in self.importers if p.engine != self.reference)
 
     @property
     def verdict(self) -> str:
-        """One sentence: who agrees, who differs, who refuses."""
+        """One sentence: who agrees, who differs, who refuses; and what was not compared."""
         same = [p.engine for p in self.importers if p.agrees]
         differ = [p.engine for p in self.importers if p.stages and not p.agrees]
         refuse = [p.engine for p in self.importers if p.refused]
-        parts = [f"{_listed(same)} agree{'s' if len(same) == 1 else ''} with the {self._told}"] if same else []
-        parts += [f"{_listed(differ)} differ{'s' if len(differ) == 1 else ''}"] if differ else []
-        parts += [f"{_listed(refuse)} refuse{'s' if len(refuse) == 1 else ''}"] if refuse else []
+        against = "" if self.reference == "file" else f" from the {self.against}"
+        alone = [p.engine for p in self.importers if not p.stages and not p.refused]
+        parts = [f"{_listed(same)} agree{_s(same)} with the {self.against.split(',')[0]}"] if same else []
+        parts += [f"{_listed(differ)} differ{_s(differ)}{against}"] if differ else []
+        parts += [f"{_listed(refuse)} refuse{_s(refuse)}"] if refuse else []
+        if not self.reference and alone:
+            parts.insert(0, f"not compared: mbkit does not read the file; {_listed(alone)} read{_s(alone)} it")
+        elif alone and not same and not differ:
+            parts.insert(0, f"not compared: {_listed(alone)} alone reads it")
         return "; ".join(parts) or "no importer was asked"
 
     @property
-    def _told(self) -> str:
-        return "file as written" if self.reference == "file" else f"reading of {self.reference}"
+    def against(self) -> str:
+        """What the importers are compared with, in words; empty where there is no reference."""
+        if self.reference == "file":
+            return f"file as written, {'link by link' if self.format == 'urdf' else 'body by body'}"
+        return f"reading of {self.reference}" if self.reference else ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
@@ -155,6 +167,8 @@ class ParserComparison:
         for p in self.importers:
             if p.refused:
                 lines.append(f"- {p.engine} refuses: {p.refused}")
+            if not p.refused and not p.stages:
+                lines.append(f"- {p.engine} reads it{', and is the reference' if p.engine == self.reference else ''}")
             for kind, says, what in grouped(p.explanation.causes) if p.explanation else ():
                 lines.append(f"- {kind}: {says} ({what})")
             lines += [f"- {p.engine}: {note}" for note in p.notes]
@@ -188,6 +202,10 @@ class ParserComparison:
 def cell(stage: Stage) -> str:
     """Return a stage as a cell of a table."""
     return stage.says if stage.same is False and stage.says else _MARK[stage.same]
+
+
+def _s(names: list[str]) -> str:
+    return "s" if len(names) == 1 else ""
 
 
 def _listed(names: list[str]) -> str:

@@ -1,10 +1,15 @@
-"""The stages at which a reading of a file is compared with another."""
+"""The stages at which a reading of a file is compared with another, and what an engine's own terms hold beside it.
+
+An engine may hold more than bodies and joints: tendons, actuators, a fluid, gravity compensation. What
+each of them does to the terms is measured by taking it out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,11 +22,12 @@ from mbkit.studies.causes.hypothesis import angle_of, told
 from mbkit.studies.causes.joints import HINGES
 from mbkit.studies.causes.matching import Matching
 from mbkit.studies.causes.near import Near
+from mbkit.studies.causes.result import Cause, Explanation
 from mbkit.studies.causes.structure import settled
-from mbkit.studies.causes.terms import States, Values, gaps, model_terms, states_of
-from mbkit.studies.parsers.result import Stage
+from mbkit.studies.causes.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
+from mbkit.studies.parsers.result import TERMS, Stage
 
-__all__ = ["stages", "unmimicked"]
+__all__ = ["OwnTerms", "measured", "own_terms", "stages", "unmimicked"]
 
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
 
@@ -38,18 +44,22 @@ def unmimicked(model: Model) -> Model:
     return replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))
 
 
-def stages(reference: Model, imported: Imported, samples: int, seed: int, tolerance: float) -> tuple[Stage, ...]:
+def stages(
+    reference: Model | Imported, imported: Imported, samples: int, seed: int, tolerance: float
+) -> tuple[Stage, ...]:
     """Compare what an importer made with the reference, from the tree to the terms.
 
     Parameters
     ----------
-    reference : Model
+    reference : Model or Imported
+        A description; or what another importer made, whose engine then computes the terms.
     imported : Imported
     samples, seed : int
-        Random states for M, g and nle, which the importer's own engine computes on its own model.
+        Random states for the terms, which the importer's own engine computes on its own model.
     tolerance : float
     """
-    free = unmimicked(reference)
+    described = reference.model if isinstance(reference, Imported) else reference
+    free = unmimicked(described)
     near = Near.of(free, tolerance)
     one, other, matching, structural = settled(free, imported.model, near)
     there = aligned(renamed(other, one.model, matching), one.model, near).compact
@@ -64,11 +74,18 @@ def stages(reference: Model, imported: Imported, samples: int, seed: int, tolera
             f"{len(alone)} without a counterpart: {', '.join(alone)}" if alone else "",
         ),
         *_tree(pairs, near),
-        _mimics(reference, imported.model, matching),
+        _mimics(described, imported.model, matching),
         *_matter(one, there, near),
         *_numbers(pairs, near),
     ]
-    return (*out, *_terms(one.model, imported, matching, structural, samples, seed, tolerance))
+    if structural:
+        return (*out, *_uncompared())
+    at = states_of(one.model, samples, seed)
+    ours = model_terms(one.model, at)
+    if isinstance(reference, Imported):
+        ours = _asked(one.model, reference, {j.name: j.name for j in one.model.joints}, at)
+    theirs = _asked(one.model, imported, matching.to_b, at)
+    return (*out, *_terms(one.model, ours, theirs, at, tolerance))
 
 
 def _stage(name: str, found: Iterable[_Difference]) -> Stage:
@@ -166,50 +183,135 @@ def _numbers(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
     return out
 
 
-def _terms(
-    reference: Model,
-    imported: Imported,
-    matching: Matching,
-    structural: list[Any],
-    samples: int,
-    seed: int,
-    tolerance: float,
-) -> list[Stage]:
-    names = ("M", "g", "nle")
-    if structural:
-        return [Stage(n, None, np.nan, "", "other coordinates") for n in names]
-    at = states_of(reference, samples, seed)
-    values = _asked(reference, imported, matching, at)
+def _uncompared() -> list[Stage]:
+    return [Stage(n, None, np.nan, "", "other coordinates") for n in TERMS]
+
+
+def _terms(reference: Model, ours: Values, theirs: Values, at: States, tolerance: float) -> list[Stage]:
     owners = [j.name for j in reference.independent_joints for _ in range(j.type.nv)]
-    found = gaps(model_terms(reference, at), values, at.v, owners)
+    found = gaps(ours, theirs, at.v, owners)
     if not found.comparable:
-        return [Stage(n, None, np.nan, "", "other coordinates") for n in names]
+        return _uncompared()
+    measured = {g.term: g for g in found.terms}
     return [
-        Stage(g.term, g.relative <= tolerance, g.relative, g.joint, f"{g.relative:.1e} at {g.joint}")
-        for g in found.terms
-        if g.term in names
+        Stage(n, g.relative <= tolerance, g.relative, g.joint, f"{g.relative:.1e} at {g.joint}")
+        if (g := measured.get(n)) is not None
+        else Stage(n, None, np.nan, "", "not computed")
+        for n in TERMS
     ]
 
 
-def _asked(reference: Model, imported: Imported, matching: Matching, at: States) -> Values:
-    """Return the engine's own terms of its own model, in the reference's coordinates by joint name."""
+def _asked(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
+    """Return the engine's own terms of its own model, in the reference's coordinates.
+
+    `names` has the engine's joint of each of the reference's.
+    """
     theirs = imported.model.layout
     q_order, v_order = (
-        np.concatenate(
-            [
-                np.arange(r[matching.to_b[j.name]].start, r[matching.to_b[j.name]].stop)
-                for j in reference.independent_joints
-            ]
-        )
+        np.concatenate([np.arange(r[names[j.name]].start, r[names[j.name]].stop) for j in reference.independent_joints])
         for r in (theirs.q, theirs.v)
     )
     q, v = np.empty((len(at.q), theirs.sizes[0])), np.empty((len(at.v), theirs.sizes[1]))
     if q.shape != at.q.shape or v.shape != at.v.shape:
         return {}
     q[:, q_order], v[:, v_order] = at.q, at.v
-    made = imported.terms(q, v)
+    made = imported.terms(q, v, ())
     return {k: _ordered(x, v_order) for k, x in made.items()}
 
 
 def _ordered(x: Array, order: np.ndarray) -> Array:
     return x[:, order][:, :, order] if x.ndim == 3 else x[:, order]
+
+
+@dataclass(frozen=True)
+class OwnTerms:
+    """What an engine's own terms hold.
+
+    Attributes
+    ----------
+    causes : tuple of Cause
+        What acts in them beside the bodies and joints that were read out, each with its measured effects.
+    idle : tuple of str
+        What was taken out and changed no term.
+    held : bool
+        Whether the terms are those of the bodies and joints, once all of that is taken out.
+    """
+
+    causes: tuple[Cause, ...]
+    idle: tuple[str, ...]
+    held: bool
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what is in the model and acts in no term."""
+        return tuple(f"{says}; in no term while controls are zero" for says in self.idle)
+
+
+def own_terms(engine: str, made: Imported, samples: int, seed: int, tolerance: float) -> OwnTerms:
+    """Measure what acts in an importer's model beside its bodies and joints.
+
+    Parameters
+    ----------
+    engine : str
+    made : Imported
+    samples, seed : int
+        Random states.
+    tolerance : float
+        Relative difference of a term that counts.
+    """
+    at = states_of(made.model, samples, seed)
+    owners = [j.name for j in made.model.independent_joints for _ in range(j.type.nv)]
+    whole, described = made.terms(at.q, at.v, ()), model_terms(made.model, at)
+    bare = made.terms(at.q, at.v, tuple(x.key for x in made.beside)) if made.beside else whole
+    causes, idle = [], []
+    for extra in made.beside:
+        without = made.terms(at.q, at.v, (extra.key,))
+        part = {} if extra.without is None else _less(described, model_terms(extra.without, at))
+        bare = _with(bare, part)
+        if gaps(whole, without, at.v, owners).worst <= tolerance:
+            idle.append(extra.says)
+            continue
+        found = gaps(whole, _with(without, part), at.v, owners)
+        if not found.worst <= tolerance:
+            says = f"{engine}: {extra.says}{', and acts otherwise than described' if part else ''}"
+            causes.append(Cause(extra.kind, extra.says, says, None, None, _effects(found), acts=True))
+    found = gaps(bare, described, at.v, owners)
+    held = found.worst <= tolerance
+    if not held:
+        says = f"{engine}: its own terms are not those of its bodies and joints, most at {found.joint or 'no joint'}"
+        causes.append(Cause("own terms", engine, says, None, None, _effects(found), acts=True))
+    return OwnTerms(tuple(causes), tuple(idle), held)
+
+
+def _less(a: Values, b: Values) -> Values:
+    return {name: x - b[name] for name, x in a.items() if name in b}
+
+
+def _with(a: Values, b: Values) -> Values:
+    return {name: x + b[name] if name in b else x for name, x in a.items()}
+
+
+def _effects(found: Gaps) -> dict[str, float]:
+    return {g.term: g.relative for g in found.terms} if found.comparable else {"M": math.inf}
+
+
+def measured(found: Explanation, stages: tuple[Stage, ...], own: OwnTerms) -> Explanation:
+    """Return an explanation of two descriptions, corrected by the terms that the engine itself computes."""
+    terms = [s for s in stages if s.name in TERMS]
+    gaps_ = tuple(Gap(s.name, s.worst, s.where) for s in terms)
+    same = all(s.same is True for s in terms)
+    if not own.causes:
+        # The terms are those of the descriptions.
+        return replace(found, gaps=gaps_) if found.agree and same else replace(found, agree=False)
+    if same and not (found.only_a or found.only_b):
+        silent = tuple(c for c in found.causes if not c.acts)
+        return replace(found, agree=True, gaps=gaps_, causes=silent, explained=True, left=(), subtree=())
+    known = all(math.isfinite(s.worst) for s in terms)
+    return replace(
+        found,
+        agree=False,
+        comparable=found.comparable and known,
+        gaps=gaps_ if known else found.gaps,
+        causes=(*found.causes, *own.causes),
+        explained=found.explained and own.held,
+    )
