@@ -34,7 +34,7 @@ import pinocchio as pin
 
 import mbkit as mb
 from mbkit.engines.mujoco_text import mjcf_text
-from mbkit.errors import MbkitError, NonPhysicalWarning, UnsupportedError
+from mbkit.errors import MbkitError, MbkitWarning, UnsupportedError
 from tests.random_files import EPS, errors, mujoco_terms, mutant, random_mjcf
 from tests.random_trees import ALL, random_tree, states
 from validation import newton_euler
@@ -98,10 +98,10 @@ def mutant_outcome(seed: int, folder: Path, files: dict[str, bytes]) -> str:
 
 
 def loaded(path: Path, policy: str) -> mb.Model:
-    """Load a file; no warning but that of bodies that no matter is like may arise."""
+    """Load a file; no warning but mbkit's own may arise."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", NonPhysicalWarning)
+        warnings.simplefilter("ignore", MbkitWarning)
         return mb.load(path, nonphysical=policy, mimic="free")
 
 
