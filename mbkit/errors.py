@@ -10,6 +10,8 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from mbkit import _escape
+
 __all__ = [
     "BaselineError",
     "DoubtfulRunWarning",
@@ -33,7 +35,13 @@ __all__ = [
 
 
 class MbkitError(Exception):
-    """Base of every error that mbkit raises on purpose."""
+    """Base of every error that mbkit raises on purpose.
+
+    Its message spells out what a terminal would obey, because names in it come from files.
+    """
+
+    def __str__(self) -> str:
+        return _escape.terminal(super().__str__())
 
 
 class InputError(MbkitError, ValueError):
@@ -145,7 +153,10 @@ class NumericalError(MbkitError, ArithmeticError):
 
 
 class MbkitWarning(UserWarning):
-    """Base of mbkit's warnings."""
+    """Base of mbkit's warnings; a message spells out what a terminal would obey, as an error's does."""
+
+    def __str__(self) -> str:
+        return _escape.terminal(super().__str__())
 
 
 class DoubtfulRunWarning(MbkitWarning):

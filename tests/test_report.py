@@ -12,10 +12,11 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
+from mbkit._escape import one_line, terminal
 from mbkit.errors import OutputError
 from mbkit.report import figures, precision, precision_tables, tables
 from mbkit.report.folder import check_writable, file_stem, write
-from mbkit.report.numbers import count_text, error_text, inline, plain, time_text
+from mbkit.report.numbers import count_text, error_text, time_text
 from mbkit.report.page import bench_page, check_page, sweep_page
 from mbkit.report.progress import Bar
 from mbkit.report.reading import failures, headline, notices, omission_state
@@ -230,8 +231,8 @@ def test_numbers_that_are_none_are_told():
 
 
 def test_text_from_files_cannot_command_a_terminal():
-    assert plain("a\x1b[31m\x07\u202eb\nc") == "a\\x1b[31m\\x07\\u202eb\nc"
-    assert inline("a\n  b   c", 4) == "a b…"
+    assert terminal("a\x1b[31m\x07\u202eb\nc") == "a\\x1b[31m\\x07\\u202eb\nc"
+    assert one_line("a\n  b   c", 4) == "a b…"
 
 
 def test_headline_names_the_engines_and_who_is_left_out():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mbkit.cli.door import AGREE, DIFFER, DONE, MISUSE, leave, say
+from mbkit.cli.door import AGREE, DIFFER, DONE, MISUSE, leave, say, tell
 from mbkit.cli.options import check_engines, load_options, model_options, split
 from mbkit.cli.output import console
 from mbkit.errors import BaselineError, InputError, MbkitError
@@ -87,7 +87,7 @@ def _record_one(
             force=force,
             progress=bar,
         )
-    click.echo(f"{file}: {model.name}, {', '.join(made.engines)}, {file.stat().st_size / 1000:.0f} kB")
+    tell(f"{file}: {model.name}, {', '.join(made.engines)}, {file.stat().st_size / 1000:.0f} kB")
     for refusal in made.left_out:
         say("note", f"{refusal.engine}{' ' * bool(refusal.term)}{refusal.term}: {refusal.reason}")
     for told in made.disagreements:
@@ -191,7 +191,7 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
 
     result = baselines.diff(path_a, path_b)
     if as_json:
-        click.echo(result.to_json())
+        tell(result.to_json())
     else:
         console().print(tables.result(result))
     leave(DONE if result.passed else DIFFER)
@@ -240,4 +240,4 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
 
 
 def _print_json(results: list[BaselineResult]) -> None:
-    click.echo("[" + ",\n".join(r.to_json() for r in results) + "]")
+    tell("[" + ",\n".join(r.to_json() for r in results) + "]")

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mbkit.cli.door import say
+from mbkit._escape import json_text
+from mbkit.cli.door import say, tell
 from mbkit.cli.options import load_options, model_options
 
 if TYPE_CHECKING:
@@ -66,12 +67,12 @@ def derive(
         told = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
         text, ending = _text(lag, told, form, as_json, bar)
     if out is None:
-        click.echo(text)
+        tell(text)
         return
     from mbkit.report.folder import file_stem, write
 
     path = write(out, f"{file_stem(lag.name)}{ending}", text + "\n")
-    click.echo(str(path))
+    tell(str(path))
 
 
 def _model(name: str, options: dict[str, Any]) -> Model:
@@ -112,8 +113,8 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     made = export_c(model, name=c_identifier(name) if find(name) else None)
     paths = made.write(out, force=force)
     for function in made.functions:
-        click.echo(f"{function.signature}: {function.operations} operations")
-    click.echo(f"header {paths[0]}\nsource {paths[1]}")
+        tell(f"{function.signature}: {function.operations} operations")
+    tell(f"header {paths[0]}\nsource {paths[1]}")
 
 
 def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
@@ -129,5 +130,5 @@ def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: boo
     if as_json:
         import json
 
-        return json.dumps(account.data(), indent=1, ensure_ascii=False), ".json"
+        return json_text(json.dumps(account.data(), indent=1, ensure_ascii=False)), ".json"
     return (account.latex(), ".tex") if form == "latex" else (account.text(_WIDTH), ".txt")

@@ -10,9 +10,10 @@ from typing import Any, Final
 
 import click
 
+from mbkit._escape import terminal
 from mbkit.errors import MbkitError, MbkitWarning
 
-__all__ = ["AGREE", "DIFFER", "DONE", "INTERNAL", "INTERRUPTED", "MISUSE", "Door", "leave", "say"]
+__all__ = ["AGREE", "DIFFER", "DONE", "INTERNAL", "INTERRUPTED", "MISUSE", "Door", "leave", "say", "tell"]
 
 AGREE: Final = 0
 DONE: Final = 0
@@ -36,7 +37,11 @@ class Door(click.Group):
         except KeyboardInterrupt:
             say("interrupted", "nothing was finished")
             ctx.exit(INTERRUPTED)
-        except (click.ClickException, click.exceptions.Exit, click.Abort):
+        except click.ClickException as error:
+            # A word of the command line may be a file of somebody else's, by a wildcard.
+            vars(error)["message"] = terminal(error.message)
+            raise
+        except (click.exceptions.Exit, click.Abort):
             raise
         except Exception:
             # A status of its own: "differ" is a verdict, and this is none.
@@ -47,10 +52,13 @@ class Door(click.Group):
 
 def say(what: str, text: str) -> None:
     """Print one line on stderr, with what it is before it."""
-    from mbkit.report.numbers import plain
-
     colour = {"error": "red", "warning": "yellow"}.get(what)
-    click.echo(f"{click.style(what, fg=colour, bold=True)}: {plain(text)}", err=True)
+    click.echo(f"{click.style(what, fg=colour, bold=True)}: {terminal(text)}", err=True)
+
+
+def tell(text: str) -> None:
+    """Print text on stdout, with what a terminal would obey spelled out."""
+    click.echo(terminal(text))
 
 
 def leave(status: int) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say
+from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say, tell
 from mbkit.cli.options import check_engines, split
 from mbkit.cli.output import File, console, show
 
@@ -118,9 +118,7 @@ def _list(*, as_json: bool) -> None:
     from mbkit.studies.stress.cases import CASES
 
     if as_json:
-        click.echo(
-            json.dumps([{**case.facts(), "values": case.values, "quick": case.quick} for case in CASES.values()])
-        )
+        tell(json.dumps([{**case.facts(), "values": case.values, "quick": case.quick} for case in CASES.values()]))
         return
     table = columns("case", "family", "swept", "about")
     for case in CASES.values():

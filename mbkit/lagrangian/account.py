@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import sympy as sp
 
+from mbkit._escape import one_line
 from mbkit._version import __version__
 from mbkit.lagrangian.abbreviations import Abbreviations
 from mbkit.lagrangian.blackboard import Blackboard, spread, written
@@ -88,12 +89,12 @@ class Account:
         """Return the page for a terminal, matrices within a width if they can be."""
         s, board = self.system, self._board
         q = ", ".join(self._named(x) for x in s.coordinates)
-        out = [f"{s.name}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
+        out = [f"{one_line(s.name)}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
         if s.parameters:
             given = (written(p.name) + ("" if x is None else f" = {x:g}") for p, x in s.parameters.items())
             out.append(f"parameters {', '.join(given)}")
         if s.time:
-            out.append(f"time {s.time}")
+            out.append(f"time {written(s.time.name)}")
         kinetic = [f"T is too long for a page ({self._size} operations): ½ vᵀ M v with"] if self.long else None
         out += ["", *(kinetic or self._sum("T", s.T, width)), *self._sum("V", s.V, width)]
         if s.dissipation != 0:
@@ -117,7 +118,7 @@ class Account:
 
     def _named(self, coordinate: sp.Symbol) -> str:
         told, own = written(coordinate.name), self._names.get(coordinate.name, coordinate.name)
-        return f"{told}" if own == coordinate.name else f"{told} ({own})"
+        return f"{told}" if own == coordinate.name else f"{told} ({one_line(own)})"
 
     def _sum(self, name: str, x: sp.Expr, width: int) -> list[str]:
         return folded(f"{name} = {self._board.text(self._short(x))}", width)
@@ -149,11 +150,11 @@ class Account:
             A = given.applyfunc(self._short)
             entries = r" \\ ".join(" & ".join(board.latex(x) for x in A[i, :]) for i in range(A.rows))
             rows.append(rf"{name} &= \begin{{bmatrix}} {entries} \end{{bmatrix}}")
-        out = [f"% {s.name}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
+        out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
         if not self.long:
             out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(latex=True)]))
         if self._kept:
-            out.append(_aligned([f"{sp.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
+            out.append(_aligned([f"{board.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
         return "\n".join(out)
 
     # Data

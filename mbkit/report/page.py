@@ -7,8 +7,9 @@ from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from mbkit._escape import terminal
 from mbkit.report import figures, importers, precision, stress
-from mbkit.report.numbers import count_text, error_text, plain, time_text
+from mbkit.report.numbers import count_text, error_text, time_text
 from mbkit.report.reading import allowances, by_term, failures, headline, judged, notices, omission_state, told
 from mbkit.report.stress_figures import stable_steps
 from mbkit.report.stress_map import section
@@ -218,7 +219,7 @@ def _environment() -> Environment:
 
 def _harmless(value: Any) -> Any:
     # Control characters too; markup made here is of another type.
-    return plain(value) if type(value) is str else value
+    return terminal(value) if type(value) is str else value
 
 
 def _three_digits(x: float) -> str:

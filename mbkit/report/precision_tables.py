@@ -7,8 +7,9 @@ import math
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from mbkit._escape import one_line
 from mbkit.report.layout import bullet, columns, right, titled
-from mbkit.report.numbers import count_text, error_text, inline, time_text
+from mbkit.report.numbers import count_text, error_text, time_text
 from mbkit.report.precision import Level, curve_lines, headline, levels, setting_text
 from mbkit.report.reading import notices
 from mbkit.studies.precision_result import WorkPrecision
@@ -26,13 +27,13 @@ def bench(result: WorkPrecision, asked: str = "") -> RenderableType:
         f"{result.seconds:.1f} s",
     ]
     parts: list[RenderableType] = [
-        Text.assemble((f"{inline(name, 80)}: ", "bold"), inline(headline(result))),
+        Text.assemble((f"{one_line(name, 80)}: ", "bold"), one_line(headline(result))),
         Text("  " + " · ".join(told), style="dim"),
         *study(result),
         *_curves(result),
     ]
     lines = [
-        bullet(inline(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", inline(n.reason, 300))
+        bullet(one_line(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", one_line(n.reason, 300))
         for n in notices(result.refusals)
     ]
     return Group(*parts, *(titled("Notes", *lines) if lines else []), Text())
@@ -44,8 +45,8 @@ def study(result: WorkPrecision) -> list[RenderableType]:
     for level in levels(result):
         table.add_row(
             f"{level.error:.0e}",
-            Text(inline(level.curve.engine)),
-            Text(inline(level.curve.method)),
+            Text(one_line(level.curve.engine)),
+            Text(one_line(level.curve.method)),
             setting_text(level.point),
             time_text(level.point.seconds),
             time_text(level.curve.compile + level.point.seconds) or "–",
@@ -53,13 +54,13 @@ def study(result: WorkPrecision) -> list[RenderableType]:
         )
     cut = f", cut from {result.asked:g} s" if result.duration < result.asked else ""
     known = f"known to {error_text(result.floor)}" if math.isfinite(result.floor) else "known to an unknown error"
-    below = bullet("", f"{inline(result.reference, 300)}; {known}{cut}", "i")
+    below = bullet("", f"{one_line(result.reference, 300)}; {known}{cut}", "i")
     title = f"Error against run time, {result.duration:g} s of motion: the fastest with an error of q (rad or m)"
     return titled(title, table if table.rows else Text("  no run reached 1e-02", style="dim"), below)
 
 
 def _next(level: Level) -> str:
-    return f"{inline(level.next[0].engine)} × {count_text(level.factor)}" if level.next else "none"
+    return f"{one_line(level.next[0].engine)} × {count_text(level.factor)}" if level.next else "none"
 
 
 def _curves(result: WorkPrecision) -> list[RenderableType]:
@@ -69,8 +70,8 @@ def _curves(result: WorkPrecision) -> list[RenderableType]:
         order = "" if math.isnan(curve.order) else f"{curve.order:.2f}"
         table.add_row(
             Text("●" if line.on_front else "", style="green"),
-            Text(inline(curve.engine)),
-            Text(inline(curve.method)),
+            Text(one_line(curve.engine)),
+            Text(one_line(curve.method)),
             Text(f"! {order}" if line.off else order, style="bold yellow" if line.off else ""),
             "" if math.isnan(curve.expected) else f"{curve.expected:g}",
             error_text(best.error) if best else "none",

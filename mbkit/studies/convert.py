@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.errors import MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import load
@@ -108,6 +109,11 @@ def convert(model: Model, to: str) -> Converted:
         raise UnknownNameError("format", str(to), FORMATS)
     if model.written is not None:
         raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
+    names = [model.name, *(x.name for x in model.bodies), *(x.name for x in model.joints)]
+    names += [*(x.name for x in model.frames), *(x.name for x in model.springs)]
+    unwritable = [name for name in names if not xml_holds(name)]
+    if unwritable:
+        raise UnsupportedError(f"convert: XML cannot hold the characters of {unwritable[0]!r}; rename this part")
     if model.parameters:
         model.require_values("convert")
         model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})

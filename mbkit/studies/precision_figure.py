@@ -11,7 +11,8 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from mbkit.studies.drawing import PLAIN, Palette, engine_mark, log_ticks, one_line, style
+from mbkit._escape import one_line
+from mbkit.studies.drawing import PLAIN, Palette, engine_mark, log_ticks, style
 from mbkit.studies.precision_result import Curve, PrecisionPoint, WorkPrecision
 
 if TYPE_CHECKING:
