@@ -90,7 +90,7 @@ def latex(name: str, ordinary: Callable[[str], str]) -> str:
         How a name is set that holds no other command and no character that TeX obeys.
     """
     rest = _COMMAND.sub("", name)
-    harmless = rest.isprintable() and not re.search(r"[\\$%#&~]|\^\s*\^|[_^]\s*$", rest) and _balanced(rest)
+    harmless = rest.isprintable() and not re.search(r"[\\$%#&~\[\]]|\^\s*\^|[_^]\s*$", rest) and _balanced(rest)
     return ordinary(name) if harmless else rf"\mathrm{{{''.join(_TEX.get(c, c) for c in one_line(name))}}}"
 
 

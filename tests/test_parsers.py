@@ -260,6 +260,7 @@ def test_the_page_tells_it_all_and_obeys_nothing(tmp_path: Path) -> None:
     assert page.index('class="verdict bad">✗ pinocchio agrees') < page.index("<table") < page.index("Why they differ")
     assert "alert" in page
     assert "<script" not in page
+    assert "<" not in result.to_markdown()
     for told in ("the base floats", "a ball of water put in its place", "✓ same", "✗ differs", "! differs", "mujoco 4"):
         assert told in page
     # Whoever reads nothing is told with the reason, in the place of a column.

@@ -405,6 +405,9 @@ def test_a_page_needs_nothing_from_elsewhere_and_is_whole(page):
         assert "\x1b" not in text
         assert "\u202e" not in text
     assert '<script>alert("x")</script>[red]x[/red]' in Tags(stress_page(NASTY)).text
+    for text in (NASTY.to_markdown(), NASTY.to_csv()):
+        assert all(c.isprintable() or c == "\n" for c in text)
+    assert "<" not in NASTY.to_markdown()
 
 
 def test_a_result_of_nothing_still_has_a_page_a_table_and_a_figure():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mbkit._escape import one_line
 from mbkit.cli.door import AGREE, DIFFER, DONE, MISUSE, leave, say, tell
 from mbkit.cli.options import check_engines, load_options, model_options, split
 from mbkit.cli.output import console
@@ -87,7 +88,7 @@ def _record_one(
             force=force,
             progress=bar,
         )
-    tell(f"{file}: {model.name}, {', '.join(made.engines)}, {file.stat().st_size / 1000:.0f} kB")
+    tell(f"{file}: {one_line(model.name)}, {', '.join(made.engines)}, {file.stat().st_size / 1000:.0f} kB")
     for refusal in made.left_out:
         say("note", f"{refusal.engine}{' ' * bool(refusal.term)}{refusal.term}: {refusal.reason}")
     for told in made.disagreements:

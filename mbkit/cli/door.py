@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import traceback
 import warnings
 from collections.abc import Iterator
@@ -51,9 +52,10 @@ class Door(click.Group):
 
 
 def say(what: str, text: str) -> None:
-    """Print one line on stderr, with what it is before it."""
+    """Print a message on stderr, with what it is before it; a line feed in it begins no message of its own."""
+    told = re.sub(r"\n(?! )", "\n  ", terminal(text))
     colour = {"error": "red", "warning": "yellow"}.get(what)
-    click.echo(f"{click.style(what, fg=colour, bold=True)}: {terminal(text)}", err=True)
+    click.echo(f"{click.style(what, fg=colour, bold=True)}: {told}", err=True)
 
 
 def tell(text: str) -> None:

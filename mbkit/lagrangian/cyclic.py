@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
-from mbkit._escape import terminal
+from mbkit._escape import one_line, terminal
 from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.probe import vanishes
 from mbkit.lagrangian.tidy import tidy
@@ -55,6 +55,9 @@ class ConservedQuantity:
     expression: sp.Expr
     meaning: str
     moving: tuple[tuple[sp.Symbol, ...], ...] = field(default=(), repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        return f"<ConservedQuantity: {one_line(str(self))}>"
 
     def __str__(self) -> str:
         return terminal(f"{self.name} = {self.expression} ({self.meaning})")

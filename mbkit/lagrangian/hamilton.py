@@ -20,7 +20,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, rows
-from mbkit._escape import terminal
+from mbkit._escape import one_line, terminal
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian import cyclic
 from mbkit.lagrangian.blackboard import Blackboard
@@ -71,6 +71,9 @@ class CanonicalEquations:
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
+
+    def __repr__(self) -> str:
+        return f"<CanonicalEquations: {one_line(str(self))}>"
 
     def __str__(self) -> str:
         return terminal("\n".join(f"{e.lhs} = {e.rhs}" for e in self.equations()))
@@ -269,6 +272,9 @@ class Hamiltonian:
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
+
+    def __repr__(self) -> str:
+        return f"<Hamiltonian: {one_line(str(self))}>"
 
     def __str__(self) -> str:
         return terminal(f"H = {self.H}")

@@ -23,7 +23,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, rows
-from mbkit._escape import terminal
+from mbkit._escape import one_line, terminal
 from mbkit.errors import InputError
 from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.numeric import Numeric, values_of
@@ -168,6 +168,9 @@ class Routhian:
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
+
+    def __repr__(self) -> str:
+        return f"<Routhian: {one_line(str(self))}>"
 
     def __str__(self) -> str:
         named = dict(zip(self.system.coordinates, self.system.velocities, strict=True))
