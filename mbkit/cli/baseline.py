@@ -50,8 +50,9 @@ def record(
 ) -> None:
     """Record each TARGET in PATH: a .toml file, or a folder that gets a file for each.
 
-    TARGET is what `mbkit check` takes; `mbkit baseline check` loads it again, a file by its place
-    beside PATH. The baseline of the same robot is replaced. Exit status: 0 done, 2 misuse or bad input.
+    TARGET is what `mbkit check` takes; `mbkit baseline check` loads a robot, a catalog system or a file again,
+    the file by its place beside PATH, and runs a function only where --target names it. The baseline of the same
+    robot is replaced. Exit status: 0 done, 2 misuse or bad input.
     """
     if path.suffix == ".toml" and len(targets) > 1:
         raise click.UsageError(f"{len(targets)} targets want a folder, and {path} is a file's name")
@@ -97,7 +98,9 @@ def _record_one(
 
 @baseline.command()
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--target", help="Check this instead of what was recorded; with one file.")
+@click.option(
+    "--target", help="Check this instead of what was recorded, or the function that was recorded; with one file."
+)
 @click.option("--strict", is_flag=True, help="Fail where an engine that was recorded is not installed.")
 @click.option("--rebaseline", is_flag=True, help="Tell what differs, and record it anew.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
@@ -217,10 +220,16 @@ def _again(file: Path, target: str | None) -> str:
 
 def _model(recorded: Baseline, file: Path) -> Model:
     from mbkit.studies.baseline.target import resolved
-    from mbkit.studies.target import model_of
+    from mbkit.studies.target import is_code, model_of
 
     if not recorded.target:
         raise BaselineError(f"{file}: it was recorded of a model in Python, so there is nothing to load; give --target")
+    if is_code(recorded.target):
+        # A baseline is data, perhaps of somebody else: no word in it decides what code is run.
+        raise BaselineError(
+            f"{file}: it was recorded of the function {recorded.target}, which is not run because a file names it; "
+            f"to run it: mbkit baseline check {file} --target {recorded.target}"
+        )
     return model_of(resolved(recorded.target, file), recorded.options)
 
 

@@ -201,13 +201,6 @@ class _Latex(LatexPrinter):  # type: ignore[misc]
     def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
         return latex(expr.name, lambda name: str(super(_Latex, self)._print_Symbol(sp.Symbol(name), style)))
 
-    def _print_Function(self, expr: sp.Function, exp: str | None = None) -> str:
-        name = expr.func.__name__
-        if latex(name, str) != name:
-            told = f"{latex(name, str)}\\left({', '.join(map(self._print, expr.args))}\\right)"
-            return told if exp is None else f"{{{told}}}^{{{exp}}}"
-        return str(super()._print_Function(expr, exp))
-
     def _print_Mul(self, expr: sp.Expr) -> str:
         number = expr.args[0]
         if number.is_Rational and number.q != 1 and len(expr.args) > 1 and not any(_below(f) for f in expr.args):

@@ -101,7 +101,7 @@ def parsed(raw: bytes, where: Path) -> Baseline:
         raise BaselineError(f"{where}: edited or damaged: its checksum belongs to other content; {_REMEDY}")
     try:
         return from_table(tomllib.loads(body))
-    except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         raise BaselineError(f"{where}: sound by its checksum, yet not readable ({error}); {_REMEDY}") from None
 
 
@@ -109,16 +109,21 @@ _REMEDY: Final = "restore it from version control, or record it anew"
 
 
 def _check_format(text: str, where: Path) -> None:
-    found = _FORMAT.search(text)
-    if found is None or int(found[1]) == FORMAT:
+    number = _format(text)
+    if number is None or number == FORMAT:
         # Without the line it is damaged, which the checksum tells.
         return
-    number = int(found[1])
     if number > FORMAT:
         told = f"of format {number}, by a newer mbkit; this one reads format {FORMAT}: update mbkit, or record it anew"
     else:
         told = f"of format {number}, by an older mbkit; this one reads format {FORMAT}: record it anew"
     raise BaselineError(f"{where}: {told}")
+
+
+def _format(text: str) -> int | None:
+    """Return the number of the format; of a number that no format has, its first nine digits."""
+    found = _FORMAT.search(text)
+    return int(found[1][:9]) if found else None
 
 
 def _checksum(body: str) -> str:
@@ -138,10 +143,10 @@ def check_replaceable(path: Path, model: str) -> None:
     if not is_baseline(path):
         raise OutputError(f"{path}: there is a file that is no baseline; name another, or replace it with force")
     text = path.read_bytes().decode("utf-8", "replace").replace("\r\n", "\n")
-    found = _FORMAT.search(text)
-    if found and int(found[1]) > FORMAT:
+    number = _format(text)
+    if number is not None and number > FORMAT:
         raise OutputError(
-            f"{path}: a newer mbkit's baseline, of format {found[1]}; update mbkit, or replace it with force"
+            f"{path}: a newer mbkit's baseline, of format {number}; update mbkit, or replace it with force"
         )
     named = _MODEL.search(text)
     if named and named[1] != toml.value(model):
