@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from mbkit import _interrupt
 from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say
 from mbkit.cli.options import check_engines, load_options, model_options, split
 from mbkit.cli.output import File, show
@@ -89,7 +90,7 @@ def bench(
         methods = tuple(m for m in _QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
     usual = _QUICK if quick else _USUAL
     try:
-        with Bar(f"bench {model.name}") as bar, _workers(jobs) as executor:
+        with _interrupt.keeping, Bar(f"bench {model.name}") as bar, _workers(jobs) as executor:
             result = work_precision(
                 model,
                 engines,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from mbkit import _interrupt
 from mbkit.cli.door import AGREE, DIFFER, INTERRUPTED, MISUSE, leave, say
 from mbkit.cli.options import check_engines, load_options, model_options, split
 from mbkit.cli.output import File, show
@@ -166,7 +167,7 @@ def _check_all(
     begun = time.perf_counter()
     interrupted = False
     try:
-        with Bar("check --all") as bar:
+        with _interrupt.keeping, Bar("check --all") as bar:
             for outcome in all_robots(
                 engines=engines, samples=samples, seed=seed, floating_base=floating_base, mimic=mimic, jobs=jobs
             ):

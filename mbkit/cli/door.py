@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import click
 
+from mbkit import _interrupt
 from mbkit._escape import terminal
 from mbkit.errors import MbkitError, MbkitWarning
 
@@ -21,7 +22,7 @@ DONE: Final = 0
 DIFFER: Final = 1
 MISUSE: Final = 2
 INTERNAL: Final = 70
-INTERRUPTED: Final = 130
+INTERRUPTED: Final = _interrupt.INTERRUPTED
 
 
 class Door(click.Group):
@@ -30,13 +31,22 @@ class Door(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command that was asked for."""
         try:
+            return self._invoke(ctx)
+        finally:
+            # A library may have swallowed it, or taken it for a failure of its own.
+            if _interrupt.received():
+                ctx.exit(INTERRUPTED)
+
+    def _invoke(self, ctx: click.Context) -> Any:
+        try:
             with _one_line_warnings():
                 return super().invoke(ctx)
         except MbkitError as error:
             say("error", str(error))
             ctx.exit(MISUSE)
         except KeyboardInterrupt:
-            say("interrupted", "nothing was finished")
+            # Where the entry point listens, it has said so by now, and nothing else is printed.
+            say("interrupted", "the command did not finish")
             ctx.exit(INTERRUPTED)
         except click.ClickException as error:
             # A word of the command line may be a file of somebody else's, by a wildcard.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mbkit import _interrupt
 from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say, tell
 from mbkit.cli.options import check_engines, split
 from mbkit.cli.output import File, console, show
@@ -73,7 +74,7 @@ def stress(
     check_writable(out)
     given: dict[str, Any] = {name: x for name, x in numbers.items() if x is not None}
     try:
-        with Bar("stress") as bar:
+        with _interrupt.keeping, Bar("stress") as bar:
             result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **given)
     except InterruptedSweepError as stopped:
         result = stopped.result

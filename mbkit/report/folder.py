@@ -7,6 +7,7 @@ import re
 import tempfile
 from pathlib import Path
 
+from mbkit import _interrupt
 from mbkit.errors import OutputError
 
 __all__ = ["check_writable", "file_stem", "write"]
@@ -33,6 +34,11 @@ def check_writable(folder: Path) -> None:
 
 def write(folder: Path, name: str, content: str | bytes) -> Path:
     """Write a file as a whole or not at all, and return its path; text is UTF-8."""
+    with _interrupt.held:
+        return _write(folder, name, content)
+
+
+def _write(folder: Path, name: str, content: str | bytes) -> Path:
     path = folder / name
     temporary = None
     try:

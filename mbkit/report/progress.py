@@ -8,6 +8,7 @@ import time
 from types import TracebackType
 from typing import Any
 
+from mbkit import _interrupt
 from mbkit._escape import one_line
 
 __all__ = ["Bar"]
@@ -40,7 +41,8 @@ class Bar:
         return self
 
     def __call__(self, fraction: float, text: str) -> None:
-        """Show how far the work is, and with what."""
+        """Show how far the work is, and with what; where Ctrl-C was swallowed by a library, it is raised here."""
+        _interrupt.raise_again()
         self._fraction, self._text = fraction, one_line(text, 60)
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=fraction, doing=self._text)

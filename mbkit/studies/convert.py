@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from mbkit import _interrupt
 from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.errors import MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
@@ -61,7 +62,8 @@ class Converted:
         """Write the text to a file, and return its path."""
         out = Path(path)
         try:
-            out.write_text(self.text, encoding="utf-8")
+            with _interrupt.held:
+                out.write_text(self.text, encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write {out}: {error.strerror}; the text itself is kept") from error
         return out

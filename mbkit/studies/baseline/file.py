@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
+from mbkit import _interrupt
 from mbkit.errors import BaselineError, InputError, OutputError
 from mbkit.studies.baseline import toml
 from mbkit.studies.baseline.content import Baseline
@@ -164,8 +165,12 @@ def store(path: Path, text: str, model: str, *, force: bool) -> None:
         It cannot be written; or, unless `force` is given, another process has put another
         robot's baseline there in the meantime.
     """
-    # Where a link leads, so that it stays one.
-    path = Path(os.path.realpath(path))
+    with _interrupt.held:
+        # Where a link leads, so that it stays one.
+        _store(Path(os.path.realpath(path)), text, model, force=force)
+
+
+def _store(path: Path, text: str, model: str, *, force: bool) -> None:
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
