@@ -26,6 +26,8 @@ __all__ = ["GRACE", "INTERRUPTED", "at_end", "ending", "held", "keeping", "raise
 INTERRUPTED = 130
 #: Seconds in which an interrupted command may close its files.
 GRACE = 0.3
+#: Seconds that the main thread has for what it does at Ctrl-C.
+_PATIENCE = 0.05
 _LINE = b"interrupted: the command did not finish\n"
 #: To the line's beginning, clear it, and show the cursor that a progress bar hides.
 _CLEAR = b"\r\x1b[2K\x1b[?25h"
@@ -53,8 +55,8 @@ class _Interrupts:
 
     Attributes
     ----------
-    count : int
-        How often Ctrl-C has come.
+    heard, count : int
+        How often Ctrl-C has come, and how often the main thread knows of.
     pending : bool
         Whether it came while a file was written, and is still to be raised.
     ending : bool
@@ -62,7 +64,7 @@ class _Interrupts:
     """
 
     def __init__(self) -> None:
-        self.count = 0
+        self.heard = self.count = 0
         self.pending = self.ending = False
         # A signal handler may come upon itself.
         self.lock = threading.RLock()
@@ -106,13 +108,12 @@ def at_end(action: Callable[[], object], *, remove: bool = False) -> None:
 
 
 def _listen(listening: int) -> None:
-    """Count what comes, in a thread: it runs while the main thread is in a library."""
+    """Do in a thread what the main thread does not come to, because it is in a library."""
     while True:
-        for number in os.read(listening, 64):
-            if number == signal.SIGINT:
-                _interrupts.count += 1
-                if not keeping.depth or _interrupts.count > 1:
-                    _begin_end()
+        _interrupts.heard += os.read(listening, 64).count(signal.SIGINT)
+        time.sleep(_PATIENCE)
+        if _interrupts.count < _interrupts.heard and (not keeping.depth or _interrupts.heard > 1):
+            _begin_end()
 
 
 def _begin_end() -> None:
@@ -147,7 +148,8 @@ def _end() -> None:
 
 
 def _raise(*_: object) -> None:
-    if not keeping.depth:
+    _interrupts.count = max(_interrupts.count + 1, _interrupts.heard)
+    if not keeping.depth or _interrupts.count > 1:
         _begin_end()
     if held.depth:
         _interrupts.pending = True

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -365,3 +366,65 @@ def test_leaving_the_loop_ends_the_processes():
         break
     assert time.perf_counter() - begun < 30
     assert not multiprocessing.active_children()
+
+
+# Ctrl-C.
+
+#: A command whose interruption is swallowed, as libraries do that it meets in their imports.
+_SWALLOWING = """
+import os, sys, time
+from mbkit import _interrupt
+import mbkit.cli
+@mbkit.cli.cli.command("wait")
+def wait():
+    keeping = _interrupt.keeping if "keep" in os.environ else _interrupt.Section()
+    with keeping:
+        for _ in range(600):
+            try:
+                print("ready", flush=True)
+                time.sleep(0.1)
+            except BaseException:
+                {then}
+sys.argv = ["mbkit", "wait"]
+from mbkit.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("then", "presses", "environment"),
+    [
+        ("pass", 1, {}),
+        ("raise ImportError('initialization failed')", 1, {}),
+        ("import traceback; traceback.print_exc(); os.write(2, b'noise')", 1, {}),
+        ("raise", 1, {}),
+        ("raise", 1, {"keep": "1"}),
+        ("pass", 2, {"keep": "1"}),
+        ("_interrupt.raise_again()", 1, {"keep": "1"}),
+    ],
+)
+def test_an_interruption_is_one_line_and_its_status_whoever_swallows_it(then, presses, environment):
+    code = _SWALLOWING.format(then=then)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+    )
+    for _ in range(presses):
+        process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        if presses > 1:
+            for _ in range(3):
+                process.stdout.readline()
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert len(said.splitlines()) == 1
+    assert said.startswith("interrupted: ")
+
+
+def test_the_entry_point_listens_before_anything_heavy_is_imported():
+    code = "import sys; from mbkit import __main__; print(*sorted(sys.modules))"
+    run = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True)
+    assert not {"typing", "click", "numpy", "mbkit.cli", "mbkit.errors"} & set(run.stdout.split())

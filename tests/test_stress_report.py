@@ -410,6 +410,23 @@ def test_a_page_needs_nothing_from_elsewhere_and_is_whole(page):
     assert "<" not in NASTY.to_markdown()
 
 
+def test_what_was_interrupted_before_any_run_is_praised_nowhere():
+    case = NASTY.cases[0]
+    cells = tuple(Cell(value=1.0, end="not run") for _ in case.values)
+    rows = tuple(
+        replace(row, method=method, engine="lagrangian", cells=cells)
+        for row, method in zip(case.rows, ("auto", "rk4"), strict=False)
+    )
+    result = replace(NASTY, complete=False, cases=(replace(case, rows=rows),))
+    text = printed(summary(result))
+    assert "✓" not in text
+    assert "0 runs" in text
+    assert "nothing was run" in text
+    page = stress_page(result)
+    assert "nothing was run" in page
+    assert "as far as any in" not in page
+
+
 def test_a_result_of_nothing_still_has_a_page_a_table_and_a_figure():
     for empty in (NOTHING, replace(NOTHING, cases=NASTY.cases[2:])):
         for text in (Tags(stress_page(empty)).text, printed(summary(empty))):

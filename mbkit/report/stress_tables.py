@@ -26,7 +26,7 @@ _PLACES: Final = 2
 def summary(result: StressResult) -> RenderableType:
     """Return each case in a line: who held furthest and how far, mbkit's own choice, what breaks first."""
     told = overview(result)
-    runs = sum(len(row.cells) for case in result.cases for row in case.rows)
+    runs = sum(cell.end != "not run" for _, row in result.rows() for cell in row.cells)
     parts: list[RenderableType] = [
         Text.assemble(("stress: ", "bold"), one_line(headline(result))),
         Text(f"  {len(told)} cases · {runs} runs · {time_text(result.seconds)}", style="dim"),
