@@ -246,7 +246,7 @@ def test_bad_input_is_one_message_and_exit_2(here, arguments, told):
 
 @pytest.mark.usefixtures("here")
 def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
-    def full(*_: object) -> Path:
+    def full(*_: object, **__: object) -> Path:
         raise OutputError("cannot write there: No space left on device")
 
     monkeypatch.setattr("mbkit.report.folder.write", full)
@@ -366,6 +366,49 @@ def test_leaving_the_loop_ends_the_processes():
         break
     assert time.perf_counter() - begun < 30
     assert not multiprocessing.active_children()
+
+
+# Files of others.
+
+COMMANDS = {
+    "check pendulum --samples 1 --no-rollouts": ("pendulum.json", "pendulum.html"),
+    "check ur3 --own-parsers": ("ur3.importers.json", "ur3.importers.html"),
+    "check --all": ("all.json", "all.html"),
+    "bench pendulum --engines lagrangian --methods rk4 --duration 0.01 --repeats 1 --seconds 1": (
+        "pendulum-bench.json",
+        "pendulum-bench.csv",
+        "pendulum-bench.png",
+        "pendulum-bench.html",
+    ),
+    "stress joint_spring": ("joint_spring-stress.json", "joint_spring-stress.csv", "joint_spring-stress.html"),
+    "derive pendulum": ("pendulum.txt",),
+    "derive pendulum --python": ("pendulum.py",),
+    "derive pendulum --latex": ("pendulum.tex",),
+    "derive pendulum --json": ("pendulum.json",),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_file_of_somebody_else_is_not_replaced(here, command):
+    for k, name in enumerate(COMMANDS[command]):
+        path = here / "out" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(('{"name": "mine"}', "engine,pages\n1,2\n", "[" * 10_000)[k % 3])
+        before = path.read_bytes()
+        result = call(*command.split(), "--out", "out")
+        assert result.exit_code == 2
+        assert name in result.stderr
+        assert "--force" in result.stderr
+        assert path.read_bytes() == before
+        assert [p.name for p in path.parent.iterdir()] == [name]
+        path.unlink()
+    if command.startswith(("bench", "derive")):
+        path.write_text("mine")
+        for more in (["--force"], []):
+            # What mbkit wrote itself, it replaces.
+            result = call(*command.split(), "--out", "out", *more)
+            assert result.exit_code == 0, result.output
+        assert {p.name for p in path.parent.iterdir()} == set(COMMANDS[command])
 
 
 # Ctrl-C.

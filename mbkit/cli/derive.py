@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mbkit._escape import json_text
+from mbkit._version import __version__
 from mbkit.cli.door import say, tell
 from mbkit.cli.options import load_options, model_options
 
@@ -28,7 +29,7 @@ _WIDTH: Final = 100
 @model_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to, instead of printing.")
-@click.option("--force", is_flag=True, help="Replace C files that mbkit did not write.")
+@click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
 def derive(
     system: str,
     form: str | None,
@@ -71,7 +72,10 @@ def derive(
         return
     from mbkit.report.folder import file_stem, write
 
-    path = write(out, f"{file_stem(lag.name)}{ending}", text + "\n")
+    if ending == ".txt":
+        # By this line mbkit knows its own file.
+        text += f"\n\nWritten by mbkit {__version__}"
+    path = write(out, f"{file_stem(lag.name)}{ending}", text + "\n", force=force)
     tell(str(path))
 
 

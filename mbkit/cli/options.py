@@ -9,7 +9,10 @@ import click
 
 from mbkit.errors import InputError, UnknownNameError
 
-__all__ = ["check_engines", "load_options", "model_options", "split"]
+__all__ = ["check_engines", "force_option", "load_options", "model_options", "split"]
+
+#: Of commands that write results into a folder.
+force_option = click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
 
 
 def split(_ctx: click.Context, _parameter: click.Parameter, value: str) -> tuple[str, ...]:

@@ -28,7 +28,9 @@ class File:
     make: Callable[[], str | bytes]
 
 
-def show(data: str, table: Callable[[], RenderableType], files: Sequence[File], out: Path, *, as_json: bool) -> bool:
+def show(
+    data: str, table: Callable[[], RenderableType], files: Sequence[File], out: Path, *, as_json: bool, force: bool
+) -> bool:
     """Write a result and print it; return whether all could be written.
 
     Parameters
@@ -41,7 +43,8 @@ def show(data: str, table: Callable[[], RenderableType], files: Sequence[File], 
         Written in their order, so the dearest to lose first.
     out : Path
         The folder.
-    as_json : bool
+    as_json, force : bool
+        Whether JSON is printed, and whether files are replaced that mbkit did not write.
     """
     from mbkit.report import folder
 
@@ -49,7 +52,7 @@ def show(data: str, table: Callable[[], RenderableType], files: Sequence[File], 
     failure = ""
     try:
         for file in files:
-            paths[file.what] = folder.write(out, file.name, file.make())
+            paths[file.what] = folder.write(out, file.name, file.make(), force=force)
     except OutputError as error:
         failure = str(error)
     try:
