@@ -14,6 +14,7 @@ import mbkit as mb
 from mbkit.cli import cli
 from mbkit.engines import imported
 from mbkit.errors import InputError, LoadError, ModelError, UnknownNameError
+from mbkit.load.names import find
 from mbkit.load.stripped import strip
 from mbkit.load.urdf_links import urdf_links
 from mbkit.report.causes import meaning
@@ -106,6 +107,9 @@ def test_massless_inertia_and_impossible_inertia_as_each_importer_takes_them(tmp
 def test_real_robots_differ_as_the_table_says() -> None:
     table = json.loads((VALIDATION / "importers.json").read_text(encoding="utf-8"))
     result = mb.compare_parsers("bolt", samples=1)
+    # Who reads the result has the robot, and another machine.
+    assert result.source == "bolt"
+    assert str(find("bolt").path.parent) not in result.to_json()
     row = table["bolt_description/bolt"]
     for p in result.importers:
         assert row[p.engine]["status"] == ("agrees" if p.agrees else "differs")
