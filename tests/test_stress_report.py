@@ -474,3 +474,17 @@ def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():
         assert drawn == stable_steps(found)
         assert ElementTree.fromstring(drawn).tag.endswith("svg")
         assert "var(--series2)" in drawn
+
+
+def test_a_page_prints_what_was_chosen_as_a_person_writes_it():
+    settings = {
+        "quick": True,
+        "dt": 0.1 + 0.2,
+        "methods": {"mujoco": ["rk4", "euler"]},
+        "values": [0.1 + 0.2],
+        "seed": None,
+    }
+    text = Tags(stress_page(replace(NASTY, settings=settings))).text
+    for python in ("True", "None", "['", "0.30000000000000004"):
+        assert python not in text
+    assert "mujoco: rk4, euler" in text

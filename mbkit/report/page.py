@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -213,6 +214,7 @@ def _environment() -> Environment:
         how=lambda outcome: stress.HOW.get(outcome, ""),
         told=stress.told,
         rowname=name_of,
+        choice=_choice,
     )
     return made
 
@@ -220,6 +222,19 @@ def _environment() -> Environment:
 def _harmless(value: Any) -> Any:
     # Control characters too; markup made here is of another type.
     return terminal(value) if type(value) is str else value
+
+
+def _choice(value: Any) -> str:
+    """Return what somebody chose, a switch, a number, a text or several of them, as a person writes it."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.12g}"
+    if isinstance(value, Mapping):
+        return "; ".join(f"{k}: {_choice(x)}" for k, x in value.items())
+    return ", ".join(map(_choice, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
 def _three_digits(x: float) -> str:
