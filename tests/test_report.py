@@ -472,6 +472,21 @@ def test_the_least_error_is_the_fastest_of_those_that_the_reference_can_tell():
     assert line.best is STUDY.curves[0].points[2]
 
 
+@pytest.mark.parametrize(
+    "names", [["pinocchio"], ["pinocchio", "lagrangian", "mujoco", "drake"], ["an_engine_with_a_name"] * 5]
+)
+def test_nothing_of_the_figure_is_cut_where_it_is_saved(names):
+    # From 1 ms to 1 s: a tick, with its label, at either end.
+    points = tuple(point(1e-3, 10.0**-k, 10.0 ** (k / 4 - 3)) for k in range(1, 13))
+    curves = tuple(replace(STUDY.curves[0], engine=f"{name}{k or ''}", points=points) for k, name in enumerate(names))
+    drawn = figure(replace(STUDY, curves=curves))
+    box, (width, height) = drawn.get_tightbbox(), drawn.get_size_inches()
+    assert box.x0 >= 0
+    assert box.y0 >= 0
+    assert box.x1 <= width
+    assert box.y1 <= height
+
+
 def test_a_bench_page_holds_what_an_expert_asks_for():
     page = " ".join(Tags(bench_page(STUDY, asked="my:arm", data="arm-bench.json", table="arm-bench.csv")).text.split())
     for wanted in (
