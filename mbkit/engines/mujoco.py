@@ -11,13 +11,16 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable
-from typing import Any, ClassVar
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, ClassVar, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, real
+from mbkit.engines import defects
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel, build
@@ -26,6 +29,10 @@ from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
 
 __all__ = ["MujocoDynamics"]
+
+
+#: Quantities that M is part of.
+_OF_MASS: Final = ("mass_matrix", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
 
 
 class MujocoDynamics(Dynamics):
@@ -56,6 +63,9 @@ class MujocoDynamics(Dynamics):
         self._lock = threading.RLock()
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+        if quantity in _OF_MASS and self.model.couplings and self._torn_couplings:
+            names = ", ".join(repr(name) for name in self._torn_couplings)
+            defects.announce(defects.TENDON_ARMATURE, f"coupling {names}")
         # One MjData and one handler of warnings: two threads in here end the process.
         with self._lock, heard_warnings() as heard:
             # MuJoCo tells each kind of warning once, unless its count is put back.
@@ -64,6 +74,21 @@ class MujocoDynamics(Dynamics):
         if heard:
             raise NumericalError(f"mujoco: {quantity} of {self.model.name}: {heard[0].strip()}{self._blame()}")
         return out
+
+    @cached_property
+    def _torn_couplings(self) -> tuple[str, ...]:
+        """Names of the couplings whose armature MuJoCo leaves out of M between branches, found by evaluating M."""
+        layout, q = self.model.layout, self.model.neutral()
+        rows = {c.name: c.armature**0.5 * layout.coupling_row(c) @ layout.G for c in self.model.couplings if c.armature}
+        if not rows:
+            return ()
+        with self._lock:
+            M = self._one_mass_matrix(q)
+        bare = MujocoDynamics(replace(self.model, couplings=()))._one_mass_matrix(q)
+        missing = np.abs(bare + sum(np.outer(x, x) for x in rows.values()) - M)
+        root = np.sqrt(np.abs(np.diag(M)))
+        lost = missing > 1e-9 * np.outer(root, root)
+        return tuple(name for name, x in rows.items() if lost[np.ix_(x != 0, x != 0)].any())
 
     # Between the description's numbers and MuJoCo's.
 
@@ -124,6 +149,9 @@ class MujocoDynamics(Dynamics):
         self._set(q)
         mujoco.mj_kinematics(self._m, self._d)
         mujoco.mj_comPos(self._m, self._d)
+        if self._m.ntendon:
+            # Their armature is part of M.
+            mujoco.mj_tendon(self._m, self._d)
         mujoco.mj_makeM(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
 
@@ -290,6 +318,7 @@ class MujocoDynamics(Dynamics):
         steps: int,
         *,
         euler_damping: bool = False,
+        progress: Callable[[float], object] | None = None,
     ) -> tuple[Array, Array]:
         """Integrate with MuJoCo's own steps.
 
@@ -305,6 +334,8 @@ class MujocoDynamics(Dynamics):
         euler_damping : bool
             Whether Euler treats joint damping implicitly, MuJoCo's default; it
             then solves (M + h D) a = f and is no longer the explicit formula.
+        progress : callable, optional
+            Gets the fraction done, about ten times a second; what it raises ends the run.
 
         Returns
         -------
@@ -334,4 +365,4 @@ class MujocoDynamics(Dynamics):
         model = copy.copy(self._m)
         if euler_damping:
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        return Rollout(self.model, self._made, model)(integrator, q0, v0, dt, tau, steps)
+        return Rollout(self.model, self._made, model)(integrator, q0, v0, dt, tau, steps, progress)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import count
 from typing import Any, Final
 
@@ -12,9 +13,10 @@ import numpy as np
 
 from mbkit import catalog
 from mbkit.errors import MbkitError
+from mbkit.load.snap import Snapper
 from mbkit.model import Expression, Model, Parameter
 
-__all__ = ["in_symbols", "letters"]
+__all__ = ["in_symbols", "letters", "with_plain_turns"]
 
 #: Of each system's arguments: a name, or three for a vector.
 _SYMBOLS: Final[dict[str, dict[str, str | tuple[str, str, str]]]] = {
@@ -102,6 +104,27 @@ def letters(model: Model) -> list[str] | None:
     return [t if t in known else f"q{next(numbers)}" for t in tails]
 
 
+def with_plain_turns(model: Model, reach: float) -> tuple[Model, str | None]:
+    """Return a model for reading, without the last digits of rounded quarter turns, and a note if it is another one.
+
+    A file's 1.57079632679 for π/2 leaves 5e-12 where a zero is meant, and with it a term in every equation.
+
+    Parameters
+    ----------
+    model : Model
+    reach : float
+        How near to 0, 1 or -1 an entry of a rotation matrix or an axis is set to it.
+    """
+    snap = Snapper(reach)
+    joints = tuple(
+        replace(j, rotation=snap(j.rotation), axes=np.array([snap(axis) for axis in j.axes]).reshape(-1, 3))
+        for j in model.joints
+    )
+    if not snap.count:
+        return model, None
+    return replace(model, joints=joints), snap.note
+
+
 def _numbered(name: str, system: str) -> bool:
     return name.startswith(f"{system}_") and name.removeprefix(f"{system}_").isdigit()
 
@@ -136,7 +159,12 @@ def _usual(name: str) -> str:
 def _form(model: Model) -> Any:
     """Return what a description has beside numbers."""
     joints = [(j.name, j.kind, j.parent, j.child, j.mimic is None) for j in model.joints]
-    return [b.name for b in model.bodies], joints, [s.name for s in model.springs], len(model.loops)
+    return (
+        [b.name for b in model.bodies],
+        joints,
+        [*(s.name for s in model.springs), *(c.name for c in model.couplings)],
+        len(model.loops),
+    )
 
 
 def _solved(made: Model, model: Model) -> dict[str, float]:
@@ -197,3 +225,5 @@ def _numbers(model: Model) -> Iterator[np.ndarray]:
         yield from (j.armature, j.damping, j.stiffness, j.rest)
     for s in model.springs:
         yield from (s.point_a, s.point_b, np.array([s.stiffness, s.rest_length, s.damping]))
+    for c in model.couplings:
+        yield np.array([*c.factors, c.stiffness, c.rest_length, c.damping, c.armature])
