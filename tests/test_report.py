@@ -576,7 +576,7 @@ def test_asking_creates_nothing_and_writing_leaves_nothing_else(tmp_path: Path):
     check_writable(folder)
     assert not folder.parent.exists()
     for text in ("one", "two ✓ \udc80"):
-        assert write(folder, "a.json", text) == folder / "a.json"
+        assert write(folder, "a.json", text, force=True) == folder / "a.json"
     assert (folder / "a.json").read_text(encoding="utf-8") == "two ✓ \\udc80"
     assert [p.name for p in folder.iterdir()] == ["a.json"]
     assert (folder / "a.json").stat().st_mode & 0o444 == 0o444

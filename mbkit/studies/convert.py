@@ -112,7 +112,7 @@ def convert(model: Model, to: str) -> Converted:
     if model.written is not None:
         raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
     names = [model.name, *(x.name for x in model.bodies), *(x.name for x in model.joints)]
-    names += [*(x.name for x in model.frames), *(x.name for x in model.springs)]
+    names += [*(x.name for x in model.frames), *(x.name for x in model.springs), *(x.name for x in model.couplings)]
     unwritable = [name for name in names if not xml_holds(name)]
     if unwritable:
         raise UnsupportedError(f"convert: XML cannot hold the characters of {unwritable[0]!r}; rename this part")
