@@ -11,11 +11,14 @@ they are first used.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
 from mbkit._version import __version__ as __version__
 
+# The module typing is no light one, and the command listens to Ctrl-C only after this.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from mbkit import catalog as catalog
     from mbkit import errors as errors
     from mbkit import lagrangian as lagrangian

@@ -1,6 +1,17 @@
-"""``python -m mbkit``: the same door as the command ``mbkit``."""
+"""The entry point of the command `mbkit` and of ``python -m mbkit``; it listens to Ctrl-C before other imports."""
 
-from mbkit.cli import main
+from mbkit import _interrupt
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command."""
+    with _interrupt.ending:
+        from mbkit.cli import main as command
+
+        command()
+
 
 if __name__ == "__main__":
     main()

@@ -10,6 +10,8 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
+from mbkit import _escape
+
 __all__ = [
     "BaselineError",
     "DoubtfulRunWarning",
@@ -40,7 +42,13 @@ _LONGEST_NAME: Final = 200
 
 
 class MbkitError(Exception):
-    """Base of every error that mbkit raises on purpose."""
+    """Base of every error that mbkit raises on purpose.
+
+    Its message spells out what a terminal would obey, because names in it come from files.
+    """
+
+    def __str__(self) -> str:
+        return _escape.terminal(super().__str__())
 
 
 class InputError(MbkitError, ValueError):
@@ -155,7 +163,10 @@ class NumericalError(MbkitError, ArithmeticError):
 
 
 class MbkitWarning(UserWarning):
-    """Base of mbkit's warnings."""
+    """Base of mbkit's warnings; a message spells out what a terminal would obey, as an error's does."""
+
+    def __str__(self) -> str:
+        return _escape.terminal(super().__str__())
 
 
 class DoubtfulRunWarning(MbkitWarning):

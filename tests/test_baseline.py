@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -542,3 +543,90 @@ def test_one_files_fault_does_not_hide_the_others(monkeypatch, tmp_path):
         result = call(*arguments)
         assert result.exit_code == 2, result.output
         assert told in result.stderr
+
+
+# Baselines of strangers.
+
+
+def forge(path: Path, key: str, value: str) -> None:
+    """Put a value into a baseline's file, with a checksum that fits."""
+    body = path.read_text().rpartition("# sha256 ")[0]
+    body, count = re.subn(rf"^{re.escape(key)} = .*$", lambda _: f"{key} = {value}", body, count=1, flags=re.MULTILINE)
+    assert count == 1, key
+    path.write_text(f"{body}# sha256 {hashlib.sha256(body.encode()).hexdigest()}\n")
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> Path:
+    path = tmp_path / "pendulum.toml"
+    mb.baseline.record(mb.catalog.pendulum(), path, ["lagrangian"], samples=1, target="pendulum")
+    return path
+
+
+@pytest.mark.parametrize("target", ["evil:made", "os:abort", "evil:made.sub", "mbkit.catalog:get"])
+def test_a_function_runs_only_where_the_caller_names_it(pendulum, target, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "evil", raising=False)
+    Path("evil.py").write_text("import mbkit as mb, pathlib\npathlib.Path('ran').touch()\nmade = mb.catalog.pendulum\n")
+    forge(pendulum, "target", f'"{target}"')
+    for arguments in (("check", "pendulum.toml"), ("check", "."), ("check", "pendulum.toml", "--rebaseline")):
+        done = call(*arguments)
+        assert done.exit_code == 2
+        assert f"--target {target}" in done.stderr
+    assert mb.baseline.check(mb.catalog.pendulum(), pendulum).passed
+    assert not Path("ran").exists()
+    if target == "evil:made":
+        assert call("check", "pendulum.toml", "--target", target).exit_code == 0
+        assert Path("ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("format", "9" * 5000),
+        ("format", "nan"),
+        ("model", "[]"),
+        ("target", "[1.0]"),
+        ("engines", "[]"),
+        ("engines", "[1.0]"),
+        ("steps", "1000000000"),
+        ("steps", "1" + "0" * 400),
+        ("dt", "inf"),
+        ("q.theta", "[nan, nan]"),
+        ("q.theta", "[1.0]"),
+        ("nle.theta", "[inf, inf]"),
+        ("nle.theta", "[1e400, 0.0]"),
+        ("passive", "nan"),
+        ("gravity", '"x"'),
+        ("bob.mass", '"1"'),
+        ("bob.mass", "1" + "0" * 400),
+        ("bob.com", "[[[]]]"),
+        ("bob.com", "[" * 3000),
+    ],
+)
+def test_a_forged_baseline_is_refused_as_such(pendulum, key, value):
+    forge(pendulum, key, value)
+    with pytest.raises(BaselineError) as caught:
+        mb.baseline.read(pendulum)
+    assert len(str(caught.value)) < 1000
+    assert call("check", str(pendulum)).exit_code == 2
+
+
+def test_a_newer_format_of_any_length_is_not_replaced(pendulum):
+    forge(pendulum, "format", "9" * 5000)
+    with pytest.raises(OutputError, match="newer"):
+        mb.baseline.record(mb.catalog.pendulum(), pendulum, ["lagrangian"])
+
+
+@pytest.mark.parametrize("target", [["panda"], np.zeros(3), b"panda", 1, Path("a.urdf")])
+def test_a_target_is_a_text_and_options_are_plain(pendulum, target):
+    model = mb.catalog.pendulum()
+    with pytest.raises(InputError, match="target"):
+        mb.baseline.record(model, pendulum, ["lagrangian"], target=target)
+    with pytest.raises(InputError, match="target"):
+        mb.baseline.check(model, pendulum, target=target)
+    for options in ({"gravity": np.zeros(3)}, {"mimic": None}, [1], {1: 2.0}):
+        with pytest.raises(InputError, match="options"):
+            mb.baseline.record(model, pendulum, ["lagrangian"], options=options)
+    assert mb.baseline.check(model, pendulum).passed

@@ -122,14 +122,14 @@ def test_interrupted_before_anything_was_finished(here, monkeypatch):
     monkeypatch.setattr("mbkit.studies.work_precision", at_once)
     result = call("bench", "pendulum", *SHORT)
     assert result.exit_code == 130
-    assert "nothing was finished" in result.stderr
+    assert "interrupted: " in result.stderr
     assert not list(here.iterdir())
 
 
 @pytest.mark.usefixtures("here")
 @pytest.mark.usefixtures("at_hand")
 def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
-    def full(*_: object) -> Path:
+    def full(*_: object, **__: object) -> Path:
         raise OutputError("cannot write there: No space left on device")
 
     monkeypatch.setattr("mbkit.report.folder.write", full)

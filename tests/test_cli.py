@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -315,7 +316,7 @@ def test_every_command_says_how_to_take_impossible_bodies_in_its_own_options(her
 
 @pytest.mark.usefixtures("here")
 def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
-    def full(*_: object) -> Path:
+    def full(*_: object, **__: object) -> Path:
         raise OutputError("cannot write there: No space left on device")
 
     monkeypatch.setattr("mbkit.report.folder.write", full)
@@ -435,3 +436,108 @@ def test_leaving_the_loop_ends_the_processes():
         break
     assert time.perf_counter() - begun < 30
     assert not multiprocessing.active_children()
+
+
+# Files of others.
+
+COMMANDS = {
+    "check pendulum --samples 1 --no-rollouts": ("pendulum.json", "pendulum.html"),
+    "check ur3 --own-parsers": ("ur3.importers.json", "ur3.importers.html"),
+    "check --all": ("all.json", "all.html"),
+    "bench pendulum --engines lagrangian --methods rk4 --duration 0.01 --repeats 1 --seconds 1": (
+        "pendulum-bench.json",
+        "pendulum-bench.csv",
+        "pendulum-bench.png",
+        "pendulum-bench.html",
+    ),
+    "stress joint_spring": ("joint_spring-stress.json", "joint_spring-stress.csv", "joint_spring-stress.html"),
+    "derive pendulum": ("pendulum.txt",),
+    "derive pendulum --python": ("pendulum.py",),
+    "derive pendulum --latex": ("pendulum.tex",),
+    "derive pendulum --json": ("pendulum.json",),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_file_of_somebody_else_is_not_replaced(here, command):
+    for k, name in enumerate(COMMANDS[command]):
+        path = here / "out" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(('{"name": "mine"}', "engine,pages\n1,2\n", "[" * 10_000)[k % 3])
+        before = path.read_bytes()
+        result = call(*command.split(), "--out", "out")
+        assert result.exit_code == 2
+        assert name in result.stderr
+        assert "--force" in result.stderr
+        assert path.read_bytes() == before
+        assert [p.name for p in path.parent.iterdir()] == [name]
+        path.unlink()
+    if command.startswith(("bench", "derive")):
+        path.write_text("mine")
+        for more in (["--force"], []):
+            # What mbkit wrote itself, it replaces.
+            result = call(*command.split(), "--out", "out", *more)
+            assert result.exit_code == 0, result.output
+        assert {p.name for p in path.parent.iterdir()} == set(COMMANDS[command])
+
+
+# Ctrl-C.
+
+#: A command whose interruption is swallowed, as libraries do that it meets in their imports.
+_SWALLOWING = """
+import os, sys, time
+from mbkit import _interrupt
+import mbkit.cli
+@mbkit.cli.cli.command("wait")
+def wait():
+    keeping = _interrupt.keeping if "keep" in os.environ else _interrupt.Section()
+    with keeping:
+        for _ in range(600):
+            try:
+                print("ready", flush=True)
+                time.sleep(0.1)
+            except BaseException:
+                {then}
+sys.argv = ["mbkit", "wait"]
+from mbkit.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("then", "presses", "environment"),
+    [
+        ("pass", 1, {}),
+        ("raise ImportError('initialization failed')", 1, {}),
+        ("import traceback; traceback.print_exc(); os.write(2, b'noise')", 1, {}),
+        ("raise", 1, {}),
+        ("raise", 1, {"keep": "1"}),
+        ("pass", 2, {"keep": "1"}),
+        ("_interrupt.raise_again()", 1, {"keep": "1"}),
+    ],
+)
+def test_an_interruption_is_one_line_and_its_status_whoever_swallows_it(then, presses, environment):
+    code = _SWALLOWING.format(then=then)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+    )
+    for _ in range(presses):
+        process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        if presses > 1:
+            for _ in range(3):
+                process.stdout.readline()
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert len(said.splitlines()) == 1
+    assert said.startswith("interrupted: ")
+
+
+def test_the_entry_point_listens_before_anything_heavy_is_imported():
+    code = "import sys; from mbkit import __main__; print(*sorted(sys.modules))"
+    run = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True)
+    assert not {"typing", "click", "numpy", "mbkit.cli", "mbkit.errors"} & set(run.stdout.split())

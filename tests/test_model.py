@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import math
 import pickle
@@ -15,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
+from mbkit.engines import ENGINES
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, UnknownNameError
 from mbkit.model import KINDS, Mimic
 from mbkit.model.physical import idle_joints, sample_mass_matrix
@@ -508,3 +510,41 @@ def test_wrong_configurations_are_explained(call):
         getattr(model, call)(2 * q, second)
     with pytest.raises(InputError, match="different sizes"):
         getattr(model, call)(np.stack([q] * 2), np.stack([second] * 3))
+
+
+# How public names look in a shell.
+
+
+@pytest.mark.parametrize(
+    ("package", "function"),
+    [
+        ("mbkit.load", "mbkit.load.loader"),
+        ("mbkit.simulate", "mbkit.simulate.run"),
+        ("mbkit.studies.stress", "mbkit.studies.stress.study"),
+    ],
+)
+def test_a_package_that_is_called_looks_like_its_function(package, function):
+    called = importlib.import_module(package)
+    function = getattr(importlib.import_module(function), package.rpartition(".")[2])
+    assert inspect.signature(called) == inspect.signature(called.__call__) == inspect.signature(function)
+    assert called.__doc__ == function.__doc__
+    # A shell shows both docstrings where there are two.
+    assert inspect.getdoc(called.__call__) is None
+    assert set(dir(called)) == set(called.__all__)
+    assert pickle.loads(pickle.dumps(called)) is called
+    with pytest.raises(TypeError):
+        called(nonsense=1)
+
+
+def test_every_engine_is_in_the_documentation_of_dynamics():
+    assert all(f'"{name}"' in mb.dynamics.__doc__ for name in ENGINES)
+
+
+def test_parts_of_a_model_are_short_to_look_at():
+    model = mb.load("panda")
+    for parts in (model.joints, model.bodies, model.frames):
+        for part in parts:
+            assert part.name in repr(part)
+            assert len(repr(part)) < 160
+    assert "\n" not in repr(model.layout)
+    assert len(repr(model.layout)) < 160

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +116,22 @@ def test_dampers_are_implicit_in_three_and_springs_in_one(tmp_path: Path, monkey
             with pytest.warns(MbkitWarning, match="diverged"):
                 simulate(slider(stiffness=stiffness), [1.0], [0.0], 0.1, method, dt=h)
     # MuJoCo writes MUJOCO_LOG.TXT where it stands, if it is let.
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_log_is_left_in_the_working_folder(tmp_path: Path) -> None:
+    code = """
+import mbkit as mb, numpy as np, mujoco, warnings
+from mbkit.engines.mujoco_variants import Variant
+dyn = mb.dynamics(mb.catalog.pendulum(), "mujoco")
+for call in (lambda q: Variant(dyn).accelerations(q, q), lambda q: mujoco.mj_step(dyn.mj_model, data(q))):
+    def data(q):
+        made = mujoco.MjData(dyn.mj_model)
+        made.qpos[:] = q
+        return made
+    call(np.array([np.nan]))
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, env=os.environ | {"PYTHONPATH": os.getcwd()})
     assert not list(tmp_path.iterdir())
 
 

@@ -16,6 +16,7 @@ from mbkit.cli import cli
 from mbkit.engines import import_mujoco, imported
 from mbkit.errors import InputError, LoadError, ModelError, UnknownNameError
 from mbkit.load import xml
+from mbkit.load.names import find
 from mbkit.load.stripped import strip
 from mbkit.load.urdf_links import urdf_links
 from mbkit.load.xml import Element
@@ -110,6 +111,9 @@ def test_massless_inertia_and_impossible_inertia_as_each_importer_takes_them(tmp
 def test_real_robots_differ_as_the_table_says() -> None:
     table = json.loads((VALIDATION / "importers.json").read_text(encoding="utf-8"))
     result = mb.compare_parsers("bolt", samples=1)
+    # Who reads the result has the robot, and another machine.
+    assert result.source == "bolt"
+    assert str(find("bolt").path.parent) not in result.to_json()
     row = table["bolt_description/bolt"]
     for p in result.importers:
         assert row[p.engine]["status"] == ("agrees" if p.agrees else "differs")
@@ -399,6 +403,7 @@ def test_the_page_tells_it_all_and_obeys_nothing(tmp_path: Path) -> None:
     assert page.index('class="verdict bad">✗ pinocchio agrees') < page.index("<table") < page.index("Why they differ")
     assert "alert" in page
     assert "<script" not in page
+    assert "<" not in result.to_markdown()
     for told in ("the base floats", "a ball of water put in its place", "✓ same", "✗ differs", "! differs", "mujoco 4"):
         assert told in page
     # Whoever reads nothing is told with the reason, in the place of a column.

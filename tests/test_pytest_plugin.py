@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -107,6 +108,16 @@ def run(project: Path, *arguments: str) -> tuple[int, str]:
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--color=no", *arguments]
     made = subprocess.run(command, cwd=project, env=env, capture_output=True, text=True, timeout=300)
     return made.returncode, made.stdout + made.stderr
+
+
+def test_the_example_in_the_readme_records_and_checks(project):
+    blocks = re.findall(r"^```python\n(.*?)^```$", (TOP / "README.md").read_text(encoding="utf-8"), flags=re.M | re.S)
+    (example,) = (code for code in blocks if "mbkit_baseline" in code)
+    (project / "test_robots.py").write_text(example)
+    status, out = run(project, "--mbkit-regen")
+    assert status == 0, out
+    assert "8 passed" in out
+    assert len(list((project / "baselines" / "test_robots").iterdir())) == 2
 
 
 def test_a_project_records_under_xdist_and_is_told_what_changed(project):

@@ -59,3 +59,16 @@ def test_every_dependency_is_given_a_reason():
         name = re.match(r"[\w-]+", requirement)
         assert name
         assert f"`{name.group()}`" in TEXT, requirement
+
+
+def test_no_file_for_others_tells_where_it_was_made():
+    kinds = {".json", ".md", ".ipynb", ".html", ".svg", ".toml", ".csv"}
+    files = [
+        TOP / "README.md",
+        *(f for part in ("validation", "notebooks", "tests") for f in (TOP / part).rglob("*")),
+    ]
+    files = [f for f in files if f.suffix in kinds]
+    assert len(files) > 20
+    place = re.compile(r"(?<![\w.])/(?:work|home|root|tmp|Users|usr|opt|var)/|site-packages")
+    found = {f.name: m[0] for f in files if (m := place.search(f.read_text(encoding="utf-8")))}
+    assert found == {}

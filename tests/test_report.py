@@ -12,10 +12,11 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
+from mbkit._escape import one_line, terminal
 from mbkit.errors import OutputError
 from mbkit.report import figures, precision, precision_tables, tables
 from mbkit.report.folder import check_writable, file_stem, write
-from mbkit.report.numbers import count_text, error_text, inline, plain, time_text
+from mbkit.report.numbers import count_text, error_text, time_text
 from mbkit.report.page import bench_page, check_page, sweep_page
 from mbkit.report.progress import Bar
 from mbkit.report.reading import failures, headline, notices, omission_state
@@ -231,8 +232,8 @@ def test_numbers_that_are_none_are_told():
 
 
 def test_text_from_files_cannot_command_a_terminal():
-    assert plain("a\x1b[31m\x07\u202eb\nc") == "a\\x1b[31m\\x07\\u202eb\nc"
-    assert inline("a\n  b   c", 4) == "a b…"
+    assert terminal("a\x1b[31m\x07\u202eb\nc") == "a\\x1b[31m\\x07\\u202eb\nc"
+    assert one_line("a\n  b   c", 4) == "a b…"
 
 
 def test_headline_names_the_engines_and_who_is_left_out():
@@ -527,6 +528,21 @@ def test_the_least_error_is_the_fastest_of_those_that_the_reference_can_tell():
     assert line.best is STUDY.curves[0].points[2]
 
 
+@pytest.mark.parametrize(
+    "names", [["pinocchio"], ["pinocchio", "lagrangian", "mujoco", "drake"], ["an_engine_with_a_name"] * 5]
+)
+def test_nothing_of_the_figure_is_cut_where_it_is_saved(names):
+    # From 1 ms to 1 s: a tick, with its label, at either end.
+    points = tuple(point(1e-3, 10.0**-k, 10.0 ** (k / 4 - 3)) for k in range(1, 13))
+    curves = tuple(replace(STUDY.curves[0], engine=f"{name}{k or ''}", points=points) for k, name in enumerate(names))
+    drawn = figure(replace(STUDY, curves=curves))
+    box, (width, height) = drawn.get_tightbbox(), drawn.get_size_inches()
+    assert box.x0 >= 0
+    assert box.y0 >= 0
+    assert box.x1 <= width
+    assert box.y1 <= height
+
+
 def test_a_bench_page_holds_what_an_expert_asks_for():
     page = " ".join(Tags(bench_page(STUDY, asked="my:arm", data="arm-bench.json", table="arm-bench.csv")).text.split())
     for wanted in (
@@ -616,7 +632,7 @@ def test_asking_creates_nothing_and_writing_leaves_nothing_else(tmp_path: Path):
     check_writable(folder)
     assert not folder.parent.exists()
     for text in ("one", "two ✓ \udc80"):
-        assert write(folder, "a.json", text) == folder / "a.json"
+        assert write(folder, "a.json", text, force=True) == folder / "a.json"
     assert (folder / "a.json").read_text(encoding="utf-8") == "two ✓ \\udc80"
     assert [p.name for p in folder.iterdir()] == ["a.json"]
     assert (folder / "a.json").stat().st_mode & 0o444 == 0o444

@@ -405,6 +405,26 @@ def test_a_page_needs_nothing_from_elsewhere_and_is_whole(page):
         assert "\x1b" not in text
         assert "\u202e" not in text
     assert '<script>alert("x")</script>[red]x[/red]' in Tags(stress_page(NASTY)).text
+    for text in (NASTY.to_markdown(), NASTY.to_csv()):
+        assert all(c.isprintable() or c == "\n" for c in text)
+    assert "<" not in NASTY.to_markdown()
+
+
+def test_what_was_interrupted_before_any_run_is_praised_nowhere():
+    case = NASTY.cases[0]
+    cells = tuple(Cell(value=1.0, end="not run") for _ in case.values)
+    rows = tuple(
+        replace(row, method=method, engine="lagrangian", cells=cells)
+        for row, method in zip(case.rows, ("auto", "rk4"), strict=False)
+    )
+    result = replace(NASTY, complete=False, cases=(replace(case, rows=rows),))
+    text = printed(summary(result))
+    assert "✓" not in text
+    assert "0 runs" in text
+    assert "nothing was run" in text
+    page = stress_page(result)
+    assert "nothing was run" in page
+    assert "as far as any in" not in page
 
 
 def test_a_result_of_nothing_still_has_a_page_a_table_and_a_figure():
@@ -454,3 +474,17 @@ def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():
         assert drawn == stable_steps(found)
         assert ElementTree.fromstring(drawn).tag.endswith("svg")
         assert "var(--series2)" in drawn
+
+
+def test_a_page_prints_what_was_chosen_as_a_person_writes_it():
+    settings = {
+        "quick": True,
+        "dt": 0.1 + 0.2,
+        "methods": {"mujoco": ["rk4", "euler"]},
+        "values": [0.1 + 0.2],
+        "seed": None,
+    }
+    text = Tags(stress_page(replace(NASTY, settings=settings))).text
+    for python in ("True", "None", "['", "0.30000000000000004"):
+        assert python not in text
+    assert "mujoco: rk4, euler" in text

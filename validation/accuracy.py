@@ -14,6 +14,7 @@ status 1 if one is missed.
 from __future__ import annotations
 
 import json
+import re
 import statistics
 import sys
 import warnings
@@ -27,7 +28,7 @@ from rich.table import Table
 
 import mbkit as mb
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.errors import MbkitError, MbkitWarning
+from mbkit.errors import MbkitError, MbkitWarning, ModelError
 from mbkit.studies.judge import Judge
 from mbkit.studies.stamp import processor, versions
 from mbkit.studies.states import states
@@ -55,6 +56,13 @@ def systems():
     return made
 
 
+def told(error):
+    """Return why a system was refused, without the place of its file on this machine."""
+    if isinstance(error, ModelError):
+        return "; ".join(error.faults)
+    return re.sub(r"(?<![^\s'\"(])/(?:[^\s'\":]+/)*", "", str(error))
+
+
 def measured(make):
     """Return the errors of one system: engine -> term -> figures, and what was refused."""
     with warnings.catch_warnings():
@@ -62,7 +70,7 @@ def measured(make):
         try:
             model = make()
         except MbkitError as error:
-            return {"refused": str(error)}
+            return {"refused": told(error)}
         if not model.nv:
             return {"refused": "nothing moves"}
         oracle, at = OracleDynamics(model), states(model, 64, 0)
@@ -71,7 +79,7 @@ def measured(make):
             try:
                 dyn = mb.dynamics(model, engine)
             except MbkitError as error:
-                notes.append(f"{engine}: {error}")
+                notes.append(f"{engine}: {told(error)}")
                 continue
             judge = Judge(model, {engine: dyn}, oracle, at, tolerance=np.inf)
             errors[engine] = {}
@@ -79,7 +87,7 @@ def measured(make):
                 try:
                     errors[engine][term.name] = figures(judge, term, dyn)
                 except MbkitError as error:
-                    notes.append(f"{term.name}: {error}")
+                    notes.append(f"{term.name}: {told(error)}")
     return {"nv": model.nv, "samples": len(at.q), "errors": errors, "notes": notes}
 
 

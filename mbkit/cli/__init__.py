@@ -6,6 +6,7 @@ bad input, 70 a fault of mbkit's own, 130 interrupted. A command is a file.
 
 from __future__ import annotations
 
+import os
 import sys
 
 import click
@@ -39,6 +40,8 @@ for _command in (
 
 def main() -> None:
     """Run the command."""
+    # Nothing is drawn with MuJoCo here, and its import would start a process that looks for a window system.
+    os.environ.setdefault("MUJOCO_GL", "disable")
     for stream in (sys.stdout, sys.stderr):
         # Marks and units are not ASCII, whatever the locale says.
         if hasattr(stream, "reconfigure"):

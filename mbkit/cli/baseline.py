@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mbkit.cli.door import AGREE, DIFFER, DONE, MISUSE, leave, say
+from mbkit._escape import one_line
+from mbkit.cli.door import AGREE, DIFFER, DONE, MISUSE, leave, say, tell
 from mbkit.cli.options import check_engines, in_options, load_options, model_options, split
 from mbkit.cli.output import console
 from mbkit.errors import BaselineError, InputError, MbkitError
@@ -49,8 +50,9 @@ def record(
 ) -> None:
     """Record each TARGET in PATH: a .toml file, or a folder that gets a file for each.
 
-    TARGET is what `mbkit check` takes; `mbkit baseline check` loads it again, a file by its place
-    beside PATH. The baseline of the same robot is replaced. Exit status: 0 done, 2 misuse or bad input.
+    TARGET is what `mbkit check` takes; `mbkit baseline check` loads a robot, a catalog system or a file again,
+    the file by its place beside PATH, and runs a function only where --target names it. The baseline of the same
+    robot is replaced. Exit status: 0 done, 2 misuse or bad input.
     """
     if path.suffix == ".toml" and len(targets) > 1:
         raise click.UsageError(f"{len(targets)} targets want a folder, and {path} is a file's name")
@@ -87,7 +89,7 @@ def _record_one(
             force=force,
             progress=bar,
         )
-    click.echo(f"{file}: {model.name}, {', '.join(made.engines)}, {file.stat().st_size / 1000:.0f} kB")
+    tell(f"{file}: {one_line(model.name)}, {', '.join(made.engines)}, {file.stat().st_size / 1000:.0f} kB")
     for refusal in made.left_out:
         say("note", f"{refusal.engine}{' ' * bool(refusal.term)}{refusal.term}: {refusal.reason}")
     for told in made.disagreements:
@@ -96,7 +98,9 @@ def _record_one(
 
 @baseline.command()
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--target", help="Check this instead of what was recorded; with one file.")
+@click.option(
+    "--target", help="Check this instead of what was recorded, or the function that was recorded; with one file."
+)
 @click.option("--strict", is_flag=True, help="Fail where an engine that was recorded is not installed.")
 @click.option("--rebaseline", is_flag=True, help="Tell what differs, and record it anew.")
 @model_options
@@ -206,7 +210,7 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
 
     result = baselines.diff(path_a, path_b)
     if as_json:
-        click.echo(result.to_json())
+        tell(result.to_json())
     else:
         console().print(tables.result(result))
     leave(DONE if result.passed else DIFFER)
@@ -232,10 +236,16 @@ def _again(file: Path, target: str | None) -> str:
 
 def _model(recorded: Baseline, file: Path) -> Model:
     from mbkit.studies.baseline.target import resolved
-    from mbkit.studies.target import model_of
+    from mbkit.studies.target import is_code, model_of
 
     if not recorded.target:
         raise BaselineError(f"{file}: it was recorded of a model in Python, so there is nothing to load; give --target")
+    if is_code(recorded.target):
+        # A baseline is data, perhaps of somebody else: no word in it decides what code is run.
+        raise BaselineError(
+            f"{file}: it was recorded of the function {recorded.target}, which is not run because a file names it; "
+            f"to run it: mbkit baseline check {file} --target {recorded.target}"
+        )
     return model_of(resolved(recorded.target, file), recorded.options)
 
 
@@ -256,4 +266,4 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
 
 
 def _print_json(results: list[BaselineResult]) -> None:
-    click.echo("[" + ",\n".join(r.to_json() for r in results) + "]")
+    tell("[" + ",\n".join(r.to_json() for r in results) + "]")

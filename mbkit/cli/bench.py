@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from mbkit import _interrupt
 from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say
-from mbkit.cli.options import check_engines, load_options, model_options, split
+from mbkit.cli.options import check_engines, force_option, load_options, model_options, split
 from mbkit.cli.output import File, show
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ _USUAL: Final[dict[str, Any]] = {"repeats": 5, "work": None}
 @click.option(
     "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
 )
+@force_option
 def bench(
     target: str,
     engines: tuple[str, ...],
@@ -65,6 +67,7 @@ def bench(
     nonphysical: str | None,
     as_json: bool,
     out: Path,
+    force: bool,
 ) -> None:
     """Measure error against run time on TARGET: every engine, every method.
 
@@ -72,7 +75,7 @@ def bench(
     Ctrl-C ends the study early, and what is finished is written.
     """
     from mbkit.load.names import canonical
-    from mbkit.report.folder import check_writable, file_stem
+    from mbkit.report.folder import check_replaceable, check_writable, file_stem
     from mbkit.report.progress import Bar
     from mbkit.simulate.methods import METHODS, method_of
     from mbkit.studies import work_precision
@@ -84,12 +87,15 @@ def bench(
         method_of(name)
     check_writable(out)
     model = model_of(target, load_options(floating_base, mimic, nonphysical))
+    # Several robots' files hold the same name.
+    stem = f"{file_stem(canonical(target) or model.name)}-bench"
+    check_replaceable(out, *(f"{stem}.{ending}" for ending in ("json", "csv", "png", "html")), force=force)
     if quick and not methods:
         # Those that none of the engines has would be refused as asked for in error.
         methods = tuple(m for m in _QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
     usual = _QUICK if quick else _USUAL
     try:
-        with Bar(f"bench {model.name}") as bar, _workers(jobs) as executor:
+        with _interrupt.keeping, Bar(f"bench {model.name}") as bar, _workers(jobs) as executor:
             result = work_precision(
                 model,
                 engines,
@@ -104,9 +110,7 @@ def bench(
             )
     except InterruptedSweepError as stopped:
         result = stopped.result
-    # Several robots' files hold the same name.
-    stem = f"{file_stem(canonical(target) or model.name)}-bench"
-    written = _show(result, target, stem, out, as_json)
+    written = _show(result, target, stem, out, as_json, force)
     if not result.complete:
         settings, curves = sum(len(c.points) for c in result.curves), len(result.curves)
         say("interrupted", f"{settings} settings of {curves} curve{'s' * (curves != 1)} were finished")
@@ -126,7 +130,7 @@ def _workers(jobs: int | None) -> Iterator[Executor | None]:
             yield pool
 
 
-def _show(result: WorkPrecision, target: str, stem: str, out: Path, as_json: bool) -> bool:
+def _show(result: WorkPrecision, target: str, stem: str, out: Path, as_json: bool, force: bool) -> bool:
     def table() -> RenderableType:
         from mbkit.report import precision_tables
 
@@ -147,4 +151,4 @@ def _show(result: WorkPrecision, target: str, stem: str, out: Path, as_json: boo
     if result.front:
         files.append(File("figure", f"{stem}.png", picture))
     files.append(File("page", f"{stem}.html", page))
-    return show(data, table, files, out, as_json=as_json)
+    return show(data, table, files, out, as_json=as_json, force=force)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from mbkit import _interrupt
 from mbkit.cli.door import AGREE, DIFFER, INTERRUPTED, MISUSE, leave, say
-from mbkit.cli.options import check_engines, load_options, model_options, split
+from mbkit.cli.options import check_engines, force_option, load_options, model_options, split
 from mbkit.cli.output import File, show
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ __all__ = ["check"]
 @click.option(
     "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
 )
+@force_option
 def check(
     target: str | None,
     everything: bool,
@@ -47,6 +49,7 @@ def check(
     jobs: int | None,
     as_json: bool,
     out: Path,
+    force: bool,
 ) -> None:
     """Compare engines on TARGET, and write a page and JSON.
 
@@ -67,15 +70,15 @@ def check(
 
     if own_parsers:
         check_writable(out)
-        _check_parsers(str(target), floating_base, seed, as_json, out)
+        _check_parsers(str(target), floating_base, seed, as_json, out, force)
         return
     check_engines(engines, least=2)
     check_writable(out)
     if everything:
-        _check_all(engines, samples, seed, floating_base, mimic or "reduce", jobs, as_json, out)
+        _check_all(engines, samples, seed, floating_base, mimic or "reduce", jobs, as_json, out, force)
     elif target is not None:
         options = load_options(floating_base, mimic, nonphysical)
-        _check_one(target, options, engines, samples, seed, no_rollouts, as_json, out)
+        _check_one(target, options, engines, samples, seed, no_rollouts, as_json, out, force)
     else:
         raise click.UsageError("give a TARGET, such as panda, or --all; mbkit robots lists what there is")
 
@@ -89,14 +92,18 @@ def _check_one(
     no_rollouts: bool,
     as_json: bool,
     out: Path,
+    force: bool,
 ) -> None:
     from mbkit.load.names import canonical
-    from mbkit.report.folder import file_stem
+    from mbkit.report.folder import check_replaceable, file_stem
     from mbkit.report.progress import Bar
     from mbkit.studies import compare
     from mbkit.studies.target import model_of
 
     model = model_of(target, options)
+    # Several robots' files hold the same name.
+    stem = file_stem(canonical(target) or model.name)
+    check_replaceable(out, f"{stem}.json", f"{stem}.html", force=force)
     with Bar(f"check {model.name}") as bar:
         result = compare(model, engines, samples, seed, terms_only=no_rollouts, progress=bar)
 
@@ -110,11 +117,9 @@ def _check_one(
 
         return check_page(result, asked=target, data=f"{stem}.json")
 
-    # Several robots' files hold the same name.
-    stem = file_stem(canonical(target) or model.name)
     data = result.to_json()
     files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
-    written = show(data, table, files, out, as_json=as_json)
+    written = show(data, table, files, out, as_json=as_json, force=force)
     if not result.rows:
         say("error", f"{result.verdict}; two engines that hold the model are needed")
     elif result.nothing:
@@ -122,11 +127,13 @@ def _check_one(
     leave(MISUSE if not written or result.nothing else AGREE if result.passed else DIFFER)
 
 
-def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, out: Path) -> None:
+def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, out: Path, force: bool) -> None:
     from mbkit.load.names import canonical
-    from mbkit.report.folder import file_stem
+    from mbkit.report.folder import check_replaceable, file_stem
     from mbkit.studies.parsers import compare_parsers
 
+    stem = f"{file_stem(canonical(target) or Path(target).stem)}.importers"
+    check_replaceable(out, f"{stem}.json", f"{stem}.html", force=force)
     result = compare_parsers(target, floating_base=floating_base, seed=seed)
 
     def table() -> RenderableType:
@@ -139,10 +146,9 @@ def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, o
 
         return importers_page(result, data=f"{stem}.json")
 
-    stem = f"{file_stem(canonical(target) or Path(target).stem)}.importers"
     data = result.to_json()
     files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
-    written = show(data, table, files, out, as_json=as_json)
+    written = show(data, table, files, out, as_json=as_json, force=force)
     read = any(not p.refused for p in result.importers)
     if not read:
         say("error", f"no importer reads {target}")
@@ -158,17 +164,20 @@ def _check_all(
     jobs: int | None,
     as_json: bool,
     out: Path,
+    force: bool,
 ) -> None:
     from mbkit.load import robots
+    from mbkit.report.folder import check_replaceable
     from mbkit.report.progress import Bar
     from mbkit.studies.all_robots import RobotOutcome, Sweep, all_robots
 
+    check_replaceable(out, "all.json", "all.html", force=force)
     expected = len(robots())
     outcomes: list[RobotOutcome] = []
     begun = time.perf_counter()
     interrupted = False
     try:
-        with Bar("check --all") as bar:
+        with _interrupt.keeping, Bar("check --all") as bar:
             for outcome in all_robots(
                 engines=engines, samples=samples, seed=seed, floating_base=floating_base, mimic=mimic, jobs=jobs
             ):
@@ -197,7 +206,7 @@ def _check_all(
 
     data = result.to_json()
     files = (File("data", "all.json", lambda: data + "\n"), File("page", "all.html", page))
-    written = show(data, table, files, out, as_json=as_json)
+    written = show(data, table, files, out, as_json=as_json, force=force)
     if interrupted:
         say("interrupted", f"{len(outcomes)} of {expected} robots were finished")
     leave(INTERRUPTED if interrupted else MISUSE if not written else AGREE if result.passed else DIFFER)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from mbkit.cli.door import say
+from mbkit.cli.door import say, tell
 from mbkit.cli.options import load_options, model_options
 from mbkit.errors import OutputError
 
@@ -40,7 +40,7 @@ def convert(
         raise OutputError(f"{output} is there already; choose another with -o, or replace it with --force")
     made = converted(model_of(target, load_options(floating_base, mimic, nonphysical)), to)
     if output is None:
-        click.echo(made.text, nl=False)
+        tell(made.text.removesuffix("\n"))
     else:
         made.write(output)
     for note in made.notes:

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mbkit.cli.door import say
+from mbkit._escape import json_text
+from mbkit._version import __version__
+from mbkit.cli.door import say, tell
 from mbkit.cli.options import load_options, model_options
 
 if TYPE_CHECKING:
@@ -35,7 +37,7 @@ _WIDTH: Final = 100
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to, instead of printing.")
-@click.option("--force", is_flag=True, help="Replace C files that mbkit did not write.")
+@click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
 def derive(
     system: str,
     form: str | None,
@@ -79,12 +81,15 @@ def derive(
         told = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
         text, ending = _text(lag, told, form, as_json, bar)
     if out is None:
-        click.echo(text)
+        tell(text)
         return
     from mbkit.report.folder import file_stem, write
 
-    path = write(out, f"{file_stem(lag.name)}{ending}", text + "\n")
-    click.echo(str(path))
+    if ending == ".txt":
+        # By this line mbkit knows its own file.
+        text += f"\n\nWritten by mbkit {__version__}"
+    path = write(out, f"{file_stem(lag.name)}{ending}", text + "\n", force=force)
+    tell(str(path))
 
 
 def _model(name: str, options: dict[str, Any]) -> Model:
@@ -136,8 +141,8 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     made = export_c(model, name=None if robot is None else c_identifier(robot))
     paths = made.write(out, force=force)
     for function in made.functions:
-        click.echo(f"{function.signature}: {function.operations} operations")
-    click.echo(f"header {paths[0]}\nsource {paths[1]}")
+        tell(f"{function.signature}: {function.operations} operations")
+    tell(f"header {paths[0]}\nsource {paths[1]}")
 
 
 def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
@@ -152,5 +157,5 @@ def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: boo
     if as_json:
         import json
 
-        return json.dumps(account.data(), indent=1, ensure_ascii=False), ".json"
+        return json_text(json.dumps(account.data(), indent=1, ensure_ascii=False)), ".json"
     return (account.latex(), ".tex") if form == "latex" else (account.text(_WIDTH), ".txt")

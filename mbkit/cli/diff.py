@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from mbkit.cli.door import AGREE, DIFFER, leave
+from mbkit.cli.door import AGREE, DIFFER, leave, tell
 from mbkit.cli.options import check_engines, load_options, model_options, split
 from mbkit.cli.output import console
 from mbkit.errors import MbkitError
@@ -68,7 +68,7 @@ def diff(
         names = first, second or ""
     result = explain(*sides, samples=samples, seed=seed, tolerance=tolerance, names=names)
     if as_json:
-        click.echo(result.to_json())
+        tell(result.to_json())
     else:
         from mbkit.report.cause_tables import explanation
 

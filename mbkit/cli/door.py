@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import traceback
 import warnings
 from collections.abc import Iterator
@@ -10,17 +11,19 @@ from typing import Any, Final
 
 import click
 
+from mbkit import _interrupt
+from mbkit._escape import terminal
 from mbkit.cli.options import in_options
 from mbkit.errors import MbkitError, MbkitWarning
 
-__all__ = ["AGREE", "DIFFER", "DONE", "INTERNAL", "INTERRUPTED", "MISUSE", "Door", "leave", "say"]
+__all__ = ["AGREE", "DIFFER", "DONE", "INTERNAL", "INTERRUPTED", "MISUSE", "Door", "leave", "say", "tell"]
 
 AGREE: Final = 0
 DONE: Final = 0
 DIFFER: Final = 1
 MISUSE: Final = 2
 INTERNAL: Final = 70
-INTERRUPTED: Final = 130
+INTERRUPTED: Final = _interrupt.INTERRUPTED
 
 
 class Door(click.Group):
@@ -29,15 +32,28 @@ class Door(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command that was asked for."""
         try:
+            return self._invoke(ctx)
+        finally:
+            # A library may have swallowed it, or taken it for a failure of its own.
+            if _interrupt.received():
+                ctx.exit(INTERRUPTED)
+
+    def _invoke(self, ctx: click.Context) -> Any:
+        try:
             with _one_line_warnings():
                 return super().invoke(ctx)
         except MbkitError as error:
             say("error", in_options(str(error)))
             ctx.exit(MISUSE)
         except KeyboardInterrupt:
-            say("interrupted", "nothing was finished")
+            # Where the entry point listens, it has said so by now, and nothing else is printed.
+            say("interrupted", "the command did not finish")
             ctx.exit(INTERRUPTED)
-        except (click.ClickException, click.exceptions.Exit, click.Abort):
+        except click.ClickException as error:
+            # A word of the command line may be a file of somebody else's, by a wildcard.
+            vars(error)["message"] = terminal(error.message)
+            raise
+        except (click.exceptions.Exit, click.Abort):
             raise
         except Exception:
             # A status of its own: "differ" is a verdict, and this is none.
@@ -47,11 +63,15 @@ class Door(click.Group):
 
 
 def say(what: str, text: str) -> None:
-    """Print one line on stderr, with what it is before it."""
-    from mbkit.report.numbers import plain
-
+    """Print a message on stderr, with what it is before it; a line feed in it begins no message of its own."""
+    told = re.sub(r"\n(?! )", "\n  ", terminal(text))
     colour = {"error": "red", "warning": "yellow"}.get(what)
-    click.echo(f"{click.style(what, fg=colour, bold=True)}: {plain(text)}", err=True)
+    click.echo(f"{click.style(what, fg=colour, bold=True)}: {told}", err=True)
+
+
+def tell(text: str) -> None:
+    """Print text on stdout, with what a terminal would obey spelled out."""
+    click.echo(terminal(text))
 
 
 def leave(status: int) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from mbkit.cli.door import tell
 from mbkit.cli.options import load_options, model_options
 
 __all__ = ["export"]
@@ -62,8 +63,8 @@ def export(
         told: dict[str, Any] = {"name": made.name, "model": model.name, "digest": made.digest}
         told |= {"versions": made.versions, "header": str(paths[0]), "source": str(paths[1])}
         told["functions"] = [asdict(f) | {"inputs": dict(f.inputs), "outputs": dict(f.outputs)} for f in made.functions]
-        click.echo(json.dumps(told, indent=1))
+        tell(json.dumps(told, indent=1))
         return
     for function in made.functions:
-        click.echo(f"{function.signature}: {function.operations} operations")
-    click.echo(f"header {paths[0]}\nsource {paths[1]}")
+        tell(f"{function.signature}: {function.operations} operations")
+    tell(f"header {paths[0]}\nsource {paths[1]}")

@@ -9,7 +9,7 @@ import click
 
 from mbkit.errors import InputError, UnknownNameError
 
-__all__ = ["check_engines", "in_options", "load_options", "model_options", "split"]
+__all__ = ["check_engines", "force_option", "in_options", "load_options", "model_options", "split"]
 
 # Keyword arguments of `mbkit.load` that messages name, as options of the command line.
 _OPTIONS: Final = {
@@ -17,6 +17,9 @@ _OPTIONS: Final = {
     "mimic='free'": "--mimic free",
     "floating_base=True": "--floating-base",
 }
+
+#: Of commands that write results into a folder.
+force_option = click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
 
 
 def split(_ctx: click.Context, _parameter: click.Parameter, value: str) -> tuple[str, ...]:

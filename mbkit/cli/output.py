@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
-
-from mbkit.cli.door import say
+from mbkit._escape import terminal
+from mbkit.cli.door import say, tell
 from mbkit.errors import OutputError
 
 if TYPE_CHECKING:
@@ -29,7 +28,9 @@ class File:
     make: Callable[[], str | bytes]
 
 
-def show(data: str, table: Callable[[], RenderableType], files: Sequence[File], out: Path, *, as_json: bool) -> bool:
+def show(
+    data: str, table: Callable[[], RenderableType], files: Sequence[File], out: Path, *, as_json: bool, force: bool
+) -> bool:
     """Write a result and print it; return whether all could be written.
 
     Parameters
@@ -42,7 +43,8 @@ def show(data: str, table: Callable[[], RenderableType], files: Sequence[File], 
         Written in their order, so the dearest to lose first.
     out : Path
         The folder.
-    as_json : bool
+    as_json, force : bool
+        Whether JSON is printed, and whether files are replaced that mbkit did not write.
     """
     from mbkit.report import folder
 
@@ -50,12 +52,12 @@ def show(data: str, table: Callable[[], RenderableType], files: Sequence[File], 
     failure = ""
     try:
         for file in files:
-            paths[file.what] = folder.write(out, file.name, file.make())
+            paths[file.what] = folder.write(out, file.name, file.make(), force=force)
     except OutputError as error:
         failure = str(error)
     try:
         if as_json:
-            click.echo(data)
+            tell(data)
         else:
             screen = console()
             screen.print(table())
@@ -76,15 +78,20 @@ def show(data: str, table: Callable[[], RenderableType], files: Sequence[File], 
 
 def console() -> Console:
     """Return where tables are printed."""
-    from rich.console import Console
+    from rich.console import Console, ConsoleOptions
+    from rich.segment import Segment
 
-    class Patient(Console):
-        """Leaves a closed pipe to the caller; rich itself would end with status 1."""
+    class Screen(Console):
+        """Prints no character of a name that a terminal would obey; leaves a closed pipe to the caller."""
+
+        def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+            for text, style, control in super().render(renderable, options):
+                yield Segment(text if control else terminal(text), style, control)
 
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    made: Console = Patient(highlight=False)
+    made: Console = Screen(highlight=False)
     if not made.is_terminal and "COLUMNS" not in os.environ:
         # A file has no width; rich would fold at 80.
         made.width = 140

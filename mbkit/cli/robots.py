@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from mbkit.cli.door import tell
 from mbkit.cli.output import console
 
 __all__ = ["robots"]
@@ -21,7 +22,7 @@ def robots(as_json: bool) -> None:
 
         fields = ("name", "aliases", "nq", "nv", "mass", "reason")
         listed = [{f: getattr(r, f) for f in fields} | {"path": str(r.path)} for r in records()]
-        click.echo(json.dumps(listed, indent=1))
+        tell(json.dumps(listed, indent=1))
         return
     from mbkit.report import tables
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say
-from mbkit.cli.options import check_engines, split
+from mbkit import _interrupt
+from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say, tell
+from mbkit.cli.options import check_engines, force_option, split
 from mbkit.cli.output import File, console, show
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ __all__ = ["stress"]
 @click.option(
     "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
 )
+@force_option
 def stress(
     cases: tuple[str, ...],
     quick: bool,
@@ -50,6 +52,7 @@ def stress(
     jobs: int | None,
     as_json: bool,
     out: Path,
+    force: bool,
     **numbers: float | None,
 ) -> None:
     """Sweep each CASE's number over decades: where does each engine and method break, and how.
@@ -61,7 +64,7 @@ def stress(
     if listing:
         _list(as_json=as_json)
         leave(DONE)
-    from mbkit.report.folder import check_writable
+    from mbkit.report.folder import check_replaceable, check_writable
     from mbkit.report.progress import Bar
     from mbkit.simulate.methods import method_of
     from mbkit.studies.precision_result import InterruptedSweepError
@@ -71,13 +74,16 @@ def stress(
     for name in methods:
         method_of(name)
     check_writable(out)
+    # One case has files of its own; several share theirs.
+    stem = f"{cases[0]}-stress" if len(cases) == 1 else "stress"
+    check_replaceable(out, *(f"{stem}.{ending}" for ending in ("json", "csv", "html")), force=force)
     given: dict[str, Any] = {name: x for name, x in numbers.items() if x is not None}
     try:
-        with Bar("stress") as bar:
+        with _interrupt.keeping, Bar("stress") as bar:
             result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **given)
     except InterruptedSweepError as stopped:
         result = stopped.result
-    written = _show(result, out, as_json=as_json)
+    written = _show(result, stem, out, as_json=as_json, force=force)
     finished = sum(cell.end == "finished" for _, row in result.rows() for cell in row.cells)
     if not result.complete:
         say("interrupted", f"{finished} runs were finished")
@@ -86,9 +92,7 @@ def stress(
     leave(INTERRUPTED if not result.complete else MISUSE if not written or not finished else DONE)
 
 
-def _show(result: StressResult, out: Path, *, as_json: bool) -> bool:
-    # One case has files of its own; several share theirs.
-    stem = f"{result.cases[0].name}-stress" if len(result.cases) == 1 else "stress"
+def _show(result: StressResult, stem: str, out: Path, *, as_json: bool, force: bool) -> bool:
 
     def table() -> RenderableType:
         from mbkit.report import stress_tables
@@ -106,7 +110,7 @@ def _show(result: StressResult, out: Path, *, as_json: bool) -> bool:
         File("table", f"{stem}.csv", result.to_csv),
         File("page", f"{stem}.html", page),
     ]
-    return show(data, table, files, out, as_json=as_json)
+    return show(data, table, files, out, as_json=as_json, force=force)
 
 
 def _list(*, as_json: bool) -> None:
@@ -118,9 +122,7 @@ def _list(*, as_json: bool) -> None:
     from mbkit.studies.stress.cases import CASES
 
     if as_json:
-        click.echo(
-            json.dumps([{**case.facts(), "values": case.values, "quick": case.quick} for case in CASES.values()])
-        )
+        tell(json.dumps([{**case.facts(), "values": case.values, "quick": case.quick} for case in CASES.values()]))
         return
     table = columns("case", "family", "swept", "about")
     for case in CASES.values():

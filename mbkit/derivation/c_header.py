@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from mbkit._escape import c_comment
 from mbkit.model import Model
 
 __all__ = ["CFunction", "header", "output_names", "prototype"]
@@ -150,9 +151,8 @@ def header(prefix: str, model: Model, functions: Sequence[CFunction], written_by
     followers = [(j.name, j.mimic) for j in model.joints if j.mimic]
     if followers:
         told += ["", "Joints that follow another and have no coordinate of their own"]
-        told += [
-            f"    {_safe(name)} = {_told(m.ratio)} * {_safe(m.joint)} + {_told(m.offset)}" for name, m in followers
-        ]
+        rows = ((c_comment(name), c_comment(m.joint), m) for name, m in followers)
+        told += [f"    {name} = {_told(m.ratio)} * {other} + {_told(m.offset)}" for name, other, m in rows]
     sizes = {"NQ": model.nq, "NV": model.nv} | ({"NP": len(model.parameters)} if model.parameters else {})
     blocks = [
         _comment(told),
@@ -171,18 +171,11 @@ def _comment(lines: Sequence[str]) -> str:
     return "\n".join([f"/* {first}", *(f" * {line}".rstrip() for line in rest), " */"])
 
 
-def _safe(name: str) -> str:
-    """Return a name from a file with nothing in it that ends a comment or hides from a reader."""
-    return "".join(
-        f"\\x{ord(c):02x}" if c in "*?" else c if c.isprintable() else c.encode("unicode_escape").decode() for c in name
-    )
-
-
 def _facts(model: Model, functions: Sequence[CFunction]) -> list[str]:
     present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on]
     alone = "inertia alone" if model.written is None else "what was written as T and V"
     return [
-        f"Model       {_safe(model.name)}",
+        f"Model       {c_comment(model.name)}",
         f"Digest      {model.digest}",
         f"Holds       {', '.join(present) or alone}",
         f"Functions   {functions[0].name}",
@@ -225,7 +218,7 @@ def _told(x: float) -> str:
 
 
 def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    listed = [[_safe(text) for text in row] for row in rows]
+    listed = [[c_comment(text) for text in row] for row in rows]
     widths = [max(len(row[k]) for row in listed) for k in range(len(listed[0]))]
     return [
         f"    {index:3}  {'  '.join(text.ljust(width) for text, width in zip(row, widths, strict=True))}".rstrip()

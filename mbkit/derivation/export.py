@@ -10,6 +10,7 @@ from typing import Final
 
 import casadi as ca
 
+from mbkit import _interrupt
 from mbkit._version import __version__
 from mbkit.derivation.c_code import c_body, places, variables
 from mbkit.derivation.c_header import CFunction, header, output_names, prototype
@@ -67,7 +68,10 @@ class CSource:
         OutputError
             A file of other origin is in the way, or the folder cannot be written to.
         """
-        folder = Path(folder)
+        with _interrupt.held:
+            return self._write(Path(folder), force=force)
+
+    def _write(self, folder: Path, *, force: bool) -> tuple[Path, Path]:
         texts = {folder / f"{self.name}.h": self.header, folder / f"{self.name}.c": self.source}
         header, source = texts
         try:

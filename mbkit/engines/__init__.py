@@ -29,9 +29,10 @@ def dynamics(model: Model, engine: str = "pinocchio", **options: Any) -> Dynamic
     Parameters
     ----------
     model : Model
-    engine : {"pinocchio", "lagrangian", "mujoco", "oracle"}
+    engine : {"pinocchio", "lagrangian", "mujoco", "drake", "oracle"}
         Rigid-body algorithms of Pinocchio, mbkit's own derivation from energies,
-        MuJoCo, or the own derivation at 34 digits, for measuring the others.
+        MuJoCo, Drake (``pip install mbkit[drake]``), or the own derivation at 34 digits, for
+        measuring the others.
 
     **options
         The lagrangian engine's ``compile=`` (True or False) and ``threads=``; other

@@ -18,6 +18,17 @@ from mbkit._check import Array
 __all__ = ["full_mass_matrix", "heard_warnings"]
 
 
+def _leave_no_log() -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the working folder, unless somebody has named another file."""
+    config = mujoco.MjLogConfig.get()
+    if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
+        config.logto_file = False
+        config.set()
+
+
+_leave_no_log()
+
+
 def full_mass_matrix(model: Any, data: Any) -> Array:
     """Return the dense mass matrix of the last `mj_makeM`."""
     out = np.zeros((model.nv, model.nv))
@@ -28,7 +39,7 @@ def full_mass_matrix(model: Any, data: Any) -> Array:
 
 @contextlib.contextmanager
 def heard_warnings() -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings, instead of prints and a MUJOCO_LOG.TXT in the working folder."""
+    """Collect MuJoCo's warnings, instead of prints."""
     heard: list[str] = []
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(heard.append)

@@ -8,12 +8,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Iterator
 from typing import Any, Final
-from xml.sax.saxutils import quoteattr
 
 import mujoco
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.base import Dynamics
 from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.mujoco_api import heard_warnings
@@ -65,8 +65,8 @@ def mjcf_text(model: Model, comment: str) -> str:
         raise UnsupportedError(f"MJCF cannot say of {model.name}: {'; '.join(faults)}")
     spec, placed, _ = specified(model)
     lines = [
-        f"<mujoco model={quoteattr(model.name)}>",
-        f"  <!-- {comment.replace('--', '- -')} -->",
+        f"<mujoco model={xml_attribute(model.name)}>",
+        f"  <!-- {xml_comment(comment)} -->",
         '  <compiler angle="radian" autolimits="false" inertiafromgeom="false" balanceinertia="false"/>',
         f"  <option{_told(gravity=model.gravity)}/>",
         "  <worldbody>",
@@ -119,7 +119,7 @@ def _told(**attributes: Any) -> str:
     out = []
     for name, value in attributes.items():
         if isinstance(value, str):
-            out.append(f" {name}={quoteattr(value)}")
+            out.append(f" {name}={xml_attribute(value)}")
         elif value is not None:
             out.append(f' {name}="{" ".join(repr(float(x)) for x in np.ravel(value))}"')
     return "".join(out)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import keyword
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, Final
 
 import sympy as sp
 
+from mbkit._escape import identifier, one_line
 from mbkit._version import __version__
 from mbkit.lagrangian.abbreviations import Abbreviations
 from mbkit.lagrangian.blackboard import Blackboard, spread, written
@@ -104,12 +106,12 @@ class Account:
         """Return the page for a terminal, matrices within a width if they can be."""
         s, board = self.system, self._board
         q = ", ".join(self._named(x) for x in s.coordinates)
-        out = [f"{s.name}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
+        out = [f"{one_line(s.name)}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
         if s.parameters:
             given = (written(p.name) + ("" if x is None else f" = {x:g}") for p, x in s.parameters.items())
             out.append(f"parameters {', '.join(given)}")
         if s.time:
-            out.append(f"time {s.time}")
+            out.append(f"time {written(s.time.name)}")
         kinetic = [f"T is too long for a page ({self._size} operations): ½ vᵀ M v with"] if self.long else None
         out += ["", *(kinetic or self._sum("T", s.T, width)), *self._sum("V", s.V, width)]
         if s.dissipation != 0:
@@ -133,7 +135,7 @@ class Account:
 
     def _named(self, coordinate: sp.Symbol) -> str:
         told, own = written(coordinate.name), self._names.get(coordinate.name, coordinate.name)
-        return f"{told}" if own == coordinate.name else f"{told} ({own})"
+        return f"{told}" if own == coordinate.name else f"{told} ({one_line(own)})"
 
     def _sum(self, name: str, x: sp.Expr, width: int) -> list[str]:
         return folded(f"{name} = {self._board.text(self._short(x))}", width)
@@ -165,45 +167,66 @@ class Account:
             A = given.applyfunc(self._short)
             entries = r" \\ ".join(" & ".join(board.latex(x) for x in A[i, :]) for i in range(A.rows))
             rows.append(rf"{name} &= \begin{{bmatrix}} {entries} \end{{bmatrix}}")
-        out = [f"% {s.name}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
+        out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
         if not self.long:
             out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(latex=True)]))
         if self._kept:
-            out.append(_aligned([f"{sp.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
+            out.append(_aligned([f"{board.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
         return "\n".join(out)
 
     # Data
 
     def data(self) -> dict[str, Any]:
-        """Return everything as text that `sympy.sympify` reads, with the equations in LaTeX too."""
+        """Return everything as text that `sympy.sympify` reads, with the equations in LaTeX too.
+
+        SymPy evaluates text as Python, so a symbol whose name is no Python name has underscores in it here.
+        """
         s, e = self.system, self.equations
-        told: dict[str, Any] = {"name": s.name, "mbkit": __version__, "sympy": sp.__version__}
-        told["coordinates"] = [q.name for q in s.coordinates]
-        told["velocities"] = [v.name for v in s.velocities]
-        told["accelerations"] = [a.name for a in e.accelerations]
-        told["names"] = [self._names.get(q.name, q.name) for q in s.coordinates]
-        told["time"] = s.time.name if s.time else None
-        told["parameters"] = {p.name: x for p, x in s.parameters.items()}
-        told |= {"T": str(s.T), "V": str(s.V), "dissipation": str(s.dissipation)}
-        told["mass_matrix"] = _listed(e.mass_matrix)
-        told["coriolis_matrix"] = None if self.long else _listed(e.coriolis_matrix)
-        told["gravity"] = [str(x) for x in e.potential_gradient]
-        told["drift"] = [str(x) for x in e.drift]
-        told["forces"] = [str(x) for x in e.forces]
-        told["constraints"] = [str(x) for x in s.constraints]
+        names = self._python_names()
+
+        def name(x: sp.Symbol) -> str:
+            return str(names.get(x, x))
+
+        def text(x: sp.Basic) -> str:
+            return str(x.xreplace(names))
+
+        out: dict[str, Any] = {"name": s.name, "mbkit": __version__, "sympy": sp.__version__}
+        out["coordinates"] = [name(q) for q in s.coordinates]
+        out["velocities"] = [name(v) for v in s.velocities]
+        out["accelerations"] = [name(a) for a in e.accelerations]
+        out["names"] = [self._names.get(q.name, q.name) for q in s.coordinates]
+        out["time"] = name(s.time) if s.time else None
+        out["parameters"] = {name(p): x for p, x in s.parameters.items()}
+        out |= {"T": text(s.T), "V": text(s.V), "dissipation": text(sp.sympify(s.dissipation))}
+        out["mass_matrix"] = [[text(x) for x in e.mass_matrix[i, :]] for i in range(e.mass_matrix.rows)]
+        C = None if self.long else e.coriolis_matrix
+        out["coriolis_matrix"] = None if C is None else [[text(x) for x in C[i, :]] for i in range(C.rows)]
+        out["gravity"] = [text(x) for x in e.potential_gradient]
+        out["drift"] = [text(x) for x in e.drift]
+        out["forces"] = [text(x) for x in e.forces]
+        out["constraints"] = [text(x) for x in s.constraints]
         # Each by itself: no letter is explained elsewhere.
         plain = Abbreviations((), ())
         rows = [] if self.long else self._lines(plain, latex=True)
-        told["equations"] = [] if self.long else [f"{x.lhs} = {x.rhs}" for x in e.equations()]
-        told["latex"] = [f"{left} = {right}" for left, right in rows]
-        told["cyclic"] = [q.name for q in s.cyclic_coordinates()]
-        told["conserved"] = [{"name": n, "expression": str(x), "meaning": m} for n, x, m in self._kept]
-        return told
+        out["equations"] = [] if self.long else [f"{text(x.lhs)} = {text(x.rhs)}" for x in e.equations()]
+        out["latex"] = [f"{left} = {right}" for left, right in rows]
+        out["cyclic"] = [name(q) for q in s.cyclic_coordinates()]
+        out["conserved"] = [{"name": n, "expression": text(x), "meaning": m} for n, x, m in self._kept]
+        return out
+
+    def _python_names(self) -> dict[sp.Symbol, sp.Symbol]:
+        """Return another symbol for each whose name is no Python name."""
+        s, e = self.system, self.equations
+        every = (*s.coordinates, *s.velocities, *e.accelerations, *s.parameters, *s.inputs.values(), *e.multipliers)
+        every = (*every, *([s.time] if s.time else []))
+        taken = {x.name for x in every}
+        out: dict[sp.Symbol, sp.Symbol] = {}
+        for x in every:
+            if not x.name.isidentifier() or keyword.iskeyword(x.name):
+                out[x] = sp.Symbol(identifier(x.name, taken))
+                taken.add(out[x].name)
+        return out
 
 
 def _aligned(rows: list[str]) -> str:
     return "\\begin{align*}\n" + " \\\\\n".join(rows) + "\n\\end{align*}"
-
-
-def _listed(A: sp.ImmutableMatrix) -> list[list[str]]:
-    return [[str(x) for x in A[i, :]] for i in range(A.rows)]

@@ -15,6 +15,8 @@ import sympy as sp
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.pretty.pretty_symbology import pretty_symbol
 
+from mbkit._escape import latex, one_line
+
 __all__ = ["Blackboard", "spread", "written"]
 
 _FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
@@ -153,7 +155,7 @@ class Blackboard:
             return f"{x.func.__name__}{space if not told.startswith('(') else ''}{told}"
         if x.is_Mul:
             return self._product(x)
-        return str(x)
+        return one_line(str(x))
 
     def _argument(self, x: sp.Expr) -> str:
         if x.is_Symbol:
@@ -194,7 +196,10 @@ class Blackboard:
 
 
 class _Latex(LatexPrinter):  # type: ignore[misc]
-    """SymPy's, with ½ before what it halves."""
+    """SymPy's, with ½ before what it halves, and with names that are no TeX."""
+
+    def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
+        return latex(expr.name, lambda name: str(super(_Latex, self)._print_Symbol(sp.Symbol(name), style)))
 
     def _print_Mul(self, expr: sp.Expr) -> str:
         number = expr.args[0]
@@ -222,6 +227,7 @@ def spread(x: sp.Expr) -> sp.Expr:
 
 def written(name: str) -> str:
     """Return a symbol's name in Unicode: θ̇₁; a letter below the line stays behind its mark: m_p."""
+    name = one_line(name)
     stem, mark, index = name.partition("_")
     split = mark and index[:1].isalpha() and stem
     # One letter with its dot where there is such a letter.

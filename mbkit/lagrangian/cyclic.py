@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
+from mbkit._escape import one_line, terminal
 from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.probe import vanishes
 from mbkit.lagrangian.tidy import tidy
@@ -55,12 +56,16 @@ class ConservedQuantity:
     meaning: str
     moving: tuple[tuple[sp.Symbol, ...], ...] = field(default=(), repr=False, compare=False)
 
+    def __repr__(self) -> str:
+        return f"<ConservedQuantity: {one_line(str(self))}>"
+
     def __str__(self) -> str:
-        return f"{self.name} = {self.expression} ({self.meaning})"
+        return terminal(f"{self.name} = {self.expression} ({self.meaning})")
 
     def latex(self) -> str:
         """Return name = expression."""
-        return f"{sp.latex(sp.Symbol(self.name))} = {Blackboard(*self.moving).latex(self.expression)}"
+        board = Blackboard(*self.moving)
+        return f"{board.latex(sp.Symbol(self.name))} = {board.latex(self.expression)}"
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"

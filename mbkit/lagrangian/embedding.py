@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._escape import one_line
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.lagrangian.constraints import Manifold
 from mbkit.lagrangian.embedded_dynamics import Chart, EmbeddedDynamics, ReducedModel
@@ -74,7 +75,7 @@ class Embedded:
 
     def __repr__(self) -> str:
         chosen = "chosen as it runs" if self.independent is None else ", ".join(self.independent)
-        return f"<Embedded {self.model.name!r}: {self.degrees} of {self.model.nv} coordinates, {chosen}>"
+        return one_line(f"<Embedded {self.model.name!r}: {self.degrees} of {self.model.nv} coordinates, {chosen}>")
 
     def chart(self, q: Array, t: float) -> Chart:
         """Return the chart to start with at a configuration: the pivots of J, or what the user chose."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array
+from mbkit._escape import html, terminal
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError
 from mbkit.lagrangian.balance import Balance
@@ -82,18 +83,16 @@ class Equilibrium:
         lines += [f"  lambda{k + 1} = {x:.9g}" for k, x in enumerate(self.multipliers)]
         if len(self.frequencies):
             lines.append("  oscillates at " + ", ".join(f"{w:.6g}" for w in self.frequencies) + " rad/s")
-        return "\n".join(lines)
+        return terminal("\n".join(lines))
 
     def _repr_html_(self) -> str:
-        from html import escape
-
-        head = f"<p><b>{escape(self.name)}</b>: equilibrium, {self._told}; residual {self.residual:.2g}</p>"
+        head = f"<p><b>{html(self.name)}</b>: equilibrium, {self._told}; residual {self.residual:.2g}</p>"
         rows = [(n, f"{x:.9g}") for n, x in zip(self.coordinates, self.q, strict=True)]
         rows += [(f"τ of {n}", f"{x:.9g}") for n, x in zip(self.velocities, self.tau, strict=True) if x]
         rows += [(f"λ{k + 1}", f"{x:.9g}") for k, x in enumerate(self.multipliers)]
         if len(self.frequencies):
             rows.append(("ω, rad/s", ", ".join(f"{w:.6g}" for w in self.frequencies)))
-        cells = "".join(f"<tr><td>{escape(n)}</td><td>{x}</td></tr>" for n, x in rows)
+        cells = "".join(f"<tr><td>{html(n)}</td><td>{x}</td></tr>" for n, x in rows)
         return f"{head}<table>{cells}</table>"
 
 

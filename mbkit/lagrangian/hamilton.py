@@ -20,6 +20,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, rows
+from mbkit._escape import one_line, terminal
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian import cyclic
 from mbkit.lagrangian.blackboard import Blackboard
@@ -65,14 +66,17 @@ class CanonicalEquations:
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block."""
         board = Blackboard(self.coordinates, self.momenta)
-        rows = (f"{sp.latex(e.lhs)} &= {board.latex(e.rhs)}" for e in self.equations())
+        rows = (f"{board.latex(e.lhs)} &= {board.latex(e.rhs)}" for e in self.equations())
         return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
 
+    def __repr__(self) -> str:
+        return f"<CanonicalEquations: {one_line(str(self))}>"
+
     def __str__(self) -> str:
-        return "\n".join(f"{e.lhs} = {e.rhs}" for e in self.equations())
+        return terminal("\n".join(f"{e.lhs} = {e.rhs}" for e in self.equations()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,8 +273,11 @@ class Hamiltonian:
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
 
+    def __repr__(self) -> str:
+        return f"<Hamiltonian: {one_line(str(self))}>"
+
     def __str__(self) -> str:
-        return f"H = {self.H}"
+        return terminal(f"H = {self.H}")
 
 
 def hamiltonian(system: Lagrangian) -> Hamiltonian:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import sympy as sp
 from sympy.matrices.exceptions import NonInvertibleMatrixError
 
+from mbkit._escape import one_line, terminal
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.slopes import gradient, slope
 from mbkit.lagrangian.tidy import tidy, tidy_matrix
@@ -129,8 +130,11 @@ class EquationsOfMotion:
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
 
+    def __repr__(self) -> str:
+        return f"<EquationsOfMotion: {one_line(str(self))}>"
+
     def __str__(self) -> str:
-        return "\n".join(f"{_joined(terms, str)} = {force}" for terms, force in self._rows())
+        return terminal("\n".join(f"{_joined(terms, str)} = {force}" for terms, force in self._rows()))
 
 
 def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:

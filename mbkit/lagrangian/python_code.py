@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import keyword
-import re
 from collections.abc import Callable
 from typing import Any, Final
 
 import sympy as sp
 from sympy.printing.numpy import NumPyPrinter
 
+from mbkit._escape import identifier, python_docstring
 from mbkit._version import __version__
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.system import Lagrangian
 
 __all__ = ["python_code"]
 
-_TAKEN: Final = {"np", "q", "v", "tau", "t", "M", "h", "parameters", "PARAMETERS"}
+#: Names that the module itself uses, beside Python's own.
+_TAKEN: Final = {"np", "q", "v", "tau", "t", "M", "h", "out", "given", "unknown", "parameters", "PARAMETERS"}
+_FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}
 
 
 def python_code(system: Lagrangian) -> str:
@@ -41,11 +42,11 @@ def python_code(system: Lagrangian) -> str:
     upper = [e.mass_matrix[i, j] for i in range(n) for j in range(i, n)]
     clock = ", t=0.0" if system.time else ""
     take = _lines(system, names)
-    told = ", ".join(s.name for s in e.coordinates)
+    told = python_docstring(", ".join(s.name for s in e.coordinates))
     values = "".join(f"    {names[s]!r}: {x!r},\n" for s, x in system.parameters.items())
     unpack = f"{take}    {', '.join(names[s] for s in e.coordinates)}, = q\n"
     moving = unpack + f"    {', '.join(names[s] for s in e.velocities)}, = v\n"
-    return f'''"""Equations of motion of {system.name}: M(q) a + h(q, v) = tau, in SI units.
+    return f'''"""Equations of motion of {python_docstring(system.name)}: M(q) a + h(q, v) = tau, in SI units.
 
 Coordinates q: {told}. Written by mbkit {__version__}; needs NumPy only.
 """
@@ -107,9 +108,5 @@ def _names(system: Lagrangian) -> dict[sp.Symbol, str]:
     if system.time:
         out[system.time] = "t"
     for s in (*system.parameters, *system.coordinates, *system.velocities):
-        name = re.sub(r"\W", "_", s.name)
-        name = name if name.isidentifier() else f"_{name}"
-        while keyword.iskeyword(name) or name in _TAKEN or name in out.values():
-            name += "_"
-        out[s] = name
+        out[s] = identifier(s.name, _TAKEN | _FUNCTIONS | set(out.values()))
     return out

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from sympy.core.function import AppliedUndef
 
 from mbkit._check import Array, rows
+from mbkit._escape import one_line
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian import cyclic
 from mbkit.lagrangian.cyclic import ConservedQuantity
@@ -210,7 +211,7 @@ class QuasiLagrangian(Lagrangian):
         return np.asarray(np.einsum("...ij,...i->...j", D, tau))
 
     def __repr__(self) -> str:
-        return f"<QuasiLagrangian {self.name!r}: quasi-velocities {', '.join(map(str, self.velocities))}>"
+        return one_line(f"<QuasiLagrangian {self.name!r}: quasi-velocities {', '.join(map(str, self.velocities))}>")
 
 
 def _checked(system: Lagrangian, given: Any) -> sp.ImmutableMatrix:

@@ -23,6 +23,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, rows
+from mbkit._escape import one_line, terminal
 from mbkit.errors import InputError
 from mbkit.lagrangian.blackboard import Blackboard
 from mbkit.lagrangian.numeric import Numeric, values_of
@@ -162,16 +163,19 @@ class Routhian:
         board = Blackboard(whole.coordinates, whole.velocities, tuple(self.momenta), time=whole.time)
         named = dict(zip(whole.coordinates, whole.velocities, strict=True))
         told = [(sp.Symbol("R"), s.L), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
-        lines = (f"{sp.latex(left)} &= {board.latex(right)}" for left, right in told)
+        lines = (f"{board.latex(left)} &= {board.latex(right)}" for left, right in told)
         return "\\begin{aligned}" + r" \\ ".join(lines) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
 
+    def __repr__(self) -> str:
+        return f"<Routhian: {one_line(str(self))}>"
+
     def __str__(self) -> str:
         named = dict(zip(self.system.coordinates, self.system.velocities, strict=True))
         lines = [f"R = {self.R}", *(f"{p} = {x}" for p, x in self.momenta.items())]
-        return "\n".join(lines + [f"{named[q]} = {x}" for q, x in self.rates.items()])
+        return terminal("\n".join(lines + [f"{named[q]} = {x}" for q, x in self.rates.items()]))
 
 
 def routhian(system: Lagrangian, cyclic: Any = None) -> Routhian:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import sympy as sp
 
+from mbkit._escape import one_line
 from mbkit.errors import InputError
 from mbkit.lagrangian import cyclic
 from mbkit.lagrangian.blackboard import Blackboard
@@ -303,7 +304,7 @@ class Lagrangian(Constrained):
     # Reading
 
     def __repr__(self) -> str:
-        return f"<Lagrangian {self.name!r}: coordinates {', '.join(map(str, self.coordinates))}>"
+        return one_line(f"<Lagrangian {self.name!r}: coordinates {', '.join(map(str, self.coordinates))}>")
 
     def _repr_latex_(self) -> str:
         board = Blackboard(self.coordinates, self.velocities, time=self.time)

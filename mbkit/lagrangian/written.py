@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property, partial
-from html import escape
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import sympy as sp
 
 from mbkit._check import Array, count, generator, real
+from mbkit._escape import html, one_line
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.abstract_parts import abstract_parts
@@ -180,10 +180,10 @@ class WrittenModel(Model):
         raise UnsupportedError(f"frame {name!r}: {self.name} was written as energies and has no frames")
 
     def __repr__(self) -> str:
-        return f"<WrittenModel {self.name!r}: coordinates {', '.join(self.coordinate_names)}>"
+        return one_line(f"<WrittenModel {self.name!r}: coordinates {', '.join(self.coordinate_names)}>")
 
     def _repr_html_(self) -> str:
-        return f"<p><b>{escape(self.name)}</b>: {self.system._repr_latex_()}</p>"
+        return f"<p><b>{html(self.name)}</b>: {html(self.system._repr_latex_())}</p>"
 
 
 def _sha(*parts: str) -> str:

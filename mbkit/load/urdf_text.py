@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any, Final
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit._escape import xml_attribute, xml_comment
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
 
@@ -45,8 +45,8 @@ def urdf_text(model: Model, comment: str) -> str:
     if faults:
         raise UnsupportedError(f"URDF cannot say of {model.name}: {'; '.join(faults)}")
     lines = [
-        f"<robot name={quoteattr(model.name)}>",
-        f"  <!-- {comment.replace('--', '- -')} -->",
+        f"<robot name={xml_attribute(model.name)}>",
+        f"  <!-- {xml_comment(comment)} -->",
         '  <link name="world"/>',
     ]
     for body in model.bodies:
@@ -64,11 +64,11 @@ def urdf_text(model: Model, comment: str) -> str:
             name += "_"
         joints.add(name)
         lines += [
-            f"  <link name={quoteattr(frame.name)}/>",
-            f'  <joint name={quoteattr(name)} type="fixed">',
+            f"  <link name={xml_attribute(frame.name)}/>",
+            f'  <joint name={xml_attribute(name)} type="fixed">',
             f"    {_origin(frame.rotation, frame.translation)}",
-            f"    <parent link={quoteattr(frame.body)}/>",
-            f"    <child link={quoteattr(frame.name)}/>",
+            f"    <parent link={xml_attribute(frame.body)}/>",
+            f"    <child link={xml_attribute(frame.name)}/>",
             "  </joint>",
         ]
     return "\n".join([*lines, "</robot>"]) + "\n"
@@ -104,7 +104,7 @@ def _origin(R: Array, p: Array) -> str:
 
 
 def _link(body: Body) -> list[str]:
-    head = f"  <link name={quoteattr(body.name)}"
+    head = f"  <link name={xml_attribute(body.name)}"
     if not body.mass and not body.inertia.any():
         return [f"{head}/>"]
     moments = {f"i{'xyz'[i]}{'xyz'[j]}": body.inertia[i, j] for i in range(3) for j in range(i, 3)}
@@ -124,10 +124,10 @@ def _joint(joint: Joint) -> list[str]:
     bounded = joint.kind == "prismatic" or (joint.kind == "revolute" and np.isfinite([joint.lower, joint.upper]).any())
     type_ = _TYPES[joint.kind] if joint.kind != "revolute" or bounded else "continuous"
     out = [
-        f'  <joint name={quoteattr(joint.name)} type="{type_}">',
+        f'  <joint name={xml_attribute(joint.name)} type="{type_}">',
         f"    {_origin(joint.rotation, joint.translation)}",
-        f"    <parent link={quoteattr(joint.parent)}/>",
-        f"    <child link={quoteattr(joint.child)}/>",
+        f"    <parent link={xml_attribute(joint.parent)}/>",
+        f"    <child link={xml_attribute(joint.child)}/>",
     ]
     if joint.kind == "planar":
         out.append('    <axis xyz="0 0 1"/>')
@@ -146,5 +146,5 @@ def _joint(joint: Joint) -> list[str]:
     if joint.mimic is not None:
         m = joint.mimic
         told = f'multiplier="{_numbers(m.ratio)}" offset="{_numbers(m.offset)}"'
-        out.append(f"    <mimic joint={quoteattr(m.joint)} {told}/>")
+        out.append(f"    <mimic joint={xml_attribute(m.joint)} {told}/>")
     return [*out, "  </joint>"]

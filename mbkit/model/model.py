@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, generator, rows, shown
+from mbkit._escape import html
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import manifold, substitution
 from mbkit.model.binding import Binding
@@ -447,15 +447,15 @@ class Model:
 
     def _repr_html_(self) -> str:
         cells = "".join(
-            f"<tr><td>{html.escape(j.name)}</td><td>{j.kind}</td><td>{html.escape(j.parent)}</td>"
-            f"<td>{html.escape(j.child)}</td><td>{self.body(j.child).mass:.4g}</td>"
-            f"<td>{html.escape(f'{j.mimic.ratio:g} × {j.mimic.joint}') if j.mimic else ''}</td></tr>"
+            f"<tr><td>{html(j.name)}</td><td>{j.kind}</td><td>{html(j.parent)}</td>"
+            f"<td>{html(j.child)}</td><td>{self.body(j.child).mass:.4g}</td>"
+            f"<td>{html(f'{j.mimic.ratio:g} × {j.mimic.joint}') if j.mimic else ''}</td></tr>"
             for j in self.tree
         )
         head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
-        notes = "".join(f"<li>{html.escape(n)}</li>" for n in (*map(str, self.couplings), *self.notes))
+        notes = "".join(f"<li>{html(n)}</li>" for n in (*map(str, self.couplings), *self.notes))
         return (
-            f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._told_mass()}; {self.needs}</p>"
+            f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._told_mass()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
 

@@ -66,6 +66,9 @@ class Body(_Frozen):
     com: Array
     inertia: Array
 
+    def __repr__(self) -> str:
+        return f"<Body {self.name!r}: {self.mass:.4g} kg>"
+
 
 @dataclass(frozen=True, eq=False)
 class Mimic(_Frozen):
@@ -120,6 +123,10 @@ class Joint(_Frozen):
     rest: Array
     mimic: Mimic | None = None
 
+    def __repr__(self) -> str:
+        follows = f", follows {self.mimic.joint!r}" if self.mimic else ""
+        return f"<Joint {self.name!r}: {self.kind}, {self.parent!r} to {self.child!r}{follows}>"
+
     @property
     def type(self) -> JointKind:
         """The formulas of this joint's kind."""
@@ -134,6 +141,9 @@ class Frame(_Frozen):
     body: str
     rotation: Array
     translation: Array
+
+    def __repr__(self) -> str:
+        return f"<Frame {self.name!r} on {self.body!r}>"
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rich.console import Group, RenderableType
 
+from mbkit._escape import one_line
 from mbkit.report.layout import bullet
-from mbkit.report.numbers import inline
 from mbkit.report.tables import verdict
 from mbkit.studies.baseline import BaselineResult
 
@@ -17,11 +17,12 @@ _MARKS = {"note": ("·", "dim"), "version": ("·", "dim"), "processor": ("·", "
 def result(found: BaselineResult, again: str = "") -> RenderableType:
     """Return the verdict and what led to it; `again` is the command that records anew."""
     name = found.path if found.question == "check" else f"{found.path} → {found.against}"
-    parts: list[RenderableType] = [verdict(f"{found.model} ({name})", inline(found.verdict), found.passed)]
+    parts: list[RenderableType] = [verdict(f"{found.model} ({name})", one_line(found.verdict), found.passed)]
     skipped = {r.engine for r in found.skipped}
     for what, told in found.lines():
         mark = ("–", "yellow") if what in skipped else _MARKS.get(what, ("✗", "bold red"))
-        parts.append(bullet(f"{inline(what)}: ", inline(told), *mark))
+        parts.append(bullet(f"{one_line(what)}: ", one_line(told), *mark))
     if again and found.question == "check" and found.status in ("description", "numbers", "versions"):
-        parts.append(bullet("if this is meant: " if found.status != "versions" else "to record anew: ", inline(again)))
+        head = "if this is meant: " if found.status != "versions" else "to record anew: "
+        parts.append(bullet(head, one_line(again)))
     return Group(*parts)

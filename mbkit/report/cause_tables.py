@@ -8,8 +8,9 @@ from pathlib import PurePath
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from mbkit._escape import one_line
 from mbkit.report.layout import bullet, columns, right, titled
-from mbkit.report.numbers import error_text, inline
+from mbkit.report.numbers import error_text
 from mbkit.report.tables import DIFFER, verdict
 from mbkit.studies.causes.result import Cause, Explanation, grouped
 from mbkit.studies.parsers.result import TERMS, Parsed, ParserComparison, Stage
@@ -26,16 +27,16 @@ def explanation(result: Explanation) -> RenderableType:
         table = columns("term", *right("relative difference"), "joint")
         for g in result.gaps:
             style = "green" if g.relative <= result.tolerance else DIFFER
-            table.add_row(inline(g.term), Text(error_text(g.relative), style=style), inline(g.joint))
+            table.add_row(one_line(g.term), Text(error_text(g.relative), style=style), one_line(g.joint))
         parts += titled("Terms, by joint name", table)
     parts += _causes("Causes", result.causes)
     if any(m.how == "structure" for m in result.matches) or result.only_a or result.only_b:
-        lines = [bullet(f"{inline(m.a)} ", f"is {inline(m.b)}") for m in result.matches if m.how == "structure"]
+        lines = [bullet(f"{one_line(m.a)} ", f"is {one_line(m.b)}") for m in result.matches if m.how == "structure"]
         for names, side in ((result.only_a, result.a), (result.only_b, result.b)):
-            lines += [bullet(f"{inline(n)} ", f"is only in {inline(side)}") for n in names]
+            lines += [bullet(f"{one_line(n)} ", f"is only in {one_line(side)}") for n in names]
         parts += titled(f"Joints: {sum(m.how == 'name' for m in result.matches)} matched by name, and", *lines)
     if result.notes:
-        parts += titled("Notes", *(bullet("", inline(n, 400)) for n in result.notes))
+        parts += titled("Notes", *(bullet("", one_line(n, 400)) for n in result.notes))
     return Group(*parts, Text())
 
 
@@ -45,7 +46,7 @@ def _causes(title: str, causes: tuple[Cause, ...]) -> list[RenderableType]:
     acting = [(*line, True) for line in grouped(c for c in causes if c.acts)]
     silent = [(*line, False) for line in grouped(c for c in causes if not c.acts)]
     lines = [
-        bullet(f"{inline(kind)}: ", f"{inline(says, 400)} ({what})", *(("✗", DIFFER) if acts else ("i", "dim")))
+        bullet(f"{one_line(kind)}: ", f"{one_line(says, 400)} ({what})", *(("✗", DIFFER) if acts else ("i", "dim")))
         for kind, says, what, acts in (*acting, *silent)
     ]
     return titled(title, *lines)
@@ -65,15 +66,15 @@ def importers(result: ParserComparison) -> RenderableType:
         parts += _importer(p)
     notes = [*result.notes, *([result.faults] if result.faults else [])]
     if notes:
-        parts += titled("Notes", *(bullet("", inline(n, 500)) for n in notes))
+        parts += titled("Notes", *(bullet("", one_line(n, 500)) for n in notes))
     return Group(*parts, Text())
 
 
 def _importer(p: Parsed) -> list[RenderableType]:
     if p.refused:
-        return titled(f"{p.engine} {p.version}", bullet("refuses: ", inline(p.refused, 500), "✗", DIFFER))
+        return titled(f"{p.engine} {p.version}", bullet("refuses: ", one_line(p.refused, 500), "✗", DIFFER))
     out = _causes(f"{p.engine}: causes", p.explanation.causes if p.explanation else ())
-    lines = [bullet("", inline(n, 300)) for n in p.notes]
+    lines = [bullet("", one_line(n, 300)) for n in p.notes]
     return [*out, *(lines if out else titled(p.engine, *lines) if lines else [])]
 
 
@@ -82,5 +83,5 @@ def _cell(stage: Stage) -> Text:
     number = ""
     if stage.name in TERMS and math.isfinite(stage.worst):
         number = f" {error_text(stage.worst)}"
-    says = f" {inline(stage.says, 44)}" if not number and stage.same is not True else number
+    says = f" {one_line(stage.says, 44)}" if not number and stage.same is not True else number
     return Text(f"{mark}{says}", style=style)

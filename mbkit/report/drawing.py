@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
+from mbkit._escape import html
 from mbkit.studies.drawing import Palette, style
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def svg(fig: Figure, title: str) -> str:
     text = text[text.index("<svg") :]
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    text = text.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)
+    text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}"', 1)
     # Names of parts would otherwise stand twice on a page with two figures.
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)

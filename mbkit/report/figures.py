@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from mbkit._escape import one_line
 from mbkit.report.drawing import PAGE, canvas, svg
-from mbkit.report.numbers import inline
 from mbkit.report.reading import by_term
 from mbkit.studies.all_robots import Sweep
 from mbkit.studies.drawing import engine_mark, log_ticks
@@ -50,7 +50,7 @@ def digits(result: Comparison) -> str:
         ax.axvline(limit, color=PAGE.muted, linestyle=(0, (2, 2)), linewidth=1.0)
         told = f"tolerance {result.tolerance:g} "
         ax.text(limit, -0.75, told, color=PAGE.muted, ha="right", va="center", fontsize=9)
-        ax.set_yticks(range(len(terms)), [inline(t, 40) for t in terms])
+        ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])
         ax.set_ylim(len(terms) - 0.4, -1.1)
         _digit_axis(ax, min(_digits(r.relative) for rows in terms.values() for r in rows.values()))
         below = -0.06 - 0.55 / (0.9 + 0.36 * len(terms))

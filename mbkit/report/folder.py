@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import tempfile
 from pathlib import Path
+from typing import Final
 
+from mbkit import _interrupt
 from mbkit.errors import OutputError
 
-__all__ = ["check_writable", "file_stem", "write"]
+__all__ = ["check_replaceable", "check_writable", "file_stem", "write"]
 
 
 def file_stem(name: str) -> str:
@@ -31,8 +34,61 @@ def check_writable(folder: Path) -> None:
         raise OutputError(f"cannot write to {folder}: no permission in {place}; choose another with --out")
 
 
-def write(folder: Path, name: str, content: str | bytes) -> Path:
-    """Write a file as a whole or not at all, and return its path; text is UTF-8."""
+def check_replaceable(folder: Path, *names: str, force: bool = False) -> None:
+    """Raise `OutputError` where a file is that mbkit did not write, unless `force` is given.
+
+    Asked before long work, as `check_writable` is.
+    """
+    for path in (folder / name for name in names):
+        if not force and os.path.lexists(path) and not _is_own(path):
+            raise OutputError(
+                f"{path} is there and mbkit did not write it; choose another folder with --out, or replace it with "
+                "--force"
+            )
+
+
+#: At the beginning or the end of what mbkit writes. Pages of earlier versions have their title only.
+_MARKS: Final = (
+    b'content="mbkit"',
+    b"mbkit</title>",
+    b"Software\0mbkit",
+    b"ritten by mbkit",
+    b"engine,method,setting,value,",
+    b"case,parameter,unit,value,engine,method,",
+)
+_HEAD: Final = 4096
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether a file is one that a command of mbkit has written."""
+    try:
+        if path.suffix == ".json":
+            data = json.loads(path.read_bytes())
+            # Equations say at their head with which mbkit they were written; results among other versions.
+            return isinstance(data, dict) and "mbkit" in (data | dict(data.get("versions") or {}))
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+            file.seek(max(0, os.path.getsize(path) - 64))
+            head += file.read()
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False
+    return any(mark in head for mark in _MARKS)
+
+
+def write(folder: Path, name: str, content: str | bytes, *, force: bool = False) -> Path:
+    """Write a file as a whole or not at all, and return its path; text is UTF-8.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written; or, unless `force` is given, a file is there that mbkit did not write.
+    """
+    with _interrupt.held:
+        check_replaceable(folder, name, force=force)
+        return _write(folder, name, content)
+
+
+def _write(folder: Path, name: str, content: str | bytes) -> Path:
     path = folder / name
     temporary = None
     try:

@@ -1,11 +1,11 @@
-"""Numbers and names as text, the same on a terminal and on a page."""
+"""Numbers as text, the same on a terminal and on a page."""
 
 from __future__ import annotations
 
 import math
 from typing import Final
 
-__all__ = ["count_text", "error_text", "inline", "plain", "time_text"]
+__all__ = ["count_text", "error_text", "time_text"]
 
 _UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
@@ -43,14 +43,3 @@ def _three(x: float) -> str:
 def count_text(x: float) -> str:
     """Return a factor without decimals where it has three digits."""
     return "" if math.isnan(x) else "∞" if math.isinf(x) else f"{x:.3g}" if abs(x) < 1000 else f"{x:.1e}"
-
-
-def plain(text: str) -> str:
-    """Return text from a file with everything spelt out that a terminal would obey."""
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
-
-
-def inline(text: str, most: int = 0) -> str:
-    """Return `plain` text on one line, cut after `most` characters if given."""
-    one = " ".join(plain(text).split())
-    return one if not most or len(one) <= most else one[: most - 1].rstrip() + "…"

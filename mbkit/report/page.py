@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from mbkit._escape import terminal
 from mbkit.report import figures, importers, precision, stress
-from mbkit.report.numbers import count_text, error_text, plain, time_text
+from mbkit.report.numbers import count_text, error_text, time_text
 from mbkit.report.reading import (
     allowances,
     by_term,
@@ -223,13 +225,27 @@ def _environment() -> Environment:
         how=lambda outcome: stress.HOW.get(outcome, ""),
         told=stress.told,
         rowname=name_of,
+        choice=_choice,
     )
     return made
 
 
 def _harmless(value: Any) -> Any:
     # Control characters too; markup made here is of another type.
-    return plain(value) if type(value) is str else value
+    return terminal(value) if type(value) is str else value
+
+
+def _choice(value: Any) -> str:
+    """Return what somebody chose, a switch, a number, a text or several of them, as a person writes it."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.12g}"
+    if isinstance(value, Mapping):
+        return "; ".join(f"{k}: {_choice(x)}" for k, x in value.items())
+    return ", ".join(map(_choice, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
 def _three_digits(x: float) -> str:

@@ -191,5 +191,5 @@ def error_against_time(result: WorkPrecision) -> str:
 def picture(result: WorkPrecision) -> bytes:
     """Return the same figure as PNG on white."""
     stream = io.BytesIO()
-    figure(result).savefig(stream, format="png", dpi=_DOTS_PER_INCH, facecolor="white", metadata={"Software": None})
+    figure(result).savefig(stream, format="png", dpi=_DOTS_PER_INCH, facecolor="white", metadata={"Software": "mbkit"})
     return stream.getvalue()

@@ -7,8 +7,9 @@ import math
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from mbkit._escape import one_line
 from mbkit.report.layout import bullet, columns, right, titled
-from mbkit.report.numbers import error_text, inline, time_text
+from mbkit.report.numbers import error_text, time_text
 from mbkit.report.precision import Lead, curve_lines, headline, leads, setting_text
 from mbkit.report.reading import notices
 from mbkit.studies.precision_result import WorkPrecision
@@ -26,13 +27,13 @@ def bench(result: WorkPrecision, asked: str = "") -> RenderableType:
         f"{result.seconds:.1f} s",
     ]
     parts: list[RenderableType] = [
-        Text.assemble((f"{inline(name, 80)}: ", "bold"), inline(headline(result))),
+        Text.assemble((f"{one_line(name, 80)}: ", "bold"), one_line(headline(result))),
         Text("  " + " · ".join(told), style="dim"),
         *study(result),
         *_curves(result),
     ]
     lines = [
-        bullet(inline(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", inline(n.reason, 300))
+        bullet(one_line(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", one_line(n.reason, 300))
         for n in notices(result.refusals)
     ]
     return Group(*parts, *(titled("Notes", *lines) if lines else []), Text())
@@ -44,22 +45,24 @@ def study(result: WorkPrecision) -> list[RenderableType]:
     for lead in leads(result):
         table.add_row(
             lead.errors,
-            Text(inline(lead.curve.engine)),
-            Text(inline(lead.curve.method)),
+            Text(one_line(lead.curve.engine)),
+            Text(one_line(lead.curve.method)),
             setting_text(lead.point),
             time_text(lead.point.seconds),
             time_text(lead.curve.compile + lead.point.seconds) or "–",
             Text(_next(lead), style="dim"),
         )
     known = f"known to {error_text(result.floor)}" if math.isfinite(result.floor) else "known to an unknown error"
-    below = bullet("", f"{inline(result.reference, 300)}; {known}", "i")
-    missing = [Text(f"  ! {inline('; '.join(result.shortened), 400)}", style="bold yellow")] if result.shortened else []
+    below = bullet("", f"{one_line(result.reference, 300)}; {known}", "i")
+    missing = (
+        [Text(f"  ! {one_line('; '.join(result.shortened), 400)}", style="bold yellow")] if result.shortened else []
+    )
     title = f"Error against run time, {result.duration:g} s of motion: the fastest with an error of q (rad or m)"
     return titled(title, *missing, table if table.rows else Text("  no run reached 1e-02", style="dim"), below)
 
 
 def _next(lead: Lead) -> str:
-    return ", ".join(f"{inline(engine)} × {factor}" if factor else engine for engine, _, factor in lead.nexts)
+    return ", ".join(f"{one_line(engine)} × {factor}" if factor else engine for engine, _, factor in lead.nexts)
 
 
 def _curves(result: WorkPrecision) -> list[RenderableType]:
@@ -69,8 +72,8 @@ def _curves(result: WorkPrecision) -> list[RenderableType]:
         order = "" if math.isnan(curve.order) else f"{curve.order:.2f}"
         table.add_row(
             Text("●" if line.on_front else "", style="green"),
-            Text(inline(curve.engine)),
-            Text(inline(curve.method)),
+            Text(one_line(curve.engine)),
+            Text(one_line(curve.method)),
             Text(f"! {order}" if line.off else order, style="bold yellow" if line.off else ""),
             "" if math.isnan(curve.expected) else f"{curve.expected:g}",
             error_text(best.error) if best else "none",

@@ -8,6 +8,9 @@ import time
 from types import TracebackType
 from typing import Any
 
+from mbkit import _interrupt
+from mbkit._escape import one_line
+
 __all__ = ["Bar"]
 
 _PATIENCE = 2.0  # s before the bar appears
@@ -23,7 +26,7 @@ class Bar:
     """
 
     def __init__(self, label: str) -> None:
-        self._label, self._text, self._fraction = label, "", 0.0
+        self._label, self._text, self._fraction = one_line(label, 60), "", 0.0
         self._begun = 0.0
         self._bar: Any = None
         self._timer: threading.Timer | None = None
@@ -38,10 +41,11 @@ class Bar:
         return self
 
     def __call__(self, fraction: float, text: str) -> None:
-        """Show how far the work is, and with what."""
-        self._fraction, self._text = fraction, text
+        """Show how far the work is, and with what; where Ctrl-C was swallowed by a library, it is raised here."""
+        _interrupt.raise_again()
+        self._fraction, self._text = fraction, one_line(text, 60)
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=fraction, doing=text)
+            self._bar.update(self._bar.task_ids[0], completed=fraction, doing=self._text)
 
     def _show(self) -> None:
         from rich.console import Console

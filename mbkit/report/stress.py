@@ -129,7 +129,7 @@ def held_text(line: Line, case: CaseResult) -> str:
 def headline(result: StressResult) -> str:
     """Return who held furthest and how much was wrong in silence, in one sentence."""
     stopped = "" if result.complete else "interrupted; what was finished: "
-    if not any(case.rows for case in result.cases):
+    if all(cell.end == "not run" for _, row in result.rows() for cell in row.cells):
         return f"{stopped}nothing was run"
     return f"{stopped}{_leaders(result)}; {_silent(result)}"
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
+from mbkit._escape import one_line
 from mbkit.report.drawing import PAGE, page_style, svg
-from mbkit.report.numbers import inline
 from mbkit.report.stress_steps import StepCase, StepLine
 from mbkit.studies.drawing import engine_index, engine_mark, log_ticks
 from mbkit.studies.stress.reading import name_of
@@ -64,8 +64,8 @@ def _panel(ax: Axes, case: StepCase, names: list[str]) -> None:
         ax.set_xlim(min(steps) / 2, max(steps) * 2)
     for step in case.lines:
         _bar(ax, names.index(name_of(step.line.row)), step)
-    ax.set_yticks(range(len(names)), [inline(n, 34) for n in names], fontsize=8.5)
-    ax.set_title(inline(case.case.name, 34), loc="left", fontsize=9.5, pad=3)
+    ax.set_yticks(range(len(names)), [one_line(n, 34) for n in names], fontsize=8.5)
+    ax.set_title(one_line(case.case.name, 34), loc="left", fontsize=9.5, pad=3)
     ax.grid(axis="x", which="major")
     log_ticks(ax, 6)
     ax.tick_params(axis="y", length=0)
@@ -92,7 +92,7 @@ def _legend(fig: Figure, cases: Sequence[StepCase]) -> None:
 
     engines = sorted({s.line.row.engine for c in cases for s in c.lines}, key=engine_index)
     handles = [
-        Line2D([], [], color=PAGE.engine(e), marker=engine_mark(e), linestyle="none", label=inline(e, 30))
+        Line2D([], [], color=PAGE.engine(e), marker=engine_mark(e), linestyle="none", label=one_line(e, 30))
         for e in engines
     ]
     handles.append(Line2D([], [], color=PAGE.ink, linewidth=1.6, linestyle=(0, (1.2, 0.8)), label="linear theory"))

@@ -7,8 +7,9 @@ from typing import Final
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from mbkit._escape import one_line
 from mbkit.report.layout import bullet, columns, right, titled
-from mbkit.report.numbers import inline, time_text
+from mbkit.report.numbers import time_text
 from mbkit.report.stress import Overview, headline, held_text, overview, value_text
 from mbkit.report.stress_silent import Avoid, avoid
 from mbkit.studies.stress.reading import Line, name_of
@@ -25,9 +26,9 @@ _PLACES: Final = 2
 def summary(result: StressResult) -> RenderableType:
     """Return each case in a line: who held furthest and how far, mbkit's own choice, what breaks first."""
     told = overview(result)
-    runs = sum(len(row.cells) for case in result.cases for row in case.rows)
+    runs = sum(cell.end != "not run" for _, row in result.rows() for cell in row.cells)
     parts: list[RenderableType] = [
-        Text.assemble(("stress: ", "bold"), inline(headline(result))),
+        Text.assemble(("stress: ", "bold"), one_line(headline(result))),
         Text(f"  {len(told)} cases · {runs} runs · {time_text(result.seconds)}", style="dim"),
         *(titled("Who holds furthest, and what breaks first", _cases(told)) if told else []),
         *_behind(told),
@@ -48,8 +49,8 @@ def _cases(told: list[Overview]) -> RenderableType:
         silent = sum(line.outcomes.count("silent") for line in o.lines)
         choice = "" if o.choice is None else "behind" if o.behind else "✓"
         table.add_row(
-            Text(inline(o.case.name, 22)),
-            Text(inline(o.leader_name, 24) if o.leader else "none ran"),
+            Text(one_line(o.case.name, 22)),
+            Text(one_line(o.leader_name, 24) if o.leader else "none ran"),
             Text(_held(o.leader, o) if o.leader else ""),
             *([Text(choice, style="yellow" if o.behind else "green")] if asked else []),
             Text(str(silent) if silent else "", style=_BAD),
@@ -59,9 +60,9 @@ def _cases(told: list[Overview]) -> RenderableType:
 
 
 def _held(line: Line, o: Overview) -> str:
-    return (
-        "all" if line.whole else "nothing" if line.broken.held is None else inline(value_text(line.broken.held, o.case))
-    )
+    if line.whole:
+        return "all"
+    return "nothing" if line.broken.held is None else one_line(value_text(line.broken.held, o.case))
 
 
 def _first(o: Overview) -> str:
@@ -70,14 +71,14 @@ def _first(o: Overview) -> str:
     if not found:
         return ""
     _, line, cell, how = min(found, key=lambda item: item[0])
-    return inline(f"{value_text(cell.value, o.case, unit=False)} {how}: {name_of(line.row)}")
+    return one_line(f"{value_text(cell.value, o.case, unit=False)} {how}: {name_of(line.row)}")
 
 
 def _behind(told: list[Overview]) -> list[RenderableType]:
     lines = [
         bullet(
-            f"{inline(o.case.name)}: ",
-            inline(
+            f"{one_line(o.case.name)}: ",
+            one_line(
                 f"auto {held_text(o.choice, o.case)}, {name_of(o.lines[0].row)} {held_text(o.lines[0], o.case)}", 200
             ),
             "!",
@@ -94,7 +95,7 @@ def _avoided(found: list[Avoid]) -> list[RenderableType]:
     for a in found[:_METHODS]:
         places = [f"{p.case.name} at {p.case.parameter} = {p.text}" for p in a.places[:_PLACES]]
         places += [f"{len(a.places) - _PLACES} more"] if len(a.places) > _PLACES else []
-        lines.append(bullet(f"{inline(a.method)}: ", inline(", ".join(places), 300), "✗", _BAD))
+        lines.append(bullet(f"{one_line(a.method)}: ", one_line(", ".join(places), 300), "✗", _BAD))
     if len(found) > _METHODS:
         lines.append(bullet("", f"and {len(found) - _METHODS} more methods, in the page and the JSON", " ", _BAD))
     return titled("Wrong in silence, and the mildest value where", *lines) if lines else []

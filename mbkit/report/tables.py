@@ -9,9 +9,10 @@ from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.text import Text
 
+from mbkit._escape import one_line
 from mbkit.report import precision_tables
 from mbkit.report.layout import bullet, columns, right, titled
-from mbkit.report.numbers import count_text, error_text, inline, time_text
+from mbkit.report.numbers import count_text, error_text, time_text
 from mbkit.report.reading import (
     allowances,
     by_term,
@@ -57,8 +58,8 @@ def verdict(name: str, text: str, passed: bool) -> Text:
     """Return the headline: a mark, the name if there is one, one sentence."""
     mark, _ = _MARK[passed]
     style = AGREE if passed else DIFFER
-    head = (f"{inline(name, 80)}: ", "bold") if name else ""
-    return Text.assemble((f"{mark} ", style), head, (inline(text), style))
+    head = (f"{one_line(name, 80)}: ", "bold") if name else ""
+    return Text.assemble((f"{mark} ", style), head, (one_line(text), style))
 
 
 def _facts(result: Comparison) -> Text:
@@ -76,7 +77,7 @@ def _facts(result: Comparison) -> Text:
 def _failed(result: Comparison) -> list[RenderableType]:
     found = failures(result)
     lines: list[RenderableType] = [
-        bullet(f"{inline(f.what)}: ", inline(f.reason, 400), "✗", DIFFER) for f in found[:_MOST_FAILURES]
+        bullet(f"{one_line(f.what)}: ", one_line(f.reason, 400), "✗", DIFFER) for f in found[:_MOST_FAILURES]
     ]
     if len(found) > _MOST_FAILURES:
         lines.append(bullet("", f"and {len(found) - _MOST_FAILURES} more, in the page and the JSON", " ", DIFFER))
@@ -87,8 +88,8 @@ def _terms(result: Comparison) -> list[RenderableType]:
     heads = [f"{e}\nvs {result.reference}" for e in result.engines]
     table = columns("term", *right(*heads))
     for term, rows in by_term(result).items():
-        table.add_row(Text(inline(term)), *(_term_cell(rows.get(engine)) for engine in result.engines))
-    below = [bullet(f"{inline(a.what)}: ", inline(a.reason, 400), *_ALLOWED) for a in allowances(result)]
+        table.add_row(Text(one_line(term)), *(_term_cell(rows.get(engine)) for engine in result.engines))
+    below = [bullet(f"{one_line(a.what)}: ", one_line(a.reason, 400), *_ALLOWED) for a in allowances(result)]
     return titled("Terms: worst relative error, time per call", table, *below)
 
 
@@ -113,7 +114,7 @@ def _rollouts(result: Comparison) -> list[RenderableType]:
     for r in judged(result):
         mark, style = _MARK[r.passed] if r.judged else ("–", "dim")
         table.add_row(
-            Text(inline(r.method)),
+            Text(one_line(r.method)),
             Text(r.engine),
             time_text(r.duration),
             count_text(r.condition),
@@ -123,9 +124,9 @@ def _rollouts(result: Comparison) -> list[RenderableType]:
             Text(f"[{notes.setdefault(r.note, len(notes) + 1)}]" if r.note else "", style="dim"),
         )
     steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in judged(result)))
-    below = [bullet("", inline(note), f"[{k}]") for note, k in notes.items()]
+    below = [bullet("", one_line(note), f"[{k}]") for note, k in notes.items()]
     below += [
-        bullet(f"{inline(r.method)} vs {inline(r.against)}: ", f"{error_text(r.error)} in q; {inline(r.note)}", "i")
+        bullet(one_line(f"{r.method} vs {r.against}") + ": ", f"{error_text(r.error)} in q; {one_line(r.note)}", "i")
         for r in told(result)
     ]
     title = f"Rollouts against MuJoCo's own, step {steps}: largest difference of q (rad or m)"
@@ -144,27 +145,27 @@ def _omissions(result: Comparison) -> list[RenderableType]:
         state = omission_state(o)
         mark, style = {"same": _MARK[True], "changed": _MARK[False], "chosen": ("i", "")}.get(state, ("", "dim"))
         table.add_row(
-            Text(inline(o.need), no_wrap=True),
+            Text(one_line(o.need), no_wrap=True),
             "yes" if o.present else "no",
             Text(saving_text(o) or "–", style="" if o.measurable else "dim"),
             Text(time_text(o.saved_setup) or "–"),
             Text("–" if state == "on" else f"{mark} {error_text(o.change):>7}", style=style),
-            Text(inline(o.what), style="dim"),
+            Text(one_line(o.what), style="dim"),
         )
         if state == "chosen":
-            below.append(bullet(f"{inline(o.need)}: ", inline(o.note), "i"))
+            below.append(bullet(f"{one_line(o.need)}: ", one_line(o.note), "i"))
     return titled("Left out because the scene does not need it: change is that of the accelerations", table, *below)
 
 
 def _notes(result: Comparison) -> list[RenderableType]:
     lines = [
-        bullet(inline(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", inline(n.reason, 400))
+        bullet(one_line(n.engine + (f" ({', '.join(n.terms)})" if n.terms else "")) + ": ", one_line(n.reason, 400))
         for n in notices(result.refusals)
     ]
-    lines += [bullet("", inline(note, 300)) for note in result.facts.get("notes", ())]
+    lines += [bullet("", one_line(note, 300)) for note in result.facts.get("notes", ())]
     bodies = list(result.facts.get("nonphysical", ()))
     if bodies:
-        lines.append(bullet("bodies that no matter is like: ", inline("; ".join(bodies), 300)))
+        lines.append(bullet("bodies that no matter is like: ", one_line("; ".join(bodies), 300)))
     return [*(titled("Notes", *lines) if lines else []), Text()]
 
 
@@ -182,14 +183,14 @@ def sweep(result: Sweep) -> RenderableType:
         worst = c.worst if c else None
         table.add_row(
             Text(f"{mark} {o.status}", style=style),
-            Text(inline(o.robot)),
+            Text(one_line(o.robot)),
             str(c.facts.get("nv", "")) if c else "",
             str(len(c.engines)) if c else "",
             f"{c.digits:.1f}" if c and worst else "",
             error_text(worst.relative) if worst else "",
         )
         if o.reason:
-            reasons.append(bullet(f"{inline(o.robot)}: ", inline(o.reason, 300), mark, style))
+            reasons.append(bullet(f"{one_line(o.robot)}: ", one_line(o.reason, 300), mark, style))
     parts = [table, *(titled("Reasons", *reasons) if reasons else [])]
     return Group(*parts, Text(), verdict("", result.verdict, result.passed), Text())
 
@@ -202,7 +203,7 @@ def robots(records: Iterable[Any], systems: Iterable[str]) -> RenderableType:
         count += 1
         names = Text(", ".join(r.aliases), style="bold")
         if r.reason:
-            table.add_row(Text(r.name), names, "–", "–", "–", Text(inline(r.reason), style="yellow"))
+            table.add_row(Text(r.name), names, "–", "–", "–", Text(one_line(r.reason), style="yellow"))
         else:
             table.add_row(Text(r.name), names, str(r.nq), str(r.nv), f"{r.mass:.4g}", "")
     foot = f"{count} robots of example-robot-data; mimic joints reduced. Catalog systems: {', '.join(systems)}"

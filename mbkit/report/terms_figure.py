@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from mbkit._escape import one_line
 from mbkit.report.drawing import PAGE, page_style, svg
-from mbkit.report.numbers import inline
 from mbkit.report.reading import by_term
 from mbkit.studies.drawing import engine_mark, log_ticks
 from mbkit.studies.result import Comparison, Row
@@ -82,7 +82,7 @@ def _panel(ax: Axes, name: str, rows: list[Row], tolerance: float) -> None:
         ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
         if not row.passed:
             ax.plot(*place, "x", color=PAGE.bad, markersize=11, markeredgewidth=2.2)
-    ax.set_title(inline(name, 28), loc="left", fontsize=9.5, pad=3)
+    ax.set_title(one_line(name, 28), loc="left", fontsize=9.5, pad=3)
 
 
 def _limits(ax: Axes, rows: list[Row], tolerance: float) -> None:

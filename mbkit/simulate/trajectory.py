@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from mbkit import _check
 from mbkit._check import Array
+from mbkit._escape import csv_text, html, one_line
 from mbkit.engines import ENGINES, Dynamics, dynamics
 from mbkit.engines.clock import at_times
 from mbkit.errors import InputError, OutputError, UnsupportedError
@@ -258,7 +258,7 @@ class Trajectory:
         try:
             with Path(path).open("w", newline="", encoding="utf-8") as file:
                 writer = csv.writer(file)
-                writer.writerow(header)
+                writer.writerow(map(csv_text, header))
                 for i, (q, v) in enumerate(zip(self.q, self.v, strict=True) if batch else [(self.q, self.v)]):
                     lead = [i] if batch else []
                     rows = np.column_stack([self.t, q, v]).tolist()
@@ -279,10 +279,10 @@ class Trajectory:
         ]
 
     def __repr__(self) -> str:
-        return f"<Trajectory {'; '.join(f'{k}: {x}' for k, x in self._facts())}>"
+        return f"<Trajectory {'; '.join(f'{k}: {one_line(x)}' for k, x in self._facts())}>"
 
     def _repr_html_(self) -> str:
-        cells = "".join(f"<tr><th>{k}</th><td>{html.escape(x)}</td></tr>" for k, x in self._facts())
+        cells = "".join(f"<tr><th>{k}</th><td>{html(x)}</td></tr>" for k, x in self._facts())
         return f"<table>{cells}</table>"
 
 

@@ -15,6 +15,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
+from mbkit import _interrupt
+
 __all__ = ["MEMORY", "MOST", "Child", "EndedError", "OverdueError"]
 
 #: What a process starts with: the folders that modules are found in, before it changes into its own.
@@ -96,6 +98,7 @@ class Child:
                 # Ctrl-C is for who started it, and what it started ends with it.
                 start_new_session=True,
             )
+        _interrupt.at_end(self.kill)
         self._channel: Connection[Any, Any] = Connection(ours.detach())
 
     @property
@@ -154,11 +157,13 @@ class Child:
     def end(self) -> None:
         """End it, and wait until it is gone."""
         self.kill()
+        _interrupt.at_end(self.kill, remove=True)
         self._process.wait()
         self._channel.close()
 
     def leave(self) -> None:
         """Let go of it without ending it, in a process that is a copy of the one that started it."""
+        _interrupt.at_end(self.kill, remove=True)
         self._channel.close()
         self._process.returncode = 0
 

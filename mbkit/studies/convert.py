@@ -13,6 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from mbkit import _interrupt
+from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.errors import MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import load
@@ -64,7 +66,8 @@ class Converted:
         """Write the text to a file, and return its path."""
         out = Path(path)
         try:
-            out.write_text(self.text, encoding="utf-8")
+            with _interrupt.held:
+                out.write_text(self.text, encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write {out}: {error.strerror}; the text itself is kept") from error
         return out
@@ -112,6 +115,11 @@ def convert(model: Model, to: str) -> Converted:
         raise UnknownNameError("format", str(to), FORMATS)
     if model.written is not None:
         raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
+    names = [model.name, *(x.name for x in model.bodies), *(x.name for x in model.joints)]
+    names += [*(x.name for x in model.frames), *(x.name for x in model.springs), *(x.name for x in model.couplings)]
+    unwritable = [name for name in names if not xml_holds(name)]
+    if unwritable:
+        raise UnsupportedError(f"convert: XML cannot hold the characters of {unwritable[0]!r}; rename this part")
     if model.parameters:
         model.require_values("convert")
         model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})

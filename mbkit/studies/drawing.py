@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["PLAIN", "Palette", "engine_index", "engine_mark", "log_ticks", "one_line", "style"]
+__all__ = ["PLAIN", "Palette", "engine_index", "engine_mark", "log_ticks", "style"]
 
 #: An engine keeps its colour and marker in every figure, whichever others are beside it.
 _ENGINES: Final = ("pinocchio", "lagrangian", "mujoco", "drake", "oracle")
@@ -46,12 +46,6 @@ def engine_index(name: str) -> int:
 def engine_mark(name: str) -> str:
     """Return an engine's marker."""
     return _MARKS[engine_index(name)]
-
-
-def one_line(text: str, most: int) -> str:
-    """Return a name as a figure can hold it: printable, at most so long."""
-    told = "".join(c if c.isprintable() else "?" for c in text)
-    return told if len(told) <= most else told[: most - 1] + "…"
 
 
 def style(palette: Palette) -> dict[str, Any]:

@@ -11,7 +11,8 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from mbkit.studies.drawing import PLAIN, Palette, engine_mark, log_ticks, one_line, style
+from mbkit._escape import one_line
+from mbkit.studies.drawing import PLAIN, Palette, engine_mark, log_ticks, style
 from mbkit.studies.precision_result import Curve, PrecisionPoint, WorkPrecision
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ _BESIDE: Final = {"mujoco_rk4": "rk4", "mujoco_euler": "semi_implicit_euler"}
 _COLUMNS: Final = 5
 _WIDTH: Final = 10.4
 _TOP: Final = 4.4
+#: Where axes end, so that half of a last tick's label has its place.
+_RIGHT: Final = 0.98
+_SMALLEST: Final = 5.0
 _ROW: Final = 1.5
 _NAME: Final = 9.0  # points, and the width of a letter in bold, in
 _LETTER: Final = 0.077
@@ -67,7 +71,7 @@ def figure(result: WorkPrecision, palette: Palette = PLAIN) -> Figure:
         floor = _floor(result)
         # With dampers the energy is not conserved, and there is no drift to show.
         conserved = any(_drawable(p.seconds, p.energy) for _, p in result.rows())
-        margins = {"left": 0.07, "right": 0.995, "top": 1 - above, "bottom": split + below, "wspace": 0.2}
+        margins = {"left": 0.07, "right": _RIGHT, "top": 1 - above, "bottom": split + below, "wspace": 0.2}
         ratios = (1.55, 1.0) if conserved else (1.0,)
         axes = fig.subplots(1, len(ratios), width_ratios=ratios, squeeze=False, gridspec_kw=margins)[0]
         _overview(axes[0], result, lambda p: _shown(p, floor), floor, palette, known_to=floor > 0)
@@ -93,7 +97,7 @@ def figure(result: WorkPrecision, palette: Palette = PLAIN) -> Figure:
                 squeeze=False,
                 gridspec_kw={
                     "left": 0.07,
-                    "right": 0.995,
+                    "right": _RIGHT,
                     "top": split - 0.58 / height,
                     "bottom": 0.42 / height,
                     "wspace": 0.08,
@@ -251,7 +255,19 @@ def _legend(fig: Figure, result: WorkPrecision, palette: Palette) -> None:
     if _floor(result) > 0:
         told = f"reference known to {result.floor:.0e}"
         handles.append(Line2D([], [], color=palette.muted, linestyle=(0, (4, 3)), linewidth=1.0, label=told))
-    fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.02, 1.0), ncols=len(handles), columnspacing=1.6)
+    # On one line, in letters as small as long names need.
+    for size in (10.0, 9.0, 8.0, 7.0, 6.0, _SMALLEST):
+        legend = fig.legend(
+            handles=handles,
+            loc="upper left",
+            bbox_to_anchor=(0.02, 1.0),
+            ncols=len(handles),
+            columnspacing=1.6,
+            prop={"size": size},
+        )
+        if size == _SMALLEST or legend.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
+            return
+        legend.remove()
 
 
 def _by_method(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import io
 import json
 import math
@@ -12,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from mbkit._escape import csv_text, html, markdown
 from mbkit.errors import InputError
 from mbkit.studies.plain import cell, plain, remade, write
 from mbkit.studies.result import Refusal
@@ -256,16 +256,16 @@ class WorkPrecision:
             numbers = (p.value, p.error, p.energy, p.seconds, p.spread, c.compile + p.seconds)
             on = (id(c), id(p)) in front
             order = (c.order, c.expected)
-            about = (c.engine, c.method, p.setting, *map(cell, numbers), p.steps, p.evaluations)
-            writer.writerow((*about, *map(cell, order), int(on), p.note))
+            about = (csv_text(c.engine), csv_text(c.method), p.setting, *map(cell, numbers), p.steps, p.evaluations)
+            writer.writerow((*about, *map(cell, order), int(on), csv_text(p.note)))
         if path is not None:
             write(path, stream.getvalue())
         return stream.getvalue()
 
     def to_markdown(self) -> str:
         """Return the front and the curves as tables."""
-        missing = f" ({'; '.join(self.shortened)})" if self.shortened else ""
-        lines = [f"**{self.model}**, {self.duration:g} s{missing}: {self.reference}", ""]
+        missing = f" ({markdown('; '.join(self.shortened))})" if self.shortened else ""
+        lines = [f"**{markdown(self.model)}**, {self.duration:g} s{missing}: {markdown(self.reference)}", ""]
         lines += ["| error ≤ | fastest | setting | run time | first run |", "|---:|---|---|---:|---:|"]
         found = {exponent: self.fastest(10.0**exponent) for exponent in range(-2, -14, -2)}
         # One row for each run, with the least error that it is fastest for.
@@ -274,15 +274,17 @@ class WorkPrecision:
             if x and last[id(x[1])] == exponent:
                 c, p = x
                 first = f"{c.compile + p.seconds:.3g} s"
-                lines.append(f"| 1e{exponent} | {c.name} | {p.setting} {p.value:g} | {p.seconds:.3g} s | {first} |")
+                about = f"{markdown(c.name)} | {p.setting} {p.value:g}"
+                lines.append(f"| 1e{exponent} | {about} | {p.seconds:.3g} s | {first} |")
         lines += ["", "| engine and method | order | expected | least error | its run time | compile |"]
         lines.append("|---|---:|---:|---:|---:|---:|")
         for c in self.curves:
             best = min((p for p in c.points if math.isfinite(p.error)), key=lambda p: p.error, default=None)
-            told = (f"{best.error:.1e}", f"{best.seconds:.3g} s") if best else ("none", "")
+            least = (f"{best.error:.1e}", f"{best.seconds:.3g} s") if best else ("none", "")
             orders = ["" if math.isnan(x) else f"{x:.2f}" for x in (c.order, c.expected)]
-            lines.append(f"| {c.name} | {orders[0]} | {orders[1]} | {told[0]} | {told[1]} | {c.compile:.3g} s |")
-        lines += ["", *(f"- {r.engine} {r.term}: {r.reason}" for r in self.refusals)] if self.refusals else []
+            lines.append(f"| {' | '.join((markdown(c.name), *orders, *least))} | {c.compile:.3g} s |")
+        told = [f"- {markdown(f'{r.engine} {r.term}')}: {markdown(r.reason)}" for r in self.refusals]
+        lines += ["", *told] if told else []
         lines += [] if self.complete else ["", "Interrupted: this is what was finished."]
         return "\n".join(lines) + "\n"
 
@@ -302,10 +304,10 @@ class WorkPrecision:
         rows = []
         for c, p in self.front:
             numbers = f"<td>{p.error:.1e}</td><td>{p.seconds:.3g} s</td><td>{c.compile + p.seconds:.3g} s</td>"
-            rows.append(f"<tr><td>{html.escape(c.name)}</td><td>{p.setting} {p.value:g}</td>{numbers}</tr>")
+            rows.append(f"<tr><td>{html(c.name)}</td><td>{p.setting} {p.value:g}</td>{numbers}</tr>")
         head = "<tr><th>on the front</th><th>setting</th><th>error</th><th>run time</th><th>first run</th></tr>"
-        missing = f" <b>{html.escape('; '.join(self.shortened))}.</b>" if self.shortened else ""
-        told = f"<p><b>{html.escape(self.model)}</b>, {self.duration:g} s.{missing} {html.escape(self.reference)}</p>"
+        missing = f" <b>{html('; '.join(self.shortened))}.</b>" if self.shortened else ""
+        told = f"<p><b>{html(self.model)}</b>, {self.duration:g} s.{missing} {html(self.reference)}</p>"
         return f"{told}<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
 
 

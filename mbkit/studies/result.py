@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
 from dataclasses import asdict, dataclass, field
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._escape import html, markdown, one_line
 from mbkit.errors import OutputError
 
 if TYPE_CHECKING:
@@ -332,29 +332,31 @@ class Comparison:
         """Return the table of terms in Markdown."""
         head = "| term | engine | worst | median | per joint | joint | ns | |\n|---|---|---|---|---|---|---|---|"
         lines = [
-            f"| {r.term} | {r.engine} | {r.relative:.1e} | {r.median:.1e} | {r.per_joint:.1e} | {r.joint} | "
-            f"{r.ns:.0f} | {_outcome(r)} |"
+            f"| {markdown(r.term)} | {markdown(r.engine)} | {r.relative:.1e} | {r.median:.1e} | {r.per_joint:.1e} "
+            f"| {markdown(r.joint)} | {r.ns:.0f} | {markdown(_outcome(r))} |"
             for r in self.rows
         ]
-        told = [f"- {r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in self.refusals]
-        return "\n".join([f"**{self.model}**: {self.verdict}", "", head, *lines, "", *told]).rstrip() + "\n"
+        told = [
+            f"- {markdown(r.engine + (' ' + r.term if r.term else ''))}: {markdown(r.reason)}" for r in self.refusals
+        ]
+        first = f"**{markdown(self.model)}**: {markdown(self.verdict)}"
+        return "\n".join([first, "", head, *lines, "", *told]).rstrip() + "\n"
 
     def _repr_html_(self) -> str:
         cells = "".join(
-            f"<tr><td>{html.escape(r.term)}</td><td>{r.engine}</td><td>{r.relative:.1e}</td><td>{r.median:.1e}</td>"
-            f"<td>{html.escape(r.joint)}</td><td>{r.ns:.0f}</td>"
-            f"<td>{html.escape(_outcome(r))}</td></tr>"
+            f"<tr><td>{html(r.term)}</td><td>{html(r.engine)}</td><td>{r.relative:.1e}</td><td>{r.median:.1e}</td>"
+            f"<td>{html(r.joint)}</td><td>{r.ns:.0f}</td>"
+            f"<td>{html(_outcome(r))}</td></tr>"
             for r in self.rows
         )
         head = "".join(f"<th>{h}</th>" for h in ("term", "engine", "worst", "median", "joint", "ns", ""))
-        refusals = "".join(f"<li>{html.escape(r.engine)}: {html.escape(r.reason)}</li>" for r in self.refusals)
-        return (
-            f"<p><b>{html.escape(self.model)}</b>: {html.escape(self.verdict)}</p>"
-            f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{refusals}</ul>" if refusals else "")
+        refusals = "".join(f"<li>{html(r.engine)}: {html(r.reason)}</li>" for r in self.refusals)
+        return f"<p><b>{html(self.model)}</b>: {html(self.verdict)}</p><table><tr>{head}</tr>{cells}</table>" + (
+            f"<ul>{refusals}</ul>" if refusals else ""
         )
 
     def __repr__(self) -> str:
-        return f"<Comparison of {self.model!r}: {self.verdict}>"
+        return f"<Comparison of {self.model!r}: {one_line(self.verdict)}>"
 
 
 def _outcome(row: Row) -> str:

@@ -18,7 +18,7 @@ from mbkit.load import load
 from mbkit.load.names import find
 from mbkit.model import Model
 
-__all__ = ["model_of"]
+__all__ = ["is_code", "model_of"]
 
 _FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
 
@@ -44,18 +44,30 @@ def model_of(target: str, options: Mapping[str, Any] | None = None) -> Model:
     if _FUNCTION.fullmatch(target) and not os.path.exists(target):
         _refuse(options, "a function")
         return _from_function(*target.split(":"))
-    systems = catalog.systems()
-    if target in systems:
+    named = catalog.systems()
+    if target in named:
         if find(target) is None:
             _refuse(options, "a catalog system")
-            return systems[target]()
+            return named[target]()
         told = f"{target!r} is a robot and a catalog system; this is the robot, mbkit.catalog:{target} is the other"
         warnings.warn(told, MbkitWarning, stacklevel=2)
     try:
         return load(target, **options)
     except UnknownNameError as error:
         hint = "(mbkit robots lists them; a path ends in .urdf or .xml, a function is package.module:function)"
-        raise UnknownNameError("robot or catalog system", target, [*systems, *error.known], hint) from None
+        raise UnknownNameError("robot or catalog system", target, [*named, *error.known], hint) from None
+
+
+def is_code(target: str) -> bool:
+    """Return whether `model_of` would import and call what a text names: a function, and no system of mbkit's own."""
+    if not _FUNCTION.fullmatch(target):
+        return False
+    module, _, name = target.partition(":")
+    if module == "mbkit.lagrangian.systems":
+        from mbkit.lagrangian import systems
+
+        return name not in systems.names()
+    return module != "mbkit.catalog" or name not in catalog.systems()
 
 
 def _refuse(options: Mapping[str, Any], what: str) -> None:

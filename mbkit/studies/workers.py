@@ -8,7 +8,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 __all__ = ["Pool", "WorkerDiedError", "processors", "run"]
 
@@ -121,6 +121,15 @@ class Pool(ProcessPoolExecutor):
         self._folder = tempfile.TemporaryDirectory(prefix="mbkit-", ignore_cleanup_errors=True)
         super().__init__(width, mp_context=_CONTEXT, initializer=_begin, initargs=(self._folder.name,))
         self._others = set(multiprocessing.active_children())
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Make a call in one of the processes, which may start for it."""
+        # A process that starts inherits this, and Ctrl-C does not disturb it while it imports.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __exit__(self, kind: object, *rest: object) -> None:
         if kind is not None:

@@ -23,6 +23,7 @@ from mbkit.studies.baseline.evaluation import evaluated
 from mbkit.studies.baseline.file import path_of, read
 from mbkit.studies.baseline.links import SECTIONS, links_of, without_consequences
 from mbkit.studies.baseline.result import BaselineResult, Status
+from mbkit.studies.baseline.target import checked_target
 from mbkit.studies.baseline.versions import VersionChange
 from mbkit.studies.baseline.yardstick import ROUNDING, Moved, Yardstick, allowed
 from mbkit.studies.result import Refusal
@@ -84,6 +85,7 @@ def check(
     mass of body bob (with tip fixed to it): 1 → 1.1
     """
     model = engines_.checked_model(model)
+    checked_target("" if target is None else target)
     recorded = read(path)
     _require_same_robot(recorded, model, os.fspath(path_of(path)))
     tell = progress or _silent

@@ -143,4 +143,4 @@ def moving_mass(description: Mapping[str, Mapping[str, Part]]) -> tuple[float, A
     """Return the total mass, kg, and the gravity, m/s²; zeros where energies do not tell them."""
     mass = sum(float(part["mass"]) for part in description.get("bodies", {}).values())
     gravity = description.get("system", {}).get("", {}).get("gravity", [0.0, 0.0, 0.0])
-    return mass, np.array(gravity)
+    return mass, np.array(gravity, dtype=np.float64)

@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
+from mbkit import _interrupt
 from mbkit.errors import BaselineError, InputError, OutputError
 from mbkit.studies.baseline import toml
 from mbkit.studies.baseline.content import Baseline
@@ -101,7 +102,7 @@ def parsed(raw: bytes, where: Path) -> Baseline:
         raise BaselineError(f"{where}: edited or damaged: its checksum belongs to other content; {_REMEDY}")
     try:
         return from_table(tomllib.loads(body))
-    except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         raise BaselineError(f"{where}: sound by its checksum, yet not readable ({error}); {_REMEDY}") from None
 
 
@@ -109,16 +110,21 @@ _REMEDY: Final = "restore it from version control, or record it anew"
 
 
 def _check_format(text: str, where: Path) -> None:
-    found = _FORMAT.search(text)
-    if found is None or int(found[1]) == FORMAT:
+    number = _format(text)
+    if number is None or number == FORMAT:
         # Without the line it is damaged, which the checksum tells.
         return
-    number = int(found[1])
     if number > FORMAT:
         told = f"of format {number}, by a newer mbkit; this one reads format {FORMAT}: update mbkit, or record it anew"
     else:
         told = f"of format {number}, by an older mbkit; this one reads format {FORMAT}: record it anew"
     raise BaselineError(f"{where}: {told}")
+
+
+def _format(text: str) -> int | None:
+    """Return the number of the format; of a number that no format has, its first nine digits."""
+    found = _FORMAT.search(text)
+    return int(found[1][:9]) if found else None
 
 
 def _checksum(body: str) -> str:
@@ -138,10 +144,10 @@ def check_replaceable(path: Path, model: str) -> None:
     if not is_baseline(path):
         raise OutputError(f"{path}: there is a file that is no baseline; name another, or replace it with force")
     text = path.read_bytes().decode("utf-8", "replace").replace("\r\n", "\n")
-    found = _FORMAT.search(text)
-    if found and int(found[1]) > FORMAT:
+    number = _format(text)
+    if number is not None and number > FORMAT:
         raise OutputError(
-            f"{path}: a newer mbkit's baseline, of format {found[1]}; update mbkit, or replace it with force"
+            f"{path}: a newer mbkit's baseline, of format {number}; update mbkit, or replace it with force"
         )
     named = _MODEL.search(text)
     if named and named[1] != toml.value(model):
@@ -159,8 +165,12 @@ def store(path: Path, text: str, model: str, *, force: bool) -> None:
         It cannot be written; or, unless `force` is given, another process has put another
         robot's baseline there in the meantime.
     """
-    # Where a link leads, so that it stays one.
-    path = Path(os.path.realpath(path))
+    with _interrupt.held:
+        # Where a link leads, so that it stays one.
+        _store(Path(os.path.realpath(path)), text, model, force=force)
+
+
+def _store(path: Path, text: str, model: str, *, force: bool) -> None:
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,7 @@ from mbkit.studies.baseline.description import described
 from mbkit.studies.baseline.evaluation import LONG, evaluated, states_of
 from mbkit.studies.baseline.file import check_replaceable, path_of, store, text_of
 from mbkit.studies.baseline.links import links_of
+from mbkit.studies.baseline.target import checked_target
 from mbkit.studies.baseline.versions import relevant
 from mbkit.studies.baseline.yardstick import FINE, ROUNDING, Yardstick
 from mbkit.studies.result import Refusal
@@ -60,7 +61,8 @@ def record(
     seed : int
     target, options : str and mapping, optional
         What `mbkit baseline check` loads, as `mbkit check` takes it, and how: keyword arguments of
-        `mbkit.load`. A file's path is relative to the baseline's folder, and begins with a dot. Of a
+        `mbkit.load`. A function, ``package.module:function``, is loaded only where ``--target`` names it. A file's
+        path is relative to the baseline's folder, and begins with a dot. Of a
         URDF, links that are fixed to each other are recorded each by itself then, beside the body
         that they make.
     force : bool
@@ -86,6 +88,7 @@ def record(
     names = engines_.checked_names(engines)
     count("samples", samples, least=1)
     count("seed", seed)
+    checked_target(target, options)
     if not force:
         check_replaceable(where, model.name)
     made = _recorded(model, names, engines is not None, samples, seed, progress or _silent)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -10,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from mbkit._escape import html, json_text, markdown, one_line
 from mbkit.errors import OutputError
 from mbkit.studies.baseline.changes import Change
 from mbkit.studies.baseline.versions import VersionChange
@@ -154,7 +154,7 @@ class BaselineResult:
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Return the result as JSON, and write it to `path` if given. What is not finite becomes null."""
-        text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False, ensure_ascii=False)
+        text = json_text(json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False, ensure_ascii=False))
         if path is not None:
             try:
                 Path(path).write_text(text, encoding="utf-8")
@@ -164,19 +164,15 @@ class BaselineResult:
 
     def to_markdown(self) -> str:
         """Return it as a list in Markdown."""
-        found = [f"- {what}: {told}" for what, told in self.lines(everything=True)]
-        return "\n".join([f"**{self.model}**: {self.verdict}", "", *found]).rstrip() + "\n"
+        found = [f"- {markdown(what)}: {markdown(told)}" for what, told in self.lines(everything=True)]
+        return "\n".join([f"**{markdown(self.model)}**: {markdown(self.verdict)}", "", *found]).rstrip() + "\n"
 
     def _repr_html_(self) -> str:
-        found = "".join(
-            f"<li>{html.escape(what)}: {html.escape(told)}</li>" for what, told in self.lines(everything=True)
-        )
-        return f"<p><b>{html.escape(self.model)}</b>: {html.escape(self.verdict)}</p>" + (
-            f"<ul>{found}</ul>" if found else ""
-        )
+        found = "".join(f"<li>{html(what)}: {html(told)}</li>" for what, told in self.lines(everything=True))
+        return f"<p><b>{html(self.model)}</b>: {html(self.verdict)}</p>" + (f"<ul>{found}</ul>" if found else "")
 
     def __repr__(self) -> str:
-        return f"<BaselineResult of {self.model!r}: {self.verdict}>"
+        return f"<BaselineResult of {self.model!r}: {one_line(self.verdict)}>"
 
 
 def _one(found: Sequence[object]) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.studies.baseline.content import ROLLOUT, Baseline, Rollout
-from mbkit.studies.baseline.description import FLAT, SECTIONS, Description
+from mbkit.studies.baseline.description import FLAT, SECTIONS, Description, moving_mass
 from mbkit.studies.result import Refusal
 from mbkit.studies.states import States
 
@@ -17,6 +17,8 @@ __all__ = ["FORMAT", "from_table", "to_table"]
 
 #: Of the file. Another number is another layout, which this one does not read.
 FORMAT: Final = 1
+#: Of a rollout that a file asks for; `record` writes far fewer.
+_MOST_STEPS: Final = 10_000
 _VECTORS: Final = ("q", "v", "a", "tau")
 
 
@@ -47,13 +49,21 @@ def to_table(b: Baseline) -> dict[str, Any]:
 
 
 def from_table(t: Mapping[str, Any]) -> Baseline:
-    """Return what was written."""
+    """Return what was written.
+
+    Raises
+    ------
+    ValueError, TypeError, LookupError, AttributeError, ArithmeticError
+        It is not what `to_table` writes: a part is missing, or of another kind or size, or a number is not finite.
+    """
+    if t["format"] != FORMAT:
+        raise ValueError(f"expected format {FORMAT}, got {t['format']!r}")
     states = t["states"]
     coordinates, velocities = tuple(states["q"]), tuple(states["v"])
     q, v, a, tau = (_unfolded(states[x]) for x in _VECTORS)
     at = States(q, v, a, tau, tuple(states["kinds"]))
     sizes = len(at.kinds), len(velocities)
-    return Baseline(
+    made = Baseline(
         model=t["model"],
         digest=t["digest"],
         target=t["target"],
@@ -78,6 +88,50 @@ def from_table(t: Mapping[str, Any]) -> Baseline:
             for term, reason in terms.items()
         ),
     )
+    _check(made)
+    return made
+
+
+def _check(b: Baseline) -> None:
+    """Raise `ValueError` for what no recording holds."""
+    texts = [b.model, b.digest, b.target, b.processor, *b.states.kinds, *b.versions, *b.versions.values(), *b.errors]
+    if not all(isinstance(x, str) for x in texts):
+        raise ValueError("a name, a target or a version is no text")
+    if type(b.seed) is not int or type(b.rollout.steps) is not int or not 0 < b.rollout.steps <= _MOST_STEPS:
+        raise ValueError(f"expected a whole number as seed, and 1 to {_MOST_STEPS} steps of the rollout")
+    if not b.terms or not b.errors or "M" not in b.terms:
+        raise ValueError("no terms, no mass matrix or no engines")
+    n, nv = len(b.states.kinds), len(b.velocities)
+    arrays: list[tuple[str, Array, tuple[int, ...]]] = [("q", b.states.q, (n, len(b.coordinates)))]
+    arrays += [(x, getattr(b.states, x), (n, nv)) for x in ("v", "a", "tau")]
+    for terms in (b.terms, *b.own.values()):
+        arrays += [
+            (term, x, (len(b.coordinates) + nv,) if term == ROLLOUT else _shape(term, (n, nv)))
+            for term, x in terms.items()
+        ]
+    for name, x, shape in arrays:
+        if x.shape != shape:
+            raise ValueError(f"{name}: expected numbers of shape {shape}, got {x.shape}")
+        if not np.isfinite(x).all():
+            raise ValueError(f"{name}: a number is not finite")
+    for section, parts in b.description.items():
+        for part in parts.values():
+            for field, x in part.items():
+                if not (_is_number(x) if field == "mass" else isinstance(x, str) or _are_numbers(x)):
+                    raise ValueError(f"{section}: {field}: expected numbers or text, got {x!r}")
+    if np.shape(moving_mass(b.description)[1]) != (3,):
+        raise ValueError("gravity: expected three numbers")
+    errors = [x for terms in b.errors.values() for x in terms.values()]
+    if not np.isfinite([*errors, b.rollout.dt]).all() or min([*errors, b.rollout.dt]) < 0:
+        raise ValueError("an error or the rollout's step is negative or not finite")
+
+
+def _are_numbers(x: object) -> bool:
+    return all(map(_is_number, x)) if isinstance(x, list) else _is_number(x)
+
+
+def _is_number(x: object) -> bool:
+    return isinstance(x, float) or (type(x) is int and abs(x) < 2**53)
 
 
 def _errors(t: Mapping[str, Any], engine: str) -> dict[str, float]:
@@ -136,6 +190,8 @@ def _read(term: str, value: Any, sizes: tuple[int, int], *, half: bool) -> Array
     if isinstance(value, list):
         return np.array(value, dtype=np.float64)
     if isinstance(value, float):
+        if value:
+            raise ValueError(f"{term}: expected rows of numbers or 0.0, got {value!r}")
         return np.zeros(_shape(term, sizes))
     if term == "M":
         return np.array([_matrix(list(rows.values()), half) for rows in value.values()])

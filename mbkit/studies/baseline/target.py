@@ -3,9 +3,27 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["kept", "resolved"]
+from mbkit.errors import InputError
+
+__all__ = ["checked_target", "kept", "resolved"]
+
+
+def checked_target(target: object, options: object = None) -> None:
+    """Refuse what a baseline cannot keep as a target, or as the options that it is loaded with."""
+    if not isinstance(target, str):
+        raise InputError(f"target: expected a text such as 'panda' or './arm.urdf', got {type(target).__name__}")
+    if options is None:
+        return
+    kept_kinds = (bool, int, float, str)
+    if not isinstance(options, Mapping) or not all(
+        isinstance(k, str)
+        and (isinstance(x, kept_kinds) or (isinstance(x, (list, tuple)) and all(isinstance(y, kept_kinds) for y in x)))
+        for k, x in options.items()
+    ):
+        raise InputError(f"options: expected keyword arguments of mbkit.load, of numbers and texts, got {options!r}")
 
 
 def kept(target: str, baseline: Path) -> str:

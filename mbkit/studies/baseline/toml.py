@@ -12,6 +12,8 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
+from mbkit._escape import json_text
+
 __all__ = ["dumps", "value"]
 
 _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
@@ -45,8 +47,11 @@ def _key(name: str) -> str:
 
 
 def _text(x: str) -> str:
-    # What JSON escapes, TOML reads alike; it wants one more character escaped.
-    return json.dumps(x, ensure_ascii=False).replace("\x7f", "\\u007f")
+    # What JSON escapes, TOML reads alike, but for characters of two units, which TOML writes as one.
+    return "".join(
+        f"\\U{ord(c):08x}" if ord(c) > 0xFFFF and not c.isprintable() else json_text(c)
+        for c in json.dumps(x, ensure_ascii=False)
+    )
 
 
 def value(x: Any) -> str:

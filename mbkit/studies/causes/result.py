@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
 from collections.abc import Iterable
@@ -12,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from mbkit._escape import html, markdown, one_line
 from mbkit.errors import OutputError
 from mbkit.studies.causes.matching import Match
 from mbkit.studies.causes.terms import Gap
@@ -157,29 +157,29 @@ class Explanation:
 
     def to_markdown(self) -> str:
         """Return verdict, causes and notes in Markdown."""
-        lines = [f"**{self.a} and {self.b}**: {self.verdict}", ""]
+        lines = [f"**{markdown(self.a)} and {markdown(self.b)}**: {markdown(self.verdict)}", ""]
         if self.causes:
             lines += ["| cause | what | effect |", "|---|---|---|"]
-            lines += [f"| {kind} | {says} | {what} |" for kind, says, what in grouped(self.causes)]
+            lines += [f"| {' | '.join(map(markdown, line))} |" for line in grouped(self.causes)]
             lines.append("")
-        lines += [f"- {note}" for note in self.notes]
+        lines += [f"- {markdown(note)}" for note in self.notes]
         return "\n".join(lines).rstrip() + "\n"
 
     def _repr_html_(self) -> str:
         cells = "".join(
-            f"<tr><td>{html.escape(kind)}</td><td>{html.escape(says)}</td><td>{what}</td></tr>"
+            f"<tr><td>{html(kind)}</td><td>{html(says)}</td><td>{html(what)}</td></tr>"
             for kind, says, what in grouped(self.causes)
         )
         head = "".join(f"<th>{h}</th>" for h in ("cause", "what", "effect"))
-        notes = "".join(f"<li>{html.escape(n)}</li>" for n in self.notes)
+        notes = "".join(f"<li>{html(n)}</li>" for n in self.notes)
         return (
-            f"<p><b>{html.escape(self.a)} and {html.escape(self.b)}</b>: {html.escape(self.verdict)}</p>"
+            f"<p><b>{html(self.a)} and {html(self.b)}</b>: {html(self.verdict)}</p>"
             + (f"<table><tr>{head}</tr>{cells}</table>" if cells else "")
             + (f"<ul>{notes}</ul>" if notes else "")
         )
 
     def __repr__(self) -> str:
-        return f"<Explanation: {self.verdict}>"
+        return f"<Explanation: {one_line(self.verdict)}>"
 
 
 def _counted(n: int, what: str) -> str:

@@ -104,7 +104,7 @@ def compare_parsers(
                 refused[engine] = str(error)
     parsed |= {engine: Parsed(engine, _version(engine), why) for engine, why in refused.items()}
     return ParserComparison(
-        source=str(stripped.path),
+        source=os.fspath(source),
         format=stripped.format,
         floating_base=floating_base,
         reference=label,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import html
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from mbkit._escape import html, markdown, one_line
 from mbkit.studies.causes.result import Explanation, grouped, saved
 
 __all__ = ["DECIDING", "TERMS", "Parsed", "ParserComparison", "Stage"]
@@ -158,28 +158,28 @@ class ParserComparison:
     def to_markdown(self) -> str:
         """Return the stages as a table, and the causes, in Markdown."""
         read = [p for p in self.importers if p.stages]
-        lines = [f"**{self.source}**: {self.verdict}", ""]
+        lines = [f"**{markdown(self.source)}**: {markdown(self.verdict)}", ""]
         if read:
             lines += [f"| stage | {' | '.join(p.engine for p in read)} |", "|---" * (len(read) + 1) + "|"]
             for k, stage in enumerate(read[0].stages):
-                lines.append(f"| {stage.name} | {' | '.join(cell(p.stages[k]) for p in read)} |")
+                lines.append(f"| {stage.name} | {' | '.join(markdown(cell(p.stages[k])) for p in read)} |")
             lines.append("")
         for p in self.importers:
             if p.refused:
-                lines.append(f"- {p.engine} refuses: {p.refused}")
+                lines.append(f"- {p.engine} refuses: {markdown(p.refused)}")
             if not p.refused and not p.stages:
                 lines.append(f"- {p.engine} reads it{', and is the reference' if p.engine == self.reference else ''}")
             for kind, says, what in grouped(p.explanation.causes) if p.explanation else ():
-                lines.append(f"- {kind}: {says} ({what})")
-            lines += [f"- {p.engine}: {note}" for note in p.notes]
-        lines += [f"- {note}" for note in (*self.notes, *([self.faults] if self.faults else []))]
+                lines.append(f"- {markdown(f'{kind}: {says} ({what})')}")
+            lines += [f"- {p.engine}: {markdown(note)}" for note in p.notes]
+        lines += [f"- {markdown(note)}" for note in (*self.notes, *([self.faults] if self.faults else []))]
         return "\n".join(lines).rstrip() + "\n"
 
     def _repr_html_(self) -> str:
         read = [p for p in self.importers if p.stages]
         head = "".join(f"<th>{h}</th>" for h in ("stage", *(p.engine for p in read)))
         rows = "".join(
-            f"<tr><td>{stage.name}</td>{''.join(f'<td>{html.escape(cell(p.stages[k]))}</td>' for p in read)}</tr>"
+            f"<tr><td>{stage.name}</td>{''.join(f'<td>{html(cell(p.stages[k]))}</td>' for p in read)}</tr>"
             for k, stage in enumerate(read[0].stages if read else ())
         )
         told = [f"{p.engine} refuses: {p.refused}" for p in self.importers if p.refused]
@@ -189,14 +189,13 @@ class ParserComparison:
             if p.explanation
             for kind, says, what in grouped(p.explanation.causes)
         ]
-        items = "".join(f"<li>{html.escape(x)}</li>" for x in told)
-        return (
-            f"<p><b>{html.escape(self.source)}</b>: {html.escape(self.verdict)}</p>"
-            f"<table><tr>{head}</tr>{rows}</table>" + (f"<ul>{items}</ul>" if items else "")
+        items = "".join(f"<li>{html(x)}</li>" for x in told)
+        return f"<p><b>{html(self.source)}</b>: {html(self.verdict)}</p><table><tr>{head}</tr>{rows}</table>" + (
+            f"<ul>{items}</ul>" if items else ""
         )
 
     def __repr__(self) -> str:
-        return f"<ParserComparison of {self.source!r}: {self.verdict}>"
+        return f"<ParserComparison of {self.source!r}: {one_line(self.verdict)}>"
 
 
 def cell(stage: Stage) -> str:

@@ -11,8 +11,9 @@ import math
 import re
 from typing import TYPE_CHECKING, Final
 
+from mbkit._escape import one_line
 from mbkit.errors import UnknownNameError
-from mbkit.studies.drawing import PLAIN, Palette, engine_mark, one_line, style
+from mbkit.studies.drawing import PLAIN, Palette, engine_mark, style
 from mbkit.studies.stress.reading import Line, best, engines_of, lines, name_of, place, recommended
 from mbkit.studies.stress.result import CaseResult, Cell, Outcome, StressResult
 

@@ -131,8 +131,9 @@ def best(case: CaseResult) -> dict[str, Line]:
 
 
 def recommended(case: CaseResult) -> Line | None:
-    """Return mbkit's own choice of method, on the engine where it held furthest, if it was asked."""
-    return next((x for x in lines(case) if x.row.method == RECOMMENDED and x.row.engine in _OWN), None)
+    """Return mbkit's own choice of method, on the engine where it held furthest, if it was run."""
+    own = (x for x in lines(case) if x.row.method == RECOMMENDED and x.row.engine in _OWN)
+    return next((x for x in own if not x.left_out), None)
 
 
 def furthest(case: CaseResult) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import io
 import json
 import math
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from mbkit._check import real
+from mbkit._escape import csv_text, html, markdown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies.plain import cell as number
 from mbkit.studies.plain import plain, remade, write
@@ -355,9 +355,10 @@ class StressResult:
         writer.writerow((*head, "error", "floor", "energy", "seconds", "steps", "warnings", "note"))
         for case, row in self.rows():
             for c in row.cells:
-                about = (case.name, case.parameter, case.unit, number(c.value), row.engine, row.method, row.setting)
+                about = (*map(csv_text, (case.name, case.parameter, case.unit)), number(c.value))
+                about += (*map(csv_text, (row.engine, row.method, row.setting)),)
                 numbers = (c.error, c.floor, c.energy, c.seconds)
-                told = (c.steps, "; ".join(c.warnings), c.note)
+                told = (c.steps, csv_text("; ".join(c.warnings)), csv_text(c.note))
                 writer.writerow((*about, c.outcome(case.bar), c.end, *map(number, numbers), *told))
         if path is not None:
             write(path, stream.getvalue())
@@ -367,14 +368,15 @@ class StressResult:
         """Return a table per case of how far each engine and method held, the furthest first."""
         lines: list[str] = []
         for case in self.cases:
-            unit = f" {case.unit}" if case.unit else ""
-            lines += [f"**{case.name}**: {case.about} Held: error ≤ {case.bar:g}.", ""]
+            unit = f" {markdown(case.unit)}" if case.unit else ""
+            lines += [f"**{markdown(case.name)}**: {markdown(case.about)} Held: error ≤ {case.bar:g}.", ""]
             lines += [f"| engine | method | setting | held to{unit} | then | how |", "|---|---|---|---:|---:|---|"]
             for row in sorted(case.rows, key=lambda row: -row.reach(case.bar)):
                 broken = row.breaking(case.bar)
                 told = ["none" if broken.held is None else f"{broken.held:g}"]
-                told += ["" if broken.failed is None else f"{broken.failed:g}", broken.how]
-                lines.append(f"| {row.engine} | {row.method} | {row.setting} | {' | '.join(told)} |")
+                told += ["" if broken.failed is None else f"{broken.failed:g}", markdown(broken.how)]
+                about = " | ".join(map(markdown, (row.engine, row.method, row.setting)))
+                lines.append(f"| {about} | {' | '.join(told)} |")
             lines.append("")
         lines += [] if self.complete else ["Interrupted: this is what was finished.", ""]
         return "\n".join(lines)
@@ -397,7 +399,7 @@ class StressResult:
         for b in self.breaking():
             held, failed = ("" if x is None else f"{x:g}" for x in (b.held, b.failed))
             told = (b.case, b.engine, b.method, b.setting, held or "none", failed, b.how)
-            rows.append("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in told) + "</tr>")
+            rows.append("<tr>" + "".join(f"<td>{html(x)}</td>" for x in told) + "</tr>")
         head = "".join(f"<th>{x}</th>" for x in ("case", "engine", "method", "setting", "held to", "then", "how"))
         return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
 

@@ -1,0 +1,174 @@
+"""Ctrl-C in a command: one line, status 130, at once, whatever is under way.
+
+Python raises KeyboardInterrupt in its main thread when that is back from a library, and libraries may swallow it, print
+it, or report it as a failure of their own. So a thread listens too. A command with nothing to keep says that it was
+interrupted, is silent from then on, has `GRACE` seconds to close its files, and ends. A study that can be shown in part
+says so with `keeping`: there the first Ctrl-C is a KeyboardInterrupt, and the second ends the command.
+
+Only the light modules of Python's own are imported here, because the entry point installs this before anything else.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["GRACE", "INTERRUPTED", "at_end", "ending", "held", "keeping", "raise_again", "received"]
+
+#: Exit status of an interrupted command.
+INTERRUPTED = 130
+#: Seconds in which an interrupted command may close its files.
+GRACE = 0.3
+#: Seconds that the main thread has for what it does at Ctrl-C.
+_PATIENCE = 0.05
+_LINE = b"interrupted: the command did not finish\n"
+#: To the line's beginning, clear it, and show the cursor that a progress bar hides.
+_CLEAR = b"\r\x1b[2K\x1b[?25h"
+
+
+class Section:
+    """A part of a command to which Ctrl-C is special; used by ``with``, and may stand in another of its kind."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+
+    def __enter__(self) -> Section:
+        self.depth += 1
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.depth -= 1
+        if _interrupts.pending and not held.depth:
+            _interrupts.pending = False
+            raise KeyboardInterrupt
+
+
+class _Interrupts:
+    """What has happened so far.
+
+    Attributes
+    ----------
+    heard, count : int
+        How often Ctrl-C has come, and how often the main thread knows of.
+    pending : bool
+        Whether it came while a file was written, and is still to be raised.
+    ending : bool
+        Whether the command has said that it was interrupted.
+    """
+
+    def __init__(self) -> None:
+        self.heard = self.count = 0
+        self.pending = self.ending = False
+        # A signal handler may come upon itself.
+        self.lock = threading.RLock()
+        self.at_end: set[Callable[[], object]] = set()
+
+
+#: A file is being written, which is brought to its end first.
+held = Section()
+#: What is finished will be shown and written: the first Ctrl-C raises KeyboardInterrupt, and the caller goes on.
+keeping = Section()
+_interrupts = _Interrupts()
+
+
+def _install() -> None:
+    """Listen to Ctrl-C in this process, unless whoever started it has it ignored or listens already."""
+    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
+        return
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return
+    listening, told = os.pipe()
+    os.set_blocking(told, False)
+    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    signal.signal(signal.SIGINT, _raise)
+    threading.Thread(target=_listen, args=(listening,), name="mbkit Ctrl-C", daemon=True).start()
+
+
+def received() -> bool:
+    """Return whether Ctrl-C has come."""
+    return _interrupts.count > 0
+
+
+def raise_again() -> None:
+    """Raise KeyboardInterrupt where Ctrl-C has come and a library has swallowed it."""
+    if _interrupts.count:
+        raise KeyboardInterrupt
+
+
+def at_end(action: Callable[[], object], *, remove: bool = False) -> None:
+    """Call a function, such as one that ends a process, when an interrupted command ends; or no longer."""
+    (_interrupts.at_end.discard if remove else _interrupts.at_end.add)(action)
+
+
+def _listen(listening: int) -> None:
+    """Do in a thread what the main thread does not come to, because it is in a library."""
+    while True:
+        _interrupts.heard += os.read(listening, 64).count(signal.SIGINT)
+        time.sleep(_PATIENCE)
+        if _interrupts.count < _interrupts.heard and (not keeping.depth or _interrupts.heard > 1):
+            _begin_end()
+
+
+def _begin_end() -> None:
+    """Say that the command was interrupted, be silent, and end it when the main thread has not in time."""
+    with _interrupts.lock:
+        if _interrupts.ending:
+            return
+        _interrupts.ending = True
+        os.write(2, _CLEAR + _LINE if os.isatty(2) else _LINE)
+        # Libraries report an interruption as a failure of theirs.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        threading.Thread(target=_end_later, daemon=True).start()
+
+
+def _end_later() -> None:
+    time.sleep(GRACE)
+    while held.depth:
+        time.sleep(0.01)
+    _end()
+
+
+def _end() -> None:
+    """End this process and those that it started."""
+    for action in list(_interrupts.at_end):
+        action()
+    if "multiprocessing" in sys.modules:
+        import multiprocessing
+
+        for process in multiprocessing.active_children():
+            process.kill()
+    os._exit(INTERRUPTED)
+
+
+def _raise(*_: object) -> None:
+    _interrupts.count = max(_interrupts.count + 1, _interrupts.heard)
+    if not keeping.depth or _interrupts.count > 1:
+        _begin_end()
+    if held.depth:
+        _interrupts.pending = True
+    else:
+        raise KeyboardInterrupt
+
+
+class _Ending:
+    """Listens to Ctrl-C, and ends the process with the status of an interrupted command where that came."""
+
+    def __enter__(self) -> None:
+        _install()
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if isinstance(kind, type) and issubclass(kind, KeyboardInterrupt):
+            _begin_end()
+        if _interrupts.ending:
+            _end()
+
+
+#: Around all that the entry point does.
+ending = _Ending()
