@@ -62,7 +62,7 @@ class PinocchioDynamics(Dynamics):
         m, d = self._m, self._d
         bare: dict[str, Callable[..., Any]] = {name: getattr(self, f"_one_{name}") for name in _SHORT}
         # What is mixed by G_q q spreads a NaN to every coordinate.
-        unread: tuple[int, ...] = ()
+        unread: dict[str, tuple[int, ...]] = {}
         if self._direct:
             unread, velocities_unread = unread_coordinates(m, d, self.model.neutral())
             if velocities_unread:
