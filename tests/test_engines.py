@@ -16,6 +16,7 @@ import mbkit as mb
 from mbkit.engines import ENGINES, QUANTITIES, Dynamics
 from mbkit.errors import InputError, MbkitError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import kind_of
+from mbkit.model.kinds import KINDS
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
 
 VECTORS = {
@@ -465,6 +466,29 @@ def test_what_an_engine_cannot_do_has_a_reason():
         mb.dynamics(model).function("nle")
     with pytest.raises(UnsupportedError, match="'j0' is helical"):
         mb.dynamics(random_tree(0, 1, ("helical",)), "mujoco")
+
+
+class Odd(type(KINDS["revolute"])):
+    """A joint type that no adapter has a counterpart of."""
+
+    name = "odd"
+
+
+def test_a_joint_type_that_an_engine_does_not_have_is_named(monkeypatch):
+    monkeypatch.setitem(KINDS, "odd", Odd())
+    b = mb.ModelBuilder("arm")
+    b.add_body("a", mass=1.0, com=(0, 0, 1))
+    b.add_joint("hinge", "odd", parent="world", child="a", axis=(0, 1, 0))
+    model = b.build()
+    others = [name for name in ENGINES if name not in ("lagrangian", "oracle")]
+    for engine in others:
+        with pytest.raises(UnsupportedError, match=f"{engine}: joint 'hinge' is odd"):
+            mb.dynamics(model, engine)
+    # The own derivation reads the type's formulas.
+    assert mb.dynamics(model, "lagrangian").gravity([0.3]) == pytest.approx(-9.81 * np.sin(0.3))
+    result = mb.compare(model, ("lagrangian", *others), samples=1, terms_only=True)
+    assert [r.engine for r in result.refusals] == others
+    assert all("'hinge' is odd" in r.reason for r in result.refusals)
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))

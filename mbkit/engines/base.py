@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.model import Model
+from mbkit.model import Joint, Model
 
-__all__ = ["QUANTITIES", "Dynamics"]
+__all__ = ["QUANTITIES", "Dynamics", "per_sample", "unknown_joint"]
 
 QUANTITIES: Final = (
     "mass_matrix",
@@ -330,6 +330,14 @@ class Dynamics(ABC):
     @staticmethod
     def _scalar(value: Array) -> Any:
         return float(value) if value.ndim == 0 else value
+
+
+def unknown_joint(engine: str, joint: Joint) -> UnsupportedError:
+    """Return the error for a joint of a type that an adapter has no counterpart of."""
+    return UnsupportedError(
+        f"{engine}: joint {joint.name!r} is {joint.kind}, a type that this engine does not have; "
+        "the lagrangian engine takes every joint type"
+    )
 
 
 def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:

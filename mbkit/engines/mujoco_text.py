@@ -15,7 +15,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines.import_mujoco import ImportedMujoco
 from mbkit.engines.mujoco_api import heard_warnings
-from mbkit.engines.mujoco_model import Placed, mapped, specified
+from mbkit.engines.mujoco_model import JOINT_TYPES, Placed, mapped, specified
 from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 
@@ -85,8 +85,8 @@ def read_back(model: Model, text: str) -> ImportedMujoco:
 def _unsayable(model: Model) -> Iterator[str]:
     for joint in model.joints:
         who = f"joint {joint.name!r}"
-        if joint.kind == "helical":
-            yield f"{who} is helical"
+        if joint.kind not in JOINT_TYPES:
+            yield f"{who} is {joint.kind}"
         parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
         if any(np.ptp(x) > 0 for x in parts):
             yield f"{who} is damped differently along its body axes"
