@@ -559,3 +559,28 @@ def test_a_point_spring_of_no_length_pulls_and_does_not_divide_by_zero():
         assert dyn.passive([0.0], [0.0]) == pytest.approx([0.0])
         assert dyn.passive([0.5], [0.0]) == pytest.approx([-3.5])
         assert dyn.potential_energy([0.5]) == pytest.approx(7 * 0.125)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("axes", [1, 3])
+@pytest.mark.parametrize("spring", [{"damping": 0.5}, {"stiffness": 7.0, "rest_length": 0.2}])
+def test_a_spring_that_needs_a_direction_is_refused_where_it_has_none(way, axes, spring):
+    """Beside that pose the force has different limits along different ways, so no number is right there."""
+    b = mb.ModelBuilder("tether")
+    parents = ["world", "x", "y"]
+    for name, axis, parent in zip("xyz"[-axes:], np.eye(3)[-axes:], ["world", *parents[4 - axes :]], strict=True):
+        b.add_body(name, mass=float(name == "z"))
+        b.add_joint(f"along {name}", "prismatic", parent=parent, child=name, axis=axis)
+    b.add_spring("s", body_a="world", body_b="z", **spring)
+    dyn = made_by(b.build(), way)
+    zero, one = np.zeros(axes), np.ones(axes)
+    for quantity, *rest in (("passive", one), ("inverse_dynamics", one, one), ("forward_dynamics", one, one)):
+        with pytest.raises(NumericalError, match=r"direction.*'s'"):
+            getattr(dyn, quantity)(zero, *rest)
+        assert np.isfinite(getattr(dyn, quantity)(1e-9 * one, *rest)).all()
+    if way != "drake":  # it refuses the energy there too
+        assert dyn.potential_energy(zero) == pytest.approx(0.5 * 7 * 0.2**2 * ("stiffness" in spring))
+    assert dyn.nle(zero, one)[-1] == pytest.approx(9.80665, rel=1e-3)
+    if way == "mujoco":
+        with pytest.raises(NumericalError, match="'s'"):
+            dyn.rollout("rk4", zero, one, 1e-3, None, 2)

@@ -322,9 +322,12 @@ class Dynamics(ABC):
         more = f" and {len(suspects) - 3} more" if len(suspects) > 3 else ""
         if suspects:
             return f"; suspect: {', '.join(suspects[:3])}{more}"
-        springs = [repr(s.name) for s in self.model.springs if s.rest_length or s.damping]
+        springs = [repr(s.name) for s in self.model.springs if s.needs_direction]
         if springs:
-            return f"; perhaps a point spring of no length there has no direction: {', '.join(springs[:3])}"
+            return (
+                f"; possible cause: a point spring with a damper or a rest length has no direction where "
+                f"its length is zero: {', '.join(springs[:3])}"
+            )
         return "; perhaps links without mass, or numbers so large that they overflow"
 
     @staticmethod
