@@ -67,7 +67,7 @@ def planar() -> LagrangianDynamics:
 @pytest.fixture
 def in_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(marching, "_ONE_PIECE", 0)
-    monkeypatch.setattr(rollout, "_PLANS", {})
+    monkeypatch.setattr(rollout, "_plan", marching.Plan)
 
 
 def start(dyn: LagrangianDynamics, n: int | None = None, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -187,7 +187,7 @@ def test_rollouts_in_stages_are_the_stepwise_runs(method: str, floating: Lagrang
     tau = np.random.default_rng(1).standard_normal((11, 50, floating.model.nv))
     run = simulate(floating, q, v, 0.05, method, torque=tau)
     assert_same(run, stepwise(floating, q, v, 0.05, method, torque=tau))
-    assert len(rollout._PLANS[floating.equations][method].parts) > 1
+    assert len(rollout._plan(floating, method).parts) > 1
 
 
 def test_robots_are_mujocos_rollouts() -> None:

@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import llvmlite
 from llvmlite import binding as llvm
+from llvmlite.binding.newpassmanagers import NewPassManager
 
 from mbkit.derivation.batch_code import MOST_ARRAYS, RUN, batch_code
 from mbkit.derivation.program import Program
@@ -80,7 +81,14 @@ def object_code(text: str) -> bytes:
     with _LOCK.held:
         module, target = llvm.parse_assembly(text), _target()
         builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
-        builder.getModulePassManager().run(module, builder)
+        passes = builder.getModulePassManager()
+        try:
+            passes.run(module, builder)
+        finally:
+            # llvmlite 0.50 frees none: the empty method of its base class comes before the one that does.
+            if type(passes)._dispose is llvm.ffi.ObjectRef._dispose:
+                NewPassManager._dispose(passes)
+            passes.close()
         return bytes(target.emit_object(module))
 
 

@@ -20,7 +20,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -49,6 +48,10 @@ _SAME: Final = (
     *("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
     *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
 )
+#: heyoka's default limit of the machine code that it keeps in memory, bytes, and the one that replaces it:
+#: enough for some hundred systems.
+_HEYOKAS_MEMORY: Final = 2**31
+_MEMORY: Final = 2**26
 _REMEDY: Final = "method='rk853' and method='dop853' go without it"
 
 
@@ -117,6 +120,8 @@ def _heyoka() -> Any:
             "taylor: heyoka is not installed; pip install heyoka (Linux), or conda install -c conda-forge heyoka.py; "
             + _REMEDY
         ) from None
+    if heyoka.llvm_state.get_memcache_limit() == _HEYOKAS_MEMORY:
+        heyoka.llvm_state.set_memcache_limit(_MEMORY)
     return heyoka
 
 
@@ -257,14 +262,12 @@ class TaylorSystem:
                 integrator.pars[place] = arguments[which - 2][at]
 
 
-_SYSTEMS: Final[WeakKeyDictionary[Equations, TaylorSystem]] = WeakKeyDictionary()
-
-
 def taylor_system(equations: Equations) -> TaylorSystem:
     """Return the Taylor system of equations, made once for all dynamics that share them."""
-    if equations not in _SYSTEMS:
-        _SYSTEMS[equations] = TaylorSystem(equations)
-    return _SYSTEMS[equations]
+    if "taylor" not in equations.kept:
+        equations.kept["taylor"] = TaylorSystem(equations)
+    made: TaylorSystem = equations.kept["taylor"]
+    return made
 
 
 def _functions(heyoka: Any) -> dict[str, Any]:
