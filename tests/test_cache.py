@@ -23,7 +23,7 @@ from tests.random_trees import random_tree, states
 def folder(tmp_path, monkeypatch):
     """A cache of this test's own, and a process that holds no functions."""
     monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(module._HELD, "functions", {})
+    monkeypatch.setattr(module, "_HELD", {})
     module._batch_object.cache_clear()
     yield tmp_path / "cache"
     module._batch_object.cache_clear()
@@ -34,7 +34,7 @@ MODEL = mb.catalog.double_pendulum()
 
 def evaluated(*, derives: bool) -> np.ndarray:
     """Return inverse dynamics from a new engine, and see whether it derived anything."""
-    module._HELD.functions.clear()
+    module._HELD.clear()
     module._batch_object.cache_clear()
     dyn = mb.dynamics(MODEL, "lagrangian", compile=True)
     q, v, a, _ = states(MODEL, 4)

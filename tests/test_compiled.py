@@ -382,28 +382,42 @@ def test_a_far_angle_leaves_its_neighbours_as_they_are():
     np.testing.assert_array_equal(code(far)[0][near], alone[near])
 
 
-@pytest.mark.parametrize("to_code", [True, False])
-def test_a_child_forked_during_another_threads_call_computes(to_code):
+def _compile_anew() -> None:
+    x = ca.SX.sym("x", 40)
+    built(ca.Function("sums", [x], [ca.densify(ca.sin(x) * ca.cumsum(x))]))
+
+
+@pytest.mark.parametrize("work", ["compiling", "compiled", "interpreted", "mujoco", "drake"])
+def test_a_child_forked_during_another_threads_work_computes(work):
     if "fork" not in multiprocessing.get_all_start_methods():
         pytest.skip("this system does not fork")
     model = mb.load("panda")
-    dyn = mb.dynamics(model, "lagrangian", compile=to_code)
+    if work in ("mujoco", "drake"):
+        pytest.importorskip("pydrake" if work == "drake" else "mujoco")
+        dyn = mb.dynamics(model, work)
+    else:
+        dyn = mb.dynamics(model, "lagrangian", compile=work != "interpreted")
     q, v, _, _ = states(model, 1)
     expected = dyn.nle(q[0], v[0])
     done = threading.Event()
 
     def calls() -> None:
         while not done.is_set():
-            dyn.nle(q[0], v[0])
+            _compile_anew() if work == "compiling" else dyn.nle(q, v)
+
+    def compute() -> None:
+        if work == "compiling":
+            _compile_anew()
+        np.testing.assert_array_equal(dyn.nle(q[0], v[0]), expected)
 
     other = threading.Thread(target=calls)
     other.start()
     context = multiprocessing.get_context("fork")
     try:
-        for _ in range(30):
+        for _ in range(12):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)
-                child = context.Process(target=lambda: np.testing.assert_array_equal(dyn.nle(q[0], v[0]), expected))
+                child = context.Process(target=compute)
                 child.start()
             child.join(30)
             if child.exitcode is None:

@@ -342,7 +342,7 @@ def test_a_model_that_cannot_move_says_who_is_to_blame() -> None:
     b.add_joint("plane", "planar", parent="world", child="mass")
     b.add_spring("string", body_a="world", body_b="mass", stiffness=1.0, rest_length=0.5)
     dyn = dynamics(b.build(), "lagrangian", compile=True)
-    with pytest.warns(MbkitWarning, match="point spring of no length there has no direction: 'string'"):
+    with pytest.warns(MbkitWarning, match=r"point spring.*direction.*'string'"):
         run = simulate(dyn, np.zeros(3), np.zeros(3), 0.1)
     assert run.stats.reached == 0.0
     assert run.q.shape == (1, 3)

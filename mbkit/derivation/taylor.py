@@ -25,6 +25,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._fork import fork_safe
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.program import Operation, program
@@ -52,6 +53,8 @@ _SAME: Final = (
 #: enough for some hundred systems.
 _HEYOKAS_MEMORY: Final = 2**31
 _MEMORY: Final = 2**26
+#: heyoka's compiler has locks of its own, which a forked child must not find held.
+_COMPILING: Final = fork_safe(threading.RLock())
 _REMEDY: Final = "method='rk853' and method='dop853' go without it"
 
 
@@ -196,7 +199,6 @@ class TaylorSystem:
         variables = [variables] if self._nq + self._nv == 1 else list(variables)
         self._system = list(zip(variables, self._expressions(heyoka, made, variables, equations.model), strict=True))
         self._idle: dict[tuple[int, int], list[Any]] = {}
-        self._lock = threading.Lock()
 
     def _expressions(self, heyoka: Any, made: Any, variables: list[Any], model: Model) -> list[Any]:
         functions = _functions(heyoka)
@@ -229,31 +231,31 @@ class TaylorSystem:
         when there is none to lend; heyoka keeps what it compiled in memory and on disk.
         """
         key = (kind.bits, order_of(tolerance))
-        with self._lock:
-            idle = self._idle.setdefault(key, [])
-            made = idle.pop() if idle else None
-        if made is None:
+        idle = self._idle.setdefault(key, [])
+        try:
+            made = idle.pop()
+        except IndexError:
             made = self._compiled(kind, tolerance)
         yield made
         # One whose run ended in an error is not lent again.
-        with self._lock:
-            idle.append(made)
+        idle.append(made)
 
     def _compiled(self, kind: Precision, tolerance: float) -> Any:
         n = self._nq + self._nv
         # Beyond double the arithmetic itself takes so long that loops cost nothing.
         compact = kind.bits > 53 or self.operations * order_of(tolerance) ** 2 > _UNROLLED
-        return _heyoka().taylor_adaptive(
-            self._system,
-            np.zeros(n).astype(kind.dtype),
-            pars=np.zeros(len(self._places)).astype(kind.dtype),
-            tol=kind.dtype(max(tolerance, kind.eps)),
-            fp_type=float if kind.bits == 53 else kind.dtype,
-            compact_mode=compact,
-            # In loops more optimization takes half as long again, and gains nothing; where every
-            # operation is a call, any takes three times as long.
-            opt_level=0 if kind.bits == 113 else 1 if compact else 3,
-        )
+        with _COMPILING:
+            return _heyoka().taylor_adaptive(
+                self._system,
+                np.zeros(n).astype(kind.dtype),
+                pars=np.zeros(len(self._places)).astype(kind.dtype),
+                tol=kind.dtype(max(tolerance, kind.eps)),
+                fp_type=float if kind.bits == 53 else kind.dtype,
+                compact_mode=compact,
+                # In loops more optimization takes half as long again, and gains nothing; where every
+                # operation is a call, any takes three times as long.
+                opt_level=0 if kind.bits == 113 else 1 if compact else 3,
+            )
 
     def fill(self, integrator: Any, *arguments: Any) -> None:
         """Write tau, and what else stands behind (q, v), into an integrator's parameters."""

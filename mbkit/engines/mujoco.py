@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, real
+from mbkit._fork import fork_safe
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel, build
@@ -55,7 +56,7 @@ class MujocoDynamics(Dynamics):
         self._reduced = model.layout.reduced
         #: Tendons of the point springs that need a direction.
         self._lines = [k for k, spring in enumerate(model.springs) if spring.needs_direction]
-        self._lock = threading.RLock()
+        self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
         # One MjData and one handler of warnings: two threads in here end the process.
