@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,25 @@ def test_a_link_and_another_users_file_are_not_followed(folder):
         evaluated(derives=True)
         os.chown(folder, 65534, 65534)
         assert cache.folder() is None
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_in_the_place_of_an_entry_is_replaced_and_not_waited_for(folder):
+    first = evaluated(derives=True)
+    names = sorted(path.name for path in folder.iterdir())
+    for name in names:
+        (folder / name).unlink()
+        os.mkfifo(folder / name, 0o600)
+    with ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(evaluated, derives=True)
+        try:
+            np.testing.assert_array_equal(reading.result(60), first)
+        finally:
+            # A reader that waits gets the end of the file.
+            for name in names:
+                with suppress(OSError):
+                    os.close(os.open(folder / name, os.O_WRONLY | os.O_NONBLOCK))
+    assert sorted(path.name for path in folder.iterdir() if path.is_file()) == names
 
 
 def test_a_folder_that_others_may_enter_is_closed(folder):
