@@ -70,14 +70,16 @@ def _target() -> Any:
 
 def object_code(text: str) -> bytes:
     """Return the object file of LLVM's textual code."""
-    with COMPILING:
-        module, target = llvm.parse_assembly(text), _target()
+    # LLVM keeps the constants and types of what it compiles as long as the context, of which a global one
+    # would grow for ever.
+    with COMPILING, llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
+        target = _target()
         builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
         passes = builder.getModulePassManager()
         try:
             passes.run(module, builder)
         finally:
-            # llvmlite 0.50 frees none: the empty method of its base class comes before the one that does.
+            # llvmlite 0.50 frees no pass manager: ObjectRef's empty _dispose hides NewPassManager's.
             if type(passes)._dispose is llvm.ffi.ObjectRef._dispose:
                 NewPassManager._dispose(passes)
             passes.close()
