@@ -13,7 +13,7 @@ from mbkit.errors import InputError
 Array = NDArray[np.float64]
 _FEW: Final = 64
 
-__all__ = ["Array", "all_finite", "batch_of", "count", "finite_array", "real", "require_finite", "rows"]
+__all__ = ["Array", "all_finite", "batch_of", "count", "finite_array", "generator", "real", "require_finite", "rows"]
 
 
 def all_finite(array: Array) -> bool:
@@ -86,6 +86,15 @@ def count(name: str, value: Any, *, least: int = 0) -> int:
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < least:
         raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
     return int(value)
+
+
+def generator(name: str, value: Any) -> np.random.Generator:
+    """Return a random generator; a whole number is the seed of one."""
+    if isinstance(value, np.random.Generator):
+        return value
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
+        return np.random.default_rng(int(value))
+    raise InputError(f"{name}: expected a numpy Generator or a seed of at least 0, got {value!r}")
 
 
 def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = False) -> float:

@@ -131,8 +131,10 @@ def test_random_states_repeat_and_have_the_asked_shape():
         assert v.shape == (*lead, model.nv)
     first, again = (model.random_state(np.random.default_rng(5), 3) for _ in range(2))
     assert np.array_equal(first[0], again[0])
-    with pytest.raises(InputError, match="Generator"):
-        model.random_state(0)
+    assert np.array_equal(model.random_state(5, 3)[0], first[0]), "a seed stands for its generator"
+    for wrong in (None, -1, 1.0, "five", True):
+        with pytest.raises(InputError, match="rng"):
+            model.random_state(wrong)
     with pytest.raises(InputError, match="size"):
         model.random_state(np.random.default_rng(0), -1)
 

@@ -138,3 +138,32 @@ def test_the_same_inputs_give_the_same_bits(method: str) -> None:
     model, q, v, _ = cases()["free body"]
     runs = [simulate(dynamics(model, "mujoco"), q, v, 0.05, method).q for _ in range(2)]
     assert np.array_equal(*runs)
+
+
+@pytest.mark.parametrize("method", NATIVE)
+def test_a_run_is_interrupted_between_its_parts_and_does_not_depend_on_them(
+    monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    """MuJoCo's own loop ignores Ctrl-C; it is left after a tenth of a second."""
+    dyn = dynamics(catalog.double_pendulum(), "mujoco")
+    start = [[0.6, -0.3], [1.0, 2.0]], [[0.2, 0.5], [0.0, 0.0]]
+    torque = np.sin(np.arange(100.0)[:, None] * [0.1, 0.2])
+    runs = []
+    for period in (0.0, 1e9):
+        monkeypatch.setattr("mbkit.engines.mujoco_rollout._PERIOD", period)
+        runs.append(simulate(dyn, *start, 0.1, method, torque=torque))
+    assert np.array_equal(runs[0].q, runs[1].q)
+    assert np.array_equal(runs[0].v, runs[1].v)
+
+    seen: list[float] = []
+
+    def interrupt(fraction: float) -> None:
+        seen.append(fraction)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mbkit.engines.mujoco_rollout._PERIOD", 0.0)
+    monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(dyn, *start, 1.0, method, progress=interrupt)
+    assert len(seen) == 1
+    assert seen[0] < 0.1

@@ -233,6 +233,40 @@ def test_every_method_runs_it(make, method):
     assert np.abs(run.q.T - truth[: len(q)]).max() < bound
 
 
+@pytest.mark.parametrize("method", [*METHODS, "auto", "rodas5", "semi_implicit_euler", "gauss4"])
+def test_a_run_goes_on_from_its_middle(method):
+    """Started again at 0.1 s from its own state, a run under a force of the time moves as it did."""
+    dyn, q, v, _ = solved(driven)
+    fixed = METHODS_OF[method].kind == "fixed"
+    setting = {"dt": 1e-3} if fixed else {"rtol": {"bdf": 1e-9, "cvodes": 1e-10, "radau": 1e-9}.get(method, 1e-12)}
+    whole = mb.simulate(dyn, q, v, 0.3, method, save=SAVE, **setting)
+    rest = mb.simulate(dyn, whole.q[1], whole.v[1], 0.2, method, save=SAVE[1:], t0=0.1, **setting)
+    assert rest.t == pytest.approx(SAVE[1:], abs=2 * EPS)
+    bound = 1e-12 if fixed else {"bdf": 1e-6, "cvodes": 1e-6, "radau": 1e-7}.get(method, 1e-8)
+    assert np.abs(rest.q[-1] - whole.q[-1]).max() < bound
+    assert np.abs(rest.energy() - whole.energy()[1:]).max() < 1e3 * bound
+    # The drive turns several times a second: a start at 0 s is another motion.
+    other = mb.simulate(dyn, whole.q[1], whole.v[1], 0.2, method, save=[0.0, 0.2], **setting)
+    assert np.abs(other.q[-1] - whole.q[-1]).max() > 1e-3
+    held = mb.simulate(dyn.at(t=0.1), whole.q[1], whole.v[1], 0.2, method, save=SAVE[1:], **setting)
+    assert np.array_equal(held.q, rest.q), "a run starts at the time that the dynamics holds"
+
+
+def test_the_oracle_starts_at_its_time():
+    dyn, q, v, _ = solved(driven)
+    own = mb.dynamics(dyn.model, "oracle")
+    near = mb.simulate(dyn, q, v, 0.2, "taylor", rtol=1e-15, save=[0.1, 0.3], t0=0.1)
+    far = mb.simulate(own.at(t=0.1), q, v, 0.2, "taylor", rtol=1e-25, save=[0.1, 0.3])
+    assert np.abs(near.q - far.q).max() < 1e-13
+
+
+def test_samples_at_different_times_need_a_start_time():
+    dyn, q, v, _ = solved(driven)
+    several = dyn.at(t=np.array([0.0, 1.0]))
+    with pytest.raises(InputError, match=r"^t0: .*2 different values of t"):
+        mb.simulate(several, q, v, 0.1, "rk4")
+
+
 def test_the_midpoint_rule_in_time_is_symplectic():
     """Area in (q, p) is kept over 20 steps; p = M v + b, so that of (q, v) at the start is M times as large."""
     lag = driven()

@@ -235,7 +235,7 @@ def test_runs_of_nothing(planar: LagrangianDynamics) -> None:
 
 
 def outcome(dyn: LagrangianDynamics, q: np.ndarray, v: np.ndarray, workers: int, steps: int = 40) -> Any:
-    grid = Grid.of(steps * 1e-3, 1e-3)
+    grid = Grid.of(0.0, steps * 1e-3, 1e-3)
     tau = Torque(np.linspace(-1, 1, len(q) * steps * dyn.model.nv).reshape(len(q), steps, -1), dyn.model, len(q), steps)
     with Progress(None, "") as bar:
         return rollout.run_rollout(dyn, "rk4", q, v, grid, np.arange(0, steps + 1), tau, bar, workers)

@@ -433,7 +433,7 @@ def test_runs_end_exactly(method: str, duration: float, dt: float, steps: int) -
 
 def test_equal_steps_are_not_split_by_rounding() -> None:
     for duration, dt in ((1.0, 1e-3), (10.0, 1e-3), (0.7, 0.1), (1.0, 1 / 3), (2.4, 0.8), (1e4, 1e-3)):
-        grid = Grid.of(duration, dt)
+        grid = Grid.of(0.0, duration, dt)
         assert grid.steps == round(duration / dt)
         assert grid.last == dt
 
@@ -791,3 +791,16 @@ def test_what_belongs_to_simulate_is_there_at_once() -> None:
     code = "import mbkit as mb; assert 'rk4' in mb.simulate.METHODS and callable(mb.simulate)"
     env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     subprocess.run([sys.executable, "-c", code], env=env, check=True)
+
+
+def test_a_start_beyond_a_joints_limits_is_warned_of(recwarn: pytest.WarningsRecorder) -> None:
+    ur5 = mb.load("ur5")
+    dyn, q = dynamics(ur5), ur5.neutral()
+    simulate(dyn, q, np.zeros(6), 0.01)
+    assert not recwarn.list
+    q[2] = 90.0
+    with pytest.warns(MbkitWarning, match=r"elbow_joint = 90 .*radians"):
+        simulate(dyn, q, np.zeros(6), 0.01)
+    batch = np.stack([np.zeros(6), q])
+    with pytest.warns(MbkitWarning, match=r"trajectory 1: .*elbow_joint = 90"):
+        simulate(dyn, batch, np.zeros(6), 0.01)

@@ -15,9 +15,10 @@ from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
 from mbkit.model import ModelBuilder
-from mbkit.simulate import METHODS, simulate
+from mbkit.simulate import METHODS, Event, simulate
 from mbkit.simulate.grid import Grid
 
+EPS = float(np.finfo(float).eps)
 ADAPTIVE = [m.name for m in METHODS.values() if m.kind == "adaptive"]
 ASKING = [m.name for m in METHODS.values() if m.callables]
 END = 0.1
@@ -46,7 +47,8 @@ def saved(method: str, duration: float = END) -> dict[str, Any]:
 def test_every_method_ends_exactly_at_the_end(method: str, duration: float, dt: float) -> None:
     save = [0.0, duration] if duration else [0.0]
     for states in ([0.1], [[0.1], [0.2]]):
-        run = simulate(dynamics_for(method), states, [0.3], duration, method, dt=dt, save=save)
+        step = {} if method in ADAPTIVE else {"dt": dt}
+        run = simulate(dynamics_for(method), states, [0.3], duration, method, **step, save=save)
         assert run.t.tolist() == save
         assert run.stats.finished
         assert np.isfinite(run.q).all()
@@ -69,11 +71,64 @@ def test_a_tolerance_that_cannot_be_met_is_named() -> None:
     assert run.stats.ended == "step_too_small"
 
 
-def test_grids_name_their_own_times() -> None:
+@pytest.mark.parametrize("start", [0.0, 3.3, -1e4])
+def test_grids_name_their_own_times(start: float) -> None:
     for duration, dt in ((0.0, 1e-3), (1.0, 0.1), (1.0, 0.3), (0.7, 1 / 3), (5.0, 7.0)):
-        grid = Grid.of(duration, dt)
+        grid = Grid.of(start, duration, dt)
         assert grid.times.tolist() == [grid.time(k) for k in range(grid.steps + 1)]
-        assert grid.times[-1] == duration
+        assert (grid.times[0], grid.times[-1]) == (start, start + duration)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_step_and_a_tolerance_are_refused_where_a_method_has_none(method: str) -> None:
+    wrong = {"dt": 1e-3} if method in ADAPTIVE else {"rtol": 1e-6}
+    with pytest.raises(InputError, match=f"^{next(iter(wrong))}: {method} .*give"):
+        simulate(dynamics_for(method), [0.1], [0.3], END, method, **wrong, **saved(method))
+
+
+@pytest.mark.parametrize("start", [3.0, -2.0])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_start_time_shifts_all_times(method: str, start: float) -> None:
+    """Nothing here depends on the time, so that states are the same; all times are shifted."""
+    dyn = dynamics_for(method)
+    save = np.linspace(0, END, 11)
+    early, late = (simulate(dyn, [0.9], [0.3], END, method, save=t + save, t0=t) for t in (0.0, start))
+    assert late.t.tolist() == (start + save).tolist()
+    assert late.stats.reached == start + END
+    # Times near 3 s have some bits less for the lengths of steps.
+    size = np.abs(early.q).max()
+    assert np.abs(late.q - early.q).max() <= (1e-9 if method in ADAPTIVE else 64 * EPS) * size
+    assert np.abs(late.energy() - early.energy()).max() <= 1e-7
+
+
+@pytest.mark.parametrize("start", [2.0, -END / 2])
+@pytest.mark.parametrize("method", [m for m in ASKING if not METHODS[m].engines])
+def test_torque_functions_and_events_get_the_time_from_t0(method: str, start: float) -> None:
+    seen: list[float] = []
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> list[float]:
+        seen.append(t)
+        return [np.sin(5 * t)]
+
+    dyn = dynamics_for(method)
+    run = simulate(dyn, [0.1], [0.0], END, method, torque=torque, t0=start, save=[start, start + END])
+    assert start <= min(seen) < max(seen) <= start + END + EPS
+    shifted = simulate(dyn, [0.1], [0.0], END, method, torque=lambda t, q, v: [np.sin(5 * (t + start))], save=[0, END])
+    assert np.abs(run.q[-1] - shifted.q[-1]).max() <= 1e-9
+    if METHODS[method].events:
+        at = Event(lambda t, q, v: t - start - END / 2, "half", terminal=True)
+        ended = simulate(dyn, [0.1], [0.0], END, method, events=at, t0=start)
+        assert ended.stats.reached == pytest.approx(start + END / 2, abs=1e-9)
+        assert ended.events[-1].t == ended.stats.reached
+
+
+def test_start_times_without_digits_are_refused() -> None:
+    for method, given in (("rk4", {}), ("rk853", {"save": [1e15, 1e15 + END]})):
+        with pytest.raises(InputError, match=r"^t0: "):
+            simulate(pendulum(), [0.1], [0.0], END, method, t0=1e15, **given)
+    for method in METHODS:
+        with pytest.raises(InputError, match=r"^duration: "):
+            simulate(dynamics_for(method), [0.1], [0.3], 1e-320, method, **saved(method, 0.0))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -290,8 +345,7 @@ def test_a_run_away_is_not_blamed_on_the_torque(method: str) -> None:
     with pytest.warns(MbkitWarning, match=r"after t = 0\.[23]"):
         run = simulate(
             *(dyn, [1.0, 0.5], [0.0, 0.0], 2.0, method),
-            dt=1e-2,
-            rtol=1e-6 if method in ADAPTIVE else None,
+            **({"rtol": 1e-6} if method in ADAPTIVE else {"dt": 1e-2}),
             torque=lambda t, q, v: 3 * v * abs(v),
         )
     assert run.stats.ended in ("diverged", "step_too_small")

@@ -346,7 +346,7 @@ def test_progress_is_told(swing: Any) -> None:
 def _direct(dyn: Any, torque: Any) -> None:
     read = Torque(torque, dyn.model, None, None)
     q, v = dyn.model.neutral(), np.zeros(dyn.model.nv)
-    run_taylor(Asked(dyn, "taylor", q, v, 1.0, Tolerances(1e-10, 1e-10), read, None, (), Progress(None, "")))
+    run_taylor(Asked(dyn, "taylor", q, v, 0.0, 1.0, Tolerances(1e-10, 1e-10), read, None, (), Progress(None, "")))
 
 
 def test_what_has_no_series_is_refused(swing: Any) -> None:

@@ -17,7 +17,7 @@ from mbkit import catalog
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
-from mbkit.simulate import Trajectory, at_section, simulate
+from mbkit.simulate import METHODS, Trajectory, at_section, simulate
 from mbkit.simulate.balance import _by_cubics
 from mbkit.simulate.skeleton import skeleton
 from tests.random_trees import off, random_tree, rotation, states
@@ -50,7 +50,8 @@ def slope(steps: list[float], errors: list[float]) -> float:
 
 
 def swing(**options: Any) -> Trajectory:
-    return simulate(dynamics(catalog.double_pendulum()), [0.6, -0.3], [0.2, 0.5], 0.3, **{"dt": 0.01, **options})
+    step = {} if METHODS[options.get("method", "rk4")].kind == "adaptive" else {"dt": 0.01}
+    return simulate(dynamics(catalog.double_pendulum()), [0.6, -0.3], [0.2, 0.5], 0.3, **{**step, **options})
 
 
 # Energies

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import ellipj, ellipk, ellipkinc
+from scipy.special import ellipj, ellipk, ellipkinc, ellipkm1
 
 Array = NDArray[np.float64]
 
@@ -279,16 +279,20 @@ def free_spin(t: Array, inertia: Array, w0: Array) -> tuple[Array, float]:
     about none of its axes.
     """
     order = np.argsort(inertia)
-    twice_energy, square = float(inertia @ w0**2), float((inertia * w0) @ (inertia * w0))
-    if square < twice_energy * inertia[order[1]]:
+    # L² - 2 E X for a moment X, without the cancellation of the two terms.
+    excess = {int(i): float(sum(inertia * (inertia - inertia[i]) * w0**2)) for i in order}
+    if excess[order[1]] < 0:
         order = order[::-1]
     A, B, C = inertia[order]
     x, y, z = w0[order]
-    a = np.sqrt((twice_energy * C - square) / (A * (C - A)))
-    b = np.sqrt((twice_energy * C - square) / (B * (C - B)))
-    c = np.sqrt((square - twice_energy * A) / (C * (C - A)))
-    rate = np.sqrt((C - B) * (square - twice_energy * A) / (A * B * C))
-    m = (B - A) * (twice_energy * C - square) / ((C - B) * (square - twice_energy * A))
+    low, middle, high = (excess[i] for i in order)
+    a = np.sqrt(-high / (A * (C - A)))
+    b = np.sqrt(-high / (B * (C - B)))
+    c = np.sqrt(low / (C * (C - A)))
+    rate = np.sqrt((C - B) * low / (A * B * C))
+    # The period depends on 1 - m, which is small near the separatrix.
+    complement = (C - A) * middle / ((C - B) * low)
+    m = 1 - complement
     side = np.sign(z)
     start = ellipkinc(np.arctan2(y / b, side * x / a), m)
     # Euler's equations run backwards in a mirrored frame (an odd order of the axes), and
@@ -297,7 +301,7 @@ def free_spin(t: Array, inertia: Array, w0: Array) -> tuple[Array, float]:
     sn, cn, dn, _ = ellipj(sense * rate * t + start, m)
     out = np.empty((len(t), 3))
     out[:, order] = np.stack([side * a * cn, b * sn, side * c * dn], axis=-1)
-    return out, float(4 * ellipk(m) / rate)
+    return out, float(4 * ellipkm1(complement) / rate)
 
 
 def light_cart_pole_cart(theta: Array, theta0: float, cart_mass: float, pole_mass: float, length: float) -> Array:

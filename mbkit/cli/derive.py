@@ -25,6 +25,13 @@ _WIDTH: Final = 100
 @click.option("--python", "form", flag_value="python", help="Print a Python module that needs NumPy only.")
 @click.option("--c", "form", flag_value="c", help="Write C99, as mbkit export does.")
 @model_options
+@click.option(
+    "--snap",
+    type=click.FloatRange(0.0, 1e-2),
+    default=1e-9,
+    show_default=True,
+    help="To read: take entries of rotations this near to 0 or 1 as exact. --python and --c take them as they are.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to, instead of printing.")
 @click.option("--force", is_flag=True, help="Replace C files that mbkit did not write.")
@@ -34,6 +41,7 @@ def derive(
     floating_base: bool,
     mimic: str | None,
     nonphysical: str | None,
+    snap: float,
     as_json: bool,
     out: Path | None,
     force: bool,
@@ -55,13 +63,17 @@ def derive(
         _write_c(target, system, out or Path("mbkit-export"), force)
         return
     from mbkit.lagrangian.on_paper import from_model
-    from mbkit.lagrangian.textbook import letters
+    from mbkit.lagrangian.textbook import letters, with_plain_turns
     from mbkit.lagrangian.written import WrittenModel
     from mbkit.report.progress import Bar
 
+    if form != "python" and not isinstance(target, WrittenModel):
+        target, note = with_plain_turns(target, snap)
+        if note:
+            say("note", f"{note}. The equations to read differ from the model by that; --snap 0 leaves it as it is")
     with Bar(f"derive {target.name}") as bar:
         names = None if isinstance(target, WrittenModel) else letters(target)
-        lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.5 * x, text))
+        lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.1 * x, text))
         # What is prescribed is no coordinate of the equation.
         told = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
         text, ending = _text(lag, told, form, as_json, bar)
@@ -120,12 +132,11 @@ def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: boo
     if form == "python":
         from mbkit.lagrangian.python_code import python_code
 
-        bar(0.5, "equations")
+        bar(0.1, "equations")
         return python_code(lag).rstrip("\n"), ".py"
     from mbkit.lagrangian.account import Account
 
-    bar(0.5, "equations")
-    account = Account(lag, names=names)
+    account = Account(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text))
     if as_json:
         import json
 

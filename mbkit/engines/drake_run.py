@@ -30,6 +30,8 @@ class DrakeRun:
         Of `pydrake.systems.analysis.GetIntegrationSchemes`.
     accuracy : float
         What Drake holds the relative error of a step below.
+    t : float
+        Time of the first state, s.
     q, v : (nq,), (nv,) arrays
     watch : callable
         Gets the time after each step; what it raises ends the run.
@@ -42,7 +44,14 @@ class DrakeRun:
     """
 
     def __init__(
-        self, dyn: DrakeDynamics, scheme: str, accuracy: float, q: Array, v: Array, watch: Callable[[float], object]
+        self,
+        dyn: DrakeDynamics,
+        scheme: str,
+        accuracy: float,
+        t: float,
+        q: Array,
+        v: Array,
+        watch: Callable[[float], object],
     ) -> None:
         if dyn.model.layout.reduced:
             raise UnsupportedError("drake: its integrators know no mimic joints; load with mimic='free'")
@@ -63,6 +72,8 @@ class DrakeRun:
         simulator = Simulator(plant, self._context)
         config = SimulatorConfig(integration_scheme=scheme, accuracy=accuracy, max_step_size=_LONGEST)
         ApplySimulatorConfig(config, simulator)
+        # The configuration resets the time.
+        self._context.SetTime(t)
         integrator = simulator.get_mutable_integrator()
         # Too small a step is told, not taken on with an error that nobody knows.
         integrator.set_throw_on_minimum_step_size_violation(True)

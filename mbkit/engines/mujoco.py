@@ -301,6 +301,7 @@ class MujocoDynamics(Dynamics):
         steps: int,
         *,
         euler_damping: bool = False,
+        progress: Callable[[float], object] | None = None,
     ) -> tuple[Array, Array]:
         """Integrate with MuJoCo's own steps.
 
@@ -316,6 +317,8 @@ class MujocoDynamics(Dynamics):
         euler_damping : bool
             Whether Euler treats joint damping implicitly, MuJoCo's default; it
             then solves (M + h D) a = f and is no longer the explicit formula.
+        progress : callable, optional
+            Gets the fraction done, about ten times a second; what it raises ends the run.
 
         Returns
         -------
@@ -347,4 +350,4 @@ class MujocoDynamics(Dynamics):
         model = copy.copy(self._m)
         if euler_damping:
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        return Rollout(self.model, self._made, model)(integrator, q0, v0, dt, tau, steps)
+        return Rollout(self.model, self._made, model)(integrator, q0, v0, dt, tau, steps, progress)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
+from collections.abc import Callable
 from typing import Any, Final
 
 import mujoco
@@ -36,6 +38,10 @@ _SINGULAR: Final = int(mujoco.mjtWarning.mjWARN_INERTIA)
 _FORCE: Final = mujoco.mjtState.mjSTATE_QFRC_APPLIED
 
 
+# MuJoCo's code cannot be interrupted: it is left this often, s, for signals and progress. States do not depend on it.
+_PERIOD: Final = 0.1
+
+
 class Rollout:
     """One call integrates one state or a batch on all cores."""
 
@@ -43,7 +49,14 @@ class Rollout:
         self._description, self._made, self._m = description, made, model
 
     def __call__(
-        self, integrator: str, q0: Array, v0: Array, dt: float, tau: Array | None, steps: int
+        self,
+        integrator: str,
+        q0: Array,
+        v0: Array,
+        dt: float,
+        tau: Array | None,
+        steps: int,
+        progress: Callable[[float], object] | None = None,
     ) -> tuple[Array, Array]:
         if integrator not in INTEGRATORS:
             raise UnknownNameError("integrator of MuJoCo", integrator, INTEGRATORS)
@@ -65,16 +78,45 @@ class Rollout:
         data = [mujoco.MjData(self._m) for _ in range(threads)]
         # A divergence is read off the states themselves.
         with heard_warnings():
-            states, _ = mujoco.rollout.rollout(
-                self._m, data, start, control, control_spec=int(_FORCE), nstep=steps, skip_checks=False
-            )
+            states = self._run(data, start, control, steps, progress)
         if any(d.warning.number[_SINGULAR] for d in data):
             told = "MuJoCo met a mass matrix that is too close to singular, and went on with another one"
             warnings.warn(f"{self._description.name}: {told}; compare with rk853", DoubtfulRunWarning, stacklevel=6)
-        states = np.concatenate([start[:, None], states], axis=1)
         states[np.logical_not(self._alive(states, dt))] = np.nan
         q, v = self._read(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + self._m.nv])
         return (q[0], v[0]) if single else (q, v)
+
+    def _run(
+        self,
+        data: list[Any],
+        start: Array,
+        control: Array | None,
+        steps: int,
+        progress: Callable[[float], object] | None,
+    ) -> Array:
+        """Return the states after 0, 1, ... steps, (N, steps + 1, size)."""
+        states = np.empty((len(start), steps + 1, start.shape[1]))
+        states[:, 0] = start
+        done, count = 0, 16
+        while done < steps:
+            end = min(done + count, steps)
+            part = None if control is None else np.ascontiguousarray(control[:, done:end])
+            begun = time.perf_counter()
+            states[:, done + 1 : end + 1], _ = mujoco.rollout.rollout(
+                self._m,
+                data,
+                np.ascontiguousarray(states[:, done]),
+                part,
+                control_spec=int(_FORCE),
+                nstep=end - done,
+                skip_checks=False,
+            )
+            seconds = time.perf_counter() - begun
+            count = max(1, int(count * min(16.0, _PERIOD / max(seconds, 1e-6))))
+            done = end
+            if progress is not None:
+                progress(done / steps)
+        return states
 
     def _velocity_in(self, q: Array, v: Array) -> Array:
         out = v[:, self._made.v_index].copy()

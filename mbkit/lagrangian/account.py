@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, Final
 
@@ -34,10 +34,17 @@ class Account:
     system : Lagrangian
     names : mapping of str to str, optional
         What each coordinate was called where it came from.
+    progress : callable, optional
+        Gets the fraction done and the part that is next.
     """
 
-    def __init__(self, system: Lagrangian, names: Mapping[str, str] | None = None) -> None:
-        self.system, self._names = system, dict(names or {})
+    def __init__(
+        self,
+        system: Lagrangian,
+        names: Mapping[str, str] | None = None,
+        progress: Callable[[float, str], object] = lambda fraction, what: None,  # noqa: ARG005
+    ) -> None:
+        self.system, self._names, self._progress = system, dict(names or {}), progress
         self._size = int(system.T.count_ops())
         self.long = self._size > _READABLE
 
@@ -62,11 +69,20 @@ class Account:
         return Abbreviations(shown, symbols)
 
     def _equations(self, *, latex: bool = False) -> list[tuple[str, str]]:
-        return [] if self.long else lines(self.equations, self._board, self._short, latex=latex)
+        return [] if self.long else self._lines(self._short, latex=latex)
+
+    def _lines(self, short: Abbreviations, *, latex: bool) -> list[tuple[str, str]]:
+        # The matrices are there before; they take about a third of the time.
+        return lines(
+            *(self.equations, self._board, short),
+            latex=latex,
+            progress=lambda x, what: self._progress(0.3 + 0.7 * x, what),
+        )
 
     @cached_property
     def _matrices(self) -> dict[str, tuple[sp.ImmutableMatrix, str]]:
         """Name -> matrix and what it is; of those that are not zero."""
+        self._progress(0.0, "mass matrix and Coriolis matrix")
         e = self.equations
         out = {"M": (e.mass_matrix, "mass matrix")}
         if not self.long:
@@ -177,7 +193,7 @@ class Account:
         told["constraints"] = [str(x) for x in s.constraints]
         # Each by itself: no letter is explained elsewhere.
         plain = Abbreviations((), ())
-        rows = [] if self.long else lines(self.equations, self._board, plain, latex=True)
+        rows = [] if self.long else self._lines(plain, latex=True)
         told["equations"] = [] if self.long else [f"{x.lhs} = {x.rhs}" for x in e.equations()]
         told["latex"] = [f"{left} = {right}" for left, right in rows]
         told["cyclic"] = [q.name for q in s.cyclic_coordinates()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations_with_replacement
 
 import sympy as sp
@@ -27,15 +28,21 @@ def letters_for(e: EquationsOfMotion) -> Abbreviations:
 
 
 def lines(
-    e: EquationsOfMotion, board: Blackboard, short: Abbreviations, *, latex: bool = False
+    e: EquationsOfMotion,
+    board: Blackboard,
+    short: Abbreviations,
+    *,
+    latex: bool = False,
+    progress: Callable[[float, str], object] = lambda fraction, what: None,  # noqa: ARG005
 ) -> list[tuple[str, str]]:
-    """Return the two sides of each equation and of each constraint."""
+    """Return the two sides of each equation and of each constraint; `progress` gets the fraction done."""
     right = e.forces
     if e.multipliers:
         right = right + e.constraint_jacobian.T * sp.Matrix(e.multipliers)
     join = board.latex_of if latex else board.text_of
     out = []
     for i, force in enumerate(right):
+        progress(i / len(right), f"equation {i + 1} of {len(right)}")
         parts = [m * a for m, a in zip(e.mass_matrix[i, :], e.accelerations, strict=True)]
         parts += [by_speeds(e.coriolis_force[i], e.velocities), e.drift[i], spread(e.potential_gradient[i])]
         out.append((join(short(part) for part in parts), join([short(force)])))

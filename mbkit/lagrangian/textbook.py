@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import count
 from typing import Any, Final
 
@@ -12,9 +13,10 @@ import numpy as np
 
 from mbkit import catalog
 from mbkit.errors import MbkitError
+from mbkit.load.snap import Snapper
 from mbkit.model import Expression, Model, Parameter
 
-__all__ = ["in_symbols", "letters"]
+__all__ = ["in_symbols", "letters", "with_plain_turns"]
 
 #: Of each system's arguments: a name, or three for a vector.
 _SYMBOLS: Final[dict[str, dict[str, str | tuple[str, str, str]]]] = {
@@ -100,6 +102,27 @@ def letters(model: Model) -> list[str] | None:
     known = {t for t in tails if _LETTER.fullmatch(t) and tails.count(t) == 1 and not t.startswith("q")}
     numbers = count(1)
     return [t if t in known else f"q{next(numbers)}" for t in tails]
+
+
+def with_plain_turns(model: Model, reach: float) -> tuple[Model, str | None]:
+    """Return a model for reading, without the last digits of rounded quarter turns, and a note if it is another one.
+
+    A file's 1.57079632679 for π/2 leaves 5e-12 where a zero is meant, and with it a term in every equation.
+
+    Parameters
+    ----------
+    model : Model
+    reach : float
+        How near to 0, 1 or -1 an entry of a rotation matrix or an axis is set to it.
+    """
+    snap = Snapper(reach)
+    joints = tuple(
+        replace(j, rotation=snap(j.rotation), axes=np.array([snap(axis) for axis in j.axes]).reshape(-1, 3))
+        for j in model.joints
+    )
+    if not snap.count:
+        return model, None
+    return replace(model, joints=joints), snap.note
 
 
 def _numbered(name: str, system: str) -> bool:

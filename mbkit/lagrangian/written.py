@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 
-from mbkit._check import Array, count, real
+from mbkit._check import Array, count, generator, real
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.abstract_parts import abstract_parts
@@ -136,10 +136,11 @@ class WrittenModel(Model):
             f"without: {self.name} was written as energies, of which only 'damping' can be left out, got {features}"
         )
 
-    def random_state(self, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
+    def random_state(self, rng: np.random.Generator | int, size: int | None = None) -> tuple[Array, Array]:
         """Draw a random state as `Model.random_state` does; under constraints the consistent one that is nearest."""
         if not self.constrained:
             return super().random_state(rng, size)
+        rng = generator("rng", rng)
         drawn = [self._consistent_state(rng) for _ in range(1 if size is None else count("size", size))]
         q, v = np.array(drawn).reshape(len(drawn), 2, self.nv).transpose(1, 0, 2)
         return (q[0], v[0]) if size is None else (q, v)

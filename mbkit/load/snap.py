@@ -23,6 +23,11 @@ _REACH: Final = 8 * float(np.finfo(float).eps)
 class Snapper:
     """Snaps entries of rotations and axes, and counts what it did.
 
+    Parameters
+    ----------
+    reach : float
+        How near to 0, 1 or -1 an entry is set to it; by default what rounding does.
+
     Attributes
     ----------
     count : int
@@ -31,19 +36,20 @@ class Snapper:
         The largest change.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, reach: float = _REACH) -> None:
+        self._reach = reach
         self.count = 0
         self.largest = 0.0
 
     def __call__(self, entries: Array) -> Array:
         """Return the entries of a rotation matrix or a unit vector, snapped."""
-        out = np.where(np.abs(entries) <= _REACH, 0.0, entries)
+        out = np.where(np.abs(entries) <= self._reach, 0.0, entries)
         # A one is set right only where it stands alone: beside an angle of 4e-8,
         # whose cosine is 1 - 8e-16, it would spoil the unit length.
         alone = np.ones(out.shape, dtype=bool)
         for axis in range(out.ndim):
             alone &= np.count_nonzero(out, axis=axis, keepdims=True) == 1
-        near_one = alone & (np.abs(np.abs(out) - 1) <= _REACH)
+        near_one = alone & (np.abs(np.abs(out) - 1) <= self._reach)
         out = np.where(near_one, np.sign(out), out)
         change = np.abs(out - entries)
         self.count += int(np.count_nonzero(change))
@@ -56,6 +62,6 @@ class Snapper:
         if not self.count:
             return None
         return (
-            f"{self.count} entries of rotations and axes within {_REACH:.1e} of 0, 1 or -1 were set to it; "
+            f"{self.count} entries of rotations and axes within {self._reach:.1e} of 0, 1 or -1 were set to it; "
             f"the largest change was {self.largest:.1e}"
         )

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, count, rows
+from mbkit._check import Array, batch_of, count, generator, rows
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import manifold, substitution
 from mbkit.model.binding import Binding
@@ -282,12 +282,13 @@ class Model:
         """
         return manifold.neutral(self)
 
-    def random_state(self, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
+    def random_state(self, rng: np.random.Generator | int, size: int | None = None) -> tuple[Array, Array]:
         """Draw a random state.
 
         Parameters
         ----------
-        rng : numpy.random.Generator
+        rng : numpy.random.Generator or int
+            Or the seed of one.
         size : int, optional
             Number of states; one without batch axis when not given.
 
@@ -299,11 +300,9 @@ class Model:
         v : (nv,) or (size, nv) array
             Standard normal.
         """
-        if not isinstance(rng, np.random.Generator):
-            raise InputError(f"rng: expected a numpy Generator, got {rng!r}; use numpy.random.default_rng(seed)")
         if size is not None:
             count("size", size)
-        return manifold.random_state(self, rng, size)
+        return manifold.random_state(self, generator("rng", rng), size)
 
     def check_q(self, q: ArrayLike, name: str = "q") -> Array:
         """Return `q` as float64, checked for shape, finite numbers and unit quaternions."""

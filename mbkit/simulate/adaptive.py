@@ -65,8 +65,9 @@ class _Jacobian(Protocol):
 
 @dataclass(frozen=True)
 class _Task:
-    """One state to integrate; `stops` are the times that steps must end on."""
+    """One state to integrate from a time; `stops` are the times that steps must end on."""
 
+    t0: float
     y0: Array
     stops: tuple[float, ...]
     saved: tuple[float, ...] | None
@@ -82,10 +83,10 @@ def run_scipy(asked: Asked) -> Outcome:
     saved times, BDF and LSODA interpolate. Without `save`, the solver's own steps are
     kept. Torques held as an array start every method anew at each interval.
     """
-    dyn, save, torque, duration = asked.dyn, asked.save, asked.torque, asked.duration
+    dyn, save, torque = asked.dyn, asked.save, asked.torque
     scheme = _SCHEMES[asked.method]
-    ends = (duration,) if save is None or (scheme.dense and not torque.held) else (*save.tolist(), duration)
-    stops = tuple(sorted({*ends} - {0.0}))
+    ends = (asked.end,) if save is None or (scheme.dense and not torque.held) else (*save.tolist(), asked.end)
+    stops = tuple(sorted({*ends} - {asked.start}))
     solve = _Solve(dyn, scheme, asked.tolerances)
     members = []
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"), _quiet():
@@ -95,7 +96,7 @@ def run_scipy(asked: Asked) -> Outcome:
                 solve.only(which)
             watch = Watch(asked.events, which) if asked.events else None
             saved = None if save is None else tuple(save.tolist())
-            task = _Task(start, stops, saved, torque.of_member(which), torque.held, watch)
+            task = _Task(asked.start, start, stops, saved, torque.of_member(which), torque.held, watch)
             members.append(solve.member(task, asked.report(i)))
             if members[-1].error is not None:
                 break
@@ -137,7 +138,7 @@ class _Solve:
 
     def member(self, task: _Task, done: Callable[[float], None]) -> Member:
         """Return what comes of one trajectory."""
-        member = Member()
+        member = Member(reached=task.t0)
         try:
             self._integrate(member, task, done)
         except FunctionError as error:
@@ -145,10 +146,10 @@ class _Solve:
         return member
 
     def _integrate(self, member: Member, task: _Task, done: Callable[[float], None]) -> None:
-        if task.saved is None or (task.saved and task.saved[0] == 0.0):
-            member.keep(0.0, task.y0)
+        if task.saved is None or (task.saved and task.saved[0] == task.t0):
+            member.keep(task.t0, task.y0)
         if task.watch is not None:
-            task.watch.start(0.0, *self._state(task.y0))
+            task.watch.start(task.t0, *self._state(task.y0))
         solver: Any = None
         for k, stop in enumerate(task.stops):
             force = task.force(k)
@@ -161,7 +162,7 @@ class _Solve:
             solver.t_bound, solver.status = stop, "running"
             while solver.status == "running":
                 start = solver.t, solver.y.copy()
-                solver = self._step(member, solver, force, stop, task.stops[-1])
+                solver = self._step(member, solver, force, stop, task.stops[-1] - task.t0)
                 if solver is None or self._stopped(member, task, solver, start, force):
                     return
                 member.steps += 1
@@ -170,7 +171,7 @@ class _Solve:
                 done(member.reached)
 
     def _anew(self, task: _Task, last: Any, force: Force, stop: float) -> Any:
-        t, y = (0.0, task.y0) if last is None else (float(last.t), last.y)
+        t, y = (task.t0, task.y0) if last is None else (float(last.t), last.y)
         # A multistep method starts again with order 1, for which its last step is too long.
         first = None if last is None or self._scheme.dense else min(last.h_abs, stop - t)
         return self._solver(t, y, force, stop, first)
@@ -218,10 +219,12 @@ class _Solve:
             member.rejected += 1
             solver = again
             _stepped(solver)
-        if solver.status == "failed" and self.rates.why:
+        stuck = solver.status == "failed" or _below_rounding(solver, duration)
+        if stuck and self.rates.why:
+            # Steps became this short because the engine failed just ahead of them.
             member.stop("diverged", f"diverged: {self.rates.why}")
             return None
-        if solver.status == "failed" or _below_rounding(solver, duration):
+        if stuck:
             rtol, atol = self._tolerances
             own = "" if atol == rtol else f", atol = {atol:g}"
             told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"

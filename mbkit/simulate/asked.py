@@ -29,8 +29,8 @@ class Asked:
     method : str
         Its name.
     q0, v0 : (nq,) or (N, nq), (nv,) or (N, nv) arrays
-    duration : float
-        s.
+    start, duration : float
+        Time of the states, and how long they move, s.
     tolerances : Tolerances
     torque : Torque
     save : (K,) array or None
@@ -48,6 +48,7 @@ class Asked:
     method: str
     q0: Array
     v0: Array
+    start: float
     duration: float
     tolerances: Tolerances
     torque: Torque
@@ -57,6 +58,11 @@ class Asked:
 
     def __post_init__(self) -> None:
         check_save(self.save, self.batch, self.q0.shape[-1] + self.v0.shape[-1])
+
+    @property
+    def end(self) -> float:
+        """Last time, s."""
+        return self.start + self.duration
 
     @property
     def batch(self) -> int | None:
@@ -83,7 +89,7 @@ class Asked:
         return None if self.batch is None else i
 
     def told(self) -> tuple[Array, Array]:
-        """Return the times to keep, and those to go through from 0 to the end.
+        """Return the times to keep, and those to go through from the start to the end.
 
         Raises
         ------
@@ -93,10 +99,10 @@ class Asked:
         if self.save is None:
             raise InputError(
                 f"save: {self.method} does not tell its own steps; give the times to keep, "
-                f"such as [0, {self.duration:g}]"
+                f"such as [{self.start:g}, {self.end:g}]"
             )
-        return self.save, np.array([0.0, *sorted({*self.save.tolist(), self.duration} - {0.0})])
+        return self.save, np.array([self.start, *sorted({*self.save.tolist(), self.end} - {self.start})])
 
     def report(self, i: int) -> Callable[[float], None]:
         """Return what is told the time that the i-th state has reached."""
-        return reporter(self.bar, i, len(self.q), self.duration)
+        return reporter(self.bar, i, len(self.q), self.start, self.duration)

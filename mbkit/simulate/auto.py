@@ -22,7 +22,6 @@ from mbkit.simulate.auto_scene import EXPLICIT, Scene
 from mbkit.simulate.embedded import march, outcome_of, stops_of
 from mbkit.simulate.embedded_trials import Trials
 from mbkit.simulate.outcome import Outcome
-from mbkit.simulate.progress import Progress
 
 __all__ = ["run_auto"]
 
@@ -32,19 +31,20 @@ _FEW: Final = 3
 
 def run_auto(asked: Asked) -> Outcome:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
-    q0, v0, save, batch, duration = asked.q, asked.v, asked.save, asked.batch, asked.duration
-    space, stops = Space(asked.dyn.model), stops_of(duration, save, asked.torque)
-    scene = Scene(asked.dyn, space, asked.tolerances, asked.torque, duration, batch, stops)
+    q0, v0, save, batch = asked.q, asked.v, asked.save, asked.batch
+    space = Space(asked.dyn.model)
+    scene = Scene(asked, space, stops_of(asked))
     courses = [Course(scene, i, q0.shape[1], save, asked.events) for i in range(len(q0))]
     explicit = scene.make(EXPLICIT, scene.granted(EXPLICIT, asked.tolerances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), explicit.width):
             part = slice(first, first + explicit.width)
-            group = _Group(courses[part], first, len(q0), duration, asked.bar)
+            group = _Group(courses[part], first, asked)
             try:
                 for course, q, v in zip(group.courses, q0[part], v0[part], strict=True):
                     course.track.begin(q, v)
-                explicit.start(range(first, first + len(group.courses)), q0[part], space.enter(q0[part], v0[part]))
+                begun = space.enter(q0[part], v0[part])
+                explicit.start(range(first, first + len(group.courses)), q0[part], begun, asked.start)
                 group.together(scene, explicit)
             except FunctionError as error:
                 # Where the torque is a function, trajectories run one by one.
@@ -61,9 +61,8 @@ def run_auto(asked: Asked) -> Outcome:
 class _Group:
     """Trajectories that begin side by side."""
 
-    def __init__(self, courses: Sequence[Course], first: int, count: int, duration: float, bar: Progress) -> None:
-        self.courses = courses
-        self._first, self._count, self._duration, self._bar = first, count, duration, bar
+    def __init__(self, courses: Sequence[Course], first: int, asked: Asked) -> None:
+        self.courses, self._first, self._asked = courses, first, asked
 
     def together(self, scene: Scene, explicit: Trials) -> None:
         """Take all to the end: explicitly side by side, what leaves that one by one."""
@@ -79,8 +78,9 @@ class _Group:
             course.alone(self._tell)
 
     def _tell(self) -> None:
-        now = sum(course.track.member.reached for course in self.courses) / self._duration
-        self._bar.update((self._first + now) / self._count)
+        asked = self._asked
+        done = sum(course.track.member.reached - asked.start for course in self.courses) / asked.duration
+        asked.bar.update((self._first + done) / len(asked.q))
 
 
 def _chosen(courses: Sequence[Course], batch: int | None) -> str:

@@ -114,13 +114,13 @@ class Course:
 
     def __init__(self, scene: Scene, index: int, nq: int, save: Array | None, events: tuple[Event, ...]) -> None:
         self._scene, self._index = scene, index
-        self.track = _Track(scene.space, nq, index, scene.batch, save, events, scene.tolerances)
+        self.track = _Track(scene.space, nq, index, scene.batch, save, events, scene.tolerances, scene.start)
         self.doubt = ""
         # As asked for or loosened, and as tightened.
         self._base, self._tolerances = scene.tolerances, scene.granted(EXPLICIT, scene.tolerances)
-        self._legs = [Leg(EXPLICIT, 0.0)]
+        self._legs = [Leg(EXPLICIT, scene.start)]
         self._gauge: Gauge | None = None
-        self._at: tuple[float, Array, Array] = 0.0, np.empty(0), np.empty(0)
+        self._at: tuple[float, Array, Array] = scene.start, np.empty(0), np.empty(0)
         self._tries = 0
         # At the last look at rk853: its tolerance and the tries for each second.
         self._looser = self._tolerances.rtol, 0.0
@@ -148,12 +148,12 @@ class Course:
 
     @property
     def _rest(self) -> float:
-        return self._scene.duration - self._at[0]
+        return self._scene.end - self._at[0]
 
     @property
     def _over(self) -> bool:
         member = self.track.member
-        return member.ended != "finished" or member.reached >= self._scene.duration
+        return member.ended != "finished" or member.reached >= self._scene.end
 
     def leaves(self, trials: Trials, place: int, made: Stretch) -> bool:
         """Look at what was made and taken in; return whether other tries go on from its end."""

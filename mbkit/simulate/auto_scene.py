@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from mbkit.engines import Dynamics
 from mbkit.model.space import Space
+from mbkit.simulate.asked import Asked
 from mbkit.simulate.embedded import make_trials
 from mbkit.simulate.embedded_trials import Stretch, Trials
 from mbkit.simulate.methods import Tolerances
-from mbkit.simulate.torque import Torque
 
 __all__ = ["EXPLICIT", "IMPLICIT", "LEAST", "Gauge", "Pace", "Scene"]
 
@@ -70,7 +69,7 @@ class Scene:
     ----------
     space : Space
     tolerances : Tolerances
-    duration : float
+    start, end, duration : float
         s.
     batch : int or None
     stops : sequence of float
@@ -78,18 +77,10 @@ class Scene:
     pace : Pace
     """
 
-    def __init__(
-        self,
-        dyn: Dynamics,
-        space: Space,
-        tolerances: Tolerances,
-        torque: Torque,
-        duration: float,
-        batch: int | None,
-        stops: Sequence[float],
-    ) -> None:
-        self._dyn, self._torque, self.batch = dyn, torque, batch
-        self.space, self.tolerances, self.duration, self.stops = space, tolerances, duration, stops
+    def __init__(self, asked: Asked, space: Space, stops: Sequence[float]) -> None:
+        self._dyn, self._torque, self.batch = asked.dyn, asked.torque, asked.batch
+        self.space, self.tolerances, self.stops = space, asked.tolerances, stops
+        self.start, self.end, self.duration = asked.start, asked.end, asked.duration
         self._trials: list[Trials] = []
         self.pace = _IN_PYTHON
 

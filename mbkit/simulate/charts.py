@@ -17,13 +17,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array, real
+from mbkit._check import Array, finite_array
 from mbkit.errors import FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.lagrangian.embedding import SINGULAR, Chart, Embedded, EmbeddedDynamics
 from mbkit.simulate.applied import TorqueFunction
 from mbkit.simulate.consistent import from_consistent
 from mbkit.simulate.events import Event, Hit
-from mbkit.simulate.grid import Grid, save_times
+from mbkit.simulate.grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.methods import Method
 from mbkit.simulate.stats import Stats
 from mbkit.simulate.torque import Force, Torque
@@ -74,8 +74,9 @@ def run_on_charts(
     method: Method,
     q0: ArrayLike,
     v0: ArrayLike,
+    t0: float,
     duration: float,
-    dt: float,
+    dt: float | None,
     rtol: float | None,
     atol: float | None,
     torque: ArrayLike | TorqueFunction | None,
@@ -90,19 +91,18 @@ def run_on_charts(
             f"use {', '.join(METHODS_ON_CHARTS)}, or the form with multipliers, lag.dynamics()"
         )
     q, v = finite_array("q0", q0, (model.nq,)), finite_array("v0", v0, (model.nv,))
-    duration = real("duration", duration, nonnegative=True)
-    q, v = from_consistent(system.dynamics, q, v)
+    q, v = from_consistent(system.dynamics, q, v, t0)
     read = Torque(torque, model, None, None)
     run = _Run()
     force = read.of_member(None)(0)
     if method.kind == "adaptive":
         if isinstance(save, (int, np.integer)):
             raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
-        times = None if save is None else save_times(save, duration)
-        _adaptive(system, run, q, v, duration, method.name, {"rtol": rtol, "atol": atol}, force, times, events)
+        times = None if save is None else save_times(save, t0, t0 + duration)
+        _adaptive(system, run, q, v, t0, t0 + duration, method.name, {"rtol": rtol, "atol": atol}, force, times, events)
     else:
-        _stepped(system, run, q, v, Grid.of(duration, real("dt", dt, positive=True)), method.name, force, save)
-    out = _finished(system, run, method, read, duration, time.perf_counter() - started)
+        _stepped(system, run, q, v, Grid.of(t0, duration, DEFAULT_STEP if dt is None else dt), method.name, force, save)
+    out = _finished(system, run, method, read, t0, t0 + duration, time.perf_counter() - started)
     for t, value in run.near:
         warnings.warn(
             f"{model.name}: {_NEAR} at t = {t:.6g} s: the smallest singular value there is {value:.3g} of the largest",
@@ -117,8 +117,10 @@ def run_on_charts(
     return out
 
 
-def _finished(system: Embedded, run: _Run, method: Method, read: Torque, duration: float, seconds: float) -> Trajectory:
-    reached = duration if run.ended == "finished" else run.t[-1] if run.t else 0.0
+def _finished(
+    system: Embedded, run: _Run, method: Method, read: Torque, start: float, end: float, seconds: float
+) -> Trajectory:
+    reached = end if run.ended == "finished" else run.t[-1] if run.t else start
     stats = Stats(run.steps, run.evaluations, seconds, run.ended, reached, run.message, run.rejected)
     n = system.model.nq
     t, q, v = np.array(run.t), np.array(run.q).reshape(-1, n), np.array(run.v).reshape(-1, n)
@@ -174,7 +176,7 @@ def _part(dyn: EmbeddedDynamics, q: Array, v: Array, chart: Chart, *given: Any, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
         try:
-            return simulate(dyn, q[chart.independent], v[chart.independent], *given, **more), None
+            return simulate(dyn, q[chart.independent], v[chart.independent], *given, **{"t0": 0.0, **more}), None
         except FunctionError as error:
             return error.trajectory, error
 
@@ -184,16 +186,17 @@ def _adaptive(
     run: _Run,
     q: Array,
     v: Array,
-    duration: float,
+    t: float,
+    end: float,
     method: str,
     tolerances: dict[str, Any],
     force: Force,
     times: Array | None,
     events: Sequence[Event],
 ) -> None:
-    t, left = 0.0, None if times is None else list(times)
-    if left is None or (left and left[0] == 0.0):
-        run.keep(0.0, q, v)
+    left = None if times is None else list(times)
+    if left is None or (left and left[0] == t):
+        run.keep(t, q, v)
         left = left and left[1:]
     for _ in range(_MOST):
         chart = system.chart(q, t)
@@ -207,9 +210,9 @@ def _adaptive(
         watched.append(_watch(system, chart, way, t, _NEAR))
         if system.independent is None:
             watched.append(_watch(system, chart, way, t, _WORN))
-        ends = [duration - t] if left is None else sorted({*(s - t for s in left), duration - t})
+        ends = [end - t] if left is None else sorted({*(s - t for s in left), end - t})
         part, run.error = _part(
-            *(dyn, q, v, chart, duration - t, method),
+            *(dyn, q, v, chart, end - t, method),
             torque=_pulled(dyn, force, t),
             save=None if left is None else ends,
             events=watched,
@@ -304,7 +307,7 @@ def _watch(system: Embedded, chart: Chart, way: _Way, begin: float, what: str) -
 def _stepped(system: Embedded, run: _Run, q: Array, v: Array, grid: Grid, method: str, force: Force, save: Any) -> None:
     kept = set(grid.kept(save, 2 * len(q)).tolist())
     if 0 in kept:
-        run.keep(0.0, q, v)
+        run.keep(grid.start, q, v)
     k, chart, was_near = 0, None, False
     while k < grid.steps:
         t = grid.time(k)
@@ -313,7 +316,9 @@ def _stepped(system: Embedded, run: _Run, q: Array, v: Array, grid: Grid, method
             run.hits.append(Hit(f"independent: {system.names(chart)}", t, q.copy(), v.copy()))
         dyn = system.on(chart, q, t)
         end = min(k + _BLOCK, grid.steps)
-        part, run.error = _part(*(dyn, q, v, chart, grid.time(end) - t, method, grid.dt), torque=_pulled(dyn, force, t))
+        part, run.error = _part(
+            *(dyn, q, v, chart, grid.time(end) - t, method), dt=grid.dt, torque=_pulled(dyn, force, t)
+        )
         run.count(part)
         dyn.remember(q)
         begin, worn = k, False

@@ -22,8 +22,8 @@ from mbkit.simulate.outcome import Outcome
 __all__ = ["along_constraints", "from_consistent", "refuse_constraints", "settled"]
 
 
-def from_consistent(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return initial states freed of rounding.
+def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array, Array]:
+    """Return initial states, at a time, freed of rounding.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
     from mbkit.lagrangian.redundancy import require_independent
 
     require_independent(dyn)
-    manifold = manifold_of(dyn).at(0.0)
+    manifold = manifold_of(dyn).at(t)
     manifold.check(q, v)
     return manifold.pulled(q, v)
 

@@ -71,7 +71,7 @@ def run_cvodes(asked: Asked) -> Outcome:
         force = torque.of_member(which)
         # A jump within a call is one that CVODES does not know of: its error test fails.
         pieces = [times[k : k + 2] for k in range(len(times) - 1)] if torque.held else [times]
-        run.begin(start)
+        run.begin(asked.start, start)
         for k, piece in enumerate(pieces):
             given = np.concatenate([np.asarray(force(k)), np.ravel(values)])
             if not run.over(piece, given):
@@ -89,9 +89,9 @@ class _Run:
         self._y: Array = np.empty(0)
         self._intervals = 1
 
-    def begin(self, y0: Array) -> None:
-        """Start at t = 0."""
-        self._take(0.0, y0)
+    def begin(self, t: float, y0: Array) -> None:
+        """Start at a state."""
+        self._keep(t, y0)
 
     def over(self, times: Array, given: Array) -> bool:
         """Go on to these times, of which the first is reached; return whether that was possible."""
@@ -126,11 +126,13 @@ class _Run:
         return steps, None
 
     def _take(self, t: float, y: Array) -> None:
+        self._keep(t, y)
+        self._done(t)
+
+    def _keep(self, t: float, y: Array) -> None:
         self._y, self.member.reached = y, t
         if t in self._saved:
             self.member.keep(t, y)
-        if t:
-            self._done(t)
 
 
 class _Solve:

@@ -32,7 +32,7 @@ def run_drake(asked: Asked) -> Outcome:
     members, evaluations = [], 0
     for i, (q, v) in enumerate(zip(asked.q, asked.v, strict=True)):
         member = Member()
-        run = DrakeRun(dyn, scheme, accuracy, q, v, asked.report(i))
+        run = DrakeRun(dyn, scheme, accuracy, asked.start, q, v, asked.report(i))
         _over(member, run, times, frozenset(save.tolist()), torque.of_member(asked.member(i)))
         member.steps, member.rejected = run.steps, run.rejected
         evaluations += run.evaluations

@@ -41,11 +41,11 @@ def run_embedded(asked: Asked) -> Outcome:
     as machine code; elsewhere stage by stage, by the same formulas. Torques held as an
     array start a new step at each interval.
     """
-    dyn, tolerances, duration, batch, save = asked.dyn, asked.tolerances, asked.duration, asked.batch, asked.save
+    dyn, tolerances, batch, save = asked.dyn, asked.tolerances, asked.batch, asked.save
     q0, v0, space = asked.q, asked.v, Space(asked.dyn.model)
-    trials = make_trials(asked.method, dyn, space, tolerances, asked.torque, duration, batch)
-    tracks = [Track(space, q0.shape[1], i, batch, save, asked.events, tolerances) for i in range(len(q0))]
-    stops = stops_of(duration, save, asked.torque)
+    trials = make_trials(asked.method, dyn, space, tolerances, asked.torque, asked.duration, batch)
+    tracks = [Track(space, q0.shape[1], i, batch, save, asked.events, tolerances, asked.start) for i in range(len(q0))]
+    stops = stops_of(asked)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), trials.width):
             part = slice(first, first + trials.width)
@@ -53,10 +53,11 @@ def run_embedded(asked: Asked) -> Outcome:
             try:
                 for track, q, v in zip(group, q0[part], v0[part], strict=True):
                     track.begin(q, v)
-                trials.start(range(first, first + len(group)), q0[part], space.enter(q0[part], v0[part]))
+                begun = space.enter(q0[part], v0[part])
+                trials.start(range(first, first + len(group)), q0[part], begun, asked.start)
                 for _ in march(trials, group, stops):
-                    now = sum(track.member.reached for track in group) / len(group)
-                    asked.bar.update((first + len(group) * now / duration) / len(q0))
+                    done = sum(track.member.reached - asked.start for track in group) / asked.duration
+                    asked.bar.update((first + done) / len(q0))
             except FunctionError as error:
                 # Where the torque is a function, trajectories run one by one.
                 which = getattr(error, "member", None)
@@ -96,10 +97,10 @@ def make_trials(
     return StageTrials(*given)
 
 
-def stops_of(duration: float, save: Array | None, torque: Torque) -> list[float]:
+def stops_of(asked: Asked) -> list[float]:
     """Return the times at which a run must stop on its way: where a held torque jumps, and the end."""
-    held = save.tolist() if save is not None and torque.held else []
-    return sorted({*held, duration} - {0.0})
+    held = asked.save.tolist() if asked.save is not None and asked.torque.held else []
+    return sorted({*held, asked.end} - {asked.start})
 
 
 def march(
@@ -140,6 +141,8 @@ class Track:
     save : (K,) array or None
     events : tuple of Event
     tolerances : Tolerances
+    start : float
+        Time of the first state, s.
 
     Attributes
     ----------
@@ -156,19 +159,20 @@ class Track:
         save: Array | None,
         events: tuple[Event, ...],
         tolerances: Tolerances,
+        start: float,
     ) -> None:
         which = None if batch is None else index
-        self.member, self._nq = Member(), nq
+        self.member, self._nq, self._start = Member(reached=start), nq, start
         self._space, self._save, self._tolerances = space, save, tolerances
         self._watch = Watch(events, which) if events else None
         self._kept: list[tuple[Array, Array, Array]] = []
 
     def begin(self, q: Array, v: Array) -> None:
         """Start at a state."""
-        if self._save is None or (len(self._save) and self._save[0] == 0.0):
-            self._kept.append((np.zeros(1), q[None], v[None]))
+        if self._save is None or (len(self._save) and self._save[0] == self._start):
+            self._kept.append((np.array([self._start]), q[None], v[None]))
         if self._watch is not None:
-            self._watch.start(0.0, q, v)
+            self._watch.start(self._start, q, v)
 
     def states(self) -> tuple[Array, Array, Array]:
         """Return t, q and v of all that was kept."""

@@ -208,7 +208,7 @@ class LaneTrials:
         arena.state[:] = start
         self.evaluations += 2 * self._places
         # Where there is no rate, the step finds that out.
-        return np.where(h > 0, h, 1e-6 * stop)
+        return np.where(h > 0, h, 1e-6 * (stop - arena.state[self._row["t"]]))
 
     def advance(self) -> list[tuple[int, Stretch]]:
         """Try until all have arrived or are stuck, some hundred times at most."""

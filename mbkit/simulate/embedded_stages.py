@@ -96,7 +96,7 @@ class StageTrials:
             h = math.nan
         # Where there is no rate, the step finds that out. At the least length no step
         # would be tried at all, and nobody be told.
-        return max(h if h > 0 else 1e-6 * self._stop, 2 * self._least)
+        return max(h if h > 0 else 1e-6 * (self._stop - self._t), 2 * self._least)
 
     def advance(self) -> list[tuple[int, Stretch]]:
         """Try one step."""

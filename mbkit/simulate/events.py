@@ -147,7 +147,7 @@ class Watch:
             lambda t: known[t] if t in known else self._value(event, t, state(t)),
             self._t,
             t1,
-            xtol=4 * eps * t1,
+            xtol=4 * eps * max(abs(self._t), abs(t1)),
             rtol=4 * eps,
         )
         return float(root)

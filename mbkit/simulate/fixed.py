@@ -64,7 +64,7 @@ class _Run:
         self._v_kept = np.full((*lead, len(kept), v0.shape[-1]), np.nan)
         self._row, self._next = 0, int(kept[0])
         self._members: Indices | None = np.arange(lead[0]) if lead else None
-        self._reached = np.full(lead, grid.duration)
+        self._reached = np.full(lead, grid.end)
         self._message = ""
         self._error: FunctionError | None = None
         self._steps = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +13,10 @@ from mbkit.errors import InputError
 
 Indices = NDArray[np.intp]
 
-__all__ = ["Grid", "Indices", "check_room", "save_times"]
+__all__ = ["DEFAULT_STEP", "Grid", "Indices", "check_room", "save_times"]
+
+#: s
+DEFAULT_STEP: Final = 1e-3
 
 # 8 GiB of float64: beyond it, a system that overcommits memory kills the process.
 _ROOM = 2**30
@@ -20,41 +24,45 @@ _ROOM = 2**30
 
 @dataclass(frozen=True)
 class Grid:
-    """Equal steps of `dt` from 0 to `duration`, the last one shortened if it must be.
+    """Equal steps of `dt` from `start` to `end`, the last one shortened if it must be.
 
     Attributes
     ----------
-    duration, dt, last : float
-        Of the run, of every step, and of the last one; s.
+    start, end : float
+        First and last time, s.
+    dt, last : float
+        Length of every step, and of the last one, s.
     steps : int
     """
 
-    duration: float
+    start: float
+    end: float
     dt: float
     steps: int
     last: float
 
     @classmethod
-    def of(cls, duration: float, dt: float) -> Grid:
+    def of(cls, start: float, duration: float, dt: float) -> Grid:
         """Count the steps; a remainder below rounding is no step of its own."""
+        end = start + duration
         ratio = duration / dt
         if not ratio < 2**53:
             raise InputError(f"dt: {dt:g} s makes {ratio:.3g} steps of {duration:g} s; expected a larger step")
         whole = round(ratio)
         if abs(ratio - whole) <= 4 * np.finfo(float).eps * ratio:
-            return cls(duration, dt, whole, dt)
+            return cls(start, end, dt, whole, dt)
         steps = int(np.ceil(ratio))
-        return cls(duration, dt, steps, duration - (steps - 1) * dt)
+        return cls(start, end, dt, steps, duration - (steps - 1) * dt)
 
     def time(self, k: int) -> float:
-        """Time of the k-th state, s; k dt, so that rounding does not pile up."""
-        return self.duration if k == self.steps else k * self.dt
+        """Time of the k-th state, s; start + k dt, so that rounding does not pile up."""
+        return self.end if k == self.steps else self.start + k * self.dt
 
     @property
     def times(self) -> Array:
         """All of them, (steps + 1,), s."""
-        out = np.arange(self.steps + 1, dtype=np.float64) * np.float64(self.dt)
-        out[-1] = self.duration
+        out = self.start + np.arange(self.steps + 1, dtype=np.float64) * np.float64(self.dt)
+        out[-1] = self.end
         return out
 
     def step(self, k: int) -> float:
@@ -77,15 +85,15 @@ class Grid:
             if save < 1:
                 raise InputError(f"save: expected a count of at least 1 or a grid of times, got {save}")
             return self._every(int(save), numbers)
-        times = save_times(save, self.duration)
-        index = np.minimum(np.rint(times / self.dt), self.steps).astype(np.intp)
-        index = np.where(times == self.duration, self.steps, index)
+        times = save_times(save, self.start, self.end)
+        index = np.minimum(np.rint((times - self.start) / self.dt), self.steps).astype(np.intp)
+        index = np.where(times == self.end, self.steps, index)
         on_grid = np.array([self.time(int(k)) for k in index])
-        off = np.abs(on_grid - times) > 1e-6 * self.dt
+        off = np.abs(on_grid - times) > 1e-6 * self.dt + 4 * np.finfo(float).eps * abs(self.start)
         if off.any():
             raise InputError(
                 f"save: {times[np.argmax(off)]:.9g} s is not a step of dt = {self.dt:g} s; "
-                "give multiples of dt, or an adaptive method"
+                "give multiples of dt after the start, or use an adaptive method"
             )
         if np.any(np.diff(index) <= 0):
             raise InputError(f"save: two times fall on one step of dt = {self.dt:g} s")
@@ -97,7 +105,7 @@ class Grid:
         return out if out[-1] == self.steps else np.append(out, self.steps)
 
 
-def save_times(save: ArrayLike, duration: float) -> Array:
+def save_times(save: ArrayLike, start: float, end: float) -> Array:
     """Return a grid of times, checked: increasing, within the run."""
     try:
         shape = np.shape(save)
@@ -108,9 +116,12 @@ def save_times(save: ArrayLike, duration: float) -> Array:
     times = finite_array("save", save, shape)
     if np.any(np.diff(times) <= 0):
         raise InputError("save: expected increasing times")
-    if times[0] < 0 or times[-1] > duration * (1 + 1e-12):
-        raise InputError(f"save: expected times between 0 and {duration:g} s, got {times[0]:g} to {times[-1]:g}")
-    return np.minimum(times, duration)
+    if times[0] < start or times[-1] > end + 1e-12 * max(abs(start), abs(end)):
+        raise InputError(
+            f"save: expected times between {start:g} and {end:g} s, got {times[0]:g} to {times[-1]:g} s; "
+            "times count from t0"
+        )
+    return np.minimum(times, end)
 
 
 def check_room(states: int, numbers: int) -> None:

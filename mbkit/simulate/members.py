@@ -80,11 +80,11 @@ def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
         check_room(len(save) * (1 if batch is None else batch), numbers)
 
 
-def reporter(bar: Progress, i: int, count: int, duration: float) -> Callable[[float], None]:
+def reporter(bar: Progress, i: int, count: int, start: float, duration: float) -> Callable[[float], None]:
     """Return what tells how far the i-th trajectory is, by its time."""
 
     def done(t: float) -> None:
-        bar.update((i + t / duration) / count)
+        bar.update((i + (t - start) / duration) / count)
 
     return done
 

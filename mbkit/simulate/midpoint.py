@@ -88,7 +88,7 @@ class _Run:
         self._midpoint = Midpoint(dyn.equations)
         self._q0, self._v0, self._w0 = q0, v0, Space(dyn.model).enter(q0, v0)
         n, rows = len(q0), len(kept)
-        (self._pi0,) = called(self._dyn, self._midpoint.momentum, slice(None), 0.0, q0, v0)
+        (self._pi0,) = called(self._dyn, self._midpoint.momentum, slice(None), grid.start, q0, v0)
         self._q, self._v = np.full((n, rows, q0.shape[1]), np.nan), np.full((n, rows, v0.shape[1]), np.nan)
         self._steps = np.zeros(n, dtype=np.intp)
         self._last = np.zeros(n)

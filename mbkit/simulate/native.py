@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from mbkit.errors import UnsupportedError
 from mbkit.simulate.grid import Grid, Indices, check_room
 from mbkit.simulate.methods import Method
 from mbkit.simulate.outcome import Outcome
+from mbkit.simulate.progress import Progress
 from mbkit.simulate.steps import credible
 from mbkit.simulate.torque import Torque
 
@@ -23,14 +25,24 @@ class HasRollout(Protocol):
     """An engine with integrators of its own."""
 
     def rollout(
-        self, integrator: str, q0: Array, v0: Array, dt: float, tau: Array | None, steps: int
+        self,
+        integrator: str,
+        q0: Array,
+        v0: Array,
+        dt: float,
+        tau: Array | None,
+        steps: int,
+        progress: Callable[[float], object] | None = None,
     ) -> tuple[Array, Array]:
-        """Return q and v after 0, 1, ... steps: (steps + 1, n) or (N, steps + 1, n)."""
+        """Return q and v after 0, 1, ... steps: (steps + 1, n) or (N, steps + 1, n).
+
+        `progress` gets the fraction done, several times a second.
+        """
         ...
 
 
 def run_native(
-    dyn: Dynamics, method: Method, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque
+    dyn: Dynamics, method: Method, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque, bar: Progress
 ) -> Outcome:
     """Run the engine's integrator; from the first state that is none on, nothing is kept."""
     engine, integrator = method.name.split("_", 1)
@@ -51,7 +63,8 @@ def run_native(
         return _outcome(method, grid, kept, *empty)
     # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
     whole = grid.steps if grid.last == grid.dt else grid.steps - 1
-    q, v = dyn.rollout(integrator=integrator, q0=q0, v0=v0, dt=grid.dt, tau=torque.over(0, whole), steps=whole)
+    first: dict[str, Any] = {"q0": q0, "v0": v0, "dt": grid.dt, "tau": torque.over(0, whole), "steps": whole}
+    q, v = dyn.rollout(integrator=integrator, progress=bar.update, **first)
     if whole < grid.steps:
         # What has diverged is void whatever follows; it only must not stop the others.
         good = np.isfinite(q[..., -1, :]).all(-1, keepdims=True) & np.isfinite(v[..., -1, :]).all(-1, keepdims=True)

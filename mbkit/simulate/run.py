@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,12 +14,13 @@ from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
 from mbkit.engines.expected import no_dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, UnsupportedError
+from mbkit.model import Model
 from mbkit.simulate.applied import Applied, TorqueFunction
 from mbkit.simulate.asked import Asked
 from mbkit.simulate.consistent import along_constraints, from_consistent
 from mbkit.simulate.doubts import doubts, halved
 from mbkit.simulate.events import Event, as_events
-from mbkit.simulate.grid import Grid, save_times
+from mbkit.simulate.grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.methods import METHODS, Method, Tolerances, method_of
 from mbkit.simulate.native import run_native
 from mbkit.simulate.outcome import Outcome
@@ -47,7 +48,7 @@ def simulate(
     v0: ArrayLike,
     duration: float,
     method: str = "rk4",
-    dt: float = 1e-3,
+    dt: float | None = None,
     rtol: float | None = None,
     atol: float | None = None,
     torque: ArrayLike | TorqueFunction | None = None,
@@ -55,6 +56,7 @@ def simulate(
     progress: bool | ProgressFunction | None = None,
     events: Event | Sequence[Event] | None = None,
     doubt: bool = True,
+    t0: float | None = None,
 ) -> Trajectory:
     """Integrate v̇ = forward_dynamics(q, v, τ), q̇ = D(q) v from one state or a batch.
 
@@ -80,19 +82,19 @@ def simulate(
         scenes); ``"taylor"``, heyoka's, and ``"cvodes"``, SUNDIALS', on the own
         derivation; ``"taylor"`` on the oracle computes with 34 digits.
         `mbkit.simulate.METHODS` describes them.
-    dt : float
-        Step of the methods that have one, s.
+    dt : float, optional
+        Step of a method with a fixed step, s; 1e-3 when not given. An adaptive method has none.
     rtol, atol : float, optional
         Tolerances of an adaptive method, from ``METHODS[method].least`` upwards;
-        1e-10, and `atol` as `rtol`, when not given.
+        1e-10, and `atol` as `rtol`, when not given. A method with a fixed step has none.
     torque : array_like or callable, optional
         Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv),
         held over each step (for an adaptive method, each interval of `save`, which
-        then runs from 0 to `duration`); or a function of (t, q, v) that returns
+        then runs from `t0` to the end); or a function of (t, q, v) that returns
         (nv,), called for one state at a time, at each stage.
     save : int or (K,) array_like, optional
         Which states to keep: every n-th and the last, or those at these times (for a
-        fixed step, multiples of it). Everything when not given. An adaptive method
+        fixed step, multiples of it after `t0`). Everything when not given. An adaptive method
         takes times alone; a batch needs them, and so does ``"cvodes"``. Steps of
         ``"dop853"`` and ``"radau"`` end on them; the others' do not depend on them.
     progress : bool or callable, optional
@@ -108,10 +110,15 @@ def simulate(
     doubt : bool
         Whether a finished run is looked at for signs that it is wrong: energy from nowhere, a step
         too long for the fastest mode, a singular mass matrix, coordinates beyond the digits of a
-        double. Some 0.4 ms for a small robot, whatever the length of the run; a method of first order
-        without torques, up to 20,000 steps, is also held against itself at twice the step, for half
-        the time of a run (of a batch, of its first trajectory). What is found is warned of, and in
-        ``Trajectory.stats.doubts``.
+        double. That takes 0.2 to 2 ms for a small robot, whatever the length of the run. A method of
+        first order without torques, up to 20,000 steps, is also compared with itself at twice the step,
+        which takes up to half a run more (of a batch, of its first trajectory). What is found is warned of,
+        and in ``Trajectory.stats.doubts``.
+
+    t0 : float, optional
+        Time of the first state, s. When not given, the time that `dyn` holds where time enters the
+        equation of motion (``dyn.at(t=3.0)``), else 0. All times of the run count from the same zero:
+        `save`, those of torque and event functions, ``Trajectory.t``.
 
     Returns
     -------
@@ -160,8 +167,10 @@ def simulate(
             # Only where SymPy and CasADi are loaded already.
             from mbkit.simulate.charts import run_on_charts
 
-            given = q0, v0, duration, dt, rtol, atol, torque, save, as_events(events)
-            return run_on_charts(dyn, method_of(method), *given)
+            chosen = method_of(method)
+            start, duration, dt = _times(dyn.dynamics, chosen, t0, duration, dt)
+            given = q0, v0, start, duration, dt, rtol, atol, torque, save, as_events(events)
+            return run_on_charts(dyn, chosen, *given)
         raise no_dynamics(dyn)
     chosen = method_of(method)
     model = dyn.model
@@ -171,53 +180,117 @@ def simulate(
     batch = _batch(dyn, batch_of(q0=q, v0=v))
     if batch is not None:
         q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
-    duration, dt = real("duration", duration, nonnegative=True), real("dt", dt, positive=True)
+    start, duration, dt = _times(dyn, chosen, t0, duration, dt)
     _require_engine(dyn, chosen)
-    q, v = from_consistent(dyn, q, v)
+    q, v = from_consistent(dyn, q, v, start)
     wanted = as_events(events)
     if wanted and not chosen.events:
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
     if callable(torque) and not chosen.callables:
         _refuse("torque functions", chosen, ["rk4", "rk853", "dop853"])
+    _warn_beyond_limits(model, q)
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
     arguments: dict[str, Any] = {"batch": batch, "torque": torque, "save": save, "bar": bar}
     started = time.perf_counter()
     with bar:
         if chosen.kind == "adaptive":
-            applied, outcome = _adaptive(dyn, chosen, q, v, duration, rtol, atol, events=wanted, **arguments)
+            applied, outcome = _adaptive(dyn, chosen, q, v, start, duration, rtol, atol, events=wanted, **arguments)
         else:
             _refuse_tolerances(chosen, rtol, atol)
-            applied, outcome = _stepped(dyn, chosen, q, v, duration, dt, **arguments)
+            applied, outcome = _stepped(dyn, chosen, q, v, Grid.of(start, duration, dt), **arguments)
     seconds = time.perf_counter() - started
     setting = dt if chosen.kind != "adaptive" else _tolerances(dyn, chosen, rtol, atol)
     outcome = along_constraints(dyn, outcome)
     found: list[str] = []
     if doubt and outcome.ended in ("finished", "event"):
-        states = _from_start(outcome, q, v)
+        states = _from_start(outcome, start, q, v)
         found = doubts(dyn, chosen, setting, *states, pushed=torque is not None, steps=outcome.steps)
         steps = round(duration / dt)
-        if chosen.order == 1 and torque is None and _FEWEST <= steps <= _MOST and not model.clock and v.size:
+        first_order = chosen.order == 1 and chosen.kind != "adaptive"
+        if first_order and torque is None and _FEWEST <= steps <= _MOST and not model.clock and v.size:
             one = (dyn, q, v) if batch is None else (dyn.of_samples([0]), q[:1], v[:1])
-            found += halved(model, chosen.name, dt, states, lambda times: _coarser(one, chosen.name, dt, times))
+            found += halved(model, chosen.name, dt, states, lambda times: _coarser(one, chosen.name, start, dt, times))
     return _wrapped(dyn, chosen, applied, outcome, seconds, (*outcome.doubts, *found))
 
 
-def _from_start(outcome: Outcome, q0: Array, v0: Array) -> tuple[Array, Array, Array]:
+@runtime_checkable
+class TakesParameters(Protocol):
+    """An engine whose parameters may have a value for each sample."""
+
+    @property
+    def parameter_values(self) -> Array:
+        """Values of the model's parameters, (p,) or one row per sample."""
+
+
+def _times(
+    dyn: Dynamics, method: Method, t0: float | None, duration: float, dt: float | None
+) -> tuple[float, float, float]:
+    """Return the first time, the duration and the step, checked; s."""
+    duration = real("duration", duration, nonnegative=True)
+    if 0 < duration < np.finfo(float).tiny:
+        raise InputError(f"duration: expected 0 or at least {np.finfo(float).tiny:.3g} s, got {duration:g} s")
+    step = DEFAULT_STEP if dt is None else real("dt", dt, positive=True)
+    if dt is not None and method.kind == "adaptive":
+        raise InputError(f"dt: {method.name} chooses its own steps; give rtol, or method='rk4' with dt")
+    start = _held_time(dyn) if t0 is None else real("t0", t0)
+    shortest = duration if method.kind == "adaptive" else min(duration, step)
+    if 4 * np.finfo(float).eps * abs(start) > shortest > 0:
+        raise InputError(f"t0: expected times that differ after {shortest:g} s, got {start:g} s; shift the time's zero")
+    return start, duration, step
+
+
+def _warn_beyond_limits(model: Model, q: Array) -> None:
+    """Warn of a start beyond a joint's limits, which do not act: degrees are a common reason."""
+    low, high = model.lower, model.upper
+    room = 1e-9 * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
+    rows = np.atleast_2d(q)
+    beyond = (rows < low - room) | (rows > high + room)
+    if beyond.any():
+        row, i = np.argwhere(beyond)[0]
+        which = f"trajectory {row}: " if q.ndim == 2 else ""
+        more = np.count_nonzero(beyond) - 1
+        warnings.warn(
+            f"{model.name}: q0: {which}{model.coordinate_names[i]} = {rows[row, i]:g} is beyond its limits "
+            f"[{low[i]:g}, {high[i]:g}]"
+            + (f", and {more} more" if more else "")
+            + "; limits do not act in a run, and angles are in radians",
+            MbkitWarning,
+            stacklevel=3,
+        )
+
+
+def _held_time(dyn: Dynamics) -> float:
+    """Return the time at which the dynamics stands, s; 0 where time does not enter."""
+    clock = dyn.model.clock
+    if clock is None:
+        return 0.0
+    if isinstance(dyn, TakesParameters):
+        held = np.unique(np.atleast_2d(dyn.parameter_values)[:, list(dyn.model.parameters).index(clock)])
+    else:
+        held = np.array([dyn.model.parameters[clock]])
+    if len(held) != 1:
+        raise InputError(f"t0: the samples hold {len(held)} different values of {clock}; give one start time, t0=")
+    return float(held[0])
+
+
+def _from_start(outcome: Outcome, start: float, q0: Array, v0: Array) -> tuple[Array, Array, Array]:
     """Return what was kept, with the start."""
-    if len(outcome.t) and outcome.t[0] == 0:
+    if len(outcome.t) and outcome.t[0] == start:
         return outcome.t, outcome.q, outcome.v
     q, v = (np.concatenate([x[..., None, :], kept], -2) for x, kept in ((q0, outcome.q), (v0, outcome.v)))
-    return np.append(0.0, outcome.t), q, v
+    return np.append(start, outcome.t), q, v
 
 
-def _coarser(one: tuple[Dynamics, Array, Array], method: str, dt: float, times: Array) -> tuple[Array, Array] | None:
+def _coarser(
+    one: tuple[Dynamics, Array, Array], method: str, start: float, dt: float, times: Array
+) -> tuple[Array, Array] | None:
     """Return q and v at some times with a step twice as long; None where it does not get there."""
     dyn, q, v = one
     if dyn.samples is None:
         q, v = np.atleast_2d(q)[0], np.atleast_2d(v)[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
-        run = simulate(dyn, q, v, float(times[-1]), method, 2 * dt, save=times, doubt=False)
+        run = simulate(dyn, q, v, float(times[-1]) - start, method, 2 * dt, save=times, doubt=False, t0=start)
     count = len(times)
     return (run.q.reshape(count, -1), run.v.reshape(count, -1)) if run.stats.finished else None
 
@@ -248,6 +321,7 @@ def _adaptive(
     method: Method,
     q: Array,
     v: Array,
+    start: float,
     duration: float,
     rtol: float | None,
     atol: float | None,
@@ -261,10 +335,11 @@ def _adaptive(
     tolerances = _tolerances(dyn, method, rtol, atol)
     if isinstance(save, (int, np.integer)):
         raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
-    times = None if save is None else save_times(save, duration)
-    whole = times is not None and times[0] == 0 and times[-1] == duration
+    times = None if save is None else save_times(save, start, start + duration)
+    whole = times is not None and times[0] == start and times[-1] == start + duration
     read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
-    outcome = adaptive_runner(method)(Asked(dyn, method.name, q, v, duration, tolerances, read, times, events, bar))
+    given = dyn, method.name, q, v, start, duration, tolerances, read, times, events, bar
+    outcome = adaptive_runner(method)(Asked(*given))
     return read.applied(times), outcome
 
 
@@ -287,8 +362,7 @@ def _stepped(
     method: Method,
     q: Array,
     v: Array,
-    duration: float,
-    dt: float,
+    grid: Grid,
     *,
     batch: int | None,
     torque: ArrayLike | TorqueFunction | None,
@@ -296,11 +370,10 @@ def _stepped(
     bar: Progress,
 ) -> tuple[Applied | None, Outcome]:
     model = dyn.model
-    grid = Grid.of(duration, dt)
     kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
     read = Torque(torque, model, batch, grid.steps)
     if method.kind == "native":
-        outcome = run_native(dyn, method, q, v, grid, kept, read)
+        outcome = run_native(dyn, method, q, v, grid, kept, read, bar)
         bar.update(1.0)
     else:
         outcome = fixed_runner(method, dyn, read)(dyn, method.name, q, v, grid, kept, read, bar)

@@ -60,8 +60,8 @@ def run_taylor(asked: Asked) -> Outcome:
         )
     kind = precision(_BITS[dyn.engine])
     system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / size_of(asked.y), kind.eps)
-    ends = [asked.duration, *(save.tolist() if save is not None and torque.held else [])]
-    stops = sorted({*ends} - {0.0})
+    ends = [asked.end, *(save.tolist() if save is not None and torque.held else [])]
+    stops = sorted({*ends} - {asked.start})
     members = []
     with system.integrator(kind, tolerance) as integrator:
         for i, start in enumerate(asked.y):
@@ -72,7 +72,7 @@ def run_taylor(asked: Asked) -> Outcome:
             steps = TaylorSteps(system, integrator, kind, _behind(own, kind), settled)
             watch = Watch(asked.events, which) if asked.events else None
             one = _Run(own, steps, save, watch, asked.report(i))
-            members.append(one.all(start, stops, torque.of_member(which)))
+            members.append(one.all(asked.start, start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
     return gathered(dyn.model, members, asked.batch, save, evaluations=evaluations)
 
@@ -136,14 +136,15 @@ class TaylorSteps:
         self.t0 = self.t = 0.0
         self.y0 = self.y = np.empty(0)
 
-    def __call__(self, y0: Any, stops: Sequence[float], force: Callable[[int], Any]) -> Iterator[float]:
-        """Take steps from t = 0 that end at the stops, and yield the time after each.
+    def __call__(self, t0: float, y0: Any, stops: Sequence[float], force: Callable[[int], Any]) -> Iterator[float]:
+        """Take steps from a time that end at the stops, and yield the time after each.
 
         Parameters
         ----------
+        t0 : float
         y0 : (nq + nv,) array
         stops : sequence of float
-            Increasing, above 0; the last is the end.
+            Increasing, above t0; the last is the end.
         force : callable
             force(k) is what acts before the k-th stop, (nv,).
 
@@ -154,12 +155,12 @@ class TaylorSteps:
         """
         integrator, kind = self._integrator, self._kind
         state = integrator.state
-        integrator.time = kind.dtype(0.0)
+        integrator.time = kind.dtype(t0)
         state[:] = y0
-        self.t0 = self.t = 0.0
+        self.t0 = self.t = t0
         self.y0 = self.y = state.copy()
         # 1/eps steps would never end, though near t = 0 they are above rounding.
-        least = stops[-1] * kind.eps if stops else 0.0
+        least = (stops[-1] - t0) * kind.eps if stops else 0.0
         last = kind.dtype(0.0)
         for k, stop in enumerate(stops):
             self._system.fill(integrator, force(k), self._behind)
@@ -251,15 +252,16 @@ class _Run:
         self._save = None if save is None else save.tolist()
         self._member = Member()
 
-    def all(self, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> Member:
+    def all(self, t0: float, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> Member:
         """Return what comes of it."""
         member, steps = self._member, self._steps
-        if self._save is None or self._save[:1] == [0.0]:
-            member.keep(0.0, y0)
+        member.reached = t0
+        if self._save is None or self._save[:1] == [t0]:
+            member.keep(t0, y0)
         try:
             if self._watch is not None:
-                self._watch.start(0.0, *_state(self._dyn.model, y0))
-            for t in steps(y0, stops, force):
+                self._watch.start(t0, *_state(self._dyn.model, y0))
+            for t in steps(t0, y0, stops, force):
                 member.steps += 1
                 if self._watch is not None and self._ends(t, self._watch):
                     return member

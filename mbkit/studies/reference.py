@@ -182,7 +182,7 @@ def _checked(model: Model, q0: ArrayLike, v0: ArrayLike, duration: float, save: 
     if q.ndim != 1 or v.ndim != 1:
         raise InputError(f"q0, v0: expected one state, got shapes {q.shape} and {v.shape}; give one after the other")
     duration = real("duration", duration, nonnegative=True)
-    times = save_times(save, duration)
+    times = save_times(save, 0.0, duration)
     whole = times[0] == 0 and times[-1] == duration
     read = Torque(torque, model, None, len(times) - 1 if whole else None)
     times = times if times[0] == 0 else np.concatenate([[0.0], times])

@@ -193,7 +193,7 @@ def _states(motion: Motion, kind: Any, steps: TaylorSteps, deadline: Deadline, m
     y0 = _unit(model, kind.array(np.concatenate([motion.q0, motion.v0])))
     out, count, force = [y0], 0, motion.torque.of_member(None)
     try:
-        for t in steps(y0, motion.stops, force):
+        for t in steps(0.0, y0, motion.stops, force):
             count += 1
             while len(out) < len(saved) and saved[len(out)] <= t:
                 out.append(_unit(model, steps.at(saved[len(out)])))
