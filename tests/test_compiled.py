@@ -9,6 +9,7 @@ import resource
 import stat
 import threading
 import warnings
+import weakref
 from pathlib import Path
 
 import casadi as ca
@@ -226,6 +227,36 @@ def test_memory_stays_flat_over_ten_thousand_batches():
 
     before = calls(500)
     assert calls(10_000) - before < 2000  # kB; a leak of one result of 1 kB a call would be 20,000
+
+
+def test_compiling_leaves_no_memory_behind():
+    """`validation/memory.py` measures the slope over 2,000 models; here a pass manager and constants would show."""
+
+    def compiled_functions(n: int) -> float:
+        for k in range(n):
+            x = ca.SX.sym("x")
+            jit.program_object(program(ca.Function("f", [x], [ca.sin(x) * (k + 0.5)])))
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * resource.getpagesize() / 1000
+
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("resident memory is read from /proc")
+    before = compiled_functions(10)
+    assert compiled_functions(40) - before < 40 * 15  # kB; it was 60 kB for each
+
+
+@pytest.mark.parametrize("method", ["rk4", "rk853", "rodas5", "implicit_midpoint", "taylor"])
+def test_equations_are_released_after_a_run(method):
+    if method == "taylor":
+        pytest.importorskip("heyoka")
+    dyn = mb.dynamics(mb.catalog.pendulum(), "lagrangian", compile=True)
+    released = weakref.ref(dyn.equations)
+    step = {"dt": 0.01} if method in ("rk4", "implicit_midpoint") else {}
+    mb.simulate(dyn, [0.3], [0.0], 0.02, method=method, **step)
+    del dyn
+    gc.collect()
+    assert released() is None
 
 
 @pytest.mark.parametrize("to_code", [True, False])
