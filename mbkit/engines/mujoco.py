@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, ClassVar
 
 import mujoco
@@ -54,8 +55,6 @@ class MujocoDynamics(Dynamics):
         self.disabled = self._made.disabled
         self._d = mujoco.MjData(self._m)
         self._reduced = model.layout.reduced
-        #: Tendons of the point springs that need a direction.
-        self._lines = [k for k, spring in enumerate(model.springs) if spring.needs_direction]
         self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
@@ -110,6 +109,11 @@ class MujocoDynamics(Dynamics):
 
     def _force(self, f: Array) -> Array:
         return np.asarray(self._columns(f[None, :])[0])
+
+    @cached_property
+    def _lines(self) -> list[int]:
+        """Tendons of the point springs that need a direction; springs are the first tendons."""
+        return [k for k, spring in enumerate(self.model.springs) if spring.needs_direction]
 
     def _directed(self, x: np.ndarray) -> Array:
         """Return what contains spring forces; NaN where a spring that needs a direction has no length.
