@@ -210,6 +210,11 @@ def _rows(model: Model, q: Array) -> dict[str, Array]:
             rotors,
         ]
         out[joint.name] = np.concatenate(rows, axis=1) @ layout.G
+    for coupling in model.couplings:
+        # They are rows of T, whichever joint they stand with.
+        row = np.sqrt(coupling.armature) * layout.coupling_row(coupling) @ layout.G
+        at_first = out[coupling.joints[0]]
+        out[coupling.joints[0]] = np.concatenate([at_first, np.broadcast_to(row, (n, 1, row.size))], axis=1)
     return out
 
 

@@ -14,7 +14,7 @@ __all__ = ["damping_forces", "gravity_energy", "kinetic_energy", "spring_energy"
 
 
 def kinetic_energy(kin: Kinematics) -> Any:
-    """Return T = Σ ½ m |v_com|² + ½ ωᵀ I ω + ½ Σ armature v² (König's theorem)."""
+    """Return T = Σ ½ m |v_com|² + ½ ωᵀ I ω (König's theorem) + ½ Σ armature v² + ½ Σ armature (dl/dt)²."""
     total: Any = ca.SX(0)
     for body in kin.model.bodies:
         linear, angular = kin.twists[body.name]
@@ -26,6 +26,9 @@ def kinetic_energy(kin: Kinematics) -> Any:
     for joint in kin.model.joints:
         for rotor, rate in zip(kin.values.joints[joint.name].armature, kin.velocities(joint), strict=True):
             total += 0.5 * rotor * rate * rate
+    for coupling in kin.model.couplings:
+        _, rate = kin.coupled(coupling)
+        total += 0.5 * kin.values.couplings[coupling.name].armature * rate * rate
     return total
 
 
@@ -51,7 +54,7 @@ def gravity_energy(kin: Kinematics) -> Any:
 
 
 def spring_energy(kin: Kinematics) -> Any:
-    """Return the energy stored in joint springs and point-to-point springs."""
+    """Return the energy stored in the springs of joints, of couplings and between points."""
     total: Any = ca.SX(0)
     for joint in kin.model.joints:
         values = kin.values.joints[joint.name]
@@ -59,6 +62,11 @@ def spring_energy(kin: Kinematics) -> Any:
             if not is_zero(stiffness):
                 stretch = kin.coordinates(joint)[k] - values.rest[k]
                 total += 0.5 * stiffness * stretch * stretch
+    for coupling in kin.model.couplings:
+        values = kin.values.couplings[coupling.name]
+        if not is_zero(values.stiffness):
+            stretch = kin.coupled(coupling)[0] - values.rest_length
+            total += 0.5 * values.stiffness * stretch * stretch
     for spring, gap in _gaps(kin):
         if is_zero(spring.stiffness):
             continue
@@ -76,6 +84,9 @@ def damping_forces(kin: Kinematics) -> Any:
     for joint in kin.model.joints:
         for damping, rate in zip(kin.values.joints[joint.name].damping, kin.velocities(joint), strict=True):
             dissipation += 0.5 * damping * rate * rate
+    for coupling in kin.model.couplings:
+        _, rate = kin.coupled(coupling)
+        dissipation += 0.5 * kin.values.couplings[coupling.name].damping * rate * rate
     for spring, gap in _gaps(kin):
         if not is_zero(spring.damping):
             rate = ca.jtimes(_length(gap), kin.q, kin.qdot)

@@ -1,8 +1,8 @@
 """Sparse LᵀDL solution of M a = f, written out as expressions.
 
 Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 6.5: eliminating from the
-leaves to the root fills in nothing on a tree. Mimic joints couple branches; the
-entries that they fill in are simply added to the pattern.
+leaves to the root fills in nothing on a tree. Mimic joints and the rotors of joint
+couplings couple branches; the entries that they fill in are added to the pattern.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from mbkit.derivation.scalars import scalar
 from mbkit.model import Model
@@ -35,6 +36,16 @@ def elimination_size(model: Model) -> int:
         # Of two velocities that move one body, the later one's row has an entry.
         for i in moving[joint.child]:
             before[i] |= {j for j in moving[joint.child] if rank[j] <= rank[i]}
+    rotors = [c for c in model.couplings if c.armature or any(b.part == c.name for b in model.bindings)]
+    for coupling in rotors:
+        row = np.flatnonzero(model.layout.coupling_row(coupling) @ model.layout.G).tolist()
+        for i in row:
+            before[i] |= {j for j in row if rank[j] <= rank[i]}
+    if rotors:
+        # They couple branches: eliminating one velocity after the other fills in more entries.
+        for k in sorted(rank, key=rank.__getitem__, reverse=True):
+            for i in before[k] - {k}:
+                before[i] |= {j for j in before[k] if rank[j] <= rank[i]}
     return sum(len(earlier) ** 2 for earlier in before.values())
 
 

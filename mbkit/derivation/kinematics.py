@@ -14,7 +14,7 @@ import casadi as ca
 from mbkit.derivation import scalars
 from mbkit.derivation.scalars import scalar
 from mbkit.derivation.values import Constants, Values, is_zero
-from mbkit.model import Joint, Model
+from mbkit.model import Joint, JointCoupling, Model
 from mbkit.model.kinds import cross3
 
 __all__ = ["Kinematics", "add", "constant_times", "constant_transposed_times", "dot3"]
@@ -80,6 +80,13 @@ class Kinematics:
     def velocities(self, joint: Joint) -> Vector:
         """Return the joint's velocities."""
         return self._v_of[joint.name]
+
+    def coupled(self, coupling: JointCoupling) -> tuple[Any, Any]:
+        """Return a coupling's length and its rate."""
+        factors = self.values.couplings[coupling.name].factors
+        pairs = list(zip(factors, coupling.joints, strict=True))
+        length, rate = (sum((c * of[joint][0] for c, joint in pairs), 0.0) for of in (self._q_of, self._v_of))
+        return length, rate
 
     @cached_property
     def placements(self) -> dict[str, tuple[Any, Vector]]:

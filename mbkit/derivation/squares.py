@@ -74,6 +74,8 @@ def squares(kin: Kinematics) -> Squares:
     for joint in kin.model.joints:
         for rotor, rate in zip(kin.values.joints[joint.name].armature, kin.velocities(joint), strict=True):
             rows.row(rotor, rate, 0.0)
+    for coupling in kin.model.couplings:
+        rows.row(kin.values.couplings[coupling.name].armature, kin.coupled(coupling)[1], 0.0)
     return rows.finished()
 
 

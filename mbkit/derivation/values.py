@@ -27,6 +27,7 @@ _BODY: Final = ("mass", "com", "inertia")
 _PLACE: Final = ("rotation", "translation")
 _JOINT: Final = (*_PLACE, "axes", "pitch", "armature", "damping", "stiffness", "rest")
 _MIMIC: Final = ("ratio", "offset")
+_COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
 _SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
 # A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum
 # of literal masses could be divided by, and its quotient be rounded to double.
@@ -58,7 +59,7 @@ class Values:
     Attributes
     ----------
     gravity : list of 3 scalars
-    bodies, joints, springs : dict of str to SimpleNamespace
+    bodies, joints, springs, couplings : dict of str to SimpleNamespace
         By name. A joint that mimics has `ratio` and `offset` too.
     named : dict of str to casadi.SX
         The parameters' symbols.
@@ -89,6 +90,7 @@ class Values:
         self.bodies = {b.name: self._read("bodies", b.name, b, _BODY) for b in model.bodies}
         self.joints = {j.name: self._joint(j) for j in model.joints}
         self.springs = {s.name: self._read("springs", s.name, s, _SPRING) for s in model.springs}
+        self.couplings = {c.name: self._read("couplings", c.name, c, _COUPLING) for c in model.couplings}
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
 
     @property

@@ -14,7 +14,7 @@ from typing import Final
 
 from mbkit.errors import KnownDefectWarning
 
-__all__ = ["CORIOLIS", "KINETIC_ENERGY", "TINY_MASS", "Defect", "announce"]
+__all__ = ["CORIOLIS", "KINETIC_ENERGY", "TENDON_ARMATURE", "TINY_MASS", "Defect", "announce"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,16 @@ TINY_MASS: Final = Defect(
     "the sum of two inertias has a wrong centre of mass where they weigh less than 2.2e-16 kg together, and with it M, "
     "nle and accelerations",
     "the lagrangian engine is right; or take a larger unit of mass",
+)
+
+
+TENDON_ARMATURE: Final = Defect(
+    "mujoco",
+    "mass_matrix",
+    "4.0.0",
+    "the armature of a tendon over joints of different branches is left out of M's entries between the branches, and "
+    "with them out of accelerations and the kinetic energy",
+    "the lagrangian and pinocchio engines have all of a c cᵀ",
 )
 
 

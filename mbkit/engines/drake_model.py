@@ -68,8 +68,15 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
     Raises
     ------
     UnsupportedError
-        A body or a spring that Drake refuses, or a joint of a type or with damping that it cannot hold; named.
+        A body or a spring that Drake refuses, a joint of a type or with damping that it cannot hold, or a joint
+        coupling; named.
     """
+    if description.couplings:
+        names = ", ".join(repr(c.name) for c in description.couplings)
+        raise UnsupportedError(
+            f"drake: {description.name} has joint couplings ({names}); Drake has no spring, damper or rotor on a sum "
+            "of joint coordinates"
+        )
     # A step of zero makes it continuous: ẋ = f(x) and nothing else.
     plant = MultibodyPlant(0.0)
     plant.mutable_gravity_field().set_gravity_vector(np.array(description.gravity) * gravity)

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import threading
 import warnings
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Final
 
 import mujoco
@@ -23,7 +25,8 @@ from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel
 from mbkit.errors import UnsupportedError
 from mbkit.load.floating import BASE_JOINT
-from mbkit.model import Body, Joint, Model
+from mbkit.load.mjcf_couplings import coupled
+from mbkit.model import Body, Joint, JointCoupling, Model, PointSpring
 from mbkit.model.kinds import kind_of
 
 __all__ = ["ImportedMujoco", "read"]
@@ -83,9 +86,9 @@ def _beside(m: Any) -> list[str]:
     for kind in dict.fromkeys(kinds):
         what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
         out.append(f"{what} ({kinds.count(kind)}), outside M and nle")
-    for count, what in ((m.ntendon, "tendons"), (m.nu, "actuators")):
+    for count, what in ((m.ntendon, "tendons"), (len(m.actuator_trntype), "actuators")):
         if count:
-            out.append(f"{count} {what}, outside M and nle")
+            out.append(f"{count} {what}: their armature is part of M, their springs and dampers are outside M and nle")
     if np.any(m.body_gravcomp):
         out.append(f"gravity compensation on {int(np.count_nonzero(m.body_gravcomp))} bodies, outside nle")
     return out
@@ -109,6 +112,7 @@ class _Description:
         self.model = Model(
             name="mujoco", gravity=np.array(m.opt.gravity), bodies=tuple(self.bodies), joints=tuple(self.joints)
         )
+        self.model = coupled(replace(self.model, springs=tuple(self._point_springs())), self._couplings())
         self.made = self._mapped()
 
     def _new(self, what: str, name: str) -> str:
@@ -193,6 +197,70 @@ class _Description:
                 rest=rest,
             )
         )
+
+    def _on(self, part: str) -> bool:
+        """Return whether no option flag switches springs, dampers or actuation off."""
+        return not self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}"))
+
+    def _spring(self, t: int) -> tuple[float, float, float]:
+        """Return a tendon's stiffness, rest length and damping; a spring with a range of rest lengths is left out."""
+        m, (low, high) = self.m, self.m.tendon_lengthspring[t].tolist()
+        stiffness = float(np.ravel(m.tendon_stiffness[t])[0]) if low == high and self._on("SPRING") else 0.0
+        return max(stiffness, 0.0), low, float(np.ravel(m.tendon_damping[t])[0]) * self._on("DAMPER")
+
+    def _point_springs(self) -> Iterator[PointSpring]:
+        """Yield the tendons that are springs between two sites."""
+        m = self.m
+        for t in range(m.ntendon):
+            wraps = range(int(m.tendon_adr[t]), int(m.tendon_adr[t]) + int(m.tendon_num[t]))
+            if [int(m.wrap_type[w]) for w in wraps] == [int(mujoco.mjtWrap.mjWRAP_SITE)] * 2:
+                sites = [int(m.wrap_objid[w]) for w in wraps]
+                bodies = [int(m.site_bodyid[k]) for k in sites]
+                (a, at_a), (b, at_b) = (
+                    (self.names[i], m.site_pos[k] - self.anchors[i]) for i, k in zip(bodies, sites, strict=True)
+                )
+                stiffness, rest, damping = self._spring(t)
+                if a != b and (stiffness or damping):
+                    name = m.tendon(t).name or f"tendon{t + 1}"
+                    yield PointSpring(name, a, at_a, b, at_b, stiffness, rest, damping)
+
+    def _couplings(self) -> Iterator[JointCoupling]:
+        """Yield what tendons and actuators do as springs, dampers and rotors on sums of joint coordinates."""
+        m, taken = self.m, set[str]()
+        names = {j: joint.name for j, joint in zip(self.numbers, self.joints, strict=True)}
+
+        def made(name: str, row: dict[int, float], *numbers: float) -> Iterator[JointCoupling]:
+            taken.add(name := unused(name, taken))
+            row = {j: x for j, x in row.items() if x}
+            if row and (numbers[0] or any(numbers[2:])):
+                yield JointCoupling(name, tuple(names[j] for j in row), np.array([*row.values()]), *numbers)
+
+        tendons: dict[int, dict[int, float]] = {}
+        for t in range(m.ntendon):
+            wraps = range(int(m.tendon_adr[t]), int(m.tendon_adr[t]) + int(m.tendon_num[t]))
+            row = dict.fromkeys((int(m.wrap_objid[w]) for w in wraps), 0.0)
+            if all(m.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
+                for w in wraps:
+                    row[int(m.wrap_objid[w])] += float(m.wrap_prm[w])
+                tendons[t] = row
+                yield from made(
+                    m.tendon(t).name or f"tendon{t + 1}", row, *self._spring(t), float(m.tendon_armature[t])
+                )
+        of_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+        # An actuator may have several controls, which nu counts.
+        for i in range(len(m.actuator_trntype)):
+            target, row = int(m.actuator_trnid[i, 0]), {}
+            if int(m.actuator_trntype[i]) in of_joint and _KINDS[int(m.jnt_type[target])] in ("prismatic", "revolute"):
+                row = {target: 1.0}
+            elif m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
+                row = tendons.get(target, {})
+            row = {j: float(m.actuator_gear[i, 0]) * x for j, x in row.items()}
+            affine = m.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and self._on("ACTUATION")
+            b0, b1, b2 = m.actuator_biasprm[i, :3].tolist() if affine else (0.0, 0.0, 0.0)
+            rest = -b0 / b1 if b1 else 0.0
+            damping = float(np.ravel(m.actuator_damping[i])[0]) * self._on("DAMPER") - min(b2, 0.0)
+            name = m.actuator(i).name or f"actuator{i + 1}"
+            yield from made(name, row, max(-b1, 0.0), rest, max(damping, 0.0), float(m.actuator_armature[i]))
 
     def _mapped(self) -> MujocoModel:
         m, layout = self.m, self.model.layout

@@ -11,8 +11,9 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import mujoco
 import numpy as np
@@ -20,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
+from mbkit.engines import defects
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco_model import MujocoModel, build
@@ -28,6 +30,10 @@ from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
 
 __all__ = ["MujocoDynamics"]
+
+
+#: Quantities that M is part of.
+_OF_MASS: Final = ("mass_matrix", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
 
 
 class MujocoDynamics(Dynamics):
@@ -58,6 +64,9 @@ class MujocoDynamics(Dynamics):
         self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+        if quantity in _OF_MASS and self.model.couplings and self._torn_couplings:
+            names = ", ".join(repr(name) for name in self._torn_couplings)
+            defects.announce(defects.TENDON_ARMATURE, f"coupling {names}")
         # One MjData and one handler of warnings: two threads in here end the process.
         with self._lock, heard_warnings() as heard:
             # MuJoCo tells each kind of warning once, unless its count is put back.
@@ -66,6 +75,21 @@ class MujocoDynamics(Dynamics):
         if heard:
             raise NumericalError(f"mujoco: {quantity} of {self.model.name}: {heard[0].strip()}{self._blame()}")
         return out
+
+    @cached_property
+    def _torn_couplings(self) -> tuple[str, ...]:
+        """Names of the couplings whose armature MuJoCo leaves out of M between branches, found by evaluating M."""
+        layout, q = self.model.layout, self.model.neutral()
+        rows = {c.name: c.armature**0.5 * layout.coupling_row(c) @ layout.G for c in self.model.couplings if c.armature}
+        if not rows:
+            return ()
+        with self._lock:
+            M = self._one_mass_matrix(q)
+        bare = MujocoDynamics(replace(self.model, couplings=()))._one_mass_matrix(q)
+        missing = np.abs(bare + sum(np.outer(x, x) for x in rows.values()) - M)
+        root = np.sqrt(np.abs(np.diag(M)))
+        lost = missing > 1e-9 * np.outer(root, root)
+        return tuple(name for name, x in rows.items() if lost[np.ix_(x != 0, x != 0)].any())
 
     # Between the description's numbers and MuJoCo's.
 
@@ -139,6 +163,9 @@ class MujocoDynamics(Dynamics):
         self._set(q)
         mujoco.mj_kinematics(self._m, self._d)
         mujoco.mj_comPos(self._m, self._d)
+        if self._m.ntendon:
+            # Their armature is part of M.
+            mujoco.mj_tendon(self._m, self._d)
         mujoco.mj_makeM(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
 

@@ -20,6 +20,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import unknown_joint
+from mbkit.engines.imported import unused
 from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
@@ -143,6 +144,7 @@ def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
     disabled = _switch_off(spec, description)
     placed = _add_tree(spec, description)
     _add_springs(spec, description, placed)
+    _add_couplings(spec, description, placed)
     return spec, placed, disabled
 
 
@@ -291,6 +293,20 @@ def _add_springs(spec: Any, description: Model, placed: Placed) -> None:
             tendon.wrap_site(site)
         tendon.stiffness[0], tendon.damping[0] = spring.stiffness, spring.damping
         tendon.springlength = [spring.rest_length, spring.rest_length]
+
+
+def _add_couplings(spec: Any, description: Model, placed: Placed) -> None:
+    taken = {spring.name for spring in description.springs}
+    for coupling in description.couplings:
+        # Springs between points are tendons too.
+        tendon = spec.add_tendon(name=unused(coupling.name, taken))
+        # A rest length of -1 would mean the length where the joints' springs rest; with all signs turned it is 1.
+        sign = -1.0 if coupling.rest_length == -1.0 else 1.0
+        for joint, factor in zip(coupling.joints, coupling.factors, strict=True):
+            tendon.wrap_joint(placed.joints[joint][0], sign * float(factor))
+        tendon.stiffness[0], tendon.damping[0] = coupling.stiffness, coupling.damping
+        tendon.springlength = [sign * coupling.rest_length] * 2
+        tendon.armature = coupling.armature
 
 
 def _refusal(description: Model, error: str) -> str:

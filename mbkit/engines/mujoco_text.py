@@ -59,7 +59,7 @@ def mjcf_text(model: Model, comment: str) -> str:
     owners = {name: joint for joint in model.joints for name in placed.joints[joint.name]}
     lines += _body(spec.worldbody, owners, placed, model, "    ")
     lines.append("  </worldbody>")
-    lines += _tendons(spec)
+    lines += _tendons(spec, model)
     lines += _equalities(model)
     return "\n".join([*lines, "</mujoco>"]) + "\n"
 
@@ -92,6 +92,9 @@ def _unsayable(model: Model) -> Iterator[str]:
             yield f"{who} is damped differently along its body axes"
         elif joint.kind == "free" and joint.parent == "world" and np.ptp(joint.damping) > 0:
             yield f"{who} is damped differently in turning and in moving"
+    for coupling in model.couplings:
+        if coupling.armature and model.branched(coupling):
+            yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
     yield from (f"loop {x.name!r} (MuJoCo's would be soft)" for x in model.loops)
     yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
@@ -160,15 +163,22 @@ def _joint(joint: Any, owner: Joint) -> str:
     return _told(**given)
 
 
-def _tendons(spec: Any) -> Iterable[str]:
+def _tendons(spec: Any, model: Model) -> Iterable[str]:
     if not spec.tendons:
         return []
     out = ["  <tendon>"]
-    for tendon in spec.tendons:
+    points, between = spec.tendons[: len(model.springs)], spec.tendons[len(model.springs) :]
+    for tendon in points:
         given = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping")}
         out.append(f"    <spatial{_told(name=tendon.name, springlength=tendon.springlength[0], **given)}>")
         out += [f"      <site{_told(site=wrap.target.name)}/>" for wrap in tendon.path]
         out.append("    </spatial>")
+    for tendon in between:
+        given = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping", "armature")}
+        rest = tendon.springlength[0] if given["stiffness"] else None
+        out.append(f"    <fixed{_told(name=tendon.name, springlength=rest, **given)}>")
+        out += [f"      <joint{_told(joint=wrap.target.name, coef=wrap.coef)}/>" for wrap in tendon.path]
+        out.append("    </fixed>")
     return [*out, "  </tendon>"]
 
 

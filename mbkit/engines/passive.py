@@ -1,4 +1,4 @@
-"""Forces and energy of joint springs and dampers, for engines that leave them out."""
+"""Forces and energy of springs and dampers at joints and between them, for engines that leave them out."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ __all__ = ["JointPassive"]
 
 
 class JointPassive:
-    """Springs and dampers at the joints, in full coordinates of a given order.
+    """Springs and dampers at the joints, and joint couplings, in full coordinates of a given order.
 
     Parameters
     ----------
     model : Model
     q_order, v_order : integer arrays
         Entry i here is full coordinate ``q_order[i]`` of the description.
+
+    Attributes
+    ----------
+    armature : (n, n) array or None
+        What the couplings' rotors add to M; None where there are none.
     """
 
     def __init__(self, model: Model, q_order: np.ndarray, v_order: np.ndarray) -> None:
@@ -39,14 +44,32 @@ class JointPassive:
         self._spring_v = np.array([s[1] for s in springs], dtype=int)
         self._stiffness = np.array([s[2] for s in springs])
         self._rest = np.array([s[3] for s in springs])
+        couplings = model.couplings
+        rows = np.array([layout.coupling_row(c) for c in couplings]).reshape(len(couplings), layout.sizes[3])
+        # The couplings' lengths are self._lengths q, the rates self._rates v.
+        self._rates, self._lengths = rows[:, v_order], np.zeros((len(couplings), layout.sizes[2]))
+        for name in {name for c in couplings for name in c.joints}:
+            iq, iv = layout.full_q[name].start, layout.full_v[name].start
+            self._lengths[:, q_place[iq]] = rows[:, iv]
+        stiffness, rest, damping, armature = (
+            np.array([getattr(c, field) for c in couplings])
+            for field in ("stiffness", "rest_length", "damping", "armature")
+        )
+        self._coupled = (stiffness, rest, damping)
+        self.armature = (self._rates.T * armature) @ self._rates if armature.any() else None
 
     def force(self, q: Array, v: Array) -> Array:
         """Return the generalized force."""
         out: Array = self._against * v
         if self._stiffness.size:
             out[self._spring_v] -= self._stiffness * (q[self._spring_q] - self._rest)
+        if len(self._rates):
+            stiffness, rest, damping = self._coupled
+            out -= self._rates.T @ (stiffness * (self._lengths @ q - rest) + damping * (self._rates @ v))
         return out
 
     def energy(self, q: Array) -> float:
         """Return the energy stored in the springs."""
-        return float(0.5 * np.sum(self._stiffness * (q[self._spring_q] - self._rest) ** 2))
+        stored = 0.5 * np.sum(self._stiffness * (q[self._spring_q] - self._rest) ** 2)
+        stiffness, rest, _ = self._coupled
+        return float(stored + 0.5 * np.sum(stiffness * (self._lengths @ q - rest) ** 2))

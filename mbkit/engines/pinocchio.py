@@ -72,8 +72,10 @@ class PinocchioDynamics(Dynamics):
             needs = self.model.needs
             if not (needs.springs or needs.damping):
                 terms |= {"inverse_dynamics": pin.rnea, "forward_dynamics": pin.aba}
-            elif not needs.springs and self._springs is None:
+            elif not needs.springs and self._springs is None and not self.model.couplings:
                 bare |= self._damped_only()
+            if self._joint_passive.armature is not None:
+                terms = {name: terms[name] for name in ("gravity", "nle")}
             bare |= {name: functools.partial(function, m, d) for name, function in terms.items()}
         checked = {name: getattr(self, name) for name in _SHORT}
         for name, call in direct_calls(self.model, unread, bare, checked).items():
@@ -112,7 +114,12 @@ class PinocchioDynamics(Dynamics):
     # Terms at one state.
 
     def _one_mass_matrix(self, q: Array) -> Array:
-        return self._matrix(pin.crba(self._m, self._d, self._full_q(q)))
+        return self._matrix(self._full_mass_matrix(self._full_q(q)))
+
+    def _full_mass_matrix(self, q: Array) -> Array:
+        M: Array = pin.crba(self._m, self._d, q)
+        rotors = self._joint_passive.armature
+        return M if rotors is None else M + rotors
 
     def _one_gravity(self, q: Array) -> Array:
         return self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q)))
@@ -122,18 +129,21 @@ class PinocchioDynamics(Dynamics):
 
     def _one_inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         q, v = self._full_q(q), self._full_v(v)
-        out: Array = pin.rnea(self._m, self._d, q, v, self._full_v(a))
+        a, rotors = self._full_v(a), self._joint_passive.armature
+        out: Array = pin.rnea(self._m, self._d, q, v, a)
         out -= self._full_passive(q, v)
+        if rotors is not None:
+            out += rotors @ a
         return self._force(out)
 
     def _one_forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         q, v = self._full_q(q), self._full_v(v)
         m, d, passive = self._m, self._d, self._full_passive(q, v)
-        if not self._reduced:
+        if not self._reduced and self._joint_passive.armature is None:
             # G only puts the joints in order, so its transpose puts them back.
             return self._force(pin.aba(m, d, q, v, self._full_v(tau) + passive))
-        # ABA knows no mimic joints: solve GᵀMG a = τ + Gᵀ(passive - nle).
-        M, h = self._matrix(pin.crba(m, d, q)), pin.nonLinearEffects(m, d, q, v)
+        # ABA knows neither mimic joints nor rotors between joints: solve GᵀMG a = τ + Gᵀ(passive - nle).
+        M, h = self._matrix(self._full_mass_matrix(q)), pin.nonLinearEffects(m, d, q, v)
         return np.asarray(np.linalg.solve(M, tau + self._force(passive - h)))
 
     def _full_passive(self, q: Array, v: Array) -> Array:
@@ -174,9 +184,14 @@ class PinocchioDynamics(Dynamics):
     def _kinetic_energy(self, q: Array, v: Array) -> Array:
         if self._kinetic_fault:
             defects.announce(defects.KINETIC_ENERGY, self._kinetic_fault)
-        return per_sample(
-            lambda q, v: pin.computeKineticEnergy(self._m, self._d, self._full_q(q), self._full_v(v)), q, v
-        )
+        rotors = self._joint_passive.armature
+
+        def one(q: Array, v: Array) -> Any:
+            q, v = self._full_q(q), self._full_v(v)
+            own = pin.computeKineticEnergy(self._m, self._d, q, v)
+            return own if rotors is None else own + 0.5 * float(v @ rotors @ v)
+
+        return per_sample(one, q, v)
 
     def _potential_energy(self, q: Array) -> Array:
         ground = -float(self.model.gravity @ self._pin.ground_moment)

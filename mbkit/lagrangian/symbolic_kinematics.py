@@ -16,7 +16,7 @@ import sympy as sp
 
 from mbkit.lagrangian.compact import number, written_out
 from mbkit.lagrangian.harmonic import Harmonic, Key, Space
-from mbkit.model import Joint, Model
+from mbkit.model import Joint, JointCoupling, Model
 from mbkit.model.kinds import cross3
 
 __all__ = ["SymbolicKinematics"]
@@ -29,6 +29,7 @@ _FIELDS: Final = {
     "bodies": ("mass", "com", "inertia"),
     "joints": ("rotation", "translation", "axes", "pitch", "armature"),
     "springs": ("point_a", "point_b"),
+    "couplings": ("factors", "armature"),
     "loops": ("rotation_a", "translation_a", "rotation_b", "translation_b"),
 }
 #: What rounded rotations leave of a term that is zero.
@@ -194,6 +195,14 @@ class SymbolicKinematics:
             for k, rotor in enumerate(self.values["joints", joint.name].armature):
                 i, ratio = self._velocity(joint, k)
                 M[i][i] = M[i][i] + rotor * ratio * ratio
+        for coupling in self.model.couplings:
+            values = self.values["couplings", coupling.name]
+            moved = [self._velocity(self.model.joint(name), 0) for name in coupling.joints]
+            rates = [(i, c * ratio) for (i, ratio), c in zip(moved, values.factors, strict=True)]
+            for i, x in rates:
+                for j, y in rates:
+                    if i <= j:
+                        M[i][j] = M[i][j] + values.armature * x * y
         self.drop_dust([x for row in M for x in row])
         made: dict[tuple[int, int], sp.Expr] = {}
         for i in range(n):
@@ -223,12 +232,15 @@ class SymbolicKinematics:
 
     @cached_property
     def spring_energy(self) -> sp.Expr:
-        """What joint springs and springs between points store."""
+        """What the springs of joints, of couplings and between points store."""
         total = sp.Integer(0)
         for joint in self.model.joints:
             for k, q in enumerate(self._q[joint.name]):
                 stiffness, rest = (self.written("joints", joint, f, k) for f in ("stiffness", "rest"))
                 total += stiffness * (self._back(q) - rest) ** 2 / 2
+        for coupling in self.model.couplings:
+            stiffness, rest = (self.written("couplings", coupling, f) for f in ("stiffness", "rest_length"))
+            total += stiffness * (self._coupled(coupling, self._q) - rest) ** 2 / 2
         for spring, square in self._squares():
             stiffness, rest = (self.written("springs", spring, f) for f in ("stiffness", "rest_length"))
             total += stiffness * (square if rest == 0 else (sp.sqrt(square) - rest) ** 2) / 2
@@ -241,6 +253,8 @@ class SymbolicKinematics:
         for joint in self.model.joints:
             for k, v in enumerate(self._v[joint.name]):
                 total += self.written("joints", joint, "damping", k) * self._back(v) ** 2 / 2
+        for coupling in self.model.couplings:
+            total += self.written("couplings", coupling, "damping") * self._coupled(coupling, self._v) ** 2 / 2
         for spring, square in self._squares():
             damping = self.written("springs", spring, "damping")
             if damping != 0:
@@ -248,6 +262,13 @@ class SymbolicKinematics:
                 rate = sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / 2
                 total += damping * rate**2 / square / 2
         return total
+
+    def _coupled(self, coupling: JointCoupling, of: dict[str, list[sp.Expr]]) -> sp.Expr:
+        """Return a coupling's sum of factors times coordinates, or velocities."""
+        factors = (self.written("couplings", coupling, "factors", k) for k in range(len(coupling.joints)))
+        return sum(
+            (c * self._back(of[joint][0]) for c, joint in zip(factors, coupling.joints, strict=True)), sp.Integer(0)
+        )
 
     def _squares(self) -> Iterator[tuple[Any, sp.Expr]]:
         """Yield each spring between points with the square of its length."""

@@ -159,7 +159,12 @@ def _usual(name: str) -> str:
 def _form(model: Model) -> Any:
     """Return what a description has beside numbers."""
     joints = [(j.name, j.kind, j.parent, j.child, j.mimic is None) for j in model.joints]
-    return [b.name for b in model.bodies], joints, [s.name for s in model.springs], len(model.loops)
+    return (
+        [b.name for b in model.bodies],
+        joints,
+        [*(s.name for s in model.springs), *(c.name for c in model.couplings)],
+        len(model.loops),
+    )
 
 
 def _solved(made: Model, model: Model) -> dict[str, float]:
@@ -220,3 +225,5 @@ def _numbers(model: Model) -> Iterator[np.ndarray]:
         yield from (j.armature, j.damping, j.stiffness, j.rest)
     for s in model.springs:
         yield from (s.point_a, s.point_b, np.array([s.stiffness, s.rest_length, s.damping]))
+    for c in model.couplings:
+        yield np.array([*c.factors, c.stiffness, c.rest_length, c.damping, c.armature])

@@ -8,11 +8,11 @@ from typing import Final
 
 from mbkit.load.xml import Element
 
-__all__ = ["Reader"]
+__all__ = ["LARGEST", "Reader"]
 
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-# Larger than anything that moves, and the products of several still fit a double.
-_LARGEST: Final = 1e30
+#: Larger than anything that moves, and the products of several still fit a double.
+LARGEST: Final = 1e30
 
 
 class Reader:
@@ -76,7 +76,7 @@ class Reader:
             if not math.isfinite(value):
                 self.fault(f"{where}: {_short(word)} is not a finite number{_hint(word)}", element)
                 return neutral
-            if bounded and abs(value) > _LARGEST:
+            if bounded and abs(value) > LARGEST:
                 self.fault(f"{where}: {_short(word)} is too large to compute with", element)
                 return neutral
             values.append(value)

@@ -30,7 +30,8 @@ def load(
     """Load a robot by name, or a URDF or MJCF file.
 
     No mesh is opened, and no other file but those that an MJCF includes. What was decided on the way
-    (mimic joints, parts left out, rounded zeros) stands in the model's ``notes``.
+    (mimic joints, parts left out, rounded zeros) stands in the model's ``notes``. Tendons and actuators of an
+    MJCF act as springs, dampers and rotors where their forces at zero control are linear.
 
     Parameters
     ----------

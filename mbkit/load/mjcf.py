@@ -25,6 +25,7 @@ from mbkit._check import Array
 from mbkit.errors import ModelError
 from mbkit.load.attributes import Reader
 from mbkit.load.floating import floated
+from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
 from mbkit.load.snap import Snapper
@@ -41,10 +42,12 @@ _REFUSED: Final = {
 }
 # Sections that are read, or that say nothing about the motion.
 _READ: Final = ("compiler", "default", "option", "worldbody", "size", "visual", "statistic", "asset")
+# Sections with notes of their own.
+_NOTED: Final = ("tendon", "actuator", "equality")
 
 
 # Option flags that change the smooth equations; the others steer an engine.
-_HONOURED: Final = frozenset({"gravity", "spring", "damper", "passive"})
+_HONOURED: Final = frozenset({"gravity", "spring", "damper", "passive", "actuation"})
 
 
 def model_of_mjcf(
@@ -75,6 +78,8 @@ def model_of_mjcf(
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=own_gravity if gravity is None else gravity)
     scale, snap = _total_scale(scene), Snapper()
     _describe(b, scene, scale, snap)
+    off = _disabled(mujoco)
+    transmissions = Transmissions(mujoco, scene, off)
     if read.faults:
         raise ModelError(str(path), read.faults)
     for note in (*_notes(mujoco, scene, scale), snap.note):
@@ -84,9 +89,9 @@ def model_of_mjcf(
         model = b.build(nonphysical=nonphysical, point_masses=False)
     except ModelError as error:
         raise ModelError(str(path), error.faults) from None
-    off = _disabled(mujoco)
     features = {"spring": ("springs",), "damper": ("damping",), "passive": ("springs", "damping")}
-    return model.without(*(f for flag, names in features.items() if flag in off for f in names))
+    model = model.without(*(f for flag, names in features.items() if flag in off for f in names))
+    return transmissions.applied(model)
 
 
 def _refuse(mujoco: Element, read: Reader) -> None:
@@ -209,7 +214,7 @@ def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
     files = list(dict.fromkeys(e.file for e in mujoco.walk() if e.file))
     if files:
         out.append(f"included: {', '.join(files)}")
-    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in _READ)
+    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in (*_READ, *_NOTED))
     if sections:
         told = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
         out.append(f"sections left out, with whatever they do to the motion: {told}")

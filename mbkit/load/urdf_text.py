@@ -89,6 +89,7 @@ def _unsayable(model: Model) -> Iterator[str]:
         if joint.type.nv > 1 and np.isfinite([joint.lower, joint.upper]).any():
             yield f"{who} is {joint.kind} and has limits"
     yield from (f"spring {s.name!r} between two points" for s in model.springs)
+    yield from (f"coupling {c.name!r} between joints" for c in model.couplings)
     yield from (f"loop {x.name!r}" for x in model.loops)
     yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
 

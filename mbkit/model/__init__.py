@@ -5,7 +5,7 @@ from mbkit.model.kinds import KINDS, JointKind, kind_of
 from mbkit.model.model import Model
 from mbkit.model.needs import Needs
 from mbkit.model.parameter import Expression, Number, Parameter, known, nominal
-from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
 
 __all__ = [
     "KINDS",
@@ -13,6 +13,7 @@ __all__ = [
     "Expression",
     "Frame",
     "Joint",
+    "JointCoupling",
     "JointKind",
     "Loop",
     "Mimic",

@@ -21,7 +21,8 @@ class Binding:
     Attributes
     ----------
     where : str
-        ``"bodies"``, ``"joints"``, ``"frames"``, ``"springs"``, ``"loops"``, ``"prescribed"``, or ``"gravity"``.
+        ``"bodies"``, ``"joints"``, ``"frames"``, ``"springs"``, ``"couplings"``, ``"loops"``, ``"prescribed"``, or
+        ``"gravity"``.
     part : str
         The part's name, of a prescribed motion its joint's; empty for gravity.
     field : str

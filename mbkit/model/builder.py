@@ -16,7 +16,7 @@ from mbkit.model.binding import Binding, split
 from mbkit.model.kinds import KINDS, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameter import Number
-from mbkit.model.parts import Body, Frame, Joint, Loop, Mimic, PointSpring, Prescribed
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
 from mbkit.model.physical import body_faults, suspects
 from mbkit.model.structure import structure_faults
 
@@ -57,6 +57,7 @@ class ModelBuilder:
         self._joints: list[Joint] = []
         self._frames: list[Frame] = []
         self._springs: list[PointSpring] = []
+        self._couplings: list[JointCoupling] = []
         self._loops: list[Loop] = []
         self._prescribed: list[Prescribed] = []
         self._notes: list[str] = []
@@ -249,6 +250,45 @@ class ModelBuilder:
         )
         self._springs.append(PointSpring(str(name), body_a=str(body_a), body_b=str(body_b), **numbers))
 
+    def add_coupling(
+        self,
+        name: str,
+        factors: Mapping[str, Number],
+        *,
+        stiffness: Number = 0.0,
+        rest_length: Number = 0.0,
+        damping: Number = 0.0,
+        armature: Number = 0.0,
+    ) -> None:
+        """Add a spring, damper and rotor on a weighted sum of joint coordinates, l = Σ factor q.
+
+        Parameters
+        ----------
+        name : str
+        factors : mapping of str to float
+            Joint name -> factor; joints of one velocity.
+        stiffness, rest_length : float
+            The potential energy is ½ stiffness (l - rest_length)².
+        damping : float
+            The power lost is damping (dl/dt)².
+        armature : float
+            The kinetic energy is ½ armature (dl/dt)².
+        """
+        who = f"coupling {name!r}"
+        if not hasattr(factors, "items"):
+            self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {factors!r}")
+            return
+        numbers = self._numbers(
+            "couplings",
+            str(name),
+            factors=self._read.quantities(f"{who}: factors", list(factors.values()), len(factors)),
+            stiffness=self._read.quantity(f"{who}: stiffness", stiffness, nonnegative=True),
+            rest_length=self._read.quantity(f"{who}: rest_length", rest_length),
+            damping=self._read.quantity(f"{who}: damping", damping, nonnegative=True),
+            armature=self._read.quantity(f"{who}: armature", armature, nonnegative=True),
+        )
+        self._couplings.append(JointCoupling(str(name), tuple(str(joint) for joint in factors), **numbers))
+
     def add_loop(
         self,
         name: str,
@@ -341,7 +381,13 @@ class ModelBuilder:
             raise InputError(f"nonphysical: expected 'error' or 'warn', got {nonphysical!r}")
         faults = list(self._read.faults)
         faults += structure_faults(
-            self._bodies, self._joints, self._frames, self._springs, self._loops, self._prescribed
+            self._bodies,
+            self._joints,
+            self._frames,
+            self._springs,
+            self._couplings,
+            self._loops,
+            self._prescribed,
         )
         faults += self._two_valued()
         # Joints that move nothing can only be found in a tree that holds together.
@@ -389,6 +435,7 @@ class ModelBuilder:
             joints=joints,
             frames=tuple(self._frames),
             springs=tuple(self._springs),
+            couplings=tuple(self._couplings),
             loops=tuple(self._loops),
             prescribed=tuple(self._prescribed),
             notes=tuple(self._notes),

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.parts import Joint
+from mbkit.model.parts import Joint, JointCoupling
 
 __all__ = ["Layout"]
 
@@ -99,6 +99,13 @@ class Layout:
                 G[part, columns[j.name]] = np.eye(part.stop - part.start)
         G.setflags(write=False)
         return G
+
+    def coupling_row(self, coupling: JointCoupling) -> Array:
+        """Return the row c of a coupling's rate dl/dt = c v_full, shape (full nv,)."""
+        row = np.zeros(self.sizes[3])
+        for joint, factor in zip(coupling.joints, coupling.factors, strict=True):
+            row[self.full_v[joint]] += factor
+        return row
 
     def expand_q(self, q: Array) -> Array:
         """Return the full coordinates, mimic joints included."""

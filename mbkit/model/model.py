@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -19,7 +20,7 @@ from mbkit.model.binding import Binding
 from mbkit.model.digest import digest
 from mbkit.model.layout import Layout
 from mbkit.model.needs import Needs
-from mbkit.model.parts import Body, Frame, Joint, Loop, PointSpring, Prescribed
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
 
 __all__ = ["Model"]
 
@@ -29,6 +30,8 @@ _PER_VELOCITY: Final = {
     "armature": "armature",
     "friction": "friction",
 }
+#: Elements between joints or points, and what acts in them.
+_ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
 _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed")
 
 
@@ -49,6 +52,7 @@ class Model:
         In the order of their coordinates; fixed joints are among them.
     frames : tuple of Frame
     springs : tuple of PointSpring
+    couplings : tuple of JointCoupling
     loops : tuple of Loop
     prescribed : tuple of Prescribed
     notes : tuple of str
@@ -66,6 +70,7 @@ class Model:
     joints: tuple[Joint, ...]
     frames: tuple[Frame, ...] = ()
     springs: tuple[PointSpring, ...] = ()
+    couplings: tuple[JointCoupling, ...] = ()
     loops: tuple[Loop, ...] = ()
     prescribed: tuple[Prescribed, ...] = ()
     notes: tuple[str, ...] = ()
@@ -87,6 +92,7 @@ class Model:
             self.joints,
             self.frames,
             self.springs,
+            self.couplings,
             self.loops,
             self.prescribed,
             self.notes,
@@ -164,7 +170,7 @@ class Model:
     def needs(self) -> Needs:
         """What this description needs from an engine."""
         bound = (b.field for b in self.bindings)
-        return Needs.of(self.gravity, self.joints, self.springs, self.loops, self.prescribed, bound)
+        return Needs.of(self.gravity, self.joints, self.springs, self.couplings, self.loops, self.prescribed, bound)
 
     @cached_property
     def digest(self) -> str:
@@ -178,6 +184,7 @@ class Model:
             self.springs,
             self.loops,
             self.prescribed,
+            *self.couplings,
             *self.bindings,
         )
 
@@ -201,6 +208,20 @@ class Model:
             out.append(joint)
             stack.extend(reversed(by_parent.get(joint.child, [])))
         return tuple(out)
+
+    @cached_property
+    def chains(self) -> Mapping[str, frozenset[str]]:
+        """Of each joint the names of the joints from the ground to it, itself included."""
+        below: dict[str, frozenset[str]] = {"world": frozenset()}
+        out = {}
+        for joint in self.tree:
+            out[joint.name] = below[joint.child] = below[joint.parent] | {joint.name}
+        return MappingProxyType(out)
+
+    def branched(self, coupling: JointCoupling) -> bool:
+        """Return whether two joints of a coupling are on different branches of the tree."""
+        chains = sorted((self.chains[name] for name in coupling.joints), key=len)
+        return not all(a <= b for a, b in pairwise(chains))
 
     @cached_property
     def quaternions(self) -> tuple[tuple[int, str], ...]:
@@ -352,8 +373,8 @@ class Model:
         ----------
         *features : str
             Any of damping, springs, armature, friction, gravity, limits, loops,
-            prescribed. Springs and damping cover joints and point-to-point
-            elements alike.
+            prescribed. Springs and damping cover joints, point-to-point
+            elements and couplings alike, armature joints and couplings.
         """
         for feature in features:
             if feature not in _FEATURES:
@@ -397,17 +418,17 @@ class Model:
             return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
         name = _PER_VELOCITY[feature]
         joints = tuple(replace(j, **{name: np.zeros(j.type.nv)}) for j in self.joints)  # type: ignore[arg-type]
-        springs: Iterable[PointSpring] = self.springs
-        if feature == "springs":
-            springs = (replace(s, stiffness=0.0) for s in springs)
-        if feature == "damping":
-            springs = (replace(s, damping=0.0) for s in springs)
         bindings = self._bindings_without(name)
-        bound = {b.part for b in bindings if b.where == "springs" and b.field in ("stiffness", "damping")}
-        kept = tuple(s for s in springs if s.stiffness or s.damping or s.name in bound)
-        names = {s.name for s in kept}
-        bindings = tuple(b for b in bindings if b.where != "springs" or b.part in names)
-        return replace(self, joints=joints, springs=kept, bindings=bindings)
+        changes: Any = {"joints": joints}
+        for where, acting in _ACTING.items():
+            parts = getattr(self, where)
+            if name in acting:
+                parts = tuple(replace(p, **{name: 0.0}) for p in parts)
+            bound = {b.part for b in bindings if b.where == where and b.field in acting}
+            changes[where] = tuple(p for p in parts if p.name in bound or any(getattr(p, f) for f in acting))
+            names = {p.name for p in changes[where]}
+            bindings = tuple(b for b in bindings if b.where != where or b.part in names)
+        return replace(self, bindings=bindings, **changes)
 
     def _bindings_without(self, field: str) -> tuple[Binding, ...]:
         return tuple(b for b in self.bindings if b.field != field)
@@ -415,7 +436,8 @@ class Model:
     # Reading
 
     def __repr__(self) -> str:
-        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._told_mass()}; {self.needs}>"
+        between = f"; joint couplings {', '.join(c.name for c in self.couplings)}" if self.couplings else ""
+        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._told_mass()}; {self.needs}{between}>"
 
     def _told_mass(self) -> str:
         unknown = any(np.isnan(b.mass) for b in self.bodies)
@@ -429,7 +451,7 @@ class Model:
             for j in self.tree
         )
         head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
-        notes = "".join(f"<li>{html.escape(n)}</li>" for n in self.notes)
+        notes = "".join(f"<li>{html.escape(n)}</li>" for n in (*map(str, self.couplings), *self.notes))
         return (
             f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._told_mass()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")

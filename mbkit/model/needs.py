@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.parts import Joint, Loop, PointSpring, Prescribed
+from mbkit.model.parts import Joint, JointCoupling, Loop, PointSpring, Prescribed
 
 __all__ = ["Needs"]
 
@@ -39,6 +39,7 @@ class Needs:
         gravity: Array,
         joints: Iterable[Joint],
         springs: Iterable[PointSpring],
+        couplings: Iterable[JointCoupling],
         loops: Iterable[Loop],
         prescribed: Iterable[Prescribed],
         bound: Iterable[str] = (),
@@ -48,14 +49,18 @@ class Needs:
         `bound` names the attributes that stand for parameters somewhere: what is
         zero now may have another value when it is evaluated.
         """
-        joints, springs, bound = tuple(joints), tuple(springs), frozenset(bound)
+        joints, bound = tuple(joints), frozenset(bound)
+        couplings = tuple(couplings)
+        between: tuple[PointSpring | JointCoupling, ...] = (*springs, *couplings)
         return cls(
             gravity="gravity" in bound or bool(np.any(gravity)),
             springs="stiffness" in bound
             or any(np.any(j.stiffness) for j in joints)
-            or any(s.stiffness for s in springs),
-            damping="damping" in bound or any(np.any(j.damping) for j in joints) or any(s.damping for s in springs),
-            armature="armature" in bound or any(np.any(j.armature) for j in joints),
+            or any(s.stiffness for s in between),
+            damping="damping" in bound or any(np.any(j.damping) for j in joints) or any(s.damping for s in between),
+            armature="armature" in bound
+            or any(np.any(j.armature) for j in joints)
+            or any(c.armature for c in couplings),
             friction=any(np.any(j.friction) for j in joints),
             limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
             effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),

@@ -6,14 +6,14 @@ All lengths are metres, masses kilograms, angles radians. Arrays are read-only.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.model.kinds import JointKind, kind_of
 
-__all__ = ["Body", "Frame", "Joint", "Loop", "Mimic", "PointSpring", "Prescribed"]
+__all__ = ["Body", "Frame", "Joint", "JointCoupling", "Loop", "Mimic", "PointSpring", "Prescribed"]
 
 
 class _Frozen:
@@ -161,6 +161,45 @@ class PointSpring(_Frozen):
     def needs_direction(self) -> bool:
         """Whether the force is undefined where the two points meet."""
         return self.damping != 0 or (self.stiffness != 0 and self.rest_length != 0)
+
+
+_OF_COUPLING: Final = ("stiffness", "rest_length", "damping", "armature")
+
+
+@dataclass(frozen=True, eq=False)
+class JointCoupling(_Frozen):
+    """A spring, a viscous damper and a rotor on a sum of joint coordinates: MuJoCo's fixed tendon.
+
+    With the length l = Σ factor q it has the potential energy ½ stiffness (l - rest_length)², dissipates
+    damping (dl/dt)² and has the kinetic energy ½ armature (dl/dt)².
+
+    Attributes
+    ----------
+    name : str
+    joints : tuple of str
+        Joints of one velocity.
+    factors : (k,) array
+        One for each joint.
+    stiffness, rest_length, damping, armature : float
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    factors: Array
+    stiffness: float
+    rest_length: float
+    damping: float
+    armature: float
+
+    @property
+    def length(self) -> str:
+        """The sum as text, such as ``"j1 - 2 j2"``."""
+        terms = [joint if c == 1 else f"{c:g} {joint}" for c, joint in zip(self.factors, self.joints, strict=True)]
+        return " + ".join(terms).replace("+ -", "- ")
+
+    def __str__(self) -> str:
+        given = [f"{n.replace('_', ' ')} {x:g}" for n in _OF_COUPLING if (x := getattr(self, n))]
+        return f"coupling {self.name!r} on {self.length}: {', '.join(given) or 'no force'}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -105,9 +105,10 @@ def idle_joints(model: Model) -> list[str]:
     return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()]
 
 
-def sample_mass_matrix(model: Model) -> Array:
-    """Return M at one fixed random state, by its definition; slow and only for checks."""
-    q, _ = model.random_state(np.random.default_rng(0))
+def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
+    """Return M at a pose, or at one fixed random state, by its definition; slow, for checks and for loading."""
+    if q is None:
+        q, _ = model.random_state(np.random.default_rng(0))
     q_full = model.layout.expand_q(q)
     n = model.layout.sizes[3]
     jacobians = {"world": np.zeros((6, n))}
@@ -128,4 +129,7 @@ def sample_mass_matrix(model: Model) -> Array:
         at_com = J[:3] - skew(body.com) @ J[3:]
         M += body.mass * at_com.T @ at_com + J[3:].T @ body.inertia @ J[3:]
         M[part[1], part[1]] += np.diag(joint.armature)
+    for coupling in model.couplings:
+        row = model.layout.coupling_row(coupling)
+        M += coupling.armature * np.outer(row, row)
     return np.asarray(model.layout.G.T @ M @ model.layout.G)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from mbkit.errors import nearest
-from mbkit.model.parts import Body, Frame, Joint, Loop, PointSpring, Prescribed
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
 
 __all__ = ["structure_faults"]
 
@@ -18,6 +18,7 @@ def structure_faults(
     joints: Sequence[Joint],
     frames: Sequence[Frame],
     springs: Sequence[PointSpring],
+    couplings: Sequence[JointCoupling],
     loops: Sequence[Loop],
     prescribed: Sequence[Prescribed],
 ) -> list[str]:
@@ -31,6 +32,7 @@ def structure_faults(
         ("joint", [j.name for j in joints]),
         ("frame", [f.name for f in frames]),
         ("spring", [s.name for s in springs]),
+        ("coupling", [c.name for c in couplings]),
         ("loop", [x.name for x in loops]),
     ):
         faults += [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
@@ -52,6 +54,8 @@ def structure_faults(
         ]
         if spring.body_a == spring.body_b:
             faults.append(f"spring {spring.name!r}: both ends on {spring.body_a!r}; it would never act")
+    for coupling in couplings:
+        faults += _coupling_faults(coupling, joints)
     for loop in loops:
         faults += _unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b), known)
         if loop.body_a == loop.body_b:
@@ -102,6 +106,21 @@ def _joint_faults(joint: Joint) -> list[str]:
     if joint.pitch and joint.kind != "helical":
         out.append(f"{who}: pitch {joint.pitch} on a {joint.kind} joint; only helical joints have one")
     return out
+
+
+def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterator[str]:
+    who, sizes = f"coupling {coupling.name!r}", {j.name: j.type.nv for j in joints}
+    for name in coupling.joints:
+        if name not in sizes:
+            near = nearest(name, sizes)
+            yield f"{who}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
+        elif sizes[name] != 1:
+            yield f"{who}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
+    for n in ("stiffness", "damping", "armature"):
+        if getattr(coupling, n) < 0:
+            yield f"{who}: {n} {getattr(coupling, n):g} is negative"
+    if not np.any(coupling.factors):
+        yield f"{who}: no joint has a factor other than zero; it would never act"
 
 
 def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:

@@ -56,11 +56,14 @@ def _substituted(model: Model, parameter: Callable[[Parameter], Any]) -> Model:
         joints=tuple(filled("joints", j, j.name) for j in model.joints),
         frames=tuple(filled("frames", f, f.name) for f in model.frames),
         springs=tuple(filled("springs", s, s.name) for s in model.springs),
+        couplings=tuple(filled("couplings", c, c.name) for c in model.couplings),
         loops=tuple(filled("loops", x, x.name) for x in model.loops),
         prescribed=tuple(filled("prescribed", p, p.name) for p in model.prescribed),
         bindings=tuple(replace(b, expression=x) for b, x in bindings if isinstance(x, Expression)),
     )
-    faults = structure_faults(made.bodies, made.joints, made.frames, made.springs, made.loops, made.prescribed)
+    faults = structure_faults(
+        made.bodies, made.joints, made.frames, made.springs, made.couplings, made.loops, made.prescribed
+    )
     # What was taken as written at first is known to be wrong, but no mass was negative.
     taken = {name for name, _ in model.nonphysical}
     found = suspects(made, point_masses=True)

@@ -106,7 +106,12 @@ def is_damped(model: Model) -> bool:
     if model.written is not None:
         return model.needs.damping
     bound = any(b.field == "damping" for b in model.bindings)
-    return bound or any(j.damping.any() for j in model.joints) or any(s.damping for s in model.springs)
+    return (
+        bound
+        or any(j.damping.any() for j in model.joints)
+        or any(s.damping for s in model.springs)
+        or any(c.damping for c in model.couplings)
+    )
 
 
 def _plain(model: Model) -> list[tuple[int, int]]:

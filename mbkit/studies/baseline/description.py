@@ -32,6 +32,7 @@ SECTIONS: Final = {
     "joints": "joint",
     "bodies": "body",
     "springs": "spring",
+    "couplings": "coupling",
     "loops": "loop",
     "motions": "prescribed motion of joint",
 }
@@ -54,6 +55,7 @@ def described(model: Model) -> Description:
         "frames": _frames(model),
         "bodies": _parts(model.bodies),
         "springs": _parts(model.springs),
+        "couplings": _parts(model.couplings),
         "loops": _parts(model.loops),
         "motions": {m.joint: _part(m, "joint") for m in model.prescribed},
     }
@@ -109,12 +111,14 @@ def _part(part: Any, name: str) -> Part:
         if f.name == "mimic":
             if value is not None:
                 out |= {"mimic": value.joint, "ratio": value.ratio, "offset": value.offset}
-        elif f.name != name and (isinstance(value, str) or not _is_default(f.name, value) or f.name == "mass"):
+        elif f.name != name and (isinstance(value, (str, tuple)) or not _is_default(f.name, value) or f.name == "mass"):
             out[f.name] = _plain(value[_TRIANGLE] if f.name == "inertia" else value)
     return out
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return ", ".join(value)
     return [float(x) for x in value.ravel()] if isinstance(value, np.ndarray) else value
 
 

@@ -67,6 +67,7 @@ def renamed(b: Compact, a: Model, matching: Matching) -> Compact:
         joints=tuple(made),
         bodies=tuple(replace(matter[j.child], name=j.child) for j in made),
         springs=tuple(replace(s, body_a=bodies[s.body_a], body_b=bodies[s.body_b]) for s in b.model.springs),
+        couplings=tuple(replace(c, joints=tuple(joints.get(n, n) for n in c.joints)) for c in b.model.couplings),
         loops=tuple(replace(x, body_a=bodies[x.body_a], body_b=bodies[x.body_b]) for x in b.model.loops),
         prescribed=tuple(replace(p, joint=joints.get(p.joint, p.joint)) for p in b.model.prescribed),
     )

@@ -176,6 +176,7 @@ class _Engines:
             if getattr(self.model.needs, feature):
                 yield _Found(kind, "", f"has no {feature}"), self.terms(self.model.without(feature), self.at)
         yield from self._gravity(own)
+        yield from self._couplings(own)
         nv = range(self.model.nv)
         off = self.said["M"] - own["M"]
         armature = np.mean(np.einsum("nii->ni", off), axis=0)
@@ -191,6 +192,18 @@ class _Engines:
             told_ = [f"{told(float(amounts[k]))}{unit} more at {self.owners[k]!r}" for k in some]
             subject = f"joint {self.owners[some[0]]!r}" if len(some) == 1 else "several joints"
             yield _Found(kind, subject, f"has {kind} {', '.join(told_)}"), values
+
+    def _couplings(self, own: Values) -> Iterator[tuple[_Found, Values]]:
+        """Yield the loss of each coupling, and that of all their rotors between branches, as MuJoCo has it."""
+        for c in self.model.couplings:
+            left = replace(self.model, couplings=tuple(x for x in self.model.couplings if x is not c))
+            yield _Found("joint coupling", f"coupling {c.name!r}", "lacks it"), self.terms(left, self.at)
+        rotors = ", ".join(repr(c.name) for c in self.model.couplings if c.armature)
+        if rotors:
+            chains = [self.model.chains[name] for name in self.owners]
+            related = np.array([[a <= b or b <= a for a in chains] for b in chains])
+            found = _Found("joint coupling", f"coupling {rotors}", "has no armature between branches")
+            yield found, {**own, "M": own["M"] * related}
 
     def _damping(self, own: Values) -> Array:
         if "passive" not in own or "passive" not in self.said:

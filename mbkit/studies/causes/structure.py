@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from mbkit.model import Body, Joint, Model
+from mbkit.model import Body, Joint, JointCoupling, Model
 from mbkit.studies.causes.alignment import aligned, renamed
 from mbkit.studies.causes.compact import Compact, compact
 from mbkit.studies.causes.hypothesis import Hypothesis
@@ -57,7 +57,16 @@ def _options(model: Model, name: str) -> Iterator[tuple[str, Model]]:
 def _held(model: Model, name: str) -> Model:
     """Return the description with a joint fixed at zero; what follows it stands still too."""
     held = {name} | {j.name for j in model.joints if j.mimic is not None and j.mimic.joint == name}
-    return replace(model, joints=tuple(_fixed(j) if j.name in held else j for j in model.joints))
+    joints = tuple(_fixed(j) if j.name in held else j for j in model.joints)
+    return replace(model, joints=joints, couplings=tuple(_left(model, held)))
+
+
+def _left(model: Model, lost: set[str]) -> Iterator[JointCoupling]:
+    """Yield the couplings without some joints, which stay at zero."""
+    for c in model.couplings:
+        kept = [k for k, name in enumerate(c.joints) if name not in lost]
+        if kept:
+            yield replace(c, joints=tuple(c.joints[k] for k in kept), factors=c.factors[kept])
 
 
 def _fixed(joint: Joint) -> Joint:
@@ -87,6 +96,7 @@ def _without(model: Model, joints: set[str]) -> Model:
         bodies=bodies,
         frames=tuple(f for f in model.frames if f.body not in lost),
         springs=tuple(s for s in model.springs if not {s.body_a, s.body_b} & lost),
+        couplings=tuple(_left(model, joints)),
         loops=tuple(x for x in model.loops if not {x.body_a, x.body_b} & lost),
         prescribed=tuple(p for p in model.prescribed if p.joint not in joints),
         nonphysical=tuple(x for x in model.nonphysical if x[0] not in lost),

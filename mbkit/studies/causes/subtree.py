@@ -25,6 +25,7 @@ def part(model: Model, joints: set[str]) -> Model:
         joints=tuple(made),
         bodies=tuple(b for b in model.bodies if b.name in bodies),
         springs=tuple(springs),
+        couplings=tuple(c for c in model.couplings if set(c.joints) <= joints),
         loops=(),
         prescribed=(),
         frames=(),

@@ -1,4 +1,4 @@
-"""Usual mistakes with what belongs to no single body or joint: gravity, springs between points, the ground."""
+"""Usual mistakes with what belongs to no single body or joint: gravity, point springs, joint couplings, the ground."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def gravities(a: Array) -> Iterator[Guess]:
 
 
 def named(a: Model, b: Model, near: Near) -> list[Hypothesis]:
-    """Return what makes gravity, springs, loops and prescribed motions of `a` those of `b`."""
+    """Return what makes gravity, springs, couplings, loops and prescribed motions of `a` those of `b`."""
     out = []
     if not near.vector(a.gravity, b.gravity, max(1.0, float(np.abs(a.gravity).max()))):
         says = next((g.says for g in gravities(a.gravity) if near.vector(g.value, b.gravity)), None)
@@ -38,6 +38,7 @@ def named(a: Model, b: Model, near: Near) -> list[Hypothesis]:
         out.append(Hypothesis("gravity", "", says, lambda m: with_gravity(m, gravity), a.gravity, b.gravity))
     for field, kind, what in (
         ("springs", "point spring", "spring"),
+        ("couplings", "joint coupling", "coupling"),
         ("loops", "loop", "loop"),
         ("prescribed", "prescribed motion", "motion of"),
     ):

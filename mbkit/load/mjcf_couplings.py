@@ -1,0 +1,476 @@
+"""Tendons, actuators and equality constraints of an MJCF: what acts linearly in q and v, and the names of the rest.
+
+The length of a fixed tendon is l = Σ coef q. Its spring, damper and armature become a `JointCoupling`, or numbers of
+the joint where there is only one. A spatial tendon straight between two sites is a `PointSpring`. The length of an
+actuator is gear times a joint's coordinate or a tendon's length. Its armature and damping act always. Its force at zero
+control and activation is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of stiffness -b1 and rest length
+-b0/b1, and a damper of -b2 (XML reference of MuJoCo 4.0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.load.attributes import LARGEST, Reader
+from mbkit.load.mjcf_scene import MjcfJoint, Scene, unfolded
+from mbkit.load.mjcf_values import HERE, pose
+from mbkit.load.xml import Element
+from mbkit.model import Joint, JointCoupling, Model, PointSpring
+from mbkit.model.physical import sample_mass_matrix
+
+__all__ = ["Transmissions", "coupled"]
+
+_ACTUATORS: Final = (
+    "general",
+    "motor",
+    "position",
+    "velocity",
+    "intvelocity",
+    "damper",
+    "cylinder",
+    "muscle",
+    "adhesion",
+    "dcmotor",
+    "pid",
+    "plugin",
+)
+#: Limits and losses, whose forces are not linear, and what switches each on.
+_TENDON_LIMITS: Final = {
+    "range": "limited",
+    "frictionloss": "",
+    "springyield": "",
+    "actuatorfrcrange": "actuatorfrclimited",
+}
+#: What equality constraints bind.
+_ENDS: Final = ("joint", "body", "tendon", "site", "flex")
+
+
+@dataclass(frozen=True)
+class _Actuator:
+    """An actuator as its default classes and its element have it, in the words of MuJoCo's `mjsActuator`.
+
+    Gain, bias and their types are inherited from a <general> and from an element of the same tag only, those of <pid>
+    from a <pid> only. `tag` is that of the last element of a class, and `parent` what the class inherits.
+    """
+
+    tag: str = "general"
+    parent: _Actuator | None = None
+    gear: float = 1.0
+    armature: float = 0.0
+    damping: tuple[float, ...] = (0.0,)
+    gain: float = 1.0
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gaintype: str = "fixed"
+    biastype: str = "none"
+    group: float = 0.0
+    forcerange: tuple[float, ...] = ()
+    forcelimited: str = "auto"
+    ctrlrange: tuple[float, ...] = ()
+
+    def with_element(self, element: Element, who: str, read: Reader) -> _Actuator:
+        """Return these settings, changed by what an element says."""
+        given = element.attributes
+
+        def number(name: str, default: float) -> float:
+            return read.number(element, name, who, default)
+
+        base = self
+        heirs = ("pid",) if element.tag == "pid" else (element.tag, "general")
+        while element.tag != "general" and base.tag not in heirs:
+            base = base.parent or _Actuator(tag=element.tag)
+        out = replace(
+            self,
+            tag=element.tag,
+            gain=base.gain,
+            bias=base.bias,
+            gaintype=base.gaintype,
+            biastype=base.biastype,
+            gear=read.numbers(element, "gear", who, count=6, least=1, default=(self.gear,))[0],
+            armature=number("armature", self.armature),
+            damping=read.numbers(element, "damping", who, count=3, least=1, default=self.damping),
+            group=number("group", self.group),
+            forcerange=read.numbers(element, "forcerange", who, count=2, default=self.forcerange),
+            forcelimited=given.get("forcelimited", self.forcelimited),
+            ctrlrange=read.numbers(element, "ctrlrange", who, count=2, default=self.ctrlrange),
+        )
+        gain, (b0, b1, b2) = out.gain, out.bias
+        if element.tag == "general":
+            if "gainprm" in given:
+                gain = read.numbers(element, "gainprm", who, count=10, least=1)[0]
+            if "biasprm" in given:
+                written = read.numbers(element, "biasprm", who, count=10, least=1)[:3]
+                b0, b1, b2 = (*written, *out.bias[len(written) :])
+            gaintype, biastype = given.get("gaintype", out.gaintype), given.get("biastype", out.biastype)
+            return replace(out, gain=gain, bias=(b0, b1, b2), gaintype=gaintype, biastype=biastype)
+        if element.tag in ("position", "intvelocity", "pid"):
+            gain = number("kp", gain)
+            # MuJoCo keeps a damping ratio as a positive b2.
+            b2 = number("dampratio", -number("kv", -b2))
+            gaintype = "pid" if element.tag == "pid" else "fixed"
+            return replace(out, gain=gain, bias=(0.0, -gain, b2), gaintype=gaintype, biastype="affine")
+        if element.tag == "velocity":
+            gain = number("kv", gain)
+            return replace(out, gain=gain, bias=(0.0, 0.0, -gain), gaintype="fixed", biastype="affine")
+        if element.tag == "cylinder":
+            bias = read.numbers(element, "bias", who, count=3, default=out.bias)
+            return replace(out, gain=number("area", gain), bias=(bias[0], bias[1], bias[2]), biastype="affine")
+        if element.tag in ("motor", "damper", "adhesion"):
+            gaintype = "affine" if element.tag == "damper" else "fixed"
+            return replace(out, gain=number("gain", 1.0), bias=(0.0, 0.0, 0.0), gaintype=gaintype, biastype="none")
+        return replace(out, gaintype=element.tag, biastype=element.tag)
+
+
+@dataclass
+class _Acting:
+    """What a tendon or an actuator does.
+
+    Attributes
+    ----------
+    who : str
+        Its name, or its number and its line.
+    name : str
+        Of the coupling.
+    factors : dict
+        Joint -> dl/dq; empty where l is no sum of coordinates.
+    ends : tuple of (str, array)
+        Bodies and points that l is the distance of; empty where it is none.
+    dampratio : float
+        What is to be the damping, of the critical one at the pose that is drawn.
+    control : str
+        What is done with an actuator's control, which is left out.
+    left_out : list of str
+    """
+
+    who: str
+    name: str
+    factors: dict[str, float]
+    stiffness: float = 0.0
+    rest_length: float = 0.0
+    damping: float = 0.0
+    armature: float = 0.0
+    dampratio: float = 0.0
+    ends: tuple[tuple[str, Array], ...] = ()
+    control: str = ""
+    left_out: list[str] = field(default_factory=list)
+
+    @property
+    def acts(self) -> bool:
+        """Whether anything of it is a spring, damper or rotor."""
+        return bool(self.stiffness or self.damping or self.armature or self.dampratio)
+
+    def linear(self) -> None:
+        """Move to `left_out` what is no spring, damper or rotor on a sum of coordinates, or spring between points."""
+        between = ("damping", "stiffness")[: 1 + (self.rest_length >= 0)] if self.ends else ()
+        for name in ("stiffness", "damping", "armature", "dampratio"):
+            value = getattr(self, name)
+            if value < 0 or (value and not self.factors and name not in between):
+                self.left_out.append(f"{name} {value:g}" + (", which is negative" if value < 0 else ""))
+                setattr(self, name, 0.0)
+
+    def coupling(self) -> JointCoupling:
+        """Return it as a coupling of joints; its damping ratio is not in it."""
+        numbers = self.stiffness, self.rest_length, self.damping, self.armature
+        return JointCoupling(self.name, tuple(self.factors), np.array([*self.factors.values()]), *numbers)
+
+    def point_spring(self) -> PointSpring:
+        """Return it as a spring between two points."""
+        (a, at_a), (b, at_b) = self.ends
+        return PointSpring(self.name, a, at_a, b, at_b, self.stiffness, self.rest_length, self.damping)
+
+    def description(self) -> str:
+        """Return who it is and what it does, for a note."""
+        if self.ends:
+            spring = f"stiffness {self.stiffness:g}, rest length {self.rest_length:g}, " if self.stiffness else ""
+            return f"{self.who} between {self.ends[0][0]!r} and {self.ends[1][0]!r}: {spring}damping {self.damping:g}"
+        ratio = f", damping ratio {self.dampratio:g}" if self.dampratio else ""
+        return f"{self.who}{str(self.coupling()).removeprefix(f'coupling {self.name!r}')}{ratio}"
+
+
+class Transmissions:
+    """Reads the tendons, actuators and equality constraints of a file.
+
+    Parameters
+    ----------
+    mujoco : Element
+    scene : Scene
+        With the bodies and joints. Faults go to its reader.
+    disabled : set of str
+        Option flags that the file switches off.
+    """
+
+    def __init__(self, mujoco: Element, scene: Scene, disabled: set[str]) -> None:
+        self._scene, self._read = scene, scene.read
+        self._joints: dict[str, MjcfJoint] = {j.name: j for body in scene.bodies for j in body.joints}
+        self._names: set[str] = set()
+        self._springs, self._dampers = "spring" not in disabled, "damper" not in disabled
+        if "passive" in disabled:
+            self._springs = self._dampers = False
+        self._actuation = "actuation" not in disabled
+        self._groups = _disabled_groups(mujoco, scene.read)
+        self._classes = {"main": _Actuator()}
+        for element in mujoco.all("default"):
+            self._collect(element, "main")
+        self._sites = {site: (body.name, X.p - body.anchor) for body in scene.bodies for site, X in body.sites}
+        self._sites |= _ground_sites(mujoco, scene)
+        tendons = [e for section in mujoco.all("tendon") for e in section.children]
+        actuators = [e for section in mujoco.all("actuator") for e in section.children]
+        self._tendons = [self._tendon(e, k) for k, e in enumerate(tendons)]
+        self._factors = {e.attributes.get("name", ""): t.factors for e, t in zip(tendons, self._tendons, strict=True)}
+        self._actuators = [self._actuator(e, k) for k, e in enumerate(actuators)]
+        equalities = (e for section in mujoco.all("equality") for e in section.children)
+        self._equalities = [self._who(e, k) + f" ({_connected(e)})" for k, e in enumerate(equalities)]
+
+    def _collect(self, element: Element, name: str) -> None:
+        """Read the actuator defaults of a class and of the classes in it."""
+        for child in element.children:
+            if child.tag in _ACTUATORS:
+                self._classes[name] = self._classes[name].with_element(child, f"default class {name!r}", self._read)
+        for child in element.all("default"):
+            inner = child.attributes.get("class", "")
+            self._classes[inner] = replace(self._classes[name], parent=self._classes[name])
+            self._collect(child, inner)
+
+    def _who(self, element: Element, number: int) -> str:
+        name = element.attributes.get("name", "")
+        return repr(name) if name else f"number {number + 1} ({element.tag}, {element.place})"
+
+    def _name(self, element: Element, kind: str, number: int) -> str:
+        name = element.attributes.get("name") or f"{kind}{number + 1}"
+        while name in self._names:
+            name += "_"
+        self._names.add(name)
+        return name
+
+    # Tendons
+
+    def _tendon(self, element: Element, number: int) -> _Acting:
+        read = self._read
+        full = replace(self._scene.defaults.filled(replace(element, tag="tendon"), None), tag=element.tag)
+        who = f"tendon {self._who(element, number)}"
+        out = _Acting(self._who(element, number), self._name(element, "tendon", number), {})
+        for joint in element.all("joint") if element.tag == "fixed" else []:
+            name = joint.attributes.get("joint", "")
+            if self._scalar(name, who, joint):
+                out.factors[name] = out.factors.get(name, 0.0) + read.number(joint, "coef", who)
+        out.factors = {joint: factor for joint, factor in out.factors.items() if factor}
+        if element.tag == "spatial":
+            out.ends = self._ends(element)
+        for name in ("stiffness", "damping"):
+            first, *higher = read.numbers(full, name, who, count=3, least=1, default=(0.0,))
+            setattr(out, name, first)
+            if any(higher):
+                setattr(out, name, 0.0)
+                out.left_out.append(f"{name} that depends on the length or its rate")
+        out.armature = read.number(full, "armature", who, 0.0)
+        first, *second = read.numbers(full, "springlength", who, count=2, least=1, default=(-1.0,))
+        out.rest_length = first
+        if first == -1.0 and all(x == -1.0 for x in second):
+            out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
+            # Where the file draws the two points is not followed.
+            out.rest_length = -1.0 if out.ends else out.rest_length
+        elif out.stiffness and second and second[0] != first:
+            out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {second[0]:g}")
+            out.stiffness = 0.0
+        out.stiffness *= self._springs
+        out.damping *= self._dampers
+        out.linear()
+        given = full.attributes
+        out.left_out += [
+            f"{n} {given[n]}" for n, on in _TENDON_LIMITS.items() if n in given and given.get(on) != "false"
+        ]
+        return out
+
+    def _ends(self, element: Element) -> tuple[tuple[str, Array], ...]:
+        """Return the two points that a tendon goes straight between, if it does."""
+        if [e.tag for e in element.children] != ["site", "site"]:
+            return ()
+        found = [self._sites.get(e.attributes.get("site", "")) for e in element.children]
+        ends = tuple(x for x in found if x is not None)
+        return ends if len({body for body, _ in ends}) == 2 else ()
+
+    def _scalar(self, name: str, who: str, element: Element) -> bool:
+        """Return whether a joint has one coordinate; a fault if it has not, or is not there."""
+        joint = self._joints.get(name)
+        if joint is None or joint.kind not in ("hinge", "slide"):
+            what = f"joint {name!r} is not in the file" if joint is None else f"joint {name!r} is a {joint.kind} joint"
+            self._read.fault(f"{who}: expected the name of a hinge or slide, {what}", element)
+            return False
+        return True
+
+    def _spring_reference(self, name: str) -> float:
+        joint = self._joints[name]
+        angle = self._scene.compiler.angle if joint.kind == "hinge" else 1.0
+        return angle * self._read.number(joint.element, "springref", f"joint {name!r}", 0.0)
+
+    # Actuators
+
+    def _actuator(self, element: Element, number: int) -> _Acting:
+        who = f"actuator {self._who(element, number)}"
+        class_ = self._scene.defaults.known(element.attributes.get("class"), element) or "main"
+        made = self._classes.get(class_, _Actuator()).with_element(element, who, self._read)
+        out = _Acting(self._who(element, number), self._name(element, "actuator", number), {})
+        out.armature = made.armature
+        out.factors = {joint: made.gear * c for joint, c in self._driven(element, who).items() if made.gear * c}
+        damping, *higher = made.damping
+        out.damping = damping * self._dampers
+        if any(higher):
+            out.left_out.append("damping that depends on the rate")
+            out.damping = 0.0
+        gain = f"gain {made.gain:g}" if made.gaintype == "fixed" else f"{made.gaintype} gain"
+        limits = f", range {made.ctrlrange[0]:g} {made.ctrlrange[1]:g}" if made.ctrlrange else ""
+        at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
+        out.control = f"{out.who} ({element.tag}, {gain}{limits}) on {at}"
+        if self._actuation and made.group not in self._groups:
+            self._bias(made, out)
+        out.linear()
+        return out
+
+    def _driven(self, element: Element, who: str) -> dict[str, float]:
+        """Return the factors of the length before the gear; none where it is no sum of coordinates."""
+        given = element.attributes
+        name = given.get("joint", given.get("jointinparent", ""))
+        if name:
+            joint = self._joints.get(name)
+            if joint is None:
+                self._read.fault(f"{who}: joint {name!r} is not in the file", element)
+            return {name: 1.0} if joint is not None and joint.kind in ("hinge", "slide") else {}
+        if "tendon" in given:
+            if given["tendon"] not in self._factors:
+                self._read.fault(f"{who}: tendon {given['tendon']!r} is not in the file", element)
+                return {}
+            return self._factors[given["tendon"]]
+        return {}
+
+    def _bias(self, made: _Actuator, out: _Acting) -> None:
+        """Add the force at zero control and activation."""
+        if made.biastype == "none":
+            return
+        if made.biastype != "affine":
+            out.left_out.append(f"the force of a {made.biastype}")
+            return
+        b0, b1, b2 = made.bias
+        rest = -b0 / b1 if b1 else 0.0
+        if abs(rest) <= LARGEST:
+            out.stiffness, out.rest_length = -b1, rest
+        if b0 and (b1 >= 0 or abs(rest) > LARGEST):
+            out.left_out.append(f"the constant force {b0:g}")
+        if b2 > 0 and made.gain == -b1 and made.gaintype in ("fixed", "pid"):
+            out.dampratio = b2
+        elif b2 <= 0:
+            out.damping -= b2
+        else:
+            out.left_out.append(f"the force {b2:g} times the rate")
+        if made.forcerange and made.forcelimited != "false" and any((b0, b1, b2)):
+            out.left_out.append(f"force range {' '.join(f'{x:g}' for x in made.forcerange)}")
+
+    # What becomes of them
+
+    def applied(self, model: Model) -> Model:
+        """Return the model with what acts, and with notes that name it and what was left out."""
+        acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
+        springs = tuple(x.point_spring() for x in acting if x.ends)
+        out = coupled(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
+        ratios = []
+        for x in acting:
+            if x.dampratio:
+                # Of the critical damping at the pose that is drawn, with the inertia that the actuator moves there.
+                inertia = self._reflected(out, x.coupling())
+                damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * inertia))
+                ratios.append(replace(x.coupling(), stiffness=0.0, armature=0.0, damping=damping))
+        out = coupled(out, ratios)
+        torn = ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c))
+        own = [*self._notes()]
+        if torn:
+            own.append(f"the armature of {torn} acts between branches; MuJoCo 4.0 leaves it out of M there")
+        return replace(out, notes=(*model.notes, *own))
+
+    def _reflected(self, model: Model, coupling: JointCoupling) -> float:
+        """Return the inertia that a coupling's length moves in the pose that is drawn; 0 where M is singular for it."""
+        q = model.neutral()
+        for name, joint in self._joints.items():
+            if joint.kind in ("hinge", "slide"):
+                q[model.layout.q[name]] = joint.ref
+        row = model.layout.coupling_row(coupling) @ model.layout.G
+        M = sample_mass_matrix(model, q)
+        root = np.sqrt(np.diag(M))
+        if not root.all():
+            return 0.0
+        # Scaled to a unit diagonal, so that masses of very different sizes keep their digits.
+        row = row / root
+        mobility = float(row @ np.linalg.lstsq(M / np.outer(root, root), row, rcond=None)[0])
+        return 1 / mobility if mobility > 0 else 0.0
+
+    def _notes(self) -> Iterator[str]:
+        for what, some in (("tendons", self._tendons), ("actuators", self._actuators)):
+            acting = "; ".join(x.description() for x in some if x.acts)
+            at = ", at zero control" if what == "actuators" else ""
+            if acting:
+                yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
+            lost = "; ".join(f"{x.who}: {', '.join(x.left_out)}" for x in some if x.left_out)
+            if lost:
+                yield f"left out of {what}: {lost}"
+            idle = ", ".join(x.who for x in some if not (x.acts or x.left_out or x.control))
+            if idle:
+                yield f"{what} that exert no force of their own: {idle}"
+        if self._actuators:
+            controls = "; ".join(x.control for x in self._actuators)
+            yield f"controls of actuators were left out, give their forces as tau: {controls}"
+        if self._equalities:
+            yield f"equality constraints left out: {'; '.join(self._equalities)}"
+
+
+def coupled(model: Model, couplings: Iterable[JointCoupling]) -> Model:
+    """Return the model with more couplings; one of a single joint becomes numbers of that joint.
+
+    A coupling that is there already gets the damping of another of its name. Two springs on one joint become one; the
+    constant by which its energy differs from theirs is left out.
+    """
+    joints: dict[str, Joint] = {j.name: j for j in model.joints}
+    kept = {c.name: c for c in model.couplings}
+    for c in couplings:
+        if len(c.joints) > 1:
+            there = kept.get(c.name)
+            kept[c.name] = c if there is None else replace(there, damping=there.damping + c.damping)
+            continue
+        joint, factor = joints[c.joints[0]], float(c.factors[0])
+        stiffness = joint.stiffness + factor**2 * c.stiffness
+        pull = joint.stiffness * joint.rest + factor * c.stiffness * c.rest_length
+        joints[joint.name] = replace(
+            joint,
+            stiffness=stiffness,
+            rest=np.divide(pull, stiffness, out=np.array(joint.rest), where=stiffness > 0),
+            damping=joint.damping + factor**2 * c.damping,
+            armature=joint.armature + factor**2 * c.armature,
+        )
+    return replace(model, joints=tuple(joints.values()), couplings=tuple(kept.values()))
+
+
+def _ground_sites(mujoco: Element, scene: Scene) -> dict[str, tuple[str, Array]]:
+    """Return the sites of the world itself."""
+    out: dict[str, tuple[str, Array]] = {}
+    for world in mujoco.all("worldbody"):
+        for element, X, class_ in unfolded(world, HERE, None, scene, "the world"):
+            site = scene.defaults.filled(element, class_) if element.tag == "site" else element
+            if element.tag == "site" and "fromto" not in site.attributes:
+                place = X @ pose(site, scene.compiler, scene.read, "site in the world")
+                out[element.attributes.get("name", "")] = ("world", place.p)
+    return out
+
+
+def _disabled_groups(mujoco: Element, read: Reader) -> set[float]:
+    out: set[float] = set()
+    for option in mujoco.all("option"):
+        if "actuatorgroupdisable" in option.attributes:
+            out |= set(read.numbers(option, "actuatorgroupdisable", "the file", count=31, least=0))
+    return out
+
+
+def _connected(element: Element) -> str:
+    """Return what an equality constraint binds."""
+    ends: Any = (f"{k} {v!r}" for k, v in element.attributes.items() if k.rstrip("12") in _ENDS)
+    return ", ".join([element.tag, *ends])
