@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from typing import Any, Final
 
 import numpy as np
@@ -12,8 +13,21 @@ from mbkit.errors import InputError
 
 Array = NDArray[np.float64]
 _FEW: Final = 64
+_SHORT: Final = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
 
-__all__ = ["Array", "all_finite", "batch_of", "count", "finite_array", "generator", "real", "require_finite", "rows"]
+__all__ = [
+    "Array",
+    "all_finite",
+    "batch_of",
+    "count",
+    "finite_array",
+    "generator",
+    "real",
+    "require_finite",
+    "rows",
+    "shown",
+]
 
 
 def all_finite(array: Array) -> bool:
@@ -34,6 +48,9 @@ def _as_float(name: str, value: ArrayLike) -> Array:
         raw = np.asarray(value)
     except (ValueError, TypeError) as error:
         raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__} ({error})") from None
+    except Exception:
+        # Any: objects may bring conversions of their own.
+        raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__}") from None
     if raw.dtype.kind not in "fiu":
         raise InputError(f"{name}: expected real numbers, got dtype {raw.dtype}")
     return np.asarray(raw, dtype=np.float64)
@@ -83,8 +100,9 @@ def batch_of(**arrays: Array) -> int | None:
 
 def count(name: str, value: Any, *, least: int = 0) -> int:
     """Return `value` as a whole number of at least `least`."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < least:
-        raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
+    if not whole or not least <= value < 2**63:
+        raise InputError(f"{name}: expected a whole number of at least {least}, got {shown(value)}")
     return int(value)
 
 
@@ -94,21 +112,31 @@ def generator(name: str, value: Any) -> np.random.Generator:
         return value
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
         return np.random.default_rng(int(value))
-    raise InputError(f"{name}: expected a numpy Generator or a seed of at least 0, got {value!r}")
+    raise InputError(f"{name}: expected a numpy Generator or a seed of at least 0, got {shown(value)}")
 
 
 def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = False) -> float:
     """Return `value` as a finite float, optionally of a required sign."""
-    if isinstance(value, (str, bytes, bool)):
-        raise InputError(f"{name}: expected a number, got {value!r}")
+    if isinstance(value, (str, bytes, bytearray, bool, np.bool_)) or (isinstance(value, np.ndarray) and value.ndim):
+        raise InputError(f"{name}: expected a number, got {shown(value)}")
     try:
         number = float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{name}: expected a number, got {value!r}") from None
     except OverflowError:
-        raise InputError(f"{name}: expected a number that a double can hold, got an integer beyond 1e308") from None
+        raise InputError(f"{name}: expected a number that a double can hold, got one beyond 1e308") from None
+    except Exception:
+        # Any: objects may bring conversions of their own.
+        raise InputError(f"{name}: expected a number, got {shown(value)}") from None
     if not np.isfinite(number):
         raise InputError(f"{name}: expected a finite number, got {number}")
     if (positive and number <= 0) or (nonnegative and number < 0):
         raise InputError(f"{name}: expected a number {'above' if positive else 'of at least'} 0, got {number}")
     return number
+
+
+def shown(value: Any) -> str:
+    """Return any value as a short text for a message; it holds no lone surrogates and never fails."""
+    try:
+        text = _SHORT.repr(value)
+    except Exception:
+        text = f"an object of type {type(value).__name__}"
+    return text.encode("utf-8", "backslashreplace").decode()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
 __all__ = [
     "BaselineError",
@@ -25,11 +25,18 @@ __all__ = [
     "NonPhysicalWarning",
     "NumericalError",
     "OutputError",
+    "Suggestions",
     "TorqueError",
     "UnknownNameError",
     "UnsupportedError",
     "nearest",
 ]
+
+# A message is for reading: this many faults of a description, and so many characters of each.
+_MOST_FAULTS: Final = 100
+_MOST_CHARACTERS: Final = 2000
+# Longer names are not compared with others: the comparison takes the square of the length.
+_LONGEST_NAME: Final = 200
 
 
 class MbkitError(Exception):
@@ -95,7 +102,7 @@ class UnknownNameError(MbkitError, LookupError):
             advice = f"there are: {', '.join(self.known) or 'none'}"
         else:
             advice = f"none of the {len(self.known)} known names is near"
-        super().__init__(f"unknown {what} {name!r}; {advice}" + (f" {hint}" if hint else ""))
+        super().__init__(f"unknown {what} {_shortened(repr(name), 200)}; {advice}" + (f" {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[type, tuple[object, ...]]:
         return type(self), (self.what, self.name, self.known, self.hint)
@@ -109,15 +116,18 @@ class ModelError(MbkitError, ValueError):
     name : str
         Name of the model, or the file it came from.
     faults : sequence of str
-        One sentence per fault, each with its remedy.
+        One sentence per fault, each with its remedy. The message shows the first of very many.
     """
 
     def __init__(self, name: str, faults: Sequence[str]) -> None:
         self.name, self.faults = name, tuple(faults)
+        shown = [_shortened(fault) for fault in self.faults[:_MOST_FAULTS]]
         if len(self.faults) == 1:
-            text = f"{name}: {self.faults[0]}"
+            text = f"{name}: {shown[0]}"
         else:
-            text = "\n".join([f"{name}: {len(self.faults)} faults", *(f"  - {f}" for f in self.faults)])
+            more = len(self.faults) - len(shown)
+            rest = [f"  - and {more} more; the error's .faults holds all"] if more else []
+            text = "\n".join([f"{name}: {len(self.faults)} faults", *(f"  - {f}" for f in shown), *rest])
         super().__init__(text)
 
     def __reduce__(self) -> tuple[type, tuple[object, ...]]:
@@ -166,7 +176,33 @@ class NonPhysicalWarning(MbkitWarning):
 
 def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
     """Return up to `count` of the `known` names that look like `name`."""
+    if len(name) > _LONGEST_NAME:
+        return []
     lower = {k.lower(): k for k in known}
     close = difflib.get_close_matches(name.lower(), lower, n=count, cutoff=0.6)
     inside = [k for k in lower if len(name) >= 3 and name.lower() in k and k not in close]
     return [lower[k] for k in (close + sorted(inside, key=len))[:count]]
+
+
+class Suggestions:
+    """Near names for the first unknown names of a description; those after them are not compared.
+
+    Each comparison looks at every known name, so a file of wrong names would take the square of its length.
+    """
+
+    def __init__(self, most: int = 5) -> None:
+        self._left = most
+        self._found: dict[str, str] = {}
+
+    def near(self, name: str, known: Iterable[str]) -> str:
+        """Return the nearest known name, or an empty text."""
+        if name not in self._found:
+            if self._left <= 0:
+                return ""
+            self._left -= 1
+            self._found[name] = next(iter(nearest(name, known, 1)), "")
+        return self._found[name]
+
+
+def _shortened(text: str, most: int = _MOST_CHARACTERS) -> str:
+    return text if len(text) <= most else text[: most - 4] + " ..."

@@ -83,7 +83,7 @@ def assert_engines_agree(
     result = compare(model, present if missing else engines, samples, seed, tolerance=rtol, terms_only=True)
     refused = [r for r in result.refusals if not r.term]
     failed = [r for r in result.rows if not r.passed]
-    if failed or refused or not result.rows:
+    if failed or refused or not result.passed:
         raise AssertionError(_comparison_text(result, failed, [f"{r.engine} refuses it: {r.reason}" for r in refused]))
     return result
 
@@ -184,9 +184,8 @@ def _strict(asked: bool | None) -> bool:
 
 
 def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterable[str]) -> str:
-    lines = [
-        f"{result.model}: {len(failed)} of {len(result.rows)} comparisons are off by more than {result.tolerance:.0e}"
-    ]
+    off = f"{len(failed)} of {len(result.rows)} comparisons are off by more than {result.tolerance:.0e}"
+    lines = [f"{result.model}: {result.verdict if result.nothing else off}"]
     worst = sorted(failed, key=lambda r: -r.relative)
     lines += [f"  {r.engine}, {r.term}: {r.reason}" for r in worst[:_MOST]]
     if len(worst) > _MOST:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import warnings
@@ -13,9 +14,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mbkit import errors
 from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
-from mbkit.load import load
+from mbkit.load import load, xml
 from mbkit.load.names import find
+from mbkit.load.urdf_links import read_links
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
@@ -89,6 +92,45 @@ def test_texts_that_are_no_description(case, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def test_text_is_written_once_however_often_elements_interrupt_it(monkeypatch):
+    written = []
+
+    class Counted(xml.Element):
+        def __setattr__(self, name, value):
+            if name == "text":
+                written.append(len(value))
+            super().__setattr__(name, value)
+
+    monkeypatch.setattr(xml, "Element", Counted)
+    content = b"<robot>" + b"<a/>word" * 1000 + b"</robot>"
+    assert xml.parse(content, "x").text == "word" * 1000
+    assert sum(written) < len(content)
+
+
+def test_more_elements_than_any_robot_has_are_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(xml, "MOST_ELEMENTS", 100)
+    error = raised(tmp_path, b'<robot name="r">' + b"<a/>" * 100 + b"</robot>")
+    assert isinstance(error, LoadError)
+    assert "100 elements" in str(error)
+
+
+@pytest.mark.parametrize("inside", [LIMIT, LIMIT + '<mimic joint="unknown_{i}"/>'])
+def test_few_unknown_names_are_compared_with_all_known_ones(monkeypatch, tmp_path, inside):
+    calls = []
+    monkeypatch.setattr(errors.difflib, "get_close_matches", lambda *given, **_: calls.append(given) or [])
+    text = robot(links("a") + "".join(joint(f"j{i}", "a", f"b{i}", inside.replace("{i}", str(i))) for i in range(50)))
+    error = raised(tmp_path, text)
+    assert sum("unknown" in fault for fault in error.faults) >= 50
+    assert len(calls) <= 10
+
+
+def test_a_message_of_many_or_long_faults_can_be_read(tmp_path):
+    error = raised(tmp_path, robot("<link/>" * 5000 + f'<link name="a"/><link name="{"b" * 100_000}"/>'))
+    assert len(error.faults) > 5000
+    assert len(str(error)) < 300_000
+    assert str(len(error.faults)) in str(error)
+
+
 # URDF. Each names the culprit, and what to do where that is not plain.
 
 URDFS = {
@@ -119,10 +161,6 @@ URDFS = {
     "unknown_type": (with_joint(LIMIT, "hinge"), ["joint 'j': type 'hinge'", "expected one of fixed, revolute"]),
     "no_limit": (with_joint(""), ["joint 'j': a revolute joint needs <limit", "continuous"]),
     "no_effort": (with_joint('<limit lower="0" upper="1" velocity="1"/>'), ["joint 'j': limit effort: missing"]),
-    "limits_swapped": (
-        with_joint('<limit lower="2" upper="1" effort="1" velocity="1"/>'),
-        ["joint 'j': lower limit 2 above upper limit 1"],
-    ),
     "negative_effort": (
         with_joint('<limit lower="0" upper="1" effort="-1" velocity="1"/>'),
         ["joint 'j': limit effort is negative"],
@@ -132,7 +170,7 @@ URDFS = {
     "short_axis": (with_joint('<axis xyz="0 1"/>' + LIMIT), ["joint 'j': axis xyz: expected 3 numbers, got '0 1'"]),
     "planar_across": (with_joint("", "planar"), ["joint 'j': planar with the normal 1 0 0", '<axis xyz="0 0 1"/>']),
     "damped_floating": (with_joint('<dynamics damping="1"/>', "floating"), ["joint 'j': damping or friction"]),
-    "two_limits": (with_joint(LIMIT + LIMIT), ["joint 'j': 2 <limit> elements"]),
+    "two_limits": (with_joint(LIMIT + LIMIT.replace('"1"', '"2"')), ["joint 'j': 2 <limit> elements"]),
     "mimic_unknown": (
         with_joint(LIMIT + '<mimic joint="k"/>'),
         ["joint 'j': mimics unknown joint 'k'", "mimic='free'"],
@@ -228,6 +266,104 @@ def test_numbers_that_are_none(where, value, tmp_path):
     assert "(line 1)" in str(error)
 
 
+@pytest.mark.parametrize(("word", "hint"), [("0.07,", "comma"), ("${x}", "xacro"), ("$(optenv", "xacro")])
+def test_numbers_that_are_none_come_with_a_hint(word, hint, tmp_path):
+    assert hint in str(raised(tmp_path, with_joint(f'<origin xyz="{word} 0 0"/>' + LIMIT)))
+
+
+# Every element and attribute in which URDF writes dynamics, each once.
+COMPLETE = robot(
+    links("a", "b")
+    + links("c").replace("<mass", '<origin xyz="0 0 1" rpy="0 0 1"/><mass')
+    + joint("j", "a", "b", LIMIT)
+    + joint(
+        "k",
+        "b",
+        "c",
+        LIMIT + '<origin xyz="0 0 1" rpy="0 0 1"/><axis xyz="0 0 1"/><dynamics damping="1" friction="1"/>'
+        '<mimic joint="j" multiplier="2" offset="1"/>',
+    )
+)
+ELEMENTS = {element.tag for element in xml.parse(COMPLETE.encode(), "").walk()} - {"robot"}
+ATTRIBUTES = {name for element in xml.parse(COMPLETE.encode(), "").walk() for name in element.attributes}
+
+
+@pytest.mark.parametrize("name", sorted(ELEMENTS | ATTRIBUTES))
+@pytest.mark.parametrize("how", ["swapped", "short", "capitals"])
+def test_misspelt_names_are_no_dynamics_that_is_lost(name, how, tmp_path):
+    wrong = {"swapped": name[:-2] + name[:-3:-1], "short": name[:-1], "capitals": name.upper()}[how]
+    for pattern in (rf"(</?){name}\b", rf"( ){name}(?==)"):
+        text = re.sub(pattern, rf"\g<1>{wrong}", COMPLETE)
+        if text != COMPLETE:
+            assert repr(wrong) in str(error := raised(tmp_path, text)) or f"<{wrong}>" in str(error)
+            assert isinstance(error, ModelError)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [('<origin xyz="0 0 1"', '<origin pos="0 0 1"'), ("<inertial>", "<inertial><com/>"), ("</link>", "<mass/></link>")],
+)
+def test_what_would_be_lost_of_the_dynamics_is_refused(old, new, tmp_path):
+    assert isinstance(raised(tmp_path, COMPLETE.replace(old, new)), ModelError)
+
+
+def test_extensions_are_left_out_with_a_note(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(COMPLETE)
+    plain = load(path)
+    path.write_text(
+        COMPLETE.replace("<axis", '<safety_controller/><drake:rotor_inertia value="1"/><axis')
+        .replace("<dynamics", '<dynamics mu_viscous="1"')
+        .replace("<robot", '<robot xmlns:drake="x"')
+        .replace("</robot>", "<gazebo/><joints_of_mine/></robot>")
+    )
+    extended = load(path)
+    assert extended == plain
+    for name in ("safety_controller", "drake:rotor_inertia", "mu_viscous", "gazebo", "joints_of_mine"):
+        assert any(name in note for note in extended.notes)
+
+
+HEADS = {"lines": b"\n\n", "words": b"robot of mine\n", "comment": b"<!-- <robot> -->\n"}
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_text_around_the_document_is_passed_over_with_a_note(head, tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_bytes(COMPLETE.encode())
+    plain = load(path)
+    for text in (
+        HEADS[head] + b'<?xml version="1.0" encoding="latin-1"?>\n<!-- \xe4 -->' + COMPLETE.encode(),
+        COMPLETE.encode() + b"\n\0\0\n",
+    ):
+        path.write_bytes(text)
+        assert load(path) == plain
+        assert len(load(path).notes) == len(plain.notes) + 1
+    path.write_bytes(HEADS[head] + b'<?xml version="1.0"?>\n<robot>\n</link>')
+    with pytest.raises(LoadError, match=f"line {HEADS[head].count(10) + 3}"):
+        load(path)
+
+
+def test_equal_elements_are_read_once(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(COMPLETE)
+    plain = load(path)
+    path.write_text(COMPLETE.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/>' * 2))
+    assert load(path) == plain
+    assert any("axis" in note for note in load(path).notes)
+    assert "2 <axis>" in str(raised(tmp_path, COMPLETE.replace("<axis", '<axis xyz="0 1 0"/><axis')))
+
+
+@pytest.mark.parametrize("read", [load, read_links])
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_lower_limit_above_the_upper_is_no_limit(read, kind, tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(with_joint('<limit lower="2" upper="1" effort="3" velocity="4"/>', kind))
+    model = read(path)
+    assert (model.lower[0], model.upper[0]) == (-math.inf, math.inf)
+    assert (model.joint("j").effort_limit, model.joint("j").velocity_limit) == (3, 4)
+    assert any("'j'" in note and "limit" in note for note in model.notes)
+
+
 def test_all_faults_come_at_once(tmp_path):
     text = (
         "<robot>"
@@ -272,6 +408,35 @@ def test_nonphysical_links_come_in_one_error_and_load_with_a_warning(tmp_path):
     assert [n for n, _ in model.nonphysical] == ["heavy", "empty"]
 
 
+def impossible(name: str) -> str:
+    return re.search("<link.*</link>", with_inertial(moments="1 0 0 1 0 3")[20:])[0].replace('"b"', f'"{name}"')
+
+
+def test_bodies_with_the_same_fault_are_one_line_with_one_way_out(tmp_path):
+    names = [f"bad{i}" for i in range(13)]
+    text = links("a") + "".join(impossible(n) + joint(f"j{n}", "a", n) for n in names)
+    error = raised(tmp_path, robot(text))
+    assert len(error.faults) == 1
+    assert all(repr(n) in str(error) for n in names)
+    assert str(error).count("nonphysical") == 1
+
+
+@pytest.mark.parametrize(("base", "link"), [("a", "odd"), ("world", "odd")])
+def test_a_fault_names_the_link_of_the_file(base, link, tmp_path):
+    text = links(base) + '<link name="moving"/>' + joint("j", base, "moving") + impossible("odd")
+    text = robot(text + joint("k", "moving", "odd", "", "fixed"))
+    error = raised(tmp_path, text)
+    assert f"link {link!r}" in str(error)
+    assert "world_link" not in str(error)
+    with pytest.warns(NonPhysicalWarning, match=f"link {link!r}"):
+        model = load(tmp_path / "robot.urdf", nonphysical="warn")
+    assert [name for name, _ in model.nonphysical] == ["moving"]
+    # The base never moves: a note, which names it as the file does.
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot(impossible(base) + links("moving") + joint("j", base, "moving")))
+    assert any(f"link {base!r}" in note and "never moves" in note for note in load(path).notes)
+
+
 def test_a_negative_mass_is_an_error_whatever_is_asked(tmp_path):
     assert "negative" in str(raised(tmp_path, with_inertial(mass="-1"), nonphysical="warn"))
     fused = robot(
@@ -313,16 +478,20 @@ MJCFS = {
         mjcf(
             '<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'
         ),
-        ["body 'b'", "meshes are not opened", "add <inertial>"],
+        ["body 'b'", "'m'", "m.stl"],
     ),
     "mesh_inertia_by_default": (
         mjcf(
             '<body name="b" childclass="v"><joint/><geom mesh="m"/></body>',
             '<default><default class="v"><geom type="mesh"/></default></default>',
         ),
-        ["body 'b'", "add <inertial>"],
+        ["body 'b'", "'m'", "no such <mesh>"],
     ),
     "unknown_class": (mjcf('<body childclass="k"><joint/></body>'), ["unknown default class 'k'; there are: main"]),
+    "renamed_main": (
+        mjcf(BODY, '<default class="k"><joint damping="1"/></default>'),
+        ["<default>", "'main'", "line 1"],
+    ),
     "same_names": (mjcf(BODY + BODY.replace('"b"', '"c"')), ["joint 'j': declared more than once"]),
     "called_world": (mjcf(BODY.replace('"b"', '"world"')), ["body 'world': that name is the ground's"]),
     "unknown_type": (mjcf(BODY.replace('name="j"', 'name="j" type="screw"')), ["joint 'j': type 'screw'"]),
@@ -340,7 +509,26 @@ MJCFS = {
         mjcf('<body name="b"><joint/><geom type="cone" size="1"/></body>'),
         ["body 'b': geom type 'cone'"],
     ),
-    "shell": (mjcf('<body name="b"><joint/><geom size="1" shellinertia="true"/></body>'), ["body 'b'", "shell"]),
+    "compiler": (
+        mjcf('<body name="b"><joint/><geom size="1" shellinertia="maybe"/></body>'),
+        ["'b'", "MuJoCo's compiler"],
+    ),
+    "flag": (mjcf(BODY, '<option><flag gravity="off"/></option>'), ["gravity", "'off'"]),
+    "limited": (mjcf(BODY.replace('name="j"', 'name="j" limited="yes"')), ["limited", "'yes'"]),
+    "springdamper": (mjcf(BODY.replace('name="j"', 'name="j" springdamper="1 0"')), ["joint 'j'", "springdamper"]),
+    "inherited": (
+        mjcf(
+            '<body name="b"><joint name="j" type="free"/><geom size="1"/></body>',
+            '<default><joint armature="1"/></default>',
+        ),
+        ["joint 'j': armature 1 on a free joint", "line 1"],
+    ),
+    "world_attribute": (
+        mjcf(BODY).replace("<worldbody", '<worldbody childclass="main"'),
+        ["worldbody", "'childclass'"],
+    ),
+    "world_joint": (mjcf(BODY + "<joint/>"), ["worldbody", "'joint'"]),
+    "scaled_frame": (mjcf(f'<frame scale="2">{BODY}</frame>'), ["frame", "'scale'"]),
     "triangle": (mjcf(BODY.replace("1 1 1", "1 1 3")), ["'b'", "A + B >= C", 'nonphysical="warn"']),
     "no_mass": (mjcf('<body name="b"><joint name="j"/></body>'), ["'b'", "no mass moves with joint 'j'"]),
     "free_below": (
@@ -353,11 +541,11 @@ MJCFS = {
     ),
     "armature_on_ball": (
         mjcf(BODY.replace('name="j"', 'name="j" type="ball" armature="1"')),
-        ["joint 'j': armature on a ball joint"],
+        ["joint 'j': armature 1 on a ball joint", "line 1"],
     ),
     "spring_on_ball": (
         mjcf(BODY.replace('name="j"', 'name="j" type="ball" stiffness="1"')),
-        ["joint 'j': joint spring on a ball joint"],
+        ["joint 'j': stiffness 1 on a ball joint", "line 1"],
     ),
     "curved_spring": (
         mjcf(BODY.replace('name="j"', 'name="j" stiffness="1 2"')),
@@ -369,11 +557,6 @@ MJCFS = {
     ),
     "degenerate_axes": (mjcf(BODY.replace('"b"', '"b" xyaxes="1 0 0 2 0 0"')), ["body 'b': body xyaxes"]),
     "old_coordinates": (mjcf(BODY, '<compiler coordinate="global"/>'), ["compiler coordinate"]),
-    "raised_mass": (
-        mjcf(BODY, '<compiler boundmass="2"/>'),
-        ["body 'b': compiler boundmass would raise its mass 1 kg"],
-    ),
-    "raised_inertia": (mjcf(BODY, '<compiler boundinertia="2"/>'), ["body 'b': compiler boundinertia"]),
     "range_without_limited": (
         mjcf(BODY.replace('name="j"', 'name="j" range="0 1"'), '<compiler autolimits="false"/>'),
         ["joint 'j': range without limited"],

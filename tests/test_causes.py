@@ -17,7 +17,9 @@ from mbkit.engines.base import per_sample
 from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.pinocchio import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.model import Body, Joint, Mimic, Model
+from mbkit.model import Body, Joint, Loop, Mimic, Model
+from mbkit.studies.causes.compact import compact
+from mbkit.studies.parsers.compare import written
 from tests.random_trees import random_tree
 
 ROBOTS = ("panda", "ur5", "solo8", "so100", "kinova")
@@ -284,6 +286,108 @@ def test_several_differences_are_told_apart_with_their_own_effects() -> None:
     assert "axis sign" in found._repr_html_()
 
 
+def planted_fields(m: Model, rng: np.random.Generator, many: int) -> dict[tuple[str, str], Callable[[Model], Model]]:
+    """Changes of single fields of a tree's parts, at least two of them in one body."""
+    joints = [j for j in m.joints if j.kind in ("revolute", "continuous", "prismatic", "helical")]
+    body, other = (m.body(f"b{k}") for k in rng.choice(len(m.bodies), 2, replace=False))
+    joint = joints[rng.integers(len(joints))]
+    near, far = 0.1 * rng.standard_normal((2, 3))
+    all_of_them = {
+        (body.name, "mass"): lambda x: with_body(x, body.name, mass=1.4 * body.mass),
+        (body.name, "centre of mass"): lambda x: with_body(x, body.name, com=body.com + near),
+        (body.name, "inertia"): lambda x: with_body(x, body.name, inertia=body.inertia + np.diag([0.3, 0.4, 0.5])),
+        (other.name, "mass"): lambda x: with_body(x, other.name, mass=0.7 * other.mass),
+        (joint.name, "joint origin"): lambda x: with_joint(x, joint.name, translation=joint.translation + far),
+        (joint.name, "armature"): lambda x: with_joint(x, joint.name, armature=joint.armature + 0.2),
+        (joint.name, "damping"): lambda x: with_joint(x, joint.name, damping=joint.damping + 0.2),
+        (joint.name, "friction"): lambda x: with_joint(x, joint.name, friction=joint.friction + 0.2),
+    }
+    keys = [list(all_of_them)[k] for k in rng.permutation(8)[:many]]
+    return {k: all_of_them[k] for k in dict.fromkeys([*list(all_of_them)[:2], *keys])}
+
+
+def moved(a: Model, b: Model) -> bool:
+    """Whether a term of two descriptions with the same coordinates differs."""
+    q, v = a.random_state(np.random.default_rng(3), 4)
+    values = []
+    for m in (a, b):
+        dyn = mb.dynamics(m)
+        values.append([dyn.mass_matrix(q), dyn.nle(q, v), dyn.passive(q, v)])
+    return any(np.abs(x - y).max() > 1e-8 * np.abs(x).max() for x, y in zip(*values, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_differences_together_are_named_each_and_silent_only_where_none_alone_changes_a_term(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a = random_tree(seed, 6, kinds=("revolute", "fixed", "prismatic", "helical", "free", "ball"))
+    planted = planted_fields(a, rng, 2 + seed % 4)
+    b = a
+    for plant in planted.values():
+        b = plant(b)
+    found = mb.explain(a, b, samples=2)
+    assert found.explained
+    assert found.remainder < 1e-12
+    causes = {(c.subject.split("'")[1], c.kind): c for c in found.causes if c.kind != "base mass"}
+    # What is fixed to the world is told as the base.
+    still = {name for name, _ in planted} - {name for name, _ in causes}
+    assert not any(moved(a, plant(a)) for (name, _), plant in planted.items() if name in still)
+    assert causes.keys() == {key for key in planted if key[0] not in still}
+    for key, cause in causes.items():
+        rest = a
+        for other, plant in planted.items():
+            rest = rest if other == key else plant(rest)
+        assert cause.acts == (moved(a, planted[key](a)) or moved(rest, b)), cause
+
+
+@pytest.mark.parametrize(("one", "two"), [("ur5", "ur10"), ("ur3", "ur5"), ("a1", "go1"), ("go1", "go2")])
+@pytest.mark.parametrize("read", [mb.load, written], ids=["loaded", "written"])
+def test_two_robots_are_explained_to_the_last_digit(one: str, two: str, read: Callable[[str], Model]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MbkitWarning)
+        a, b = read(one), read(two)
+    found = mb.explain(a, b, samples=1)
+    assert not found.agree
+    assert found.explained
+    assert {g.term for g in found.left} == {"M", "g", "nle", "passive"}
+    assert found.remainder < 1e-12
+    # A mass that no term holds turns about a vertical axis through it.
+    first = next(j.child for j in a.tree if j.type.nv)
+    assert {c.subject for c in found.causes if c.kind == "mass" and not c.acts} <= {f"{x} {first!r}" for x in _PART}
+    # The numbers are those of the files, and of links that are fixed to each other as one.
+    for c in found.causes:
+        if c.kind == "centre of mass" and c.subject.startswith("body"):
+            assert any(np.allclose(c.b, x.com) for x in compact(b).model.bodies)
+
+
+_PART = ("body", "link")
+
+
+def test_a_mass_counts_whichever_side_shows_it() -> None:
+    # With its centre of mass on the hinge, the mass of a body is in no term.
+    a = random_tree(0, 1, kinds=("revolute",), springs=False)
+    a = with_body(a, "b0", com=np.zeros(3))
+    b = with_body(a, "b0", mass=2.0 * a.body("b0").mass, com=np.array([0.1, 0.2, 0.3]))
+    for one, two in ((a, b), (b, a)):
+        assert {c.kind for c in mb.explain(one, two).acting} == {"mass", "centre of mass"}
+
+
+def test_a_loop_is_no_difference_that_changes_nothing() -> None:
+    open_chain = random_tree(0, 3, kinds=("revolute",))
+    loop = Loop("close", "point", "b2", np.eye(3), np.zeros(3), "world", np.eye(3), np.ones(3))
+    found = mb.explain(replace(open_chain, loops=(loop,)), open_chain)
+    (cause,) = found.acting
+    assert cause.kind == "loop"
+    assert not found.agree
+
+
+def test_robots_without_a_joint_in_common_are_not_compared() -> None:
+    found = mb.explain(mb.catalog.pendulum(), mb.catalog.heavy_top())
+    assert not found.matches
+    assert not found.agree
+    assert not found.explained
+    assert "no joint in common" in found.verdict
+
+
 def test_other_names_are_matched_by_structure_and_six_digits_are_told_as_rounding() -> None:
     a = robot("so100")
     b = replace(a, joints=tuple(replace(j, name=f"motor_{j.name}", mimic=None) for j in a.joints))
@@ -428,6 +532,21 @@ def test_engines_that_are_asked_in_another_convention() -> None:
     assert [c.kind for c in told] == ["velocity frame"]
     assert "ω × v" in str(told[0])
     assert [c.kind for c in mb.explain(plain, Shuffled(free)).causes] == ["quaternion order"]
+
+
+def test_a_term_that_is_not_always_there_is_compared_too() -> None:
+    class Odd(PinocchioDynamics):
+        """Wrong in C v alone."""
+
+        engine = "odd"
+
+        def _coriolis_force(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            return 1.1 * (self._nle(q, v) - self._gravity(q))
+
+    found = mb.explain(mb.dynamics(arm()), Odd(arm()))
+    assert not found.agree
+    assert not found.explained
+    assert [g.term for g in found.left if g.relative > found.tolerance] == ["C v"]
 
 
 def test_a_known_defect_is_the_cause_and_no_defect_is_none() -> None:

@@ -93,6 +93,46 @@ def test_import_of_the_command_is_light():
     assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout == "set()\n"
 
 
+@pytest.mark.parametrize(
+    ("command", "files"),
+    [
+        (("check", "SO100", *QUICK, "--engines", "pinocchio,mujoco", "--out", "o"), {"so100.html", "so100.json"}),
+        (("export", "UR5", "--quantity", "gravity", "--out", "o"), {"ur5.c", "ur5.h"}),
+        (
+            ("baseline", "record", "UR5", "Ur/UR5-gripper", "o", "--engines", "pinocchio"),
+            {"ur5.toml", "ur_ur5_gripper.toml"},
+        ),
+    ],
+)
+def test_files_have_the_robots_own_name_whatever_its_case_was(here, command, files):
+    assert call(*command).exit_code == 0
+    assert {p.name for p in (here / "o").iterdir()} == files
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("width", ["40", "80"])
+def test_no_name_of_a_robot_is_cut(monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", width)
+    assert "…" not in call("robots").output
+
+
+@pytest.mark.parametrize("target", ["https://example.org/robot.urdf", "file:///tmp/robot.urdf", "package://a/b.urdf"])
+def test_a_url_is_to_be_downloaded_first(target):
+    result = call("check", target)
+    assert result.exit_code == 2
+    assert target in result.stderr
+    assert "download" in result.stderr
+
+
+def test_a_folder_is_told_with_the_descriptions_in_it(here):
+    (here / "things" / "urdf").mkdir(parents=True)
+    assert "no .urdf" in call("check", "things").stderr
+    (here / "things" / "urdf" / "arm.urdf").write_text(IMPOSSIBLE)
+    result = call("check", "things")
+    assert result.exit_code == 2
+    assert os.path.join("urdf", "arm.urdf") in result.stderr
+
+
 def test_a_robots_file_has_the_name_that_was_asked_for(here):
     assert call("check", "double_pendulum", *QUICK).exit_code == 0
     assert (here / "mbkit-report" / "double_pendulum.html").exists()
@@ -241,6 +281,36 @@ def test_bad_input_is_one_message_and_exit_2(here, arguments, told):
     assert "Traceback" not in result.output
     assert result.stdout == ""
     assert not (here / "mbkit-report").exists()
+
+
+IMPOSSIBLE = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="9"/></inertial></link>
+<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "check FILE",
+        "diff FILE FILE --mimic reduce",
+        "baseline record FILE r.toml",
+        "baseline check b.toml --nonphysical error --target FILE",
+        "derive FILE",
+        "bench FILE",
+        "convert FILE --to urdf",
+        "export FILE",
+    ],
+)
+def test_every_command_says_how_to_take_impossible_bodies_in_its_own_options(here, command):
+    (here / "r.urdf").write_text(IMPOSSIBLE)
+    if "b.toml" in command:
+        assert call("baseline", "record", "pendulum", "b.toml").exit_code == 0
+    result = call(*command.replace("FILE", "r.urdf").split())
+    assert result.exit_code == 2, result.output
+    assert "'b'" in result.stderr
+    assert "--nonphysical warn" in result.stderr
+    assert 'nonphysical="warn"' not in result.stderr
+    assert "--nonphysical" in call(*command.split()[: 2 if "baseline" in command else 1], "--help").output
 
 
 @pytest.mark.usefixtures("here")

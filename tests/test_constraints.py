@@ -9,7 +9,14 @@ import pytest
 import sympy as sp
 
 import mbkit as mb
-from mbkit.errors import InputError, MbkitWarning, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import (
+    DoubtfulRunWarning,
+    InputError,
+    MbkitWarning,
+    NumericalError,
+    UnknownNameError,
+    UnsupportedError,
+)
 from mbkit.lagrangian import Lagrangian
 from mbkit.simulate import METHODS, Event
 from validation.closed_forms import published
@@ -264,9 +271,12 @@ def test_rows_are_named_wherever_they_are_met(rows, told):
     asked = [
         lambda: lag.dynamics(options=OWN).forward_dynamics([0, 0], [0, 0], [0, 0]),
         lambda: lag.multipliers([0, 0], [0, 0]),
-        lambda: lag.embedded(),
+        lambda: lag.project([0, 0], [0, 0]),
+        lambda: mb.simulate(lag.dynamics(options=OWN), [0, 0], [0, 0], 1.0),
         lambda: mb.equilibrium(lag.dynamics(options=OWN)),
     ]
+    if len(rows) == 1:
+        asked.append(lambda: mb.simulate(lag.embedded(), [0, 0], [0, 0], 1.0))
     for ask in asked:
         with pytest.raises(InputError, match=told):
             ask()
@@ -292,7 +302,7 @@ def test_contradictory_rows_are_named():
     with pytest.raises(InputError, match=r"constraints\[0\].*constraints\[1\].*contradict each other"):
         pendulum(constraints=[x + y, x + y - 1]).project([1, 0], [0, 0])
     with pytest.raises(InputError, match=r"constraints\[0\] \(x\*\*2 \+ 1\) cannot hold"):
-        pendulum(constraints=[x**2 + 1]).embedded()
+        mb.simulate(pendulum(constraints=[x**2 + 1]).embedded(), [0, 0], [0, 0], 1.0)
     with pytest.raises(InputError, match="3 of them for 2 coordinates"):
         pendulum(constraints=[x, y, x + y]).project([0, 0], [0, 0])
     # Too long a gap for these links.
@@ -372,16 +382,103 @@ def test_a_choice_that_stays_ends_at_its_singular_pose(rod):
         mb.simulate(rod.embedded(["x"]), [1.5, 0.0], [0.0, 1.0], 1.0, "rk853")
 
 
-def test_singular_poses_are_reported_with_their_time():
-    # A slider-crank of equal links: at a right angle of the crank the slider is at the pivot, and may stay there.
+def row_of_bars(N):
+    """N unit squares of equal rods side by side, upright and pushed: as one parallelogram, or as N rhombs that fold."""
+    angles, rates = sp.symbols(f"a0:{N + 1}"), sp.symbols(f"u0:{N + 1}")
+    couplers, turns = sp.symbols(f"c1:{N + 1}"), sp.symbols(f"w1:{N + 1}")
+    T = sum(u**2 for u in rates) / 6
+    V = g * sum(map(sp.sin, angles)) / 2
+    rows = []
+    for k in range(N):
+        T += rates[k] ** 2 / 2 + turns[k] ** 2 / 6 + rates[k] * turns[k] * sp.cos(angles[k] - couplers[k]) / 2
+        V += g * (sp.sin(angles[k]) + sp.sin(couplers[k]) / 2)
+        rows += [f(angles[k]) + f(couplers[k]) - f(angles[k + 1]) for f in (sp.cos, sp.sin)]
+        rows[-2] -= 1
+    lag = Lagrangian(
+        T, V, [*angles, *couplers], [*rates, *turns], parameters={g: 9.81}, constraints=rows, name=f"{N} four-bars"
+    )
+    # The parallelogram alone.
+    one = Lagrangian(
+        (sp.Rational(N + 1, 3) + N) * w**2 / 2, g * (sp.Rational(N + 1, 2) + N) * sp.sin(th), [th], [w],
+        parameters={g: 9.81},
+    )  # fmt: skip
+    return lag, one, np.r_[np.full(N + 1, np.pi / 2), np.zeros(N)], np.r_[-np.ones(N + 1), np.zeros(N)]
+
+
+def test_independence_is_judged_where_the_motion_is():
+    # Random poses of such a row all close on branches where the constraints depend on each other.
+    lag, one, q, v = row_of_bars(6)
+    tau = np.zeros(13)
+    tau[0] = 1.0
+    own = lag.dynamics(options=OWN).forward_dynamics(q, v, tau)
+    assert np.abs(own - lag.dynamics("oracle").forward_dynamics(q, v, tau)).max() < 1e-13
+    assert own[0] == pytest.approx(one.dynamics(options=OWN).forward_dynamics([np.pi / 2], [-1.0], [1.0])[0], rel=1e-13)
+    # In line, they depend on each other there alone.
+    flat = np.zeros(13)
+    for ask in (
+        lambda: lag.multipliers(flat, 0 * flat),
+        lambda: mb.simulate(lag.dynamics(options=OWN), flat, 0 * flat, 1.0),
+    ):
+        with pytest.raises((InputError, NumericalError), match=r"constraints\[.*\]"):
+            ask()
+
+
+def test_runs_go_through_singular_poses_and_name_them():
+    lag, one, q, v = row_of_bars(2)
+    save = np.array([1.0, 2.0, 5.0])
+    level = Event(lambda _t, q, _v: np.sin(q[0]), "level", terminal=False)
+    exact = mb.simulate(one.dynamics(options=OWN), q[:1], v[:1], 5.0, "dop853", rtol=1e-13, save=save, events=level)
+    first = exact.events[0].t
+    cases = [("auto", 1e-8, 1e-6), ("auto", 1e-10, 1e-8), ("auto", 1e-12, 1e-9), ("dop853", 1e-10, 1e-6)]
+    for method, rtol, close in cases:
+        with pytest.warns(DoubtfulRunWarning, match="singular pose"):
+            run = mb.simulate(lag.dynamics(options=OWN), q, v, 5.0, method, rtol=rtol, save=save)
+        assert run.stats.finished
+        assert np.abs(run.q[:, :3] - exact.q).max() < close
+        (told,) = run.stats.doubts
+        assert float(told.split("t = ")[1].split(",")[0]) == pytest.approx(first, abs=1e-3)
+    # On independent coordinates too, and telling how far it is.
+    calls = []
+    with pytest.warns(MbkitWarning, match="singular pose"):
+        run = mb.simulate(lag.embedded(), q, v, 2.0, "rk853", rtol=1e-9, save=save[:2], progress=calls.append)
+    assert run.stats.finished
+    assert calls[-1] == 1.0
+    assert np.abs(run.q[:, :3] - exact.q[:2]).max() < 1e-7
+
+
+def test_light_and_massless_links_keep_their_digits():
+    for light in (1e-9, 1e-12, 0.0):
+        lag = massive_slider_crank().substituted({m2: light})
+        q, v = lag.project([0.7, 0.2, 0.37], [1.0, 0.0, 0.0])
+        own, exact = (
+            d.forward_dynamics(q, v, np.zeros(3)) for d in (lag.dynamics(options=OWN), lag.dynamics("oracle"))
+        )
+        assert np.abs(own - exact).max() < 1e-14 * np.abs(exact).max()
+    # A light body on a heavy one, and beside one that has nothing to do with it.
+    for on in (z, 0):
+        T = (vx**2 + vy**2 + a * sp.Symbol("vz") ** 2) / 2
+        lag = Lagrangian(T, g * y, [x, y, z], [vx, vy, sp.Symbol("vz")], parameters={g: 9.81, a: 1e10},
+                         constraints=[((x - on) ** 2 + y**2 - 1) / 2])  # fmt: skip
+        state = lag.project([0.6, -0.8, 0.0], [1.0, 0.75, 0.0])
+        own, exact = (
+            d.forward_dynamics(*state, np.zeros(3)) for d in (lag.dynamics(options=OWN), lag.dynamics("oracle"))
+        )
+        assert np.abs(own - exact).max() < 1e-14 * np.abs(exact).max()
+
+
+def test_a_slider_crank_of_equal_links_goes_through_its_singular_pose():
+    # At a right angle of the crank the slider is at the pivot, and may stay there.
     lag, q, v = equal_slider_crank(angle=1.0, rate=1.0)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         run = mb.simulate(lag.embedded(), q, v, 0.8, "rk853", rtol=1e-9)
-    near, end = (str(w.message) for w in told if issubclass(w.category, MbkitWarning))
+    near, *_ = (str(w.message) for w in told if issubclass(w.category, MbkitWarning))
     assert "near a singular pose at t = 0.63" in near
-    assert "beyond a singular pose at theta = 1.570" in end
-    assert not run.stats.finished
+    assert run.stats.finished
+    # The motion goes on with its velocity: the slider does not stay.
+    assert run.q[-1, 0] > np.pi / 2 + 0.1
+    assert run.q[-1, 2] == pytest.approx(0.6 * np.cos(run.q[-1, 0]), abs=1e-9)
+    assert np.ptp(run.energy()) < 1e-9
     (near,) = (hit for hit in run.events if hit.name == "near a singular pose")
     assert near.q[0] == pytest.approx(np.pi / 2, abs=0.01)
 

@@ -12,6 +12,7 @@ import mbkit as mb
 from mbkit import spatial
 from mbkit.cli import cli
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
+from mbkit.load import xml
 from tests.random_trees import IN_MUJOCO, random_tree
 
 
@@ -103,3 +104,21 @@ def test_the_door(tmp_path: Path) -> None:
     assert printed.stdout.startswith("<robot")
     same = run(cli, ["diff", str(out), "acrobot"])
     assert same.exit_code == 0, same.output
+
+
+@pytest.mark.parametrize("to", ["mjcf", "urdf"])
+@pytest.mark.parametrize("where", ["model", "body", "joint"])
+@pytest.mark.parametrize("character", ["\x00", "\x0b", "\x1b", "\uffff", "\n", "\t", "<", "&", '"', "é", "\x85"])
+def test_a_name_is_written_so_that_xml_reads_it_or_refused(character: str, where: str, to: str) -> None:
+    names = {n: f"a{character * (n == where)}b" for n in ("model", "body", "joint")}
+    b = mb.ModelBuilder(names["model"])
+    b.add_body(names["body"], mass=1.0, com=(0, 0, 1), inertia=(1, 1, 1))
+    b.add_joint(names["joint"], "continuous", parent="world", child=names["body"], axis=(0, 1, 0))
+    model = b.build()
+    if character.isprintable() or character in "\n\t\x85":
+        root = xml.parse(mb.convert(model, to).text.encode(), "text")
+        assert any(names[where] in element.attributes.values() for element in root.walk())
+    else:
+        with pytest.raises(UnsupportedError) as caught:
+            mb.convert(model, to)
+        assert repr(names[where]) in str(caught.value)

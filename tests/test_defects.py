@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 import mbkit as mb
 from mbkit.errors import KnownDefectWarning
 from mbkit.model.kinds import KINDS
+from mbkit.report.page import check_page
+from mbkit.report.reading import headline
 from tests.random_trees import off, random_tree, states
 
 PINOCCHIO = version("pin")
@@ -111,3 +114,44 @@ def test_own_answers_are_right_where_pinocchios_are_not(seed):
     assert off(np.einsum("nij,nj->ni", C, v), own.nle(q, v) - own.gravity(q)) < 1e-13
     half = 0.5 * np.einsum("ni,nij,nj->n", v, own.mass_matrix(q), v)
     assert off(own.kinetic_energy(q, v), half) < 1e-14
+
+
+@in_this_version
+@pytest.mark.parametrize(
+    ("model", "term", "word"),
+    [
+        (one_joint("revolute", 0.7, axis=(0.6, 0, 0.8)), "kinetic energy", "computeKineticEnergy"),
+        (one_joint("universal", **CORIOLIS["universal"]), "C v", "computeCoriolisMatrix"),
+    ],
+    ids=["kinetic_energy", "coriolis"],
+)
+def test_a_comparison_names_the_engine_and_its_defect_where_nothing_else_differs(model, term, word):
+    result = mb.compare(model, ("pinocchio", "lagrangian", "mujoco"), samples=4, terms_only=True)
+    assert not result.passed
+    assert result.only_known_defects
+    assert {(r.engine, r.term) for r in result.rows if r.defect} == {("pinocchio", term)}
+    for text in (result.verdict, headline(result), result.to_markdown(), result._repr_html_(), check_page(result)):
+        first = next(line for line in text.splitlines() if "differs in" in line)
+        assert word in first
+        assert "mujoco" not in first.split("differs in")[0].rpartition(">")[2]
+    assert result.digits > 13
+    # Something else that differs is told beside it.
+    row = replace(result.rows[0], engine="mujoco", passed=False, relative=0.1)
+    worse = replace(result, rows=(*result.rows, row))
+    assert not worse.only_known_defects
+    assert word in worse.verdict
+    assert f"mujoco differs in {row.term}" in worse.verdict
+    assert headline(worse).startswith("pinocchio, mujoco differ")
+
+
+@in_this_version
+def test_a_defect_of_the_whole_engine_is_in_its_rows():
+    b = mb.ModelBuilder("tiny")
+    for k, parent in enumerate(("world", "b0")):
+        b.add_body(f"b{k}", mass=1e-17, com=(0.1, 0.2, 0.3), inertia=(1e-17, 1e-17, 1e-17))
+        b.add_joint(f"j{k}", "revolute", parent=parent, child=f"b{k}", axis=(0, 1, 0), translation=(0, 0, 0.3))
+    result = mb.compare(b.build(), ("pinocchio", "lagrangian"), samples=2, terms_only=True)
+    failed = [r for r in result.rows if not r.passed]
+    assert {r.term for r in failed} > {"M", "power balance"}
+    assert all(r.engine == "pinocchio" and "sum of two inertias" in r.defect for r in failed)
+    assert result.only_known_defects

@@ -9,6 +9,8 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning
+from mbkit.simulate.doubts import idle
+from mbkit.simulate.members import Member
 from mbkit.simulate.stability import STEPS, growth
 from mbkit.studies.stress.cases._pendulums import pendulum
 
@@ -216,3 +218,25 @@ def test_errors_that_add_up_over_many_steps_are_told():
     told = doubts(hinge(1e6), "radau", [0.1], duration=1.0, rtol=1e-4, save=[0.0, 1.0])[1]
     assert any("errors of" in x and "add up" in x for x in told)
     assert not doubts(hinge(1e2), "radau", [0.1], duration=1.0, rtol=1e-8, save=[0.0, 1.0])[1]
+
+
+def test_a_joint_that_moves_no_mass_in_a_pose_is_named():
+    # A point on a massless rod: where the second axis has turned the rod along the first one, nothing turns about it.
+    b = mb.ModelBuilder("rod")
+    b.add_body("rod", mass=1.0, com=(0, 0, -1))
+    b.add_joint("hook", "universal", parent="world", child="rod", axis=(1, 0, 0), axis2=(0, 1, 0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    told = idle(dyn, np.array([0.3, np.pi / 2 - 1e-6]))
+    assert "'hook'" in told
+    assert "gimbal lock" in told
+    assert not idle(dyn, np.array([0.3, 0.3]))
+
+
+@pytest.mark.parametrize(("reached", "ends"), [(0.5, False), (1e-5, False), (1e-8, True)])
+def test_steps_that_cover_nothing_end_a_run(reached, ends):
+    member = Member(duration=1.0)
+    member.steps, member.rejected, member.reached = 19_000, 900, reached / 2
+    assert not member.crawls()
+    member.rejected, member.reached = 1_000, reached
+    assert member.crawls() == ends
+    assert member.ended == ("step_too_small" if ends else "finished")

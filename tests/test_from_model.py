@@ -205,3 +205,33 @@ def test_fractions_where_people_write_them():
     assert number(Fraction(1, 12)) == sp.Rational(1, 12)
     assert number(Fraction("9.81")) == sp.Float(9.81)
     assert number(Fraction(7, 2)) == sp.Rational(7, 2)
+
+
+def test_a_damper_on_a_prescribed_joint_alone_acts_on_nothing():
+    b = mb.ModelBuilder("driven")
+    for name in ("a", "c"):
+        b.add_body(name, mass=1.0, com=(1, 0, 0))
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.3)
+    b.add_joint("k", "revolute", parent="a", child="c", axis=(0, 1, 0), translation=(1, 0, 0))
+    b.prescribe("j", rate=1.0)
+    model = b.build()
+    damped, free = (from_model(m).dynamics(options={"compile": False}) for m in (model, model.without("damping")))
+    state = [0.1], [0.2], [0.3]
+    assert np.array_equal(damped.forward_dynamics(*state), free.forward_dynamics(*state))
+    assert from_model(model, drives=True).dissipation != 0
+
+
+def test_loops_are_written_out_beyond_what_anybody_reads():
+    # The engines refuse loops, so that nothing else computes them.
+    b = mb.ModelBuilder("row", gravity=(0, -9.81, 0))
+    for k in range(13):
+        b.add_body(f"rod{k}", mass=1.0, com=(0.5, 0, 0))
+        b.add_joint(f"a{k}", "continuous", parent="world", child=f"rod{k}", axis=(0, 0, 1), translation=(k, 0, 0))
+    for k in range(12):
+        b.add_body(f"bar{k}", mass=float(k > 0), com=(0.5, 0, 0))
+        b.add_joint(f"c{k}", "continuous", parent=f"rod{k}", child=f"bar{k}", axis=(0, 0, 1), translation=(1, 0, 0))
+        ends = {"translation_a": (1, 0, 0), "translation_b": (1, 0, 0)}
+        b.add_loop(f"pin{k}", "point", body_a=f"bar{k}", body_b=f"rod{k + 1}", **ends)
+    # The first coupler has no mass, and the loop moves it.
+    lag = from_model(b.build())
+    assert (len(lag.coordinates), len(lag.constraints)) == (25, 24)

@@ -106,6 +106,8 @@ def test_files_are_found_and_placed_as_mujoco_does(content: dict[str, str], name
     model = mb.load(path)
     assert [b.name for b in model.bodies] == names == [m.body(i).name for i in range(1, m.nbody)]
     assert [b.mass for b in model.bodies] == pytest.approx(list(m.body_mass[1:]), rel=1e-14)
+    # Only what stands above the file's folder is said to be outside.
+    assert any("outside" in note for note in model.notes) == any(name.startswith("..") for name in content)
 
 
 WRONG = {

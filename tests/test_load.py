@@ -3,8 +3,11 @@
 # ruff: noqa: E501 -- a description is easier to read on one line
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
+import itertools
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -19,13 +22,23 @@ import pytest
 
 import mbkit as mb
 from mbkit import spatial
-from mbkit.errors import InputError, LoadError, ModelError, NonPhysicalWarning, UnknownNameError
+from mbkit.errors import (
+    InputError,
+    KnownDefectWarning,
+    LoadError,
+    MbkitWarning,
+    ModelError,
+    NonPhysicalWarning,
+    UnknownNameError,
+)
 from mbkit.load import load, robots
+from mbkit.load.mjcf_schema import rules as mjcf_rules
 from mbkit.load.names import find
 from mbkit.load.snap import Snapper
 from mbkit.load.solids import solid
 from mbkit.model import Mimic
 from mbkit.model.physical import sample_mass_matrix
+from mbkit.studies import compare
 
 EPS = np.finfo(float).eps
 ROBOTS = {r.name: r for r in robots()}
@@ -375,16 +388,82 @@ def test_nonphysical_bodies_by_name_and_by_path():
     path = find("romeo_small").path
     with pytest.warns(NonPhysicalWarning, match="RShoulderYawLink"):
         by_name = load("romeo_small")
-    with pytest.raises(ModelError, match=r"RShoulderYawLink.*A \+ B >= C") as caught:
+    with pytest.raises(ModelError, match=r"A \+ B >= C.*RShoulderYawLink") as caught:
         load(path)
     assert 'nonphysical="warn"' in str(caught.value)
     assert str(path) in str(caught.value)
-    assert len(caught.value.faults) == 2
+    assert "RElbowYawLink" in str(caught.value)
     with pytest.warns(NonPhysicalWarning):
         assert load(path, nonphysical="warn") == by_name
     with pytest.raises(ModelError):
         load("romeo_small", nonphysical="error")
     assert {n for n, _ in by_name.nonphysical} == {"RShoulderYawLink", "RElbowYawLink"}
+
+
+# Numbers of a three-link arm, each far from the others; what is printed of them is what double precision keeps.
+def arm(mass=1.0, length=1.0, com=1.0, axis="0 0 1"):
+    def link(name, m, c):
+        moments = " ".join(f'{k}="{0.02 * m}"' for k in ("ixx", "iyy", "izz"))
+        return (
+            f'<link name="{name}"><inertial><origin xyz="{c} 0 0"/><mass value="{m}"/>'
+            f'<inertia {moments} ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+
+    def joint(name, parent, child, x, axis):
+        return (
+            f'<joint name="{name}" type="continuous"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{x} 0 0"/><axis xyz="{axis}"/></joint>'
+        )
+
+    return (
+        f'<robot name="r">{link("a", 1, 0.1)}{link("b", 1, 0.1)}{link("c", mass, 0.1 * com)}'
+        f"{joint('j', 'a', 'b', 1, '0 1 0')}{joint('k', 'b', 'c', length, axis)}</robot>"
+    )
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ({"mass": 1e-14}, "'k'"),
+        ({"length": 1e8}, "'k'"),
+        ({"length": -1e6}, "'k'"),
+    ],
+)
+def test_sizes_at_which_digits_vanish_come_with_a_warning(numbers, told, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm(**numbers))
+    with pytest.warns(MbkitWarning, match=f"digits.*{told}"):
+        model = load(path)
+    # What the warning says is so: engines that agree on the plain arm differ on this one.
+    plain = tmp_path / "plain.urdf"
+    plain.write_text(arm())
+    assert compare(load(plain), ("pinocchio", "mujoco"), 4, 0, terms_only=True).passed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KnownDefectWarning)
+        assert not compare(model, ("pinocchio", "mujoco"), 4, 0, terms_only=True).passed
+
+
+@pytest.mark.parametrize(
+    "numbers", [{}, {"mass": 1e-3}, {"mass": 1e6}, {"length": 1e2}, {"length": 1e-3}, {"com": 1e-3}]
+)
+def test_usual_sizes_come_without_a_warning(numbers, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm(**numbers))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(path)
+
+
+def test_no_robot_is_warned_of_for_its_sizes():
+    loaded = 0
+    for robot in robots():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NonPhysicalWarning)
+            warnings.filterwarnings("error", "(?s).*digits", MbkitWarning)
+            with contextlib.suppress(ModelError):
+                load(robot.name)
+                loaded += 1
+    assert loaded > 60
 
 
 def test_links_healed_by_what_is_fixed_to_them_are_noted():
@@ -544,7 +623,7 @@ def test_no_mesh_is_touched(tmp_path):
         import sys
         from mbkit.load import load
         opened = []
-        load({str(urdf)!r})
+        load({str(urdf)!r}), load({str(mjcf)!r})
         sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == "open" else None)
         load({str(urdf)!r}), load({str(mjcf)!r})
         print(".stl" in "".join(opened), sum("robot" in o for o in opened))
@@ -601,6 +680,17 @@ def check_against_mujoco(model, compiled):
     q = sample(model)
     # MuJoCo keeps principal moments, found to about 1e-12.
     assert_near(sample_mass_matrix(model), mujoco_mass_matrix(compiled, model, q), factor=1e5)
+    for i in range(1, compiled.nbody):
+        theirs, body = compiled.body(i), model.body(compiled.body(i).name)
+        axes = spatial.matrix_from_quaternion(theirs.iquat[[1, 2, 3, 0]])
+        anchor = compiled.jnt_pos[theirs.jntadr[0] + theirs.jntnum[0] - 1] if theirs.jntnum[0] else np.zeros(3)
+        assert body.mass == pytest.approx(theirs.mass[0], rel=1e-12)
+        if body.mass:
+            np.testing.assert_allclose(
+                body.com + anchor, theirs.ipos, rtol=0, atol=1e-12 * (1 + abs(theirs.ipos).max())
+            )
+        inertia = axes @ np.diag(theirs.inertia) @ axes.T
+        np.testing.assert_allclose(body.inertia, inertia, rtol=0, atol=1e-11 * abs(inertia).max())
     data = mujoco_data(compiled, model, q)
     com = data.subtree_com[0]
     assert height_energy(model, q) == pytest.approx(-model.mass * model.gravity @ com, abs=1e-12 * model.mass)
@@ -672,6 +762,31 @@ MJCF = {
     '<geom size=".1"/></body></body></worldbody>',
     "from_geom": f'<compiler inertiafromgeom="true"/><worldbody><body name="a"><joint name="j"/>{INERTIA}<geom size=".1"/>'
     f'<body name="b" pos="1 0 0">{INERTIA}</body></body></worldbody>',
+    "bounds": f'<compiler boundmass="2.5" boundinertia=".14"/><worldbody><body name="a"><joint name="j"/>{INERTIA}<body '
+    f'name="b" euler="10 20 30"><joint name="k"/>{INERTIA}<geom size=".3"/><frame pos="1 2 3" euler="0 40 0">'
+    '<body name="c" pos="1 1 0" euler="0 0 9"/></frame></body></body></worldbody>',
+    "balance": '<compiler balanceinertia="true" boundinertia=".15"/><worldbody><body name="a"><joint name="j"/><inertial '
+    'pos="1 0 0" mass="1" diaginertia=".1 .2 .5"/><body name="b"><joint name="k"/><inertial pos="0 0 0" mass="1" fullinertia='
+    '"1 .5 3 .1 .2 .3"/><body name="c" euler="10 20 30"><inertial pos="0 0 0" mass="1" euler="30 20 10" diaginertia="1 2 3"/>'
+    "</body></body></body></worldbody>",
+    "frame_class": '<default><default class="k"><geom density="3"/></default><default class="l"><geom density="5"/></default>'
+    '</default><worldbody><frame class="k"><body name="a"><joint name="j"/><geom size=".1"/><frame class="k" childclass="l">'
+    '<geom size=".2" pos="1 0 0"/></frame></body></frame></worldbody>',
+    "inherited_ranges": '<default><joint limited="true" actuatorfrcrange="-2 1"/></default><worldbody>'
+    f'<body name="a"><joint name="f" type="free"/>{INERTIA}<body name="b"><joint name="k" range="-30 60"/>{INERTIA}</body>'
+    f'</body><body name="c"><joint name="s" type="ball" range="0 30"/>{INERTIA}</body></worldbody>',
+    "no_autolimits": '<compiler autolimits="false"/><default><joint range="-30 60"/></default><worldbody><body name="a">'
+    f'<joint name="f" type="free"/>{INERTIA}<body name="b"><joint name="k" range="0 0"/>{INERTIA}</body><body name="d">'
+    f'<joint name="l" limited="true"/>{INERTIA}</body></body></worldbody>',
+    "unordered_ranges": f'<worldbody><body name="a"><joint name="s" type="ball" limited="true"/>{INERTIA}<body name="b">'
+    f'<joint name="k" range="2 1"/>{INERTIA}</body></body></worldbody>',
+    "springdamper": '<compiler settotalmass="5"/><option><flag gravity="enable"/></option><worldbody><body name="a"><joint '
+    f'name="j" springdamper=".5 .7" springref="10"/>{INERTIA}<body name="b" pos="1 0 0"><joint name="k" axis="0 1 0" '
+    'armature=".1" stiffness="3" damping="2" springdamper="2 1"/><geom name="g" size=".1" pos="1 0 0"/><site name="s"/></body>'
+    "</body></worldbody>",
+    "shells": '<worldbody><body name="a"><joint name="j"/><geom type="box" size=".1 .2 .3" shellinertia="true"/></body>'
+    '<body name="b"><joint name="k" axis="1 0 0"/><geom type="capsule" size=".1 .2" shellinertia="true" mass="2" pos="1 0 0"/>'
+    "</body></worldbody>",
     "moon": f'<option gravity="0 .1 -1.62"/><worldbody><geom type="plane" size="1 1 1"/><body name="a"><joint name="j" '
     f'axis="1 0 0"/>{INERTIA}</body></worldbody>',
 }
@@ -682,6 +797,11 @@ def test_mjcf_is_what_mujoco_makes_of_it(name, tmp_path):
     text = f'<mujoco model="{name}">{MJCF[name]}</mujoco>'
     model = load(write(tmp_path, text, "robot.xml"))
     assert model.name == name
+    # Free joints have no limits in MuJoCo, whatever they inherit.
+    assert any("ball joint (1)" in note for note in model.notes) == (name in ("inherited_ranges", "unordered_ranges"))
+    # What a setting or the compiler changed is said.
+    for setting in ("boundmass", "boundinertia", "balanceinertia", "settotalmass", "springdamper"):
+        assert any(setting in note for note in model.notes) == (f"{setting}=" in text)
     check_against_mujoco(model, mujoco.MjModel.from_xml_string(text))
 
 
@@ -697,18 +817,33 @@ def random_mjcf(rng):
         return f'pos="{numbers(3)}"' + (f' {kind}="{numbers(sizes[kind])}"' if kind else "")
 
     def matter():
-        if rng.random() < 0.5:
-            a, b, c = rng.uniform(0.5, 1, 3).tolist()
-            return f'<inertial {placed()} mass="{float(rng.uniform(0.1, 3))!r}" diaginertia="{a + b!r} {b + c!r} {c + a!r}"/>'
+        if rng.random() < 0.2:
+            return inertial() + massless() * (rng.random() < 0.7)
+        return solids() + massless() * (rng.random() < 0.3) + inertial() * (rng.random() < 0.3)
+
+    def massless():
+        kind = rng.choice(['mass="0"', 'density="0"', 'group="4"', 'mass="1e-15"'])
+        return f'<geom size="{float(rng.uniform(0.1, 0.5))!r}" {placed()} {kind}/>'
+
+    def inertial():
+        a, b, c = rng.uniform(0.5, 1, 3).tolist()
+        moments = f'diaginertia="{a + b!r} {b + c!r} {c + a!r}"'
+        return f'<inertial {placed()} mass="{float(rng.uniform(0.1, 3))!r}" {moments}/>'
+
+    def solids():
         out = ""
         for _ in range(rng.integers(1, 3)):
             shape = rng.choice(["sphere", "capsule", "cylinder", "ellipsoid", "box"])
             sizes = " ".join(repr(float(x)) for x in rng.uniform(0.1, 0.5, 3))
             long = shape in ("capsule", "cylinder") and rng.random() < 0.5
             where = f'fromto="{numbers(6)}"' if long else placed()
-            out += f'<geom type="{shape}" size="{sizes}" {where} density="{float(rng.uniform(10, 500))!r}"/>'
+            shell = 'shellinertia="true"' if rng.random() < 0.1 else ""
+            out += f'<geom type="{shape}" size="{sizes}" {where} density="{float(rng.uniform(10, 500))!r}" {shell}/>'
+        if rng.random() < 0.2:
+            out += f'<geom type="mesh" mesh="{rng.choice(meshes)}" {placed()}/>'
         return out
 
+    meshes = [f"m{i}" for i in range(3)]
     count = 0
 
     def body(depth):
@@ -738,10 +873,20 @@ def random_mjcf(rng):
     angle = rng.choice(["degree", "radian"])
     sequence = "".join(rng.choice(list("xyzXYZ"), 3))
     trees = "".join(body(0) for _ in range(rng.integers(1, 3)))
-    return f'<mujoco><compiler angle="{angle}" eulerseq="{sequence}"/><worldbody>{trees}</worldbody></mujoco>'
+    rules = f'inertiafromgeom="{rng.choice(["auto", "true"])}" inertiagrouprange="0 {rng.integers(0, 4)}"'
+    bounds = f'boundmass="{float(rng.uniform(0, 1))!r}" balanceinertia="true"' if rng.random() < 0.3 else ""
+    kinds = rng.choice(["exact", "convex", "legacy", "shell"], 3)
+    assets = "".join(
+        f'<mesh name="{m}" vertex="{numbers(24)}" scale="{numbers(3)}" refpos="{numbers(3)}" inertia="{k}"/>'
+        for m, k in zip(meshes, kinds, strict=True)
+    )
+    return (
+        f'<mujoco><compiler angle="{angle}" eulerseq="{sequence}" {rules} {bounds}/><asset>{assets}</asset>'
+        f"<worldbody>{trees}</worldbody></mujoco>"
+    )
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(100))
 def test_random_mjcf_trees(seed, tmp_path):
     text = random_mjcf(np.random.default_rng(seed))
     check_against_mujoco(load(write(tmp_path, text, "robot.xml")), mujoco.MjModel.from_xml_string(text))
@@ -752,6 +897,255 @@ def test_geoms_without_mass_may_be_meshes(tmp_path):
     plain = load(write(tmp_path, text % "", "plain.xml"))
     for mesh in ('mesh="absent" mass="0"', 'mesh="absent" density="0"', 'mesh="absent" group="9"'):
         assert load(write(tmp_path, text % f'<geom type="mesh" {mesh}/>', "mesh.xml")) == plain
+
+
+def test_springdamper_follows_from_all_that_is_in_the_mass_matrix(tmp_path):
+    tendon = '<tendon><fixed name="t" armature=".2"><joint joint="k" coef="2"/></fixed></tendon>'
+    text = f'<mujoco model="m">{MJCF["springdamper"]}{tendon}</mujoco>'
+    model, compiled = load(write(tmp_path, text, "r.xml")), mujoco.MjModel.from_xml_string(text)
+    for name in ("j", "k"):
+        assert model.joint(name).stiffness[0] == pytest.approx(compiled.joint(name).stiffness[0], rel=1e-12)
+        assert model.joint(name).damping[0] == pytest.approx(compiled.joint(name).damping[0], rel=1e-12)
+
+
+def test_an_inertial_counts_where_no_geom_has_mass(tmp_path):
+    """Which of <inertial> and geoms gives a body its mass, by every combination of rules."""
+    inertials = ["", INERTIA, '<inertial pos="0 .1 0" mass="0"/>']
+    geoms = [
+        [],
+        *([part] for part in ("mass='3'", "mass='0'", "density='0'", "group='4'", "mass='1e-14'", "mass='2e-14'")),
+        *(["mass='3'", part] for part in ("mass='0'", "group='4'", "group='1'")),
+        ["mass='0'", "group='4'"],
+    ]
+    bodies = ""
+    for k, (inertial, parts) in enumerate(itertools.product(inertials, geoms)):
+        shapes = "".join(f'<geom size=".1" pos="0 0 {i + 1}" {part}/>' for i, part in enumerate(parts))
+        bodies += f'<body name="b{k}">{inertial}{shapes}</body>'
+    for rule, groups in itertools.product(["true", "false", "auto"], ["0 5", "1 2", "4 5", "3 1"]):
+        compiler = f'<compiler inertiafromgeom="{rule}" inertiagrouprange="{groups}"/>'
+        moving = f'<body name="a"><joint name="j" axis="0 1 0"/>{INERTIA}{bodies}</body>'
+        text = f"<mujoco>{compiler}<worldbody>{moving}</worldbody></mujoco>"
+        check_against_mujoco(load(write(tmp_path, text, "r.xml")), mujoco.MjModel.from_xml_string(text))
+
+
+# Meshes.
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+MESHED = (
+    '<body name="a"><joint name="j" axis="1 1 0"/><geom type="mesh" mesh="part" density="50" pos="1 0 0" euler="0 20 0"/>'
+    '<geom type="box" mesh="part" mass="2"/><geom type="mesh" mesh="seen" mass="0"/></body>'
+    f'<body name="b"><joint name="k"/>{INERTIA}<geom type="mesh" mesh="seen"/></body>'
+)
+
+
+def meshed(folder, asset, compiler='meshdir="meshes"'):
+    (folder / "meshes" / "more").mkdir(parents=True)
+    for name in ("part", "seen", "more/part"):
+        (folder / "meshes" / f"{name}.obj").write_text(OBJ)
+    text = (
+        f'<mujoco model="m"><compiler {compiler}/><asset>{asset}<mesh file="seen.obj"/></asset>'
+        f"<worldbody>{MESHED}</worldbody></mujoco>"
+    )
+    return write(folder, text, "robot.xml")
+
+
+@pytest.mark.parametrize("inertia", ["exact", "convex", "legacy", "shell"])
+@pytest.mark.parametrize(
+    ("asset", "compiler"),
+    [
+        ('<mesh file="part.obj" scale=".1 -.2 .3"/>', 'meshdir="meshes"'),
+        ('<mesh name="part" file="more\\part.obj" refpos="1 2 3" refquat="1 2 3 4"/>', 'assetdir="meshes"'),
+        ('<mesh file="none/part.obj"/>', 'meshdir="meshes" strippath="true" assetdir="none" fitaabb="true"'),
+        ('<mesh name="part" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>', 'meshdir="meshes" discardvisual="true"'),
+        ('<mesh name="part" builtin="sphere" params="2"/>', 'meshdir="meshes"'),
+    ],
+)
+def test_inertia_of_meshes(tmp_path, inertia, asset, compiler):
+    path = meshed(tmp_path, asset.replace("<mesh", f'<mesh inertia="{inertia}"'), compiler)
+    model = load(path)
+    check_against_mujoco(model, mujoco.MjModel.from_xml_path(str(path)))
+    notes = " ".join(model.notes)
+    assert "'a'" in notes
+    assert ("part.obj" in notes) == ("file" in asset)
+    assert "seen.obj" not in notes
+
+
+def test_only_meshes_that_give_an_inertia_are_opened(tmp_path):
+    path = meshed(tmp_path, '<mesh file="part.obj"/>')
+    model = load(path)
+    seen = tmp_path / "meshes" / "seen.obj"
+    seen.unlink()
+    # Opening a pipe that nobody writes to would wait for ever.
+    os.mkfifo(seen)
+    assert load(path) == model
+    # The name of a mesh is that of a file, whose content may change.
+    part = tmp_path / "meshes" / "part.obj"
+    part.write_text(OBJ.replace("3", "4", 1))
+    assert load(path) != model
+    with pytest.raises(ModelError, match=r"'a'.*mesh"):
+        load(path, meshes="never")
+    for spoil in (lambda: part.write_text("v 0"), part.unlink, lambda: os.mkfifo(part)):
+        spoil()
+        with pytest.raises(ModelError, match="part"):
+            load(path)
+    with pytest.raises(InputError, match="meshes"):
+        load(path, meshes="always")
+
+
+# Names that MuJoCo does not know.
+
+RICH = (
+    '<mujoco model="m"><compiler angle="radian"/><option gravity="0 0 -9"><flag contact="disable"/></option>'
+    '<default><joint damping=".1"/><geom density="900"/><default class="k"><joint armature=".1"/></default></default>'
+    '<worldbody><frame pos="1 0 0"><body name="a" pos="0 0 1"><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
+    '<joint name="j" class="k" stiffness="3"/><geom size=".1" mass="2"/><site name="s" pos="0 0 1"/></body></frame>'
+    '<body name="b"><freejoint name="f"/><geom size=".1"/></body></worldbody>'
+    '<tendon><fixed name="t"><joint joint="j" coef="2"/></fixed></tendon><actuator><motor joint="j" gear="3"/></actuator>'
+    "</mujoco>"
+)
+
+
+def test_a_misspelt_name_is_never_lost(tmp_path):
+    """Every element and attribute in turn has a name that MuJoCo's schema does not know."""
+    load(write(tmp_path, RICH, "r.xml"))
+    places = [(i, key) for i, e in enumerate(ET.fromstring(RICH).iter()) for key in (None, *e.attrib)]
+    for i, key in places[1:]:
+        tree = ET.fromstring(RICH)
+        element = list(tree.iter())[i]
+        right = key or element.tag
+        wrong = [right.upper(), right[0] + right[2:], right + right[-1]][i % 3]
+        if key is None:
+            element.tag = wrong
+        else:
+            element.attrib = {wrong if k == key else k: v for k, v in element.attrib.items()}
+        text = ET.tostring(tree, encoding="unicode")
+        with pytest.raises(ModelError, match=re.escape(repr(wrong))):
+            load(write(tmp_path, text, "r.xml"))
+        # MuJoCo refuses it too, but for what stands in a <frame>, where it does not look.
+        if "frame" not in text or element.tag not in ("frame", "body", "inertial", "joint", "geom", "site"):
+            with pytest.raises(ValueError, match="XML Error"):
+                mujoco.MjSpec.from_string(text)
+    with pytest.raises(ModelError, match="did you mean 'damping'"):
+        load(write(tmp_path, RICH.replace("stiffness", "dampnig"), "r.xml"))
+
+
+def all_attributes(given):
+    """An MJCF with one of each element that acts, and the attributes that are given."""
+
+    def put(tag, **attributes):
+        return f"<{tag} " + " ".join(f'{k}="{v}"' for k, v in (attributes | given.get(tag, {})).items())
+
+    inner = (
+        f'<body name="b" pos="1 0 0"><joint name="h" axis="0 1 0" stiffness="2" springref="30"/>'
+        f"{put('inertial', pos='1 0 0', mass='2', diaginertia='1 1.2 1.5')}/>"
+        '<geom size=".1" type="capsule" fromto="0 0 0 1 0 0"/><geom size=".1 .1 .2" type="box" euler="10 20 30"/>'
+        f'<geom type="mesh" mesh="m"/>{put("site", name="s", size=".1")}/></body>'
+    )
+    return (
+        f"<mujoco>{put('compiler')}/>{put('option')}>{put('flag')}/></option><default>"
+        '<default class="k"><joint damping="5"/><geom density="7"/></default></default><asset>'
+        f"{put('mesh', name='m', vertex='0 0 0 1 0 0 0 1 0 0 0 1')}/></asset><worldbody>{put('frame')}>"
+        f"{put('body', name='a')}>{put('joint', name='j', axis='1 1 0')}/>"
+        f"{put('geom', name='g', size='.1 .2 .3', type='box', pos='.1 .2 .3')}/>{inner}</body></frame></worldbody></mujoco>"
+    )
+
+
+def motion(compiled):
+    """M, nle, passive forces and the site's place, at a state off the drawn one; only hinges and slides."""
+    data = mujoco.MjData(compiled)
+    rng = np.random.default_rng(0)
+    data.qpos[:] = compiled.qpos0 + 0.3 * rng.random(compiled.nq)
+    data.qvel[:] = rng.random(compiled.nv)
+    mujoco.mj_forward(compiled, data)
+    M = np.zeros((compiled.nv, compiled.nv))
+    mujoco.mj_fullM(compiled, data, M)
+    return data, np.concatenate([M.ravel(), data.qfrc_bias, data.qfrc_passive, data.site_xpos[0]])
+
+
+VALUES = ".7|true|.1 1|.1 .2 .3|.1 .2 .3 .4|1 2 3 4 5 6|disable|radian|zyx|slide|m|k|1 5"
+
+
+def test_no_attribute_changes_the_motion_in_silence(tmp_path):
+    """What MuJoCo's motion feels is as in MuJoCo, refused, or noted, for every attribute of its schema."""
+    plain = load(write(tmp_path, all_attributes({}), "r.xml"))
+    _, before = motion(mujoco.MjModel.from_xml_string(all_attributes({})))
+    body = mjcf_rules().children["worldbody"].children["body"]
+    option = mjcf_rules().children["option"]
+    rules = {tag: body.children[tag] for tag in ("joint", "geom", "inertial", "site", "frame")}
+    rules |= {"body": body, "option": option, "flag": option.children["flag"]}
+    rules |= {"compiler": mjcf_rules().children["compiler"], "mesh": mjcf_rules().children["asset"].children["mesh"]}
+    names = {tag: sorted(rule.attributes) for tag, rule in rules.items()}
+    # The schema does not show these.
+    names["frame"] += ["massscale", "scale", "scaling"]
+    felt = set()
+    for tag, name in [(tag, name) for tag, all_of_it in names.items() for name in all_of_it]:
+        for value in VALUES.split("|"):
+            text = all_attributes({tag: {name: value}})
+            try:
+                data, after = motion(mujoco.MjModel.from_xml_string(text))
+            except ValueError:
+                continue
+            if after.shape != before.shape or np.abs(after - before).max() > 1e-10:
+                break
+        else:
+            continue
+        felt.add((tag, name))
+        try:
+            model = load(write(tmp_path, text, "r.xml"))
+        except ModelError:
+            continue
+        dyn = mb.dynamics(model, "pinocchio")
+        q, v = data.qpos, data.qvel
+        p = dyn.pose(q, model.frames[-1].name)[:3, 3]
+        ours = np.concatenate([dyn.mass_matrix(q).ravel(), dyn.nle(q, v), dyn.passive(q, v), p])
+        agrees = np.abs(ours - after).max() < 1e-9 * max(1, np.abs(after).max())
+        assert agrees or set(model.notes) - set(plain.notes), (tag, name, value)
+    assert len(felt) > 40
+
+
+def test_an_unknown_name_beside_the_motion_is_a_note(tmp_path):
+    text = RICH.replace("<compiler", '<visual><map zneer="1"/></visual><compiler')
+    assert any("'zneer'" in note for note in load(write(tmp_path, text, "r.xml")).notes)
+
+
+def test_fluid_forces_are_named_where_there_is_a_fluid(tmp_path):
+    notes = [
+        " ".join(load(write(tmp_path, RICH.replace("<option", f"<option {option}"), "r.xml")).notes)
+        for option in ('density="1.2"', 'viscosity=".1" wind="1 0 0"', 'density="0" wind="1 0 0"')
+    ]
+    assert ["fluid" in note for note in notes] == [True, True, False]
+
+
+STILL = [("2", "1 1 3"), ("2", "0 0 0"), ("0", "0 0 2")]
+
+
+@pytest.mark.parametrize(("mass", "moments"), STILL)
+def test_a_body_that_never_moves_may_have_any_inertia(tmp_path, mass, moments):
+    def model(moments, joint=""):
+        base = f'<inertial pos=".1 0 0" mass="{mass}" diaginertia="{moments}"/>'
+        inner = f'<body name="b" euler="10 20 30">{base}<body name="c"><joint name="j" axis="1 0 0"/>{INERTIA}</body></body>'
+        text = f'<mujoco model="m"><worldbody><body name="a">{joint}{base}{inner}</body></worldbody></mujoco>'
+        return load(write(tmp_path, text, "r.xml"))
+
+    odd = model(moments)
+    assert sum("never moves" in note for note in odd.notes) == 2
+    assert not odd.nonphysical
+    for engine in ("pinocchio", "lagrangian", "mujoco", "drake"):
+        if engine == "drake":
+            pytest.importorskip("pydrake")
+        ours, sound = (mb.dynamics(m, engine) for m in (odd, model("1 1 1") if mass != "0" else model("0 0 0")))
+        np.testing.assert_array_equal(ours.mass_matrix([0.3]), sound.mass_matrix([0.3]))
+        np.testing.assert_array_equal(ours.gravity([0.3]), sound.gravity([0.3]))
+    with pytest.raises(ModelError, match="'a'"):
+        model(moments, '<freejoint name="f"/>')
+    urdf = (
+        f'<robot name="r"><link name="a"><inertial><mass value="{mass}"/><inertia ixx="{moments.split()[0]}" iyy="'
+        f'{moments.split()[1]}" izz="{moments.split()[2]}" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="b">'
+        f"{INERTIAL}</link>{urdf_joint('j', 'a', 'b')}</robot>"
+    )
+    assert any("never moves" in note for note in load(write(tmp_path, urdf)).notes)
+    with pytest.raises(ModelError, match="'a'"):
+        load(write(tmp_path, urdf), floating_base=True)
 
 
 def test_mjcf_floating_base(tmp_path):

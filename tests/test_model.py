@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+import math
 import pickle
 from dataclasses import FrozenInstanceError, fields, replace
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -13,7 +17,7 @@ from hypothesis import strategies as st
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, UnknownNameError
 from mbkit.model import KINDS, Mimic
-from mbkit.model.physical import sample_mass_matrix
+from mbkit.model.physical import idle_joints, sample_mass_matrix
 from tests.random_trees import off, random_tree, states
 
 I3 = (1.0, 1.0, 1.0)
@@ -24,6 +28,78 @@ def pendulum(**joint):
     b.add_body("bob", mass=1.0, com=(0, 0, -1))
     b.add_joint("hinge", "revolute", parent="world", child="bob", axis=(0, 1, 0), **joint)
     return b
+
+
+# Arguments
+
+
+class Rude:
+    """Raises whatever is asked of it."""
+
+    def __getattr__(self, name):
+        raise RuntimeError(name)
+
+    __float__ = __repr__ = __str__ = __iter__ = __len__ = __array__ = lambda *_: 1 / 0
+
+
+def nested(depth):
+    out = []
+    for _ in range(depth):
+        out = [out]
+    return out
+
+
+HOSTILE = [
+    *(10**400, -(10**400), Decimal("1e500"), Decimal("sNaN"), Fraction(10**400, 3), 1j, None, True, int, {}, [], {1}),
+    *([[1, [2]]], nested(10_000), b"1", bytearray(b"1"), math.nan, math.inf, 1e200, [1e160] * 3, "\ud800", "a\0b", ""),
+    *(np.zeros((2, 2)), np.array([10**400, 1, 2], dtype=object), np.array([1j, 0, 0]), np.array(["a", "b", "c"])),
+    *(np.array([True, False, True]), np.arange(3).astype(">f8"), Rude(), "x" * 100_000, mb.Parameter("p")),
+    *(mb.Parameter("p", 1e300), np.datetime64("2020"), mb.Parameter("p", 1e200) * 1e100),
+]
+METHODS = {
+    "__init__": {"name": "m"},
+    "add_body": {"name": "b", "mass": 1.0, "com": (0, 0, 1)},
+    "add_joint": {"name": "j", "kind": "revolute", "parent": "world", "child": "b", "axis": (0, 1, 0)},
+    "add_frame": {"name": "f", "body": "b"},
+    "add_spring": {"name": "s", "body_a": "b", "body_b": "world", "stiffness": 1.0},
+    "add_loop": {"name": "l", "kind": "point", "body_a": "b", "body_b": "world"},
+    "prescribe": {"joint": "j"},
+    "note": {"text": "words"},
+    "build": {},
+}
+PLACES = [(m, a) for m in METHODS for a in inspect.signature(getattr(mb.ModelBuilder, m)).parameters if a != "self"]
+
+
+@given(wrong=st.dictionaries(st.sampled_from(PLACES), st.sampled_from(HOSTILE), min_size=1, max_size=3))
+@settings(max_examples=150, deadline=None)
+def test_whatever_a_builder_is_given_is_built_or_refused_by_name(wrong):
+    def arguments(method):
+        return METHODS[method] | {a: x for (m, a), x in wrong.items() if m == method}
+
+    try:
+        b = mb.ModelBuilder(**arguments("__init__"))
+        for method in list(METHODS)[1:-1]:
+            getattr(b, method)(**arguments(method))
+        model = b.build(**arguments("build"))
+    except (ModelError, InputError) as error:
+        message = str(error)
+        assert len(message) < 10_000
+        message.encode()
+    else:
+        assert len(model.digest) == 64
+        assert np.isfinite(sample_mass_matrix(model)).all() or model.parameters
+
+
+def test_numbers_whose_mass_matrix_overflows_are_refused_by_name():
+    b = pendulum()
+    b.add_body("far", mass=1.0, com=(1e160, 0, 0))
+    b.add_joint("arm", "revolute", parent="bob", child="far", axis=(0, 1, 0))
+    with pytest.raises(ModelError, match="'far': com"):
+        b.build()
+    heavy = pendulum().build()
+    heavy = replace(heavy, bodies=(replace(heavy.bodies[0], mass=1e300, com=np.array([1e10, 0, 0])),))
+    with pytest.raises(InputError, match="hinge"):
+        idle_joints(heavy)
 
 
 # The manifold

@@ -196,7 +196,7 @@ def test_nothing_is_lost_on_the_way_to_json_and_back(study):
     assert "| pinocchio | rk4 | dt 0.001 s | 3 |  |  |" in study.to_markdown()
     assert "<td>died</td>" in study._repr_html_()
     assert "4 cases" in repr(study)
-    for text in ("{}", "no JSON", '{"cases": [1]}'):
+    for text in ("{}", "no JSON", '{"cases": [1]}', "[" * 100_000):
         with pytest.raises(InputError, match="StressResult"):
             StressResult.from_json(text)
 

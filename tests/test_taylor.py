@@ -382,3 +382,16 @@ def test_without_heyoka_it_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch
 def test_systems_go_with_their_equations() -> None:
     equations = Equations(catalog.pendulum())
     assert taylor_system(equations) is taylor_system(equations)
+
+
+def test_forces_of_the_time_alone_are_no_jumps() -> None:
+    import sympy as sp
+
+    x, u, t = sp.symbols("x u t")
+    V = x * (sp.sqrt(2 + t) + (2 + t) ** sp.Float(1.7) + sp.atan2(1, 2 + t))
+    lag = mb.lagrangian.Lagrangian(u**2 / 2, V, [x], [u], time=t)
+    exact = simulate(lag.dynamics(options={"compile": False}), [0.0], [0.0], 1.0, "rk853", rtol=1e-13, save=[1.0])
+    for engine in ("lagrangian", "oracle"):
+        run = simulate(lag.dynamics(engine), [0.0], [0.0], 1.0, "taylor", rtol=1e-14, save=[1.0])
+        assert run.stats.finished
+        assert abs(run.q[0, 0] - exact.q[0, 0]) < 1e-12

@@ -11,9 +11,11 @@ import math
 import multiprocessing
 import os
 import pickle
+import sys
 import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -145,9 +147,34 @@ def test_coarse_tolerances_that_bind_no_step_do_not_end_a_grid():
         seconds=60.0,
     )
     (curve,) = result.curves
-    assert curve.points[0].steps <= 1.1 * curve.points[2].steps
-    assert curve.points[2].error < 1e-6
-    assert min(p.error for p in curve.points) < 1e-3 * curve.points[2].error
+    # Tolerances that take the same steps are one point.
+    first, second = curve.points[:2]
+    assert first.value == 1e-3
+    assert second.value < 1e-5
+    assert first.error < 1e-6
+    assert min(p.error for p in curve.points) < 1e-3 * first.error
+    for a, b in itertools.pairwise(curve.points):
+        assert (a.steps, a.evaluations) != (b.steps, b.evaluations)
+
+
+def test_a_slow_machine_measures_the_same_points(monkeypatch):
+    def few_runs():
+        return study(("pinocchio", "mujoco"), ("rk4", "rk853", "mujoco_rk4"), steps=None, tolerances=None, work=4000)
+
+    quick = few_runs()
+    clocks = {name: getattr(time, name) for name in ("perf_counter", "process_time")}
+    starts = {name: clock() for name, clock in clocks.items()}
+    slow = SimpleNamespace(
+        perf_counter=lambda: 40 * clocks["perf_counter"]() - 39 * starts["perf_counter"],
+        process_time=lambda: 40 * clocks["process_time"]() - 39 * starts["process_time"],
+    )
+    for module in ("walk", "sweeping"):
+        monkeypatch.setattr(sys.modules[f"mbkit.studies.{module}"], "time", slow)
+    assert errors(few_runs()) == errors(quick)
+    assert not quick.shortened
+    # Work is counted, and a call from Python counts eight.
+    assert max(8 * p.evaluations for c, p in quick.rows() if c.engine == "pinocchio") <= 4000
+    assert 2000 < max(p.evaluations for c, p in quick.rows() if c.method == "mujoco_rk4") <= 4000
 
 
 @pytest.mark.parametrize("name", ["pinocchio", "lagrangian", "mujoco"])
@@ -318,6 +345,9 @@ def test_what_there_was_no_time_for_is_said():
     assert math.isnan(fine.error)
     assert "time allowed was used up" in fine.note or "given up after" in fine.note
     assert result.complete
+    early = study(("pinocchio", "lagrangian"), ["rk853", "rk4"], steps=None, tolerances=None, seconds=1e-3)
+    assert early.shortened
+    assert early.shortened[0] in repr(early)
     assert result.seconds < 5
 
 
@@ -347,6 +377,7 @@ def test_a_tolerance_that_no_run_takes_is_said():
             r"methods\['pinocchio'\]: taylor is not on pinocchio; it is on lagrangian",
         ),
         ({"steps": []}, InputError, "steps: expected at least one"),
+        ({"q0": [0.0], "v0": [0.0], "reference": None}, InputError, "q0, v0: .*something moves"),
         ({"steps": [0.1, -0.1]}, InputError, r"steps\[1\]: expected a number above 0"),
         ({"steps": 0.1}, InputError, "steps: expected several numbers"),
         ({"tolerances": [0.0]}, InputError, r"tolerances\[0\]"),
@@ -644,7 +675,7 @@ def test_results_survive_json_and_csv(result):
 def test_what_is_no_result_is_refused(change, few):
     data = json.loads(few.to_json())
     change(data)
-    for text in (json.dumps(data), "", "[]", few.to_json()[:200], None):
+    for text in (json.dumps(data), "", "[]", "[" * 100_000, few.to_json()[:200], None):
         with pytest.raises(InputError, match="text: expected the JSON of a WorkPrecision"):
             WorkPrecision.from_json(text)
 

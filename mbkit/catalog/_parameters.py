@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import finite_array, real
+from mbkit._check import finite_array, real, shown
 from mbkit.errors import InputError
 from mbkit.model import Expression, Number, known, nominal
 
@@ -20,6 +20,9 @@ Vector = ArrayLike | Sequence[Number]
 
 #: Axis of planar hinges: a positive turn about -y swings what hangs down towards +x.
 SWING: Final = (0.0, -1.0, 0.0)
+
+# Rods and segments; `ModelBuilder.build` takes few more.
+_MOST: Final = 2000
 
 
 def positive(name: str, value: Number) -> Number:
@@ -67,11 +70,11 @@ def moments(name: str, value: Any) -> tuple[Number, Number, Number]:
 
 
 def count(name: str, value: int) -> int:
-    """Return a whole number of at least one."""
+    """Return a whole number of at least one, and of no more than a description holds."""
     try:
         n = 0 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         n = 0
-    if n < 1:
-        raise InputError(f"{name}: expected a whole number of at least 1, got {value!r}")
+    if not 1 <= n <= _MOST:
+        raise InputError(f"{name}: expected a whole number from 1 to {_MOST}, got {shown(value)}")
     return n

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from mbkit._check import shown
 from mbkit.catalog._beam import STUB, add_beam
 from mbkit.catalog._parameters import Vector, count, moments, nonnegative, positive
 from mbkit.errors import InputError
@@ -64,8 +65,8 @@ def flexible_spacecraft(
     hub with two appendages. The default values are those of no particular craft; the beams' first
     frequency, clamped, is 0.96 rad/s.
     """
-    if hub not in ("planar", "free"):
-        raise InputError(f"hub: expected 'planar' or 'free', got {hub!r}")
+    if not isinstance(hub, str) or hub not in ("planar", "free"):
+        raise InputError(f"hub: expected 'planar' or 'free', got {shown(hub)}")
     n, centre = count("segments", segments), positive("hub_mass", hub_mass)
     radius, reach, matter = nonnegative("hub_radius", hub_radius), positive("length", length), positive("mass", mass)
     stiffness = positive("bending_stiffness", bending_stiffness)

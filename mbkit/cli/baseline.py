@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mbkit.cli.door import AGREE, DIFFER, DONE, MISUSE, leave, say
-from mbkit.cli.options import check_engines, load_options, model_options, split
+from mbkit.cli.options import check_engines, in_options, load_options, model_options, split
 from mbkit.cli.output import console
 from mbkit.errors import BaselineError, InputError, MbkitError
 
@@ -99,8 +99,18 @@ def _record_one(
 @click.option("--target", help="Check this instead of what was recorded; with one file.")
 @click.option("--strict", is_flag=True, help="Fail where an engine that was recorded is not installed.")
 @click.option("--rebaseline", is_flag=True, help="Tell what differs, and record it anew.")
+@model_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
-def check(paths: tuple[Path, ...], target: str | None, strict: bool, rebaseline: bool, as_json: bool) -> None:
+def check(
+    paths: tuple[Path, ...],
+    target: str | None,
+    strict: bool,
+    rebaseline: bool,
+    floating_base: bool,
+    mimic: str | None,
+    nonphysical: str | None,
+    as_json: bool,
+) -> None:
     """Hold robots and engines against what was recorded in each PATH, a file or a folder of them.
 
     A changed parameter of the description is named first; then a number that moved, with its
@@ -112,14 +122,17 @@ def check(paths: tuple[Path, ...], target: str | None, strict: bool, rebaseline:
     files = _files(paths)
     if target is not None and len(files) != 1:
         raise click.UsageError(f"--target goes with one file, and there are {len(files)}")
+    options = load_options(floating_base, mimic, nonphysical)
+    if options and target is None:
+        raise click.UsageError("options of loading go with --target; what was recorded is loaded as it was then")
     statuses = []
     results: list[BaselineResult] = []
     for file in files:
         try:
-            result, recorded = _check_one(file, target, strict, rebaseline, table=not as_json)
+            result, recorded = _check_one(file, target, options, strict, rebaseline, table=not as_json)
         except MbkitError as error:
             # One file's fault must not hide what the others say.
-            say("error", str(error))
+            say("error", in_options(str(error)))
             statuses.append(MISUSE)
             continue
         results.append(result)
@@ -131,7 +144,7 @@ def check(paths: tuple[Path, ...], target: str | None, strict: bool, rebaseline:
 
 
 def _check_one(
-    file: Path, target: str | None, strict: bool, rebaseline: bool, *, table: bool
+    file: Path, target: str | None, options: dict[str, Any], strict: bool, rebaseline: bool, *, table: bool
 ) -> tuple[BaselineResult, bool]:
     """Return what was found, and whether it was recorded anew."""
     from mbkit.report import baselines as tables
@@ -141,7 +154,9 @@ def _check_one(
     from mbkit.studies.target import model_of
 
     recorded = baselines.read(file)
-    model = _model(recorded, file) if target is None else model_of(target, recorded.options)
+    # A target of other options is recorded with them.
+    options = {**recorded.options, **options}
+    model = _model(recorded, file) if target is None else model_of(target, options)
     asked = None if target is None else kept(target, file)
     with Bar(f"check {file.name}") as bar:
         result = baselines.check(model, file, strict=strict, target=asked, progress=bar)
@@ -161,7 +176,7 @@ def _check_one(
         samples=recorded.states.kinds.count("random"),
         seed=recorded.seed,
         target=recorded.target if asked is None else asked,
-        options=recorded.options,
+        options=options,
         # Whoever reads it knows whose it is.
         force=True,
     )
@@ -202,11 +217,12 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
 
 def _name(target: str) -> str:
     """Return what a target's file is called in a folder: as the robot, the file or the function."""
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
     from mbkit.report.folder import file_stem
 
-    path = not find(target) and (Path(target).is_file() or "/" in target)
-    return f"{file_stem(Path(target).stem if path else target.rpartition(':')[2])}.toml"
+    robot = canonical(target)
+    path = robot is None and (Path(target).is_file() or "/" in target)
+    return f"{file_stem(Path(target).stem if path else robot or target.rpartition(':')[2])}.toml"
 
 
 def _again(file: Path, target: str | None) -> str:

@@ -31,8 +31,8 @@ _QUICK_METHODS: Final = (
     "mujoco_euler",
     "mujoco_implicitfast",
 )
-_QUICK: Final[dict[str, Any]] = {"repeats": 3, "seconds": 20.0}
-_USUAL: Final[dict[str, Any]] = {"repeats": 5, "seconds": 120.0}
+_QUICK: Final[dict[str, Any]] = {"repeats": 3, "work": 24_000}
+_USUAL: Final[dict[str, Any]] = {"repeats": 5, "work": None}
 
 
 @click.command()
@@ -42,9 +42,9 @@ _USUAL: Final[dict[str, Any]] = {"repeats": 5, "seconds": 120.0}
 @click.option("--duration", default=1.0, show_default=True, type=float, help="Horizon of the motion, s.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Of the start.")
 @click.option("--repeats", type=click.IntRange(min=1), help="Timings of each setting.  [default: 5; quick: 3]")
-@click.option("--seconds", type=float, help="What the study may take, compiling too, s.  [default: 120; quick: 20]")
+@click.option("--seconds", type=float, help="Of the processor, at the most, s.  [default: work is bounded, not time]")
 @click.option("--jobs", type=click.IntRange(min=1), help="Measure in so many processes: sooner done, times less sure.")
-@click.option("--quick", is_flag=True, help="Seven methods, fewer repetitions and less time.")
+@click.option("--quick", is_flag=True, help="Seven methods, fewer repetitions and shorter runs.")
 @model_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
 @click.option(
@@ -71,7 +71,7 @@ def bench(
     TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written.
     Ctrl-C ends the study early, and what is finished is written.
     """
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
     from mbkit.report.folder import check_writable, file_stem
     from mbkit.report.progress import Bar
     from mbkit.simulate.methods import METHODS, method_of
@@ -97,14 +97,15 @@ def bench(
                 duration=duration,
                 seed=seed,
                 repeats=repeats if repeats is not None else usual["repeats"],
-                seconds=seconds if seconds is not None else usual["seconds"],
+                seconds=seconds,
+                work=usual["work"],
                 executor=executor,
                 progress=bar,
             )
     except InterruptedSweepError as stopped:
         result = stopped.result
     # Several robots' files hold the same name.
-    stem = f"{file_stem(target if find(target) else model.name)}-bench"
+    stem = f"{file_stem(canonical(target) or model.name)}-bench"
     written = _show(result, target, stem, out, as_json)
     if not result.complete:
         settings, curves = sum(len(c.points) for c in result.curves), len(result.curves)

@@ -90,7 +90,7 @@ def _check_one(
     as_json: bool,
     out: Path,
 ) -> None:
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
     from mbkit.report.folder import file_stem
     from mbkit.report.progress import Bar
     from mbkit.studies import compare
@@ -111,17 +111,19 @@ def _check_one(
         return check_page(result, asked=target, data=f"{stem}.json")
 
     # Several robots' files hold the same name.
-    stem = file_stem(target if find(target) else model.name)
+    stem = file_stem(canonical(target) or model.name)
     data = result.to_json()
     files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
     written = show(data, table, files, out, as_json=as_json)
     if not result.rows:
         say("error", f"{result.verdict}; two engines that hold the model are needed")
-    leave(MISUSE if not written or not result.rows else AGREE if result.passed else DIFFER)
+    elif result.nothing:
+        say("error", result.verdict)
+    leave(MISUSE if not written or result.nothing else AGREE if result.passed else DIFFER)
 
 
 def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, out: Path) -> None:
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
     from mbkit.report.folder import file_stem
     from mbkit.studies.parsers import compare_parsers
 
@@ -137,7 +139,7 @@ def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, o
 
         return importers_page(result, data=f"{stem}.json")
 
-    stem = f"{file_stem(target if find(target) else Path(target).stem)}.importers"
+    stem = f"{file_stem(canonical(target) or Path(target).stem)}.importers"
     data = result.to_json()
     files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
     written = show(data, table, files, out, as_json=as_json)

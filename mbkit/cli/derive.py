@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -98,6 +99,7 @@ def _model(name: str, options: dict[str, Any]) -> Model:
     if name in systems.names() and not options and (made is None or made.quaternions):
         if made is not None:
             say("note", f"{name} is in Euler angles here; the catalog's has a quaternion, which mbkit check takes")
+        say("note", _described(systems.get(name)))
         return systems.get(name)().model
     if made is not None:
         robot = find(name)
@@ -113,15 +115,25 @@ def _model(name: str, options: dict[str, Any]) -> Model:
         raise UnknownNameError("robot, catalog system or system on paper", name, known, error.hint) from None
 
 
+def _described(system: Callable[..., Lagrangian]) -> str:
+    """Return what a system on paper is, its coordinates and their zero, from its docstring."""
+    from inspect import getdoc
+
+    about = (getdoc(system) or "").split("\n\nReferences\n")[0].split("\n\nParameters\n")[0]
+    first, *rest = " ".join(about.replace("`", "").split()).split(". ")
+    return ". ".join([first.replace("Return ", f"{system.__name__}: ", 1), *rest])
+
+
 def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     from mbkit.derivation.export import c_identifier, export_c
     from mbkit.lagrangian.textbook import in_symbols
     from mbkit.lagrangian.written import WrittenModel
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
 
     if not isinstance(model, WrittenModel):
         model = in_symbols(model) or model
-    made = export_c(model, name=c_identifier(name) if find(name) else None)
+    robot = canonical(name)
+    made = export_c(model, name=None if robot is None else c_identifier(robot))
     paths = made.write(out, force=force)
     for function in made.functions:
         click.echo(f"{function.signature}: {function.operations} operations")

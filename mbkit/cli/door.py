@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import click
 
+from mbkit.cli.options import in_options
 from mbkit.errors import MbkitError, MbkitWarning
 
 __all__ = ["AGREE", "DIFFER", "DONE", "INTERNAL", "INTERRUPTED", "MISUSE", "Door", "leave", "say"]
@@ -31,7 +32,7 @@ class Door(click.Group):
             with _one_line_warnings():
                 return super().invoke(ctx)
         except MbkitError as error:
-            say("error", str(error))
+            say("error", in_options(str(error)))
             ctx.exit(MISUSE)
         except KeyboardInterrupt:
             say("interrupted", "nothing was finished")

@@ -46,12 +46,13 @@ def export(
     replaced; an unknown quantity lists those that there are.
     """
     from mbkit.derivation.export import DEFAULT, c_identifier, export_c
-    from mbkit.load.names import find
+    from mbkit.load.names import canonical
     from mbkit.studies.target import model_of
 
     model = model_of(target, load_options(floating_base, mimic, nonphysical))
     # Several robots' files hold the same name.
-    stem = name if name is not None else c_identifier(target) if find(target) else None
+    robot = canonical(target)
+    stem = name if name is not None else c_identifier(robot) if robot is not None else None
     made = export_c(model, quantities or DEFAULT, name=stem)
     paths = made.write(out, force=force)
     if as_json:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import click
 
 from mbkit.errors import InputError, UnknownNameError
 
-__all__ = ["check_engines", "load_options", "model_options", "split"]
+__all__ = ["check_engines", "in_options", "load_options", "model_options", "split"]
+
+# Keyword arguments of `mbkit.load` that messages name, as options of the command line.
+_OPTIONS: Final = {
+    'nonphysical="warn"': "--nonphysical warn",
+    "mimic='free'": "--mimic free",
+    "floating_base=True": "--floating-base",
+}
 
 
 def split(_ctx: click.Context, _parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -36,6 +43,13 @@ def load_options(floating_base: bool, mimic: str | None, nonphysical: str | None
     """Return what was asked for as keyword arguments of `mbkit.load`."""
     asked = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical}
     return {k: v for k, v in asked.items() if v is not None}
+
+
+def in_options(message: str) -> str:
+    """Return a message of `mbkit.load` in the words of the command line."""
+    for keyword, option in _OPTIONS.items():
+        message = message.replace(keyword, option)
+    return message
 
 
 def check_engines(names: tuple[str, ...], least: int) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from mbkit.derivation.scalars import scalar
 from mbkit.model import Model
 
-__all__ = ["elimination_order", "elimination_size", "solve"]
+__all__ = ["Factors", "elimination_order", "elimination_size", "solve"]
 
 
 def elimination_order(model: Model) -> tuple[int, ...]:
@@ -61,31 +61,43 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
     order : sequence of int
         The indices with every parent before its children.
     """
-    n = M.shape[0]
-    rank = {index: k for k, index in enumerate(order)}
-    rows: list[dict[int, Any]] = [{} for _ in range(n)]
-    for i, j in zip(*M.sparsity().get_triplet(), strict=True):
-        if rank[j] <= rank[i]:
-            rows[rank[i]][rank[j]] = scalar(M[i, j])
-    x = [scalar(f[index, :]) for index in order]
-    diagonal: list[Any] = [None] * n
-    factors: list[dict[int, Any]] = [{} for _ in range(n)]
-    for k in reversed(range(n)):
-        row = rows[k]
-        # A joint that moves nothing has no entry at all: the quotient is then
-        # infinite, and whoever evaluates finds it.
-        diagonal[k] = row.pop(k, 0.0)
-        for i in sorted(row, reverse=True):
-            factors[k][i] = row[i] / diagonal[k]
-            for j, entry in row.items():
-                if j <= i:
-                    rows[i][j] = rows[i].get(j, 0.0) - factors[k][i] * entry
-    for k in reversed(range(n)):
-        for i, factor in factors[k].items():
-            x[i] = x[i] - factor * x[k]
-    for k in range(n):
-        x[k] = x[k] / diagonal[k] - sum((factor * x[i] for i, factor in factors[k].items()), 0.0)
-    rows_out: list[Any] = [None] * n
-    for k, index in enumerate(order):
-        rows_out[index] = x[k]
-    return ca.vertcat(ca.SX(0, f.shape[1]), *rows_out)
+    return Factors(M, order).solve(f)
+
+
+class Factors:
+    """The LᵀDL factors of a matrix, for several right-hand sides one after the other; parameters as of `solve`."""
+
+    def __init__(self, M: ca.SX, order: Sequence[int]) -> None:
+        n = M.shape[0]
+        self._order = tuple(order)
+        rank = {index: k for k, index in enumerate(order)}
+        rows: list[dict[int, Any]] = [{} for _ in range(n)]
+        for i, j in zip(*M.sparsity().get_triplet(), strict=True):
+            if rank[j] <= rank[i]:
+                rows[rank[i]][rank[j]] = scalar(M[i, j])
+        self._diagonal: list[Any] = [None] * n
+        self._factors: list[dict[int, Any]] = [{} for _ in range(n)]
+        for k in reversed(range(n)):
+            row, factors = rows[k], self._factors[k]
+            # A joint that moves nothing has no entry at all: the quotient is then
+            # infinite, and whoever evaluates finds it.
+            self._diagonal[k] = row.pop(k, 0.0)
+            for i in sorted(row, reverse=True):
+                factors[i] = row[i] / self._diagonal[k]
+                for j, entry in row.items():
+                    if j <= i:
+                        rows[i][j] = rows[i].get(j, 0.0) - factors[i] * entry
+
+    def solve(self, f: ca.SX) -> ca.SX:
+        """Return M⁻¹ f, (n,) or (n, k)."""
+        n = len(self._order)
+        x = [scalar(f[index, :]) for index in self._order]
+        for k in reversed(range(n)):
+            for i, factor in self._factors[k].items():
+                x[i] = x[i] - factor * x[k]
+        for k in range(n):
+            x[k] = x[k] / self._diagonal[k] - sum((factor * x[i] for i, factor in self._factors[k].items()), 0.0)
+        rows_out: list[Any] = [None] * n
+        for k, index in enumerate(self._order):
+            rows_out[index] = x[k]
+        return ca.vertcat(ca.SX(0, f.shape[1]), *rows_out)

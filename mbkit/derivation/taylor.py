@@ -30,7 +30,6 @@ from mbkit.derivation.equations import Equations
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.program import Operation, program
 from mbkit.errors import UnsupportedError
-from mbkit.model import Model
 
 __all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
 
@@ -169,6 +168,8 @@ class TaylorSystem:
         Whether a length, an absolute value, a decision or a function with branches enters,
         where forces can jump. A series goes on analytically there, as if nothing had
         happened.
+    clock : int or None
+        Place of the time among what is behind tau, where it enters.
 
     Raises
     ------
@@ -189,21 +190,22 @@ class TaylorSystem:
                 f"taylor: {name} takes {size} operations, too many for a Taylor series; method='rk853' or 'dop853'"
             )
         self.operations = made.arithmetic
-        # Each quaternion's norm is a square root too, of what never vanishes.
-        kinks = sum(o.name in _KINKS for o in made.operations)
-        self.kinked = kinks > len(equations.model.quaternions)
+        # Each quaternion's norm is a square root too, and each constraint's weight, of what never vanishes.
+        kinks, model = sum(o.name in _KINKS for o in made.operations), equations.model
+        rows = equations.constraints.value.numel() if model.constrained else 0  # type: ignore[attr-defined]  # written
+        self.kinked = kinks > len(model.quaternions) + rows
+        # Parameters stand first among what is behind tau.
+        self.clock = list(model.parameters).index(model.clock) if model.clock else None
         self._nq, self._nv = made.inputs[:2]
         #: Place of each parameter among heyoka's -> (argument, entry); unused ones have none.
         self._places: dict[tuple[int, int], int] = {}
         variables = heyoka.make_vars(*(f"y{i}" for i in range(self._nq + self._nv)))
         variables = [variables] if self._nq + self._nv == 1 else list(variables)
-        self._system = list(zip(variables, self._expressions(heyoka, made, variables, equations.model), strict=True))
+        self._system = list(zip(variables, self._expressions(heyoka, made, variables), strict=True))
         self._idle: dict[tuple[int, int], list[Any]] = {}
 
-    def _expressions(self, heyoka: Any, made: Any, variables: list[Any], model: Model) -> list[Any]:
-        functions = _functions(heyoka)
-        # Parameters stand first among what is behind tau.
-        clock = list(model.parameters).index(model.clock) if model.clock else None
+    def _expressions(self, heyoka: Any, made: Any, variables: list[Any]) -> list[Any]:
+        functions, clock = _functions(heyoka), self.clock
         values: list[Any] = []
 
         def entry(operation: Operation) -> Any:

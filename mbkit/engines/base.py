@@ -304,8 +304,8 @@ class Dynamics(ABC):
             q = np.atleast_2d(arguments["q"])[where[0] if arguments["q"].ndim == 2 else 0]
             there = ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, q, strict=True))
             if self.model.constrained:
-                # Rows that depend on each other everywhere are told by name.
-                self.model.require_independent()  # type: ignore[attr-defined]  # of a written model
+                # Rows that depend on each other are named.
+                self.model.require_independent(q)  # type: ignore[attr-defined]  # of a written model
             constraints = ", or the constraints depend on each other," if self.model.constrained else ""
             raise NumericalError(
                 f"{self.engine}: {quantity} of {self.model.name} is not finite at {there}{state}; perhaps the mass "

@@ -22,6 +22,7 @@ from mbkit.engines.base import unknown_joint
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.parts import PointSpring
+from mbkit.model.physical import static_bodies
 
 __all__ = ["DrakeModel", "build"]
 
@@ -81,9 +82,10 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
     plant = MultibodyPlant(0.0)
     plant.mutable_gravity_field().set_gravity_vector(np.array(description.gravity) * gravity)
     bodies: dict[str, Any] = {"world": plant.world_body()}
+    static = static_bodies(description.joints)
     for k, body in enumerate(description.bodies):
         # Names of files may hold what Drake's do not; ours are kept in the map.
-        bodies[body.name] = plant.AddRigidBody(f"{k}:{body.name}", _inertia(body))
+        bodies[body.name] = plant.AddRigidBody(f"{k}:{body.name}", _inertia(body, body.name in static))
     made = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
     springs = [s for s in description.springs if bushings or s.rest_length > 0]
     added = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
@@ -115,10 +117,11 @@ def _add_spring(
         plant.AddForceElement(tree.LinearSpringDamper(*ends, length, stiffness, spring.damping))
 
 
-def _inertia(body: Body) -> Any:
-    if body.mass == 0 and not body.inertia.any():
+def _inertia(body: Body, static: bool) -> Any:
+    if body.mass == 0 and (static or not body.inertia.any()):
         return tree.SpatialInertia.Zero()
-    I = body.inertia
+    # Drake refuses some inertias that cannot act, because the body never moves.
+    I = np.zeros((3, 3)) if static else body.inertia
     try:
         central = tree.RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
         return tree.SpatialInertia.MakeFromCentralInertia(float(body.mass), np.array(body.com), central)

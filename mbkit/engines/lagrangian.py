@@ -226,6 +226,8 @@ class LagrangianDynamics(Dynamics):
         return self.model.constrained or elimination_size(self.model) <= _WRITTEN_OUT[self.compile]
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        if self.model.constrained:
+            self.model.require_meaningful(q)  # type: ignore[attr-defined]  # of a written model
         if self.written_out:
             return self._vector("forward_dynamics", q, v, tau)
         M, f = self._machine("applied_function")(q, v)

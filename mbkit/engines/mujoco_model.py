@@ -24,6 +24,7 @@ from mbkit.engines.imported import unused
 from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
+from mbkit.model.physical import static_bodies
 
 __all__ = ["JOINT_TYPES", "MujocoModel", "Placed", "build", "mapped", "specified"]
 
@@ -110,12 +111,15 @@ class Placed:
     joints : dict
         Joint name -> names of MuJoCo's joints.
     absorbed : set of str
+    static : set of str
+        Bodies that are fixed to the world.
     """
 
     bodies: dict[str, Any]
     degenerate: dict[str, Array]
     joints: dict[str, list[str]]
     absorbed: set[str]
+    static: set[str]
 
 
 def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
@@ -180,7 +184,7 @@ def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
 
 
 def _add_tree(spec: Any, description: Model) -> Placed:
-    placed = Placed({"world": spec.worldbody}, {}, {}, set())
+    placed = Placed({"world": spec.worldbody}, {}, {}, set(), static_bodies(description.joints))
     children: dict[str, list[Joint]] = {}
     for joint in description.joints:
         children.setdefault(joint.parent, []).append(joint)
@@ -210,6 +214,10 @@ def _add_tree(spec: Any, description: Model) -> Placed:
         made = placed.bodies[owner].add_body(name=body.name, pos=p, quat=_wxyz(R))
         placed.bodies[body.name] = made
         _give_inertia(made, body, description, placed)
+        if len(stack) > 1 and any(stacked.kind == "prismatic" for stacked, _, _ in stack):
+            # MuJoCo 4.0.0 takes the mass matrix of several slides of a "simple" body for diagonal, even
+            # where they are parallel.
+            made.simple = 0
         at_origin = owner == "world" and np.array_equal(R, np.eye(3)) and not p.any()
         for stacked, R_PJ, p_PJ in stack:
             _add_joint(made, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin=at_origin)
@@ -235,10 +243,12 @@ def _give_inertia(made: Any, body: Body, description: Model, placed: Placed) -> 
     made.inertia = moments
     listed = {name for name, _ in description.nonphysical}
     low, middle, high = np.sort(moments)
-    if body.mass > 0 and body.name not in listed and (low < _SMALLEST or low + middle < high):
-        # A point mass, a thin rod or a plate is a fair idealization, which the
-        # compiler refuses though the dynamics needs no such rule: it is compiled
-        # with a placeholder and gets its own moments afterwards.
+    harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
+    if harmless and (low < _SMALLEST or low + middle < high):
+        # A point mass, a thin rod or a plate is a fair idealization, and what is fixed
+        # to the world may have any inertia. The compiler refuses them though the dynamics
+        # needs no such rule: they are compiled with a placeholder and get their own
+        # moments afterwards.
         placed.degenerate[body.name] = moments
         made.inertia = np.ones(3)
 

@@ -125,7 +125,8 @@ def _body(body: Any, owners: dict[str, Joint], placed: Placed, model: Model, ind
     for own, p, R in frames:
         yield f"{indent}<site{_told(name=own, pos=p, xyaxes=R.T[:2])}/>"
     for child in body.bodies:
-        yield f"{indent}<body{_told(name=child.name, pos=child.pos, quat=child.quat)}>"
+        simple = None if child.simple else "false"
+        yield f"{indent}<body{_told(name=child.name, pos=child.pos, quat=child.quat, simple=simple)}>"
         yield from _body(child, owners, placed, model, indent + "  ")
         yield f"{indent}</body>"
 

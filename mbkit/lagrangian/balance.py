@@ -50,9 +50,7 @@ class Balance:
         self.rows = 0
         if self.model.constrained:
             from mbkit.lagrangian.constraints import manifold_of
-            from mbkit.lagrangian.redundancy import require_independent
 
-            require_independent(dyn)
             self._manifold = manifold_of(dyn).at(t)
             self.rows = len(self._manifold.value(self.model.neutral()))
         self._zero = np.zeros(self.model.nv)
@@ -114,7 +112,22 @@ class Balance:
 
     def allowed(self, q: Array) -> Array:
         """Return a configuration on the constraints."""
-        return np.asarray(self._manifold.restored(q, self._zero)) if self.rows else q
+        if not self.rows:
+            return q
+        from mbkit.lagrangian.redundancy import refuse_unreachable
+
+        try:
+            return np.asarray(self._manifold.restored(q, self._zero))
+        except InputError:
+            refuse_unreachable(self._manifold.dyn, q)
+            raise
+
+    def require_independent(self, q: Array) -> None:
+        """Refuse constraints that depend on each other at a configuration: they share the load in no one way."""
+        if self.rows:
+            from mbkit.lagrangian.redundancy import require_independent
+
+            require_independent(self._manifold.dyn, q)
 
     def multipliers(self, q: Array, tau: Array) -> Array:
         """Return the λ that balance best, (m,)."""

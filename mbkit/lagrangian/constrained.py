@@ -12,7 +12,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.symbols import name_of
 
 if TYPE_CHECKING:
@@ -77,9 +77,14 @@ class Constrained:
         **values
             Of parameters, by name.
         """
+        from mbkit.lagrangian.redundancy import require_independent
+
         q, v = self.model.check_q(q), self.model.check_v(v)
         tau = self.model.check_v(np.zeros_like(v) if tau is None else tau, "tau")
-        out = self._manifold(t, values).multipliers(*np.broadcast_arrays(q, v, tau))
+        manifold, (q, v, tau) = self._manifold(t, values), np.broadcast_arrays(q, v, tau)
+        for one in np.atleast_2d(q):
+            require_independent(manifold.dyn, one)
+        out = manifold.multipliers(q, v, tau)
         if not np.isfinite(out).all():
             raise NumericalError(
                 f"{self.name}: the multipliers are not finite at q = {q.tolist()}; perhaps the constraints depend on "
@@ -111,9 +116,20 @@ class Constrained:
         manifold = self._manifold(t, values)
         q, v = np.broadcast_arrays(self.model.check_q(q), self.model.check_v(v))
         if q.ndim == 1:
-            return manifold.project(q, v)
-        found = [manifold.project(*pair) for pair in zip(q, v, strict=True)]
+            return self._projected(manifold, q, v)
+        found = [self._projected(manifold, *pair) for pair in zip(q, v, strict=True)]
         return np.array([pair[0] for pair in found]), np.array([pair[1] for pair in found])
+
+    def _projected(self, manifold: Manifold, q: Array, v: Array) -> tuple[Array, Array]:
+        from mbkit.lagrangian.redundancy import refuse_unreachable, require_independent
+
+        try:
+            found = manifold.project(q, v)
+        except InputError:
+            refuse_unreachable(manifold.dyn, q)
+            raise
+        require_independent(manifold.dyn, found[0], everywhere=True)
+        return found
 
     def embedded(self, independent: Sequence[Any] | None = None, **values: float) -> Embedded:
         """Return the system on independent coordinates alone, for `mbkit.simulate`.
@@ -138,13 +154,11 @@ class Constrained:
         return self._consistent(self._interpreted.at(**values) if values else self._interpreted).at(real("t", t))
 
     def _consistent(self, dyn: Dynamics) -> Manifold:
-        # These load CasADi.
+        # It loads CasADi.
         from mbkit.lagrangian.constraints import manifold_of
-        from mbkit.lagrangian.redundancy import require_independent
 
         if not self.constraints:
             raise UnsupportedError(f"{self.name}: has no constraints; give them as constraints=[...]")
-        require_independent(dyn)
         return manifold_of(dyn)
 
     @cached_property

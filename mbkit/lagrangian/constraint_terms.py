@@ -8,14 +8,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 import casadi as ca
-import numpy as np
 
 from mbkit.derivation.factorize import solve
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.written_equations import WrittenEquations
 
-__all__ = ["FUNCTIONS", "ConstraintTerms", "weight"]
+__all__ = ["FUNCTIONS", "ConstraintTerms", "stiffening", "weight"]
+
+#: Mass of a coordinate that has none, in terms of the mean one.
+_MASSLESS: Final = 1e-20
+_TINY: Final = 1e-300
 
 
 class ConstraintTerms:
@@ -45,28 +48,26 @@ class ConstraintTerms:
             self.gamma = self.gamma + ca.jacobian(self.rate, time)
 
 
-def weight(eq: WrittenEquations) -> tuple[Any, Any]:
-    """Return M + s JᵀJ and s; s = 0 unless M alone is singular, as of coordinates that move no mass.
+def stiffening(eq: WrittenEquations) -> Any:
+    """Return s > 0 of each row, (m, 1), so that W = M + Jᵀ diag(s) J has an inverse where M has it on J's null space.
 
-    With J v̇ given, the added term changes neither v̇ nor λ.
+    With J v̇ given, the added term changes neither v̇ nor λ, and coordinates that move no mass need no other way. Of a
+    row, s is the mean of two masses that are felt along it, the sum's and the lightest coordinate's: W keeps the
+    digits of both, in a loop with a light rod as of a light body on a heavy one.
     """
-    M, J = eq.mass_matrix, eq.constraints.jacobian
-    if not _singular(eq):
-        return M, 0.0
-    s = ca.trace(M) / ca.sumsqr(J)
-    return M + s * ca.mtimes(J.T, J), s
+    J, n = eq.constraints.jacobian, eq.model.nv
+    M = ca.diag(eq.mass_matrix)
+    masses = M + _MASSLESS / n * ca.sum1(M)
+    squares = J**2
+    heavy, light = ca.mtimes(squares, masses), ca.mtimes(squares, 1 / masses)
+    # Of a row without slope the term is zero.
+    return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
 
 
-def _singular(eq: WrittenEquations) -> bool:
-    """Return whether M has no inverse anywhere, of a few random configurations and values."""
-    rng = np.random.default_rng(0)
-    given = [eq.q, *eq.trailing.values()]
-    M = ca.Function("M", given, [ca.densify(eq.mass_matrix)])
-    for _ in range(3):
-        at = [rng.uniform(0.5, 1.5, x.numel()) for x in given]
-        if np.linalg.matrix_rank(np.array(M(*at)), hermitian=True) == eq.model.nv:
-            return False
-    return True
+def weight(eq: WrittenEquations) -> Any:
+    """Return W = M + Jᵀ diag(s) J of `stiffening`."""
+    J = eq.constraints.jacobian
+    return eq.mass_matrix + ca.mtimes(J.T, stiffening(eq) * J)
 
 
 # The functions that are compiled
@@ -85,14 +86,14 @@ def _rows(eq: WrittenEquations) -> ca.Function:
 
 def _all(eq: WrittenEquations) -> ca.Function:
     c = eq.constraints
-    made = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": weight(eq)[0]}
+    made = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": weight(eq), "M": eq.mass_matrix}
     return _function(eq, "constraint", {"q": eq.q, "v": eq.v}, made)
 
 
 def _step(eq: WrittenEquations) -> ca.Function:
     """(q, v) -> q after a step of Newton's, v made consistent there, f before it and its scale."""
     c, m = eq.constraints, eq.constraints.value.shape[0]
-    W = weight(eq)[0]
+    W = weight(eq)
     Y = solve(W, c.jacobian.T, eq.elimination_order)
     S = ca.mtimes(c.jacobian, Y)
     q1 = eq.q - ca.mtimes(Y, solve(S, c.value, range(m)))

@@ -30,13 +30,14 @@ _TWIN: Final = "_constrained_twin"
 
 @dataclass(frozen=True)
 class _Terms:
-    """Numbers at one state: f (m,), J (m, n), ∂f/∂t (m,), ḟ (m,) and the weight (n, n)."""
+    """Numbers at one state: f (m,), J (m, n), ∂f/∂t (m,), ḟ (m,), the weight W and the mass matrix (n, n)."""
 
     f: Array
     J: Array
     by_time: Array
     rate: Array
     W: Array
+    M: Array
 
     @property
     def scale(self) -> Array:
@@ -91,8 +92,8 @@ class Manifold:
         return np.asarray(self.call("multipliers", q, v, tau)[0][..., 0])
 
     def _terms(self, q: Array, v: Array) -> _Terms:
-        f, J, by_time, rate, W = self.call("constraint", q, v)
-        return _Terms(f[:, 0], J, by_time[:, 0], rate[:, 0], W)
+        f, J, by_time, rate, W, M = self.call("constraint", q, v)
+        return _Terms(f[:, 0], J, by_time[:, 0], rate[:, 0], W, M)
 
     # Consistency
 
@@ -106,8 +107,7 @@ class Manifold:
         """
         states = zip(np.atleast_2d(q), np.atleast_2d(v), strict=True)
         for k, (one_q, one_v) in enumerate(states):
-            member = self._member(k) if self.dyn.samples is not None else self
-            terms = member._terms(one_q, one_v)
+            terms = self.member(k)._terms(one_q, one_v)
             limits = [_CONSISTENT * terms.scale * max(1.0, float(np.abs(x).max())) for x in (one_q, one_v)]
             for name, what, residual, limit in (
                 ("q0", "f", terms.f, limits[0]),
@@ -121,7 +121,10 @@ class Manifold:
                         f"{where}; lag.project(q0, v0) returns the nearest consistent state"
                     )
 
-    def _member(self, k: int) -> Manifold:
+    def member(self, k: int) -> Manifold:
+        """Return the states of one sample of a batch of parameters; the same where there is none."""
+        if self.dyn.samples is None:
+            return self
         one = self.dyn.of_samples([k])
         return Manifold(one.at(**dict(zip(one.model.parameters, one.parameter_values[0].tolist(), strict=True))))
 
@@ -148,12 +151,12 @@ class Manifold:
             None was found from here.
         """
         x = self.restored(q, v)
-        W = self._terms(q, v).W
-        # Stationary: W (x - q) + Jᵀ μ = 0 with f(x) = 0.
+        M = self._terms(q, v).M
+        # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
         last = np.inf
         for _ in range(_MOST):
             terms = self._terms(x, v)
-            step = _kkt(W, terms.J, W @ (q - x), -terms.f)
+            step = _kkt(M, terms.J, M @ (q - x), -terms.f)
             size = float(np.linalg.norm(step))
             if size <= 1e-12 * (1 + float(np.linalg.norm(x))):
                 break

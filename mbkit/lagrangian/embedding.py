@@ -20,6 +20,7 @@ from mbkit._check import Array
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.lagrangian.constraints import Manifold
 from mbkit.lagrangian.embedded_dynamics import Chart, EmbeddedDynamics, ReducedModel
+from mbkit.lagrangian.redundancy import require_few
 
 __all__ = ["SINGULAR", "Chart", "Embedded", "EmbeddedDynamics"]
 
@@ -52,6 +53,7 @@ class Embedded:
         self.manifold, self.dynamics, self.independent = manifold, manifold.dyn, independent
         self.model = manifold.dyn.model
         rows = len(self.model.system.constraints)  # type: ignore[attr-defined]  # of a written model
+        require_few(self.model)
         self.degrees = self.model.nv - rows
         if self.degrees < 1:
             raise InputError(f"{self.model.name}: {rows} constraints leave none of {self.model.nv} coordinates free")

@@ -185,6 +185,7 @@ def equilibrium(
 
 def _told(balance: Balance, q: Array, tau: Array, multipliers: Array) -> Equilibrium:
     """Return what was found, with the small motions about it."""
+    balance.require_independent(q)
     if balance.changes(q, tau, multipliers):
         # Mathieu's equation and its kind: no instant says whether the whole motion stays small.
         motion = SmallMotion(None, np.empty(0), np.empty(0, dtype=complex))

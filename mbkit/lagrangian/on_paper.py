@@ -22,6 +22,8 @@ __all__ = ["from_model"]
 
 #: Velocities up to which anybody reads a matrix.
 _MOST: Final = 24
+#: The same with loops or motions in time. A row of 40 four-bars has 81 coordinates.
+_MOST_BOUND: Final = 100
 
 
 def from_model(
@@ -127,6 +129,8 @@ def from_model(
     put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
     T, V, R, *constraints = (x.xreplace(put) for x in (T, V, R, *(row for _, row in rows)))
     kept = [i for i in range(len(q)) if i not in moved]
+    # Dampers on prescribed joints alone act on no coordinate that is left.
+    R = R if R.free_symbols & {v[i] for i in kept} else sp.Integer(0)
     _check_kept(model, {q[i] for i in kept}, zip((name for name, _ in rows), constraints, strict=True))
     used = set().union(*(x.free_symbols for x in (T, V, R, *constraints)))
     return Lagrangian(
@@ -156,10 +160,16 @@ def _check(model: Model) -> None:
         )
     if not model.nv:
         raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
-    if model.nv > _MOST:
+    # Engines take trees of any size. What they refuse is solved here alone.
+    bound = model.needs.loops or model.needs.time
+    most = _MOST_BOUND if bound else _MOST
+    if model.nv > most:
+        other = (
+            "leave out bodies" if bound else 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+        )
         raise UnsupportedError(
-            f"{model.name}: {model.nv} coordinates are more than the {_MOST} that are written out; "
-            'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+            f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of "
+            f"{model.name}; {other}"
         )
 
 

@@ -15,10 +15,10 @@ import sympy as sp
 
 from mbkit._check import Array, count, generator, real
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.abstract_parts import abstract_parts
 from mbkit.lagrangian.constraints import Manifold, manifold_of
-from mbkit.lagrangian.redundancy import require_independent
+from mbkit.lagrangian.redundancy import is_judged, refuse_unreachable, require_independent
 from mbkit.lagrangian.written_equations import WrittenEquations
 from mbkit.model import Model
 from mbkit.model.needs import Needs
@@ -137,7 +137,10 @@ class WrittenModel(Model):
         )
 
     def random_state(self, rng: np.random.Generator | int, size: int | None = None) -> tuple[Array, Array]:
-        """Draw a random state as `Model.random_state` does; under constraints the consistent one that is nearest."""
+        """Draw a random state as `Model.random_state` does; under constraints the consistent one that is nearest.
+
+        Singular poses are drawn again.
+        """
         if not self.constrained:
             return super().random_state(rng, size)
         rng = generator("rng", rng)
@@ -147,19 +150,26 @@ class WrittenModel(Model):
 
     def _consistent_state(self, rng: np.random.Generator) -> tuple[Array, Array]:
         for _ in range(_DRAWS):
-            # From some places there is no way to the constraints.
-            with suppress(InputError):
-                return self._states.project(*super().random_state(rng))
-        self.require_independent()
+            # From some places there is no way to the constraints; on some branches they depend on each other.
+            with suppress(InputError, NumericalError):
+                state = self._states.project(*super().random_state(rng))
+                require_independent(self._states.dyn, state[0])
+                return state
+        refuse_unreachable(self._states.dyn)
         return self._states.project(*super().random_state(rng))
 
-    def require_independent(self) -> None:
-        """Refuse constraints that follow from each other or contradict each other, with the rows.
+    def require_independent(self, q: Array) -> None:
+        """Refuse constraints that follow from each other at a configuration or contradict each other, with the rows.
 
-        Not while a parameter has no value, of which it may depend.
+        Not while a parameter has no value, on which it may depend.
         """
         if self.constrained and None not in self.parameters.values():
-            require_independent(LagrangianDynamics(self, compile=False))
+            require_independent(self._states.dyn, q)
+
+    def require_meaningful(self, q: Array) -> None:
+        """Refuse constraints that depend on each other at the first configuration that is evaluated."""
+        if self.constrained and len(q) and None not in self.parameters.values() and not is_judged(self):
+            require_independent(self._states.dyn, np.atleast_2d(q)[0])
 
     @cached_property
     def _states(self) -> Manifold:

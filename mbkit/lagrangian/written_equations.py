@@ -120,7 +120,6 @@ class WrittenEquations(Equations):
         """M⁻¹ (τ + τ_passive - nle + Jᵀ λ); every other term of the equation is the one without constraints."""
         if not self.model.constrained:
             return super().forward_dynamics
-        self.model.require_independent()
         return self._constrained[0]
 
     @cached_property

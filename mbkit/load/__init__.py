@@ -1,4 +1,4 @@
-"""URDF, MJCF, and robots by name, to a `Model`. No mesh is ever opened."""
+"""URDF, MJCF, and robots by name, to a `Model`."""
 
 from mbkit._callable import make_callable
 from mbkit.load.loader import load

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
+from collections.abc import Iterable
 from typing import Final
 
 from mbkit.load.xml import Element
 
-__all__ = ["LARGEST", "Reader"]
+__all__ = ["LARGEST", "Reader", "misspelt"]
 
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 #: Larger than anything that moves, and the products of several still fit a double.
 LARGEST: Final = 1e30
+_LONGEST_NAME: Final = 1000
 
 
 class Reader:
@@ -22,10 +25,13 @@ class Reader:
     ----------
     faults : list of str
         One sentence per fault: the element, what was expected, what came.
+    notes : list of str
+        What was passed over without loss.
     """
 
     def __init__(self) -> None:
         self.faults: list[str] = []
+        self.notes: list[str] = []
 
     def fault(self, text: str, element: Element | None = None) -> None:
         """Keep one fault; the element tells the line, and the file where that is an included one."""
@@ -33,10 +39,17 @@ class Reader:
         self.faults.append(text + where)
 
     def name(self, element: Element, attribute: str, who: str) -> str:
-        """Return a name that must be there and not be empty."""
+        """Return a name that must be there, not be empty, and be short enough for a message."""
         value = element.attributes.get(attribute, "")
         if not value.strip():
             self.fault(f"{who}: <{element.tag}> has no {attribute}; give it one", element)
+        if len(value) > _LONGEST_NAME:
+            self.fault(
+                f"{who}: {element.tag} {attribute}: a name of {len(value)} characters; "
+                f"expected up to {_LONGEST_NAME}, got {_short(value)}",
+                element,
+            )
+            return value[:_LONGEST_NAME]
         return value
 
     def numbers(
@@ -92,10 +105,20 @@ class Reader:
         fallback = None if default is None else (default,)
         return self.numbers(element, attribute, who, count=1, default=fallback, bounded=bounded)[0]
 
+    def choice(self, element: Element, attribute: str, choices: tuple[str, ...]) -> str:
+        """Return one of the choices, the first where the attribute is absent."""
+        value = element.attributes.get(attribute, choices[0])
+        if value in choices:
+            return value
+        self.fault(f"{element.tag} {attribute}: expected one of {', '.join(choices)}, got {value[:40]!r}", element)
+        return choices[0]
+
     def only(self, element: Element, tag: str, who: str) -> Element | None:
-        """Return the child of this tag, of which there may be one."""
+        """Return the child of this tag, of which there may be one, or several that are equal."""
         found = element.all(tag)
-        if len(found) > 1:
+        if len(found) > 1 and all(_content(e) == _content(found[0]) for e in found):
+            self.notes.append(f"{who}: {len(found)} equal <{tag}> elements were read as one ({found[1].place})")
+        elif len(found) > 1:
             self.fault(f"{who}: {len(found)} <{tag}> elements; keep one", found[1])
         return found[0] if found else None
 
@@ -111,4 +134,28 @@ def _short(text: str) -> str:
 
 
 def _hint(word: str) -> str:
-    return "; run xacro on the file first" if "${" in word else ""
+    if "${" in word or "$(" in word:
+        return "; run xacro on the file first"
+    if "," in word:
+        return "; it has a comma: write numbers with a point, and spaces between them"
+    return ""
+
+
+def _content(element: Element) -> tuple[object, ...]:
+    """Return what an element says, to compare it with another."""
+    return element.tag, element.attributes, element.text.split(), [_content(c) for c in element.children]
+
+
+def misspelt(name: str, known: Iterable[str]) -> str:
+    """Return the known name that was probably meant, or an empty text.
+
+    Names are compared without case and separators. They must have most letters in common and nearly the same length,
+    so that an extension whose name holds a known word (``gear_velocity``) is none.
+    """
+    plain = {_plain(k): k for k in known if abs(len(k) - len(name)) <= 2}
+    found = difflib.get_close_matches(_plain(name), plain, n=1, cutoff=0.75) if plain else ()
+    return plain[found[0]] if found else ""
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[-_.\s]", "", name.lower())

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import os
+import re
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit.errors import InputError, LoadError
+from mbkit._check import shown
+from mbkit.errors import InputError, LoadError, MbkitWarning
 from mbkit.load import names, xml
 from mbkit.load.includes import expanded
 from mbkit.load.urdf_file import examine
 from mbkit.model import Model
+from mbkit.model.physical import scale_doubts
 
 __all__ = ["load"]
 
+# A path has lost one of the strokes.
+_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _GRAVITY: Final = (0.0, 0.0, -9.81)
 
 
@@ -26,12 +34,14 @@ def load(
     mimic: Literal["reduce", "free"] = "reduce",
     nonphysical: Literal["error", "warn"] | None = None,
     gravity: ArrayLike | None = None,
+    meshes: Literal["auto", "never"] = "auto",
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
-    No mesh is opened, and no other file but those that an MJCF includes. What was decided on the way
-    (mimic joints, parts left out, rounded zeros) stands in the model's ``notes``. Tendons and actuators of an
-    MJCF act as springs, dampers and rotors where their forces at zero control are linear.
+    Of other files, those that an MJCF includes are opened, and the meshes that give a body of an MJCF its
+    inertia; no others. What was decided on the way (mimic joints, parts left out, rounded zeros, files that
+    were opened) stands in the model's ``notes``. Tendons and actuators of an MJCF act as springs, dampers and
+    rotors where their forces at zero control are linear.
 
     Parameters
     ----------
@@ -50,6 +60,9 @@ def load(
         A negative mass is always refused.
     gravity : (3,) array_like, optional
         m/s², in world axes; by default the file's own (MJCF), else (0, 0, -9.81).
+    meshes : {"auto", "never"}
+        Whether an MJCF's meshes are read where a body has no other inertia. MuJoCo's compiler infers it.
+        With "never" such bodies are refused.
 
     Returns
     -------
@@ -71,6 +84,8 @@ def load(
     -----
     NonPhysicalWarning
         Some bodies can be of no matter, and were taken as written.
+    MbkitWarning
+        Masses or lengths are so far apart that engines lose digits in double precision.
 
     Examples
     --------
@@ -80,10 +95,14 @@ def load(
     >>> mb.load("panda", mimic="free").nv
     9
     """
-    if mimic not in ("reduce", "free"):
-        raise InputError(f"mimic: expected 'reduce' or 'free', got {mimic!r}")
-    if nonphysical not in ("error", "warn", None):
-        raise InputError(f"nonphysical: expected 'error', 'warn' or None, got {nonphysical!r}")
+    if not isinstance(mimic, str) or mimic not in ("reduce", "free"):
+        raise InputError(f"mimic: expected 'reduce' or 'free', got {shown(mimic)}")
+    if nonphysical is not None and (not isinstance(nonphysical, str) or nonphysical not in ("error", "warn")):
+        raise InputError(f"nonphysical: expected 'error', 'warn' or None, got {shown(nonphysical)}")
+    if not isinstance(floating_base, (bool, np.bool_)):
+        raise InputError(f"floating_base: expected True or False, got {shown(floating_base)}")
+    if not isinstance(meshes, str) or meshes not in ("auto", "never"):
+        raise InputError(f"meshes: expected 'auto' or 'never', got {shown(meshes)}")
     path, by_name = _resolved(source)
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml.read(path)
@@ -94,7 +113,7 @@ def load(
         urdf = examine(
             root, str(path), floating_base=floating_base, mimic_matters=mimic == "reduce", lenient=policy == "warn"
         )
-        return model_of(
+        made = model_of(
             urdf,
             str(path),
             floating_base=floating_base,
@@ -102,30 +121,39 @@ def load(
             nonphysical=policy,
             gravity=_GRAVITY if gravity is None else gravity,
         )
-    if root.tag == "mujoco":
+    elif root.tag == "mujoco":
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = expanded(root, path)
-        return model_of_mjcf(whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity)
-    raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+        made = model_of_mjcf(
+            whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity, meshes=meshes
+        )
+    else:
+        raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    doubts = scale_doubts(made)
+    if doubts:
+        warnings.warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning, stacklevel=2)
+    return replace(made, notes=(*root.notes, *made.notes)) if root.notes else made
 
 
 def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
     """Return the file, and whether it was asked for by a robot's name."""
     if not isinstance(source, (str, os.PathLike)):
-        raise InputError(f"source: expected a robot's name or a path, got {source!r}")
+        raise InputError(f"source: expected a robot's name or a path, got {shown(source)}")
     text = os.fspath(source)
     if not isinstance(text, str):
-        raise InputError(f"source: expected a path of characters, got bytes {text!r}")
+        raise InputError(f"source: expected a path of characters, got bytes {shown(text)}")
     if not text:
         raise InputError("source: expected a robot's name or a path, got an empty text")
+    if _URL.match(text) and not os.path.exists(text):
+        raise LoadError(f"{text}: this is a URL, and mbkit reads local files; download it and give its path")
     if isinstance(source, str):
         looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf"))
         robot = None if looks_like_path else names.find(text)
         if robot is not None:
             return robot.path, True
         separated = "/" in text or os.sep in text
-        if not looks_like_path and not separated and not os.path.isfile(text):
+        if not looks_like_path and not separated and not os.path.exists(text):
             raise names.unknown(text)
         if separated and not looks_like_path and not os.path.exists(text):
             raise names.unknown(text)

@@ -15,6 +15,7 @@ in the world.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -25,8 +26,10 @@ from mbkit._check import Array
 from mbkit.errors import ModelError
 from mbkit.load.attributes import Reader
 from mbkit.load.floating import floated
+from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, listed
 from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
+from mbkit.load.mjcf_schema import check_names
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
 from mbkit.load.snap import Snapper
 from mbkit.load.xml import Element
@@ -47,7 +50,7 @@ _NOTED: Final = ("tendon", "actuator", "equality")
 
 
 # Option flags that change the smooth equations; the others steer an engine.
-_HONOURED: Final = frozenset({"gravity", "spring", "damper", "passive", "actuation"})
+_HONOURED: Final = frozenset({"gravity", "spring", "damper", "actuation"})
 
 
 def model_of_mjcf(
@@ -57,10 +60,12 @@ def model_of_mjcf(
     floating_base: bool,
     nonphysical: Literal["error", "warn"],
     gravity: ArrayLike | None,
+    meshes: Literal["auto", "never"] = "never",
 ) -> Model:
-    """Describe the bodies and joints of a <mujoco> element."""
+    """Describe the bodies and joints of a <mujoco> element; for the arguments see `mbkit.load.load`."""
     read = Reader()
     _refuse(mujoco, read)
+    misspelt = check_names(mujoco, read)
     if floating_base:
         mujoco = floated(mujoco, read)
     scene = Scene(Compiler.of(mujoco, read), Defaults(mujoco, read), read)
@@ -70,27 +75,37 @@ def model_of_mjcf(
         for element, X, childclass in unfolded(world, HERE, None, scene, "the world"):
             if element.tag == "body":
                 walk(element, "world", X, childclass, scene)
-    own_gravity = _gravity(mujoco, read)
+    flags = _flags(mujoco, read)
+    own_gravity = _gravity(mujoco, flags, read)
+    for body, geoms in scene.inferred.items() if meshes == "never" else ():
+        read.fault(
+            f"body {body!r}: its inertia would come from a mesh or a shell, and none is opened; "
+            'add <inertial>, or load with meshes="auto"',
+            geoms[0][0],
+        )
+    inferred = infer_inertias(mujoco, path, scene)
     if not scene.bodies:
         read.fault("no bodies; expected <worldbody> with <body> elements")
     elif not any(b.joints for b in scene.bodies):
         read.fault("no joints, so nothing moves (nq = 0); add a joint, or load with floating_base=True")
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=own_gravity if gravity is None else gravity)
     scale, snap = _total_scale(scene), Snapper()
-    _describe(b, scene, scale, snap)
-    off = _disabled(mujoco)
+    springs = infer_springs(mujoco, path, scene)
+    _describe(b, scene, scale, snap, springs)
+    off = {name for name, value in flags.items() if value == "disable"}
     transmissions = Transmissions(mujoco, scene, off)
     if read.faults:
         raise ModelError(str(path), read.faults)
-    for note in (*_notes(mujoco, scene, scale), snap.note):
+    sprung = f"springdamper made stiffness and damping, by MuJoCo's compiler: {listed(springs)}" if springs else ""
+    for note in (*_notes(mujoco, path, scene, flags, scale), inferred, sprung, misspelt, snap.note):
         if note:
             b.note(note)
     try:
         model = b.build(nonphysical=nonphysical, point_masses=False)
     except ModelError as error:
         raise ModelError(str(path), error.faults) from None
-    features = {"spring": ("springs",), "damper": ("damping",), "passive": ("springs", "damping")}
-    model = model.without(*(f for flag, names in features.items() if flag in off for f in names))
+    features = {"spring": "springs", "damper": "damping"}
+    model = model.without(*(feature for flag, feature in features.items() if flag in off))
     return transmissions.applied(model)
 
 
@@ -100,17 +115,22 @@ def _refuse(mujoco: Element, read: Reader) -> None:
             read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
 
 
-def _disabled(mujoco: Element) -> set[str]:
-    """Return the names of the flags that switch a part of the smooth motion off."""
-    flags = [flag.attributes for option in mujoco.all("option") for flag in option.all("flag")]
-    return {name for attributes in flags for name, value in attributes.items() if value == "disable"} & _HONOURED
+def _flags(mujoco: Element, read: Reader) -> dict[str, str]:
+    """Return the option flags; later ones win."""
+    out: dict[str, str] = {}
+    for flag in (f for option in mujoco.all("option") for f in option.all("flag")):
+        for name, value in flag.attributes.items():
+            if value not in ("enable", "disable"):
+                read.fault(f"option flag {name}: expected 'enable' or 'disable', got {value[:40]!r}", flag)
+        out.update(flag.attributes)
+    return out
 
 
-def _gravity(mujoco: Element, read: Reader) -> tuple[float, ...]:
+def _gravity(mujoco: Element, flags: Mapping[str, str], read: Reader) -> tuple[float, ...]:
     out: tuple[float, ...] = (0.0, 0.0, -9.81)
     for option in mujoco.all("option"):
         out = read.numbers(option, "gravity", "the file", count=3, default=out)
-    return (0.0, 0.0, 0.0) if "gravity" in _disabled(mujoco) else out
+    return (0.0, 0.0, 0.0) if flags.get("gravity") == "disable" else out
 
 
 def _total_scale(scene: Scene) -> float:
@@ -121,7 +141,9 @@ def _total_scale(scene: Scene) -> float:
 # Describing it.
 
 
-def _describe(b: ModelBuilder, scene: Scene, scale: float, snap: Snapper) -> None:
+def _describe(
+    b: ModelBuilder, scene: Scene, scale: float, snap: Snapper, springs: Mapping[str, tuple[float, float]]
+) -> None:
     anchors: dict[str, Array] = {"world": np.zeros(3)}
     for body in scene.bodies:
         anchors[body.name] = body.anchor
@@ -139,7 +161,7 @@ def _describe(b: ModelBuilder, scene: Scene, scale: float, snap: Snapper) -> Non
                 R, p = np.eye(3), np.zeros(3)
             else:
                 p = p + R @ (joint.anchor - before)
-            _add_joint(b, joint, parent, child, R, p, scene, snap)
+            _add_joint(b, joint, parent, child, R, p, scene, snap, springs)
             if not last:
                 b.add_body(child)
             R, p, parent, before = np.eye(3), np.zeros(3), child, joint.anchor
@@ -153,7 +175,15 @@ def _describe(b: ModelBuilder, scene: Scene, scale: float, snap: Snapper) -> Non
 
 
 def _add_joint(
-    b: ModelBuilder, joint: MjcfJoint, parent: str, child: str, R: Array, p: Array, scene: Scene, snap: Snapper
+    b: ModelBuilder,
+    joint: MjcfJoint,
+    parent: str,
+    child: str,
+    R: Array,
+    p: Array,
+    scene: Scene,
+    snap: Snapper,
+    springs: Mapping[str, tuple[float, float]],
 ) -> None:
     who, element, read = f"joint {joint.name!r}", joint.element, scene.read
     angle = scene.compiler.angle if joint.kind in ("hinge", "ball") else 1.0
@@ -172,14 +202,24 @@ def _add_joint(
         force = _range(element, "actuatorfrcrange", "actuatorfrclimited", who, scene)
         if force:
             given["effort_limit"] = max(abs(x) for x in force)
-    elif _range(element, "range", "limited", who, scene):
+    elif joint.kind == "ball" and _range(element, "range", "limited", who, scene, ordered=False):
         scene.left_out["limit of a ball joint"] += 1
     for name in ("stiffness", "damping"):
         given[name], *higher = read.numbers(element, name, who, count=3, least=1, default=(0.0,))
         if any(higher):
             read.fault(f"{who}: {name} that depends on the position or speed; only constants are read", element)
-    if any(read.numbers(element, "springdamper", who, count=2, default=(0.0, 0.0))):
-        read.fault(f"{who}: springdamper is not read; write stiffness and damping", element)
+    if joint.name in springs:
+        given["stiffness"], given["damping"] = springs[joint.name]
+    armature = read.number(element, "armature", who, 0.0)
+    if joint.kind in ("ball", "free"):
+        # They may come from a default class that was meant for hinges.
+        for name, value in (("stiffness", given["stiffness"]), ("armature", armature)):
+            if value:
+                why = "a joint of one coordinate" if name == "stiffness" else "a joint of one velocity"
+                read.fault(f"{who}: {name} {value:g} on a {joint.kind} joint; expected {why}; set it to 0", element)
+        given["stiffness"] = armature = 0.0
+    if read.number(element, "springyield", who, 0.0) and given["stiffness"]:
+        scene.left_out["yield of a spring"] += 1
     if not given["stiffness"]:
         given.pop("rest", None)
     b.add_joint(
@@ -189,31 +229,36 @@ def _add_joint(
         child=child,
         translation=p,
         rotation=snap(R),
-        armature=read.number(element, "armature", who, 0.0),
+        armature=armature,
         friction=read.number(element, "frictionloss", who, 0.0),
         **given,
     )
 
 
-def _range(element: Element, range_: str, limited: str, who: str, scene: Scene) -> tuple[float, float] | None:
+def _range(
+    element: Element, range_: str, limited: str, who: str, scene: Scene, *, ordered: bool = True
+) -> tuple[float, float] | None:
     """Return a range that applies, or None."""
     low, high = scene.read.numbers(element, range_, who, count=2, default=(0.0, 0.0), bounded=False)
-    said = element.attributes.get(limited, "auto")
-    if said == "auto" and range_ in element.attributes and not scene.compiler.autolimits:
+    said = scene.read.choice(element, limited, ("auto", "true", "false"))
+    if said == "auto" and (low or high) and not scene.compiler.autolimits:
         scene.read.fault(f"{who}: {range_} without {limited}, and autolimits is off; write {limited}", element)
     if said == "false" or (said == "auto" and not low < high):
         return None
-    if not low < high:
+    if ordered and not low < high:
         scene.read.fault(f"{who}: {range_} {low:g} {high:g}; expected the lower limit first", element)
     return low, high
 
 
-def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
+def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], scale: float) -> list[str]:
     """Say what was decided and what was left out."""
     out = []
     files = list(dict.fromkeys(e.file for e in mujoco.walk() if e.file))
     if files:
         out.append(f"included: {', '.join(files)}")
+        outside = [f for f in files if not (path.parent / f).resolve().is_relative_to(path.parent.resolve())]
+        if outside:
+            out.append(f"included from outside the folder of {path.name}: {', '.join(outside)}")
     sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in (*_READ, *_NOTED))
     if sections:
         told = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
@@ -221,23 +266,35 @@ def _notes(mujoco: Element, scene: Scene, scale: float) -> list[str]:
     if scene.left_out:
         told = ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()))
         out.append(f"not represented here, and left out: {told}")
-    for option in mujoco.all("option"):
-        fluid = [a for a in ("density", "viscosity", "wind") if a in option.attributes]
-        if fluid:
-            out.append(f"the forces of a fluid (option {', '.join(fluid)}) were left out")
-        for flag in option.all("flag"):
-            told = ", ".join(f"{k}={v}" for k, v in sorted(flag.attributes.items()) if k not in _HONOURED)
-            if told:
-                out.append(f"option flags are an engine's, and were left out: {told}")
+    out += _fluid_note(mujoco, scene)
+    told = ", ".join(f"{k}={v}" for k, v in sorted(flags.items()) if k not in _HONOURED)
+    if told:
+        out.append(f"option flags are an engine's, and were left out: {told}")
     if scene.unnamed:
         told = " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items()))
         out.append(f"names were made up for what has none ({told})")
+    for setting, bodies in scene.bounded.items():
+        what = "mass" if setting == "boundmass" else "inertia"
+        out.append(f"compiler {setting} changed the {what} of {listed(bodies)}")
     if scale != 1:
         out.append(f"compiler settotalmass: all masses and inertias times {scale:.9g}")
-    for body in scene.bodies:
-        drawn = np.any(body.pose.p) or not np.array_equal(body.pose.R, np.eye(3))
-        if body.joints and body.joints[0].kind == "free" and drawn:
-            out.append(f"free body {body.name!r}: q is its pose in the world; where the file draws it was left out")
-        if len(body.joints) > 1:
-            out.append(f"body {body.name!r} has {len(body.joints)} joints: massless bodies stand between them")
+    drawn = [b for b in scene.bodies if np.any(b.pose.p) or not np.array_equal(b.pose.R, np.eye(3))]
+    free = [b.name for b in drawn if b.joints and b.joints[0].kind == "free"]
+    if free:
+        out.append(f"q of a free body is its pose in the world; where the file draws it was left out: {listed(free)}")
+    stacked = [b.name for b in scene.bodies if len(b.joints) > 1]
+    if stacked:
+        out.append(f"massless bodies stand between the joints of bodies with several: {listed(stacked)}")
     return out
+
+
+def _fluid_note(mujoco: Element, scene: Scene) -> list[str]:
+    """Say that the forces of a fluid act in MuJoCo, where its medium has density or viscosity."""
+    option: dict[str, str] = {}
+    for element in mujoco.all("option"):
+        option |= {k: v for k, v in element.attributes.items() if k in ("density", "viscosity", "wind")}
+    medium = Element("option", option, 0)
+    if not any(scene.read.number(medium, name, "the file", 0.0) for name in ("density", "viscosity")):
+        return []
+    told = ", ".join(f"{k} {v}" for k, v in sorted(option.items()))
+    return [f"the forces of a fluid were left out (option {told}), with fluidshape and fluidcoef of geoms"]

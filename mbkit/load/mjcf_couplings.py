@@ -208,8 +208,6 @@ class Transmissions:
         self._joints: dict[str, MjcfJoint] = {j.name: j for body in scene.bodies for j in body.joints}
         self._names: set[str] = set()
         self._springs, self._dampers = "spring" not in disabled, "damper" not in disabled
-        if "passive" in disabled:
-            self._springs = self._dampers = False
         self._actuation = "actuation" not in disabled
         self._groups = _disabled_groups(mujoco, scene.read)
         self._classes = {"main": _Actuator()}

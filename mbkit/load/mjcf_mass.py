@@ -1,52 +1,93 @@
-"""A body's mass and inertia in MJCF: written, or inferred from its geoms."""
+"""Mass and inertia of an MJCF's bodies by MuJoCo's rules: written, or inferred from geoms.
+
+A geom counts where its group is in ``inertiagrouprange`` and its mass is above 1e-14 kg. Where one
+counts, and ``inertiafromgeom`` is "true", or "auto" without an <inertial>, the geoms decide. Else the
+<inertial> does. Then ``boundmass`` and ``boundinertia`` raise what is below them, and
+``balanceinertia`` makes an impossible inertia that of a sphere.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Final
+
 import numpy as np
 
+from mbkit._check import Array
 from mbkit.load.attributes import Reader
 from mbkit.load.mjcf_values import ORIENTATIONS, Compiler, Pose, pose, z_to
 from mbkit.load.solids import NOTHING, SIZES, Lump, solid, together
 from mbkit.load.xml import Element
 
-__all__ = ["body_lump"]
+__all__ = ["body_lump", "counts"]
+
+# MuJoCo 4.0.0 counts geoms above this mass, in kg.
+_LEAST_MASS: Final = 1e-14
 
 
 def body_lump(
     inertials: list[tuple[Element, Pose]],
     geoms: list[tuple[Element, Pose]],
+    place: Array,
     compiler: Compiler,
     read: Reader,
     who: str,
-) -> Lump:
-    """Return a body's mass, centre of mass and inertia in its own axes.
+) -> tuple[Lump | None, list[str]]:
+    """Return a body's mass, centre of mass and inertia in its own axes, and the settings that changed them.
+
+    None stands for an inertia that only MuJoCo's compiler can infer: of a mesh, or of a shell.
 
     Parameters
     ----------
     inertials, geoms : list of (Element, Pose)
-        With the pose of the <frame> they stand in; defaults filled in.
+        With the pose of the <frame> they stand in; defaults filled in. Geoms are those that `counts` lets through.
+    place : (3,) array
+        Of the body in its parent or <frame>, as it is written.
     compiler, read, who
         Settings, where faults go, and whom they blame.
     """
     if len(inertials) > 1:
         read.fault(f"{who}: {len(inertials)} <inertial> elements; keep one", inertials[1][0])
-    before = len(read.faults)
-    if inertials and not (compiler.inertiafromgeom and geoms):
-        lump = _written(*inertials[0], compiler, read, who)
-    elif compiler.inertiafromgeom is False:
-        lump = NOTHING
-    else:
-        first, last = compiler.groups
-        lumps = [
-            _geom(e, X, compiler, read, who) for e, X in geoms if first <= read.number(e, "group", who, 0.0) <= last
-        ]
-        lump = together([x for x in lumps if x.mass]) if any(x.mass for x in lumps) else NOTHING
-    if len(read.faults) == before:
-        _check_bounds(lump, compiler, read, who)
-    return lump
+    infer = compiler.inertiafromgeom
+    if infer or (infer is None and not inertials):
+        lumps = [_geom(e, X, compiler, read, who) for e, X in geoms]
+        if any(x is None for x in lumps):
+            return None, []
+        heavy = [x for x in lumps if x and x.mass > _LEAST_MASS]
+        if heavy:
+            # A flat body's A + B and C differ by rounding.
+            return _bounded(together(heavy), compiler, slack=1e-14)
+    if not inertials:
+        lump, changed = _bounded(NOTHING, compiler)
+        # MuJoCo takes that place for the centre of mass in the body.
+        return replace(lump, com=place) if changed else lump, changed
+    principal, placed = _written(*inertials[0], compiler, read, who)
+    lump, changed = _bounded(principal, compiler, slack=1e-14 if "fullinertia" in inertials[0][0].attributes else 0.0)
+    return lump.moved(placed.R, placed.p), changed
 
 
-def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, who: str) -> Lump:
+def _bounded(lump: Lump, compiler: Compiler, slack: float = 0.0) -> tuple[Lump, list[str]]:
+    """Return a lump after the compiler's bounds, and the settings that changed it.
+
+    `slack` is the relative rounding of the principal moments.
+    """
+    mass, inertia, changed = lump.mass, lump.inertia, list[str]()
+    if mass < compiler.boundmass > 0:
+        mass = compiler.boundmass
+        changed.append("boundmass")
+    moments, axes = np.linalg.eigh(inertia)
+    if moments[0] < compiler.boundinertia > 0:
+        moments = np.maximum(moments, compiler.boundinertia)
+        inertia = axes @ np.diag(moments) @ axes.T
+        changed.append("boundinertia")
+    if compiler.balanceinertia and moments[0] + moments[1] < moments[2] * (1 - slack):
+        inertia = float(np.mean(moments)) * np.eye(3)
+        changed.append("balanceinertia")
+    return (Lump(mass, lump.com, inertia) if changed else lump), changed
+
+
+def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, who: str) -> tuple[Lump, Pose]:
+    """Return an <inertial> about its own centre, and its pose in the body."""
     mass = read.number(element, "mass", who)
     if mass < 0:
         read.fault(f"{who}: mass {mass:g} kg is negative; expected 0 or more", element)
@@ -60,34 +101,38 @@ def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, who: s
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     else:
         inertia = np.diag(read.numbers(element, "diaginertia", who, count=3, default=(0, 0, 0)))
-    return Lump(mass, np.zeros(3), inertia).moved(placed.R, placed.p)
+    return Lump(mass, np.zeros(3), inertia), placed
 
 
-def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, who: str) -> Lump:
+def counts(geom: Element, compiler: Compiler, read: Reader, who: str) -> bool:
+    """Return whether a geom, with its defaults filled in, may give its body mass."""
+    first, last = compiler.groups
+    given = geom.attributes
+    # A number that cannot be read is a fault where it is used.
+    amount = Reader().number(geom, "mass" if "mass" in given else "density", who, 1000.0)
+    inside = first <= read.number(geom, "group", who, 0.0) <= last
+    return inside and amount != 0 and given.get("type", "sphere") not in ("plane", "hfield")
+
+
+def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, who: str) -> Lump | None:
+    """Return what a geom adds to its body; None where only MuJoCo's compiler can tell."""
     given = element.attributes
-    density = read.number(element, "density", who, 1000.0)
-    mass = read.number(element, "mass", who, -1.0)
-    if density < 0 or ("mass" in given and mass < 0):
+    amount = read.number(element, "mass" if "mass" in given else "density", who, 1000.0)
+    if amount < 0:
         read.fault(f"{who}: a geom's mass or density is negative; expected 0 or more", element)
         return NOTHING
     shape = given.get("type", "sphere")
-    if mass == 0 or (density == 0 and "mass" not in given) or shape in ("plane", "hfield"):
-        return NOTHING
-    if shape in ("mesh", "sdf") or "mesh" in given:
-        read.fault(f"{who}: its inertia would come from a mesh, and meshes are not opened; add <inertial>", element)
-        return NOTHING
+    if shape in ("mesh", "sdf") or "mesh" in given or given.get("shellinertia", "false") != "false":
+        return None
     if shape not in SIZES:
-        read.fault(f"{who}: geom type {shape[:40]!r}; expected one of {', '.join(SIZES)}", element)
-        return NOTHING
-    if given.get("shellinertia", "false") != "false":
-        read.fault(f"{who}: the inertia of a shell is not read; add <inertial>", element)
+        read.fault(f"{who}: geom type {shape[:40]!r}; expected one of {', '.join((*SIZES, 'mesh'))}", element)
         return NOTHING
     before = len(read.faults)
     size, placed = _sized(element, shape, compiler, read, who)
     if len(read.faults) > before:
         return NOTHING
     lump = solid(shape, size)
-    return lump.scaled(mass / lump.mass if "mass" in given else density).moved((X @ placed).R, (X @ placed).p)
+    return lump.scaled(amount / lump.mass if "mass" in given else amount).moved((X @ placed).R, (X @ placed).p)
 
 
 def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, who: str) -> tuple[tuple[float, ...], Pose]:
@@ -114,12 +159,3 @@ def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, who: 
         told = " ".join(f"{x:g}" for x in size)
         read.fault(f"{who}: a {shape} of size {told}; expected sizes above 0", element)
     return size, placed
-
-
-def _check_bounds(lump: Lump, compiler: Compiler, read: Reader, who: str) -> None:
-    """Name the bodies that boundmass or boundinertia would change; nothing is changed here."""
-    if lump.mass < compiler.boundmass:
-        read.fault(f"{who}: compiler boundmass would raise its mass {lump.mass:g} kg; write the mass you mean")
-    smallest = float(np.linalg.eigvalsh(lump.inertia)[0])
-    if compiler.boundinertia > 0 and smallest < compiler.boundinertia:
-        read.fault(f"{who}: compiler boundinertia would raise its inertia {smallest:g} kg m²; write what you mean")

@@ -11,9 +11,9 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.attributes import Reader
-from mbkit.load.mjcf_mass import body_lump
+from mbkit.load.mjcf_mass import body_lump, counts
 from mbkit.load.mjcf_values import HERE, Compiler, Defaults, Pose, pose
-from mbkit.load.solids import Lump
+from mbkit.load.solids import NOTHING, Lump
 from mbkit.load.xml import Element
 
 __all__ = ["KINDS", "MjcfBody", "MjcfJoint", "Scene", "unfolded", "walk"]
@@ -55,7 +55,7 @@ class MjcfBody:
     pose : Pose
         In the parent's axes, with the <frame> elements around it.
     lump : Lump
-        In its own axes.
+        In its own axes; nothing while ``Scene.inferred`` has the body.
     sites : list of (str, Pose)
     """
 
@@ -74,14 +74,29 @@ class MjcfBody:
 
 @dataclass
 class Scene:
-    """What is known while the tree is walked."""
+    """What is known while the tree is walked.
+
+    Attributes
+    ----------
+    called : dict
+        The names of bodies and joints, given or made up, by the id of the element.
+    inferred : dict
+        Bodies whose inertia MuJoCo's compiler infers, and the geoms with their meshes that count for it.
+    bounded : dict
+        The compiler's settings that changed a body's mass or inertia, and the bodies.
+    left_out : collections.Counter
+        What the file says about the motion and a `Model` does not hold.
+    """
 
     compiler: Compiler
     defaults: Defaults
     read: Reader
     bodies: list[MjcfBody] = field(default_factory=list)
     names: dict[str, set[str]] = field(default_factory=lambda: {"body": {"world"}, "joint": set(), "site": set()})
+    called: dict[int, str] = field(default_factory=dict)
     unnamed: Counter[str] = field(default_factory=Counter)
+    inferred: dict[str, list[tuple[Element, str]]] = field(default_factory=dict)
+    bounded: dict[str, list[str]] = field(default_factory=dict)
     left_out: Counter[str] = field(default_factory=Counter)
 
     def collect_names(self, world: Element) -> None:
@@ -96,11 +111,12 @@ class Scene:
 
     def name(self, element: Element, kind: str, fallback: str) -> str:
         """Return the element's name, or one made up."""
-        given = element.attributes.get("name", "")
-        if given:
-            return given
-        self.unnamed[kind] += 1
-        return self.unused(kind, fallback)
+        name = element.attributes.get("name", "")
+        if not name:
+            self.unnamed[kind] += 1
+            name = self.unused(kind, fallback)
+        self.called[id(element)] = name
+        return name
 
     def unused(self, kind: str, name: str) -> str:
         """Return this name, or a longer one that is free, and take it."""
@@ -118,7 +134,9 @@ def unfolded(
         if child.tag != "frame":
             yield child, X, childclass
             continue
-        inner = scene.defaults.known(child.attributes.get("childclass"), child) or childclass
+        # MuJoCo takes a frame's class for its childclass.
+        own = child.attributes.get("childclass", child.attributes.get("class"))
+        inner = scene.defaults.known(own, child) or childclass
         yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, who), inner, scene, who)
 
 
@@ -128,7 +146,7 @@ def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: 
     who = f"body {name!r}"
     read, compiler = scene.read, scene.compiler
     childclass = scene.defaults.known(element.attributes.get("childclass"), element) or childclass
-    placed = X @ pose(element, compiler, read, who)
+    own = pose(element, compiler, read, who)
     if read.number(element, "gravcomp", who, 0.0):
         scene.left_out["gravity compensation"] += 1
     if element.attributes.get("mocap") == "true":
@@ -137,9 +155,14 @@ def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: 
     joints = [_joint(e, name, Y, c, scene) for e, Y, c in parts if e.tag in ("joint", "freejoint")]
     _check_joints(joints, parent, who, read)
     inertials = [(e, Y) for e, Y, _ in parts if e.tag == "inertial"]
-    geoms = [(scene.defaults.filled(e, c), Y) for e, Y, c in parts if e.tag == "geom"]
-    lump = body_lump(inertials, geoms, compiler, read, who)
-    body = MjcfBody(name, parent, placed, joints, lump, [])
+    geoms = [(e, scene.defaults.filled(e, c), Y) for e, Y, c in parts if e.tag == "geom"]
+    geoms = [(e, full, Y) for e, full, Y in geoms if counts(full, compiler, read, who)]
+    lump, changed = body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, who)
+    if lump is None:
+        scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
+    for setting in changed:
+        scene.bounded.setdefault(setting, []).append(name)
+    body = MjcfBody(name, parent, X @ own, joints, lump or NOTHING, [])
     scene.bodies.append(body)
     for e, Y, c in parts:
         if e.tag == "site":

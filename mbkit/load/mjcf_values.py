@@ -47,6 +47,7 @@ class Compiler:
         None: only where there is no <inertial>.
     groups : (float, float)
         First and last geom group that has mass.
+    balanceinertia : bool
     boundmass, boundinertia, settotalmass : float
     """
 
@@ -55,6 +56,7 @@ class Compiler:
     autolimits: bool = True
     inertiafromgeom: bool | None = None
     groups: tuple[float, float] = (0.0, 5.0)
+    balanceinertia: bool = False
     boundmass: float = 0.0
     boundinertia: float = 0.0
     settotalmass: float = -1.0
@@ -78,26 +80,18 @@ class Compiler:
             seq = "xyz"
         low, high = read.numbers(merged, "inertiagrouprange", who, count=2, default=(0.0, 5.0))
         return cls(
-            angle={"degree": np.pi / 180, "radian": 1.0}[_choice(merged, "angle", ("degree", "radian"), read)],
+            angle={"degree": np.pi / 180, "radian": 1.0}[read.choice(merged, "angle", ("degree", "radian"))],
             eulerseq=seq,
-            autolimits=_choice(merged, "autolimits", ("true", "false"), read) == "true",
+            autolimits=read.choice(merged, "autolimits", ("true", "false")) == "true",
             inertiafromgeom={"auto": None, "true": True, "false": False}[
-                _choice(merged, "inertiafromgeom", ("auto", "true", "false"), read)
+                read.choice(merged, "inertiafromgeom", ("auto", "true", "false"))
             ],
             groups=(low, high),
+            balanceinertia=read.choice(merged, "balanceinertia", ("false", "true")) == "true",
             boundmass=read.number(merged, "boundmass", who, 0.0),
             boundinertia=read.number(merged, "boundinertia", who, 0.0),
             settotalmass=read.number(merged, "settotalmass", who, -1.0),
         )
-
-
-def _choice(element: Element, attribute: str, choices: tuple[str, ...], read: Reader) -> str:
-    """Return one of the choices, the first where the attribute is absent."""
-    value = element.attributes.get(attribute, choices[0])
-    if value in choices:
-        return value
-    read.fault(f"{element.tag} {attribute}: expected one of {', '.join(choices)}, got {value[:40]!r}", element)
-    return choices[0]
 
 
 class Defaults:
@@ -107,6 +101,8 @@ class Defaults:
         self.read = read
         self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for element in mujoco.all("default"):
+            if element.attributes.get("class", "main") != "main":
+                read.fault("the outermost <default> has another class than 'main'; put a <default> around it", element)
             self._collect(element, self.classes["main"], "main")
 
     def _collect(self, element: Element, values: dict[str, dict[str, str]], name: str) -> None:

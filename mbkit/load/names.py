@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from mbkit.errors import LoadError, UnknownNameError
 
-__all__ = ["Entry", "entries", "find", "unknown"]
+__all__ = ["Entry", "canonical", "entries", "find", "unknown"]
 
 _PACKAGE: Final = "example-robot-data"
 
@@ -60,6 +60,16 @@ def entries() -> tuple[Entry, ...]:
 def find(name: str) -> Entry | None:
     """Return the robot of this name, or None; case and ``-`` or ``_`` do not matter."""
     return _table()[1].get(_key(name))
+
+
+def canonical(name: str) -> str | None:
+    """Return a robot's name as it is listed, whatever its case here; None for no robot's name."""
+    robot = find(name)
+    if robot is None:
+        return None
+    folder, _, stem = robot.name.partition("/")
+    spellings = (*robot.aliases, robot.name, f"{_short_folder(folder)}/{stem}")
+    return next(s for s in spellings if _key(s) == _key(name))
 
 
 def unknown(name: str) -> UnknownNameError:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from mbkit.errors import LoadError, ModelError
 from mbkit.load.snap import Snapper
-from mbkit.load.urdf_file import UrdfFile
+from mbkit.load.urdf_file import UrdfFile, unbounded
 from mbkit.load.urdf_tree import UrdfJoint
 from mbkit.model import Body, Mimic, Model, ModelBuilder
 from mbkit.model.physical import body_fault
@@ -60,6 +60,8 @@ class _Conversion:
         self.bodies: list[str] = []
         self.suspects: set[str] = set()
         self.renamed: list[str] = []
+        # Links that no matter is like, by the body that they were merged into.
+        self.odd: dict[str, list[tuple[str, str]]] = {}
 
     def run(self, source: str, nonphysical: Literal["error", "warn"], gravity: ArrayLike) -> Model:
         """Describe the parsed model, joint by joint."""
@@ -68,11 +70,12 @@ class _Conversion:
         for index in range(1, self.raw.njoints):
             self._add_joint(b, index, X_base)
         self._add_frames(b, X_base)
+        self.odd = self._odd_links()
         for note in (*self.urdf.notes, *self._mimic_notes(), *self._odd_notes(), *self._rename_notes(), self.snap.note):
             if note:
                 b.note(note)
         try:
-            return b.build(nonphysical=nonphysical, point_masses=False)
+            return b.build(nonphysical=nonphysical, point_masses=False, parts=self.odd)
         except ModelError as error:
             raise ModelError(source, error.faults) from None
 
@@ -145,11 +148,11 @@ class _Conversion:
         v = slice(joint.idx_v, joint.idx_v + joint.nv)
         limits: dict[str, Any] = {}
         if kind in ("revolute", "prismatic"):
-            limits["lower"] = _unbounded(raw.lowerPositionLimit[joint.idx_q])
-            limits["upper"] = _unbounded(raw.upperPositionLimit[joint.idx_q])
+            limits["lower"] = unbounded(raw.lowerPositionLimit[joint.idx_q])
+            limits["upper"] = unbounded(raw.upperPositionLimit[joint.idx_q])
         if joint.nv == 1:
-            limits["velocity_limit"] = _unbounded(raw.upperVelocityLimit[joint.idx_v])
-            limits["effort_limit"] = _unbounded(raw.upperEffortLimit[joint.idx_v])
+            limits["velocity_limit"] = unbounded(raw.upperVelocityLimit[joint.idx_v])
+            limits["effort_limit"] = unbounded(raw.upperEffortLimit[joint.idx_v])
         b.add_joint(
             name,
             kind,
@@ -194,12 +197,16 @@ class _Conversion:
             return [f"mimic joints kept independent, as mimic='free' asks: {told}"]
         return [f"mimic joints reduced, so that they have no coordinate of their own: {told}"]
 
-    def _odd_notes(self) -> list[str]:
-        healed = []
+    def _odd_links(self) -> dict[str, list[tuple[str, str]]]:
+        bodies: dict[str, list[tuple[str, str]]] = {}
         for link, why in self.urdf.odd_links.items():
             frame = self.raw.frames[self.raw.getFrameId(link, pin.BODY)]
-            if self.bodies[frame.parentJoint] not in self.suspects:
-                healed.append(f"{link} ({why})")
+            bodies.setdefault(self.bodies[frame.parentJoint], []).append((link, why))
+        return bodies
+
+    def _odd_notes(self) -> list[str]:
+        odd = [(body, link, why) for body, links in self.odd.items() for link, why in links]
+        healed = [f"{link} ({why})" for body, link, why in odd if body not in self.suspects]
         if not healed:
             return []
         told = "; ".join(healed[:5]) + (f"; and {len(healed) - 5} more" if len(healed) > 5 else "")
@@ -220,8 +227,3 @@ def _kind(joint: Any) -> tuple[str, Any]:
         motion = np.ravel(data.S)
         return _UNALIGNED[name], motion[:3] if name.startswith("P") else motion[3:]
     return _WHOLE[name], None
-
-
-def _unbounded(x: float) -> float:
-    """Return a limit, infinite where a parser's largest double stands for none."""
-    return float(x) if abs(x) < 1e300 else float(np.copysign(np.inf, x))

@@ -7,22 +7,23 @@ and everything else that could point outside the file are gone from that text.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from mbkit.errors import ModelError
-from mbkit.load.attributes import Reader
+from mbkit.load.attributes import Reader, misspelt
 from mbkit.load.urdf_tree import UrdfJoint, check_mimics, check_names, check_size, check_tree
 from mbkit.load.xml import Element
 from mbkit.model import Body, Mimic
 from mbkit.model.physical import body_fault
 
-__all__ = ["UrdfFile", "examine"]
+__all__ = ["UrdfFile", "examine", "unbounded"]
 
 _KINDS: Final = {
     "fixed": "fixed",
@@ -32,6 +33,10 @@ _KINDS: Final = {
     "floating": "free",
     "planar": "planar",
 }
+# What Pinocchio's parser takes for no limit.
+_OPEN: Final = "{}1.7976931348623157e308"
+# How many names stand in a note.
+_MOST_TOLD: Final = 40
 _MOMENTS: Final = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -89,6 +94,7 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
     name = robot.attributes.get("name", "")
     if not name.strip():
         read.fault('<robot> has no name; write <robot name="...">', robot)
+    unread = _unread(robot, read)
     macros = [e for e in robot.walk() if e.tag.startswith("xacro:")]
     if macros:
         read.fault(f"{len(macros)} xacro elements, such as <{macros[0].tag}>; run xacro on the file first", macros[0])
@@ -106,9 +112,14 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
         read.fault("joint 'root_joint': floating_base=True adds a joint of that name; rename yours")
     if read.faults:
         raise ModelError(source, read.faults)
-    notes += _left_out(robot)
+    notes += [*read.notes, *unread]
     text = _written("robot", {"name": name}, [*link_texts, *(t for _, t in made)])
     return UrdfFile(name, text, root, tuple(joints), frozenset(links), odd, tuple(notes))
+
+
+def unbounded(limit: float) -> float:
+    """Return a limit, infinite where a parser's largest double stands for none."""
+    return limit if abs(limit) < 1e300 else math.copysign(math.inf, limit)
 
 
 # Single elements. Each returns its text: numbers as they were written, one space
@@ -234,17 +245,94 @@ def _limit(joint: Element, kind: str, who: str, read: Reader) -> list[str]:
         if read.number(limit, attribute, who, needed, bounded=False) < 0:
             read.fault(f"{who}: limit {attribute} is negative; expected 0 or more", limit)
     if bounded and lower > upper:
-        read.fault(f"{who}: lower limit {lower:g} above upper limit {upper:g}; swap them", limit)
+        # PyBullet and others write no limit in this way.
+        read.notes.append(f"{who}: lower limit {lower:g} above upper limit {upper:g}, read as no limit ({limit.place})")
+        unlimited = {"lower": _OPEN.format("-"), "upper": _OPEN.format("")}
+        return [
+            _copied(replace(limit, attributes=limit.attributes | unlimited), "lower", "upper", "effort", "velocity")
+        ]
     if not bounded and not (kind == "continuous" and {"effort", "velocity"} <= limit.attributes.keys()):
         return []
     return [_copied(limit, "lower", "upper", "effort", "velocity")]
 
 
-def _left_out(robot: Element) -> list[str]:
-    """Say which elements were not looked at."""
-    counts = Counter(c.tag for c in robot.children if c.tag not in ("link", "joint"))
-    for part in (*robot.all("link"), *robot.all("joint")):
-        read = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
-        counts.update(c.tag for c in part.children if c.tag not in read)
-    told = ", ".join(f"{n} {tag}" for tag, n in sorted(counts.items()))
-    return [f"left out of the file, with every path in it: {told}"] if told else []
+# What URDF says of dynamics: the elements in each element, and its attributes.
+_SCHEMA: Final[Mapping[str, tuple[frozenset[str], frozenset[str]]]] = {
+    tag: (frozenset(children.split()), frozenset(attributes.split()))
+    for tag, children, attributes in (
+        ("robot", "link joint", "name version"),
+        ("link", "inertial", "name"),
+        ("inertial", "origin mass inertia", ""),
+        ("origin", "", "xyz rpy"),
+        ("mass", "", "value"),
+        ("inertia", "", " ".join(_MOMENTS)),
+        ("joint", "origin parent child axis limit dynamics mimic", "name type"),
+        ("parent", "", "link"),
+        ("child", "", "link"),
+        ("axis", "", "xyz"),
+        ("limit", "", "lower upper effort velocity"),
+        ("dynamics", "", "damping friction"),
+        ("mimic", "", "joint multiplier offset"),
+    )
+}
+# Elements and attributes with a meaning of their own, in the specification or in common extensions.
+_EXTENSIONS: Final = frozenset({"visual", "collision", "material", "transmission", "contact", "calibration"})
+# In these each unknown name would be a part of the dynamics that is lost, but for what simulators keep there.
+_WHOLE: Final = frozenset({"inertial", "origin", "mass", "inertia", "parent", "child", "dynamics", "mimic"})
+_HARMLESS: Final = frozenset({"D", "K", "mu_coulomb", "mu_viscous"})
+
+
+def _unread(robot: Element, read: Reader) -> list[str]:
+    """Find misspelt and misplaced names where dynamics is written, and say what else was not looked at."""
+    elements: Counter[str] = Counter()
+    attributes: Counter[str] = Counter()
+    stack = [robot]
+    while stack:
+        element = stack.pop()
+        children, known = _SCHEMA[element.tag]
+        for name in element.attributes.keys() - known:
+            if not _misspelt_attribute(element, name, known, read) and not name.startswith("xmlns"):
+                attributes[f"{element.tag} {name}"] += 1
+        stack.extend(c for c in reversed(element.children) if c.tag in children)
+        for child in element.children:
+            if child.tag not in children and not _misspelt_element(element, child, children, read):
+                elements[child.tag] += 1
+    notes = []
+    for what, counts in (
+        ("left out of the file, with every path in it", elements),
+        ("attributes that URDF does not define, left out", attributes),
+    ):
+        told = ", ".join(f"{n} {tag[:40]}" for tag, n in sorted(counts.items())[:_MOST_TOLD])
+        told += f" and {len(counts) - _MOST_TOLD} more" if len(counts) > _MOST_TOLD else ""
+        notes += [f"{what}: {told}"] if told else []
+    return notes
+
+
+def _misspelt_attribute(element: Element, name: str, known: frozenset[str], read: Reader) -> bool:
+    """Keep a fault where an attribute is a misspelt one, or an unknown one among numbers of the dynamics."""
+    if ":" in name or name in _HARMLESS:
+        return False
+    meant = misspelt(name, known)
+    if not meant and element.tag not in _WHOLE:
+        return False
+    hint = f"did you mean {meant!r}?" if meant else f"expected {', '.join(sorted(known)) or 'none'}"
+    read.fault(f"<{element.tag}>: unknown attribute {name[:60]!r}; {hint}", element)
+    return True
+
+
+def _misspelt_element(owner: Element, child: Element, known: frozenset[str], read: Reader) -> bool:
+    """Keep a fault where an element is a misspelt or misplaced one."""
+    if ":" in child.tag or child.tag in _EXTENSIONS or (owner.tag, child.tag) == ("link", "origin"):
+        return False
+    places = [f"<{tag}>" for tag, (inside, _) in _SCHEMA.items() if child.tag in inside]
+    meant = "" if places else misspelt(child.tag, known)
+    if places:
+        hint = f"it belongs into {' or '.join(places)}"
+    elif meant:
+        hint = f"did you mean <{meant}>?"
+    elif owner.tag in _WHOLE:
+        hint = f"expected {', '.join(f'<{tag}>' for tag in sorted(known)) or 'none'}"
+    else:
+        return False
+    read.fault(f"<{owner.tag}>: unknown element <{child.tag[:60]}>; {hint}", child)
+    return True

@@ -7,6 +7,7 @@ origin, rpy are turns about fixed x, y and z, and a missing axis is x.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,9 +18,9 @@ from mbkit._check import Array
 from mbkit.load import xml
 from mbkit.load.floating import BASE_JOINT
 from mbkit.load.snap import Snapper
-from mbkit.load.urdf_file import UrdfFile, examine
+from mbkit.load.urdf_file import examine, unbounded
 from mbkit.load.xml import Element
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Mimic, Model, ModelBuilder
 
 __all__ = ["urdf_links"]
 
@@ -54,8 +55,9 @@ def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Mo
         while name in names:
             name += "_"
         b.add_joint(name, "fixed", parent="world", child=base)
+    mimics = {j.name: j.mimic for j in urdf.joints}
     for joint in robot.all("joint"):
-        _add_joint(b, joint, urdf, snap)
+        _add_joint(b, joint, mimics, snap)
     for note in urdf.notes:
         b.note(note)
     return b.build(nonphysical="warn", point_masses=False)
@@ -86,7 +88,7 @@ def _add_link(b: ModelBuilder, link: Element, snap: Snapper) -> None:
     b.add_body(name, mass=float(_numbers(mass, "value", "0")[0]), com=p, inertia=0.5 * (turned + turned.T))
 
 
-def _add_joint(b: ModelBuilder, joint: Element, urdf: UrdfFile, snap: Snapper) -> None:
+def _add_joint(b: ModelBuilder, joint: Element, mimics: Mapping[str, Mimic | None], snap: Snapper) -> None:
     name, kind = joint.attributes["name"], _KINDS.get(joint.attributes["type"], joint.attributes["type"])
     R, p = _pose(joint, snap)
     parent, child = (e.attributes["link"] for tag in ("parent", "child") for e in joint.all(tag))
@@ -96,12 +98,12 @@ def _add_joint(b: ModelBuilder, joint: Element, urdf: UrdfFile, snap: Snapper) -
         given["axis"] = _numbers(joint.first("axis"), "xyz", "1 0 0")
         given["damping"] = float(_numbers(dynamics, "damping", "0")[0])
         given["friction"] = float(_numbers(dynamics, "friction", "0")[0])
-        given["mimic"] = next(j.mimic for j in urdf.joints if j.name == name)
+        given["mimic"] = mimics[name]
         for ours, theirs in (("velocity_limit", "velocity"), ("effort_limit", "effort")):
             if limit is not None and theirs in limit.attributes:
-                given[ours] = float(_numbers(limit, theirs, "0")[0])
+                given[ours] = unbounded(float(_numbers(limit, theirs, "0")[0]))
         if limit is not None and kind != "continuous":
-            given["lower"], given["upper"] = (float(_numbers(limit, x, "0")[0]) for x in ("lower", "upper"))
+            given["lower"], given["upper"] = (unbounded(float(_numbers(limit, x, "0")[0])) for x in ("lower", "upper"))
     b.add_joint(name, kind, parent=parent, child=child, translation=p, rotation=R, **given)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from mbkit.errors import nearest
+from mbkit.errors import Suggestions
 from mbkit.load.attributes import Reader
 from mbkit.model import Mimic
 
@@ -35,11 +35,12 @@ def check_names(links: Sequence[str], joints: Sequence[UrdfJoint], read: Reader)
             if count > 1 and name:
                 read.fault(f"{what} {name!r}: declared {count} times; names must differ")
     known = dict.fromkeys(n for n in links if n)
+    suggestions = Suggestions()
     for joint in joints:
         for end in (joint.parent, joint.child):
             if end and end not in known:
-                near = nearest(end, known)
-                hint = f"did you mean {near[0]!r}?" if near else "add the link"
+                near = suggestions.near(end, known)
+                hint = f"did you mean {near!r}?" if near else "add the link"
                 read.fault(f"joint {joint.name!r}: unknown link {end!r}; {hint}")
 
 
@@ -102,12 +103,13 @@ def check_mimics(
     """Return the joints without the tags that cannot be followed, and what was said about those."""
     by_name = {j.name: j for j in joints}
     out, fixed, lost = [], [], []
+    suggestions = Suggestions()
     for joint in joints:
         keep = joint.mimic
         if keep is not None and joint.kind == "fixed":
             keep = None
             fixed.append(joint.name)
-        elif keep is not None and (why := _why_lost(keep.joint, by_name)):
+        elif keep is not None and (why := _why_lost(keep.joint, by_name, suggestions)):
             keep = None
             lost.append(f"{joint.name} (mimics {why})")
             if matters and not lenient:
@@ -121,8 +123,8 @@ def check_mimics(
     return out, notes
 
 
-def _why_lost(leader: str, by_name: Mapping[str, UrdfJoint]) -> str:
+def _why_lost(leader: str, by_name: Mapping[str, UrdfJoint], suggestions: Suggestions) -> str:
     if leader not in by_name:
-        near = nearest(leader, by_name)
-        return f"unknown joint {leader!r}" + (f", near {near[0]!r}" if near else "")
+        near = suggestions.near(leader, by_name)
+        return f"unknown joint {leader!r}" + (f", near {near!r}" if near else "")
     return f"fixed joint {leader!r}" if by_name[leader].kind == "fixed" else ""

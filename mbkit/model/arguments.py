@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import Array, finite_array, real
+from mbkit._check import Array, _as_float, finite_array, real, shown
 from mbkit.errors import InputError
 from mbkit.model.kinds import kind_of
 from mbkit.model.parameter import Expression, Number, nominal
 from mbkit.model.parts import Mimic
 
 __all__ = ["ArgumentReader", "shape_of"]
+
+# The squares of sums of such lengths still fit a double.
+_LONGEST: Final = 1e150
+_LONGEST_NAME: Final = 1000
 
 
 class ArgumentReader:
@@ -29,6 +33,18 @@ class ArgumentReader:
 
     def __init__(self) -> None:
         self.faults: list[str] = []
+
+    def name(self, what: str, value: Any, longest: int = _LONGEST_NAME) -> str:
+        """Return a name: text that UTF-8 can hold, short enough for a message."""
+        if not isinstance(value, str):
+            self.faults.append(f"{what}: expected a name, got {shown(value)}")
+            return shown(value)
+        text = value.encode("utf-8", "backslashreplace").decode()
+        if text != value:
+            self.faults.append(f"{what}: expected text, got lone surrogates, which UTF-8 cannot hold: {text[:60]!r}")
+        if len(text) > longest:
+            self.faults.append(f"{what}: expected up to {longest} characters, got {len(text)}")
+        return text[:longest]
 
     def vector(self, name: str, value: ArrayLike, n: int) -> Array:
         """Return n finite numbers; a single one is repeated."""
@@ -83,6 +99,15 @@ class ArgumentReader:
             return np.zeros(n)
         return np.array([self.quantity(f"{name}[{i}]", x) for i, x in enumerate(array)], dtype=object)
 
+    def place(self, name: str, value: Any) -> Array:
+        """Return three lengths, or expressions, whose squares do not overflow."""
+        lengths = self.quantities(name, value, 3)
+        largest = max(abs(nominal(x)) for x in lengths)
+        if largest > _LONGEST:
+            self.faults.append(f"{name}: expected lengths up to {_LONGEST:g} m, got {largest:g}")
+            return np.zeros(3)
+        return lengths
+
     def inertia(self, name: str, value: Any) -> Array:
         """Return a symmetric 3 by 3 matrix, given as such or by its diagonal, or zeros for None."""
         if value is None:
@@ -107,17 +132,17 @@ class ArgumentReader:
         if value is None:
             return np.full(n, default)
         try:
-            array = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
+            array = _as_float(name, value)
+        except InputError:
             array = np.full(n, np.nan)
         if array.ndim == 0:
             array = np.full(n, float(array))
         if array.shape != (n,) or np.isnan(array).any():
-            self.faults.append(f"{name}: expected {n} numbers (infinite where there is no limit), got {value!r}")
+            self.faults.append(f"{name}: expected {n} numbers (infinite where there is no limit), got {shown(value)}")
             return np.full(n, default)
         return array
 
-    def rotation(self, who: str, rotation: ArrayLike | None, rpy: ArrayLike | None) -> Array:
+    def rotation(self, who: str, rotation: ArrayLike | None, rpy: ArrayLike | None, name: str = "rotation") -> Array:
         """Return a rotation matrix, given as such or as roll, pitch, yaw."""
         if rotation is not None and rpy is not None:
             self.faults.append(f"{who}: both rotation and rpy given; give one")
@@ -125,9 +150,9 @@ class ArgumentReader:
             return spatial.matrix_from_rpy(*self.vector(f"{who}: rpy", rpy, 3))
         if rotation is None:
             return np.eye(3)
-        R = self.matrix(f"{who}: rotation", rotation)
+        R = self.matrix(f"{who}: {name}", rotation)
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0:
-            self.faults.append(f"{who}: rotation is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
+            self.faults.append(f"{who}: {name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
             return np.eye(3)
         return R
 
@@ -142,6 +167,10 @@ class ArgumentReader:
         out = np.zeros((wanted, 3))
         for i, a in enumerate(given):
             vector = self.vector(f"{who}: axis", a, 3)
+            # The square of a component may overflow, or vanish.
+            largest = float(np.abs(vector).max())
+            if largest and not 1e-100 < largest < 1e100:
+                vector = vector / largest
             length = float(np.linalg.norm(vector))
             if not length:
                 self.faults.append(f"{who}: axis is zero; expected a direction")
@@ -156,28 +185,30 @@ class ArgumentReader:
             value = (value.joint, value.ratio, value.offset)
         try:
             joint, ratio, offset = value
-        except (TypeError, ValueError):
-            self.faults.append(f"{who}: mimic: expected (joint, ratio, offset), got {value!r}")
+        except Exception:
+            # Any: iterating over an object may raise what it likes.
+            self.faults.append(f"{who}: mimic: expected (joint, ratio, offset), got {shown(value)}")
             return None
         return (
-            str(joint),
+            self.name(f"{who}: mimic joint", joint),
             self.quantity(f"{who}: mimic ratio", ratio),
             self.quantity(f"{who}: mimic offset", offset),
         )
 
 
-def _has_expressions(value: Any) -> bool:
-    """Return whether any entry of a number, array or nested sequence is an expression."""
+def _has_expressions(value: Any, depth: int = 3) -> bool:
+    """Return whether any entry of a number, array or nested sequence is an expression; matrices are the deepest."""
     if isinstance(value, np.ndarray):
-        return value.dtype == object and any(_has_expressions(x) for x in value.flat)
+        return value.dtype == object and any(_has_expressions(x, 0) for x in value.flat)
     if isinstance(value, (list, tuple)):
-        return any(_has_expressions(x) for x in value)
+        return depth > 0 and any(_has_expressions(x, depth - 1) for x in value)
     return isinstance(value, Expression)
 
 
-def shape_of(value: ArrayLike) -> tuple[int, ...] | None:
+def shape_of(value: Any) -> tuple[int, ...] | None:
     """Return the shape, or None of what has none, such as a ragged list."""
     try:
-        return np.shape(value)
-    except ValueError:
+        return tuple(np.shape(value))
+    except Exception:
+        # Any: objects may bring conversions of their own.
         return None

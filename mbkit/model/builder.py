@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbkit._check import shown
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.arguments import ArgumentReader
 from mbkit.model.binding import Binding, split
@@ -17,7 +18,7 @@ from mbkit.model.kinds import KINDS, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameter import Number
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
-from mbkit.model.physical import body_faults, suspects
+from mbkit.model.physical import body_faults, grouped, static_bodies, suspects
 from mbkit.model.structure import structure_faults
 
 __all__ = ["ModelBuilder"]
@@ -49,8 +50,8 @@ class ModelBuilder:
     """
 
     def __init__(self, name: str, gravity: ArrayLike | Sequence[Number] = (0.0, 0.0, -9.81)) -> None:
-        self._name = str(name)
         self._read = ArgumentReader()
+        self._name = self._read.name("name", name)
         self._bindings: list[Binding] = []
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
         self._bodies: list[Body] = []
@@ -83,15 +84,16 @@ class ModelBuilder:
             About the centre of mass, in body axes (or its diagonal), kg m².
             Without it the body is a point mass.
         """
+        name = self._read.name("body name", name)
         who = f"body {name!r}"
         numbers = self._numbers(
             "bodies",
-            str(name),
+            name,
             mass=self._read.quantity(f"{who}: mass", mass),
-            com=self._read.quantities(f"{who}: com", com, 3),
+            com=self._read.place(f"{who}: com", com),
             inertia=self._read.inertia(f"{who}: inertia", inertia),
         )
-        self._bodies.append(Body(str(name), **numbers))
+        self._bodies.append(Body(name, **numbers))
 
     def add_joint(
         self,
@@ -150,10 +152,12 @@ class ModelBuilder:
         mimic : Mimic or (joint, ratio, offset), optional
             The joint that this one follows.
         """
+        name = self._read.name("joint name", name)
         who = f"joint {name!r}"
         if not isinstance(kind, str) or kind not in KINDS:
-            near = nearest(str(kind), KINDS) or list(KINDS)
-            self._read.faults.append(f"{who}: unknown kind {kind!r}; use one of {', '.join(near)}")
+            near = nearest(kind, KINDS) if isinstance(kind, str) else []
+            near = near or list(KINDS)
+            self._read.faults.append(f"{who}: unknown kind {shown(kind)}; use one of {', '.join(near)}")
             # The other faults of this call would only be echoes of this one.
             kind, axis, axis2, pitch, mimic = "fixed", None, None, 0.0, None
             lower = upper = velocity_limit = effort_limit = None
@@ -162,11 +166,11 @@ class ModelBuilder:
         follows = None if mimic is None else self._read.mimic(who, mimic)
         leader = None
         if follows:
-            leader = Mimic(follows[0], **self._numbers("joints", str(name), ratio=follows[1], offset=follows[2]))
+            leader = Mimic(follows[0], **self._numbers("joints", name, ratio=follows[1], offset=follows[2]))
         numbers = self._numbers(
             "joints",
-            str(name),
-            translation=self._read.quantities(f"{who}: translation", translation, 3),
+            name,
+            translation=self._read.place(f"{who}: translation", translation),
             pitch=self._read.quantity(f"{who}: pitch", pitch),
             armature=self._read.quantities(f"{who}: armature", armature, type_.nv),
             damping=self._read.quantities(f"{who}: damping", damping, type_.nv),
@@ -175,10 +179,10 @@ class ModelBuilder:
         )
         self._joints.append(
             Joint(
-                name=str(name),
+                name=name,
                 kind=kind,
-                parent=str(parent),
-                child=str(child),
+                parent=self._read.name(f"{who}: parent", parent),
+                child=self._read.name(f"{who}: child", child),
                 rotation=self._read.rotation(who, rotation, rpy),
                 axes=self._read.axes(who, kind, axis, axis2),
                 lower=self._read.limits(f"{who}: lower", lower, type_.nq, -np.inf),
@@ -201,10 +205,13 @@ class ModelBuilder:
         rpy: ArrayLike | None = None,
     ) -> None:
         """Name a frame that is fixed to a body, for poses and Jacobians."""
+        name = self._read.name("frame name", name)
         who = f"frame {name!r}"
-        place = self._read.quantities(f"{who}: translation", translation, 3)
+        place = self._read.place(f"{who}: translation", translation)
         R = self._read.rotation(who, rotation, rpy)
-        self._frames.append(Frame(str(name), str(body), R, **self._numbers("frames", str(name), translation=place)))
+        self._frames.append(
+            Frame(name, self._read.name(f"{who}: body", body), R, **self._numbers("frames", name, translation=place))
+        )
 
     def add_spring(
         self,
@@ -238,17 +245,25 @@ class ModelBuilder:
         damping : float
             N s/m, on the rate of the distance.
         """
+        name = self._read.name("spring name", name)
         who = f"spring {name!r}"
         numbers = self._numbers(
             "springs",
-            str(name),
-            point_a=self._read.quantities(f"{who}: point_a", point_a, 3),
-            point_b=self._read.quantities(f"{who}: point_b", point_b, 3),
+            name,
+            point_a=self._read.place(f"{who}: point_a", point_a),
+            point_b=self._read.place(f"{who}: point_b", point_b),
             stiffness=self._read.quantity(f"{who}: stiffness", stiffness, nonnegative=True),
             rest_length=self._read.quantity(f"{who}: rest_length", rest_length, nonnegative=True),
             damping=self._read.quantity(f"{who}: damping", damping, nonnegative=True),
         )
-        self._springs.append(PointSpring(str(name), body_a=str(body_a), body_b=str(body_b), **numbers))
+        self._springs.append(
+            PointSpring(
+                name,
+                body_a=self._read.name(f"{who}: body_a", body_a),
+                body_b=self._read.name(f"{who}: body_b", body_b),
+                **numbers,
+            )
+        )
 
     def add_coupling(
         self,
@@ -274,20 +289,24 @@ class ModelBuilder:
         armature : float
             The kinetic energy is ½ armature (dl/dt)².
         """
+        name = self._read.name("coupling name", name)
         who = f"coupling {name!r}"
         if not hasattr(factors, "items"):
-            self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {factors!r}")
+            told = shown(factors)
+            self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {told}")
             return
         numbers = self._numbers(
             "couplings",
-            str(name),
+            name,
             factors=self._read.quantities(f"{who}: factors", list(factors.values()), len(factors)),
             stiffness=self._read.quantity(f"{who}: stiffness", stiffness, nonnegative=True),
             rest_length=self._read.quantity(f"{who}: rest_length", rest_length),
             damping=self._read.quantity(f"{who}: damping", damping, nonnegative=True),
             armature=self._read.quantity(f"{who}: armature", armature, nonnegative=True),
         )
-        self._couplings.append(JointCoupling(str(name), tuple(str(joint) for joint in factors), **numbers))
+        self._couplings.append(
+            JointCoupling(name, tuple(self._read.name(f"{who}: factors", j) for j in factors), **numbers)
+        )
 
     def add_loop(
         self,
@@ -317,23 +336,25 @@ class ModelBuilder:
         rotation_a, rotation_b : (3, 3) array_like, optional
             The frames' orientations in their bodies.
         """
+        name = self._read.name("loop name", name)
         who = f"loop {name!r}"
-        if kind not in ("point", "frame"):
-            self._read.faults.append(f"{who}: unknown kind {kind!r}; use 'point' or 'frame'")
+        if not isinstance(kind, str) or kind not in ("point", "frame"):
+            self._read.faults.append(f"{who}: unknown kind {shown(kind)}; use 'point' or 'frame'")
+            kind = "point"
         numbers = self._numbers(
             "loops",
-            str(name),
-            translation_a=self._read.quantities(f"{who}: translation_a", translation_a, 3),
-            translation_b=self._read.quantities(f"{who}: translation_b", translation_b, 3),
+            name,
+            translation_a=self._read.place(f"{who}: translation_a", translation_a),
+            translation_b=self._read.place(f"{who}: translation_b", translation_b),
         )
         self._loops.append(
             Loop(
-                name=str(name),
+                name=name,
                 kind=kind,
-                body_a=str(body_a),
-                rotation_a=self._read.rotation(who, rotation_a, None),
-                body_b=str(body_b),
-                rotation_b=self._read.rotation(who, rotation_b, None),
+                body_a=self._read.name(f"{who}: body_a", body_a),
+                rotation_a=self._read.rotation(who, rotation_a, None, "rotation_a"),
+                body_b=self._read.name(f"{who}: body_b", body_b),
+                rotation_b=self._read.rotation(who, rotation_b, None, "rotation_b"),
                 **numbers,
             )
         )
@@ -352,15 +373,22 @@ class ModelBuilder:
 
         `mbkit.lagrangian.from_model` puts it into the energies; the engines by themselves refuse it.
         """
+        joint = self._read.name("prescribed joint", joint)
         given = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
         read = {n: self._read.quantity(f"prescribed {joint!r}: {n}", x) for n, x in given.items()}
-        self._prescribed.append(Prescribed(str(joint), **self._numbers("prescribed", str(joint), **read)))
+        self._prescribed.append(Prescribed(joint, **self._numbers("prescribed", joint, **read)))
 
     def note(self, text: str) -> None:
         """Keep a sentence for whoever reads the model."""
-        self._notes.append(text)
+        self._notes.append(self._read.name("note text", text, longest=1_000_000))
 
-    def build(self, *, nonphysical: Literal["error", "warn"] = "error", point_masses: bool = True) -> Model:
+    def build(
+        self,
+        *,
+        nonphysical: Literal["error", "warn"] = "error",
+        point_masses: bool = True,
+        parts: Mapping[str, Sequence[tuple[str, str]]] | None = None,
+    ) -> Model:
         """Check everything and return the frozen model.
 
         Parameters
@@ -368,17 +396,25 @@ class ModelBuilder:
         nonphysical : {"error", "warn"}
             What to do about bodies that no matter can have (an inertia that is
             not positive or violates the triangle inequality, joints that move no
-            inertia): raise, or keep them as written and warn.
+            inertia): raise, or keep them as written and warn. Of a body that is fixed
+            to the world only a negative mass counts; the rest is noted.
         point_masses : bool
             Whether a mass without inertia is meant that way.
+        parts : mapping of str to sequence of (str, str), optional
+            Of bodies that were merged from several links: the links that are at fault, each with the
+            reason. Messages name them instead of the body.
 
         Raises
         ------
         ModelError
             With every fault found.
         """
-        if nonphysical not in ("error", "warn"):
-            raise InputError(f"nonphysical: expected 'error' or 'warn', got {nonphysical!r}")
+        if not isinstance(nonphysical, str) or nonphysical not in ("error", "warn"):
+            raise InputError(f"nonphysical: expected 'error' or 'warn', got {shown(nonphysical)}")
+        if not isinstance(point_masses, bool):
+            raise InputError(f"point_masses: expected True or False, got {shown(point_masses)}")
+        if parts is not None and not isinstance(parts, Mapping):
+            raise InputError(f"parts: expected a mapping from bodies to links, got {shown(parts)}")
         faults = list(self._read.faults)
         faults += structure_faults(
             self._bodies,
@@ -394,19 +430,22 @@ class ModelBuilder:
         found = body_faults(self._bodies, point_masses=point_masses)
         if not faults:
             found = suspects(self._assemble(()), point_masses=point_masses)
-        strict = nonphysical == "error"
-        remedy = '; correct it, or take it as written with nonphysical="warn"'
         negative = {b.name for b in self._bodies if b.mass < 0}
-        faults += [f"body {n!r}: {why}{remedy}" for n, why in found if strict and n not in negative]
-        faults += [f"body {n!r}: {why}" for n, why in found if n in negative]
+        still = static_bodies(self._joints) - negative
+        idle = grouped([(n, why) for n, why in found if n in still], parts or {})
+        notes = [f"never moves, so this cannot act: {text}" for text in idle]
+        found = tuple((n, why) for n, why in found if n not in still)
+        refused = [(n, why) for n, why in found if n not in negative]
+        if nonphysical == "error" and refused:
+            faults += grouped(refused, parts or {})
+            faults[-1] += '; correct it, or take it as written with nonphysical="warn"'
+        faults += grouped([(n, why) for n, why in found if n in negative], parts or {})
         if faults:
             raise ModelError(self._name, faults)
-        model = self._assemble(found)
+        model = self._assemble(found, notes)
         if found:
-            told = "; ".join(f"{n!r}: {why}" for n, why in found[:5])
-            more = f" and {len(found) - 5} more" if len(found) > 5 else ""
             warnings.warn(
-                f"{self._name}: taken as written, though no matter is like this: {told}{more}",
+                f"{self._name}: physically impossible, used as written: {'; '.join(grouped(found, parts or {}))}",
                 NonPhysicalWarning,
                 stacklevel=2,
             )
@@ -426,7 +465,7 @@ class ModelBuilder:
             if values.setdefault(p.name, p.value) != p.value
         ]
 
-    def _assemble(self, suspects: tuple[tuple[str, str], ...]) -> Model:
+    def _assemble(self, suspects: tuple[tuple[str, str], ...], notes: Iterable[str] = ()) -> Model:
         joints, bindings = _resolved(self._joints, self._bindings)
         return Model(
             name=self._name,
@@ -438,7 +477,7 @@ class ModelBuilder:
             couplings=tuple(self._couplings),
             loops=tuple(self._loops),
             prescribed=tuple(self._prescribed),
-            notes=tuple(self._notes),
+            notes=(*self._notes, *notes),
             nonphysical=suspects,
             bindings=bindings,
         )

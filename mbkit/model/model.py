@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, count, generator, rows
+from mbkit._check import Array, batch_of, count, generator, rows, shown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import manifold, substitution
 from mbkit.model.binding import Binding
@@ -244,6 +244,7 @@ class Model:
 
     def body(self, name: str) -> Body:
         """Return the body of this name."""
+        _expect_name("body", name)
         for body in self.bodies:
             if body.name == name:
                 return body
@@ -251,6 +252,7 @@ class Model:
 
     def joint(self, name: str) -> Joint:
         """Return the joint of this name."""
+        _expect_name("joint", name)
         for joint in self.joints:
             if joint.name == name:
                 return joint
@@ -262,8 +264,7 @@ class Model:
         A body's own frame has the body's name, and the ground's is ``"world"``. A
         declared frame of a body's name goes before it.
         """
-        if not isinstance(name, str):
-            raise InputError(f"frame: expected a name, got {name!r}")
+        _expect_name("frame", name)
         for frame in self.frames:
             if frame.name == name:
                 return frame
@@ -377,8 +378,9 @@ class Model:
             elements and couplings alike, armature joints and couplings.
         """
         for feature in features:
+            _expect_name("feature", feature)
             if feature not in _FEATURES:
-                raise UnknownNameError("feature", str(feature), _FEATURES)
+                raise UnknownNameError("feature", feature, _FEATURES)
         model = self
         for feature in features:
             model = model._without(feature)
@@ -456,6 +458,11 @@ class Model:
             f"<p><b>{html.escape(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._told_mass()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
+
+
+def _expect_name(what: str, name: object) -> None:
+    if not isinstance(name, str):
+        raise InputError(f"{what}: expected a name, got {shown(name)}")
 
 
 def _unlimited(joint: Joint) -> Joint:

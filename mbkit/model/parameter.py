@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import real
+from mbkit._check import real, shown
 from mbkit.errors import InputError
 
 __all__ = ["Expression", "Number", "Parameter", "known", "nominal"]
@@ -76,9 +76,9 @@ class Expression:
         return self
 
     def __pow__(self, exponent: float) -> Expression:
-        if not _is_number(exponent) or not (float(exponent).is_integer() or exponent == 0.5) or abs(exponent) > 100:
+        if not _is_number(exponent) or abs(exponent) > 100 or not (float(exponent).is_integer() or exponent == 0.5):
             raise InputError(
-                f"power of {self}: expected a whole number from -100 to 100 or 0.5 as exponent, got {exponent!r}"
+                f"power of {self}: expected a whole number from -100 to 100 or 0.5 as exponent, got {shown(exponent)}"
             )
         return _Power(self, float(exponent))
 
@@ -117,8 +117,8 @@ class Parameter(Expression):
     value: float | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise InputError(f"Parameter: expected a name, got {self.name!r}")
+        if not isinstance(self.name, str) or not self.name or any("\ud800" <= c <= "\udfff" for c in self.name):
+            raise InputError(f"Parameter: expected a name, got {shown(self.name)}")
         if self.value is not None:
             # + 0.0 makes one of the two zeros.
             object.__setattr__(self, "value", real(f"Parameter {self.name!r}", self.value) + 0.0)
@@ -185,7 +185,8 @@ def _combined(name: str, *operands: Any) -> Expression:
     if not all(isinstance(x, Expression) or _is_number(x) for x in operands):
         # Python then asks the other operand: a NumPy array goes entry by entry.
         return NotImplemented  # type: ignore[no-any-return]
-    return _Operation(name, tuple(x if isinstance(x, Expression) else float(x) for x in operands))
+    numbers = (x if isinstance(x, Expression) else real("number in an expression", x) for x in operands)
+    return _Operation(name, tuple(numbers))
 
 
 def known(value: Number) -> bool:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
+from typing import Final
 
 import numpy as np
 
-from mbkit.errors import nearest
+from mbkit.errors import Suggestions, nearest
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
 
 __all__ = ["structure_faults"]
+
+# Up to so many names stand in a message.
+_FEW: Final = 40
+# M of so many velocities takes 200 MB.
+_MOST_VELOCITIES: Final = 5000
 
 
 def structure_faults(
@@ -27,6 +33,9 @@ def structure_faults(
     faults: list[str] = []
     if not bodies:
         faults.append("no bodies; add at least one")
+    velocities = sum(j.type.nv for j in joints)
+    if velocities > _MOST_VELOCITIES:
+        faults.append(f"{velocities} velocities; up to {_MOST_VELOCITIES} are taken, because M takes their square")
     for what, names in (
         ("body", [b.name for b in bodies]),
         ("joint", [j.name for j in joints]),
@@ -40,13 +49,15 @@ def structure_faults(
         faults.append("frame 'world': that name is the ground's; choose another")
     if any(b.name == "world" for b in bodies):
         faults.append("body 'world': that name is the ground's; choose another")
+    suggestions = Suggestions()
+    bodily = known - {"world"}
     for joint in joints:
-        faults += _unknown(f"joint {joint.name!r}", (joint.parent, joint.child), known)
+        faults += _unknown(f"joint {joint.name!r}", (joint.parent, joint.child), known, suggestions)
         faults += _joint_faults(joint)
     for frame in frames:
-        faults += _unknown(f"frame {frame.name!r}", (frame.body,), known - {"world"})
+        faults += _unknown(f"frame {frame.name!r}", (frame.body,), bodily, suggestions)
     for spring in springs:
-        faults += _unknown(f"spring {spring.name!r}", (spring.body_a, spring.body_b), known)
+        faults += _unknown(f"spring {spring.name!r}", (spring.body_a, spring.body_b), known, suggestions)
         faults += [
             f"spring {spring.name!r}: {n} {getattr(spring, n):g} is negative"
             for n in ("stiffness", "rest_length", "damping")
@@ -57,7 +68,7 @@ def structure_faults(
     for coupling in couplings:
         faults += _coupling_faults(coupling, joints)
     for loop in loops:
-        faults += _unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b), known)
+        faults += _unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b), known, suggestions)
         if loop.body_a == loop.body_b:
             faults.append(f"loop {loop.name!r}: both ends on {loop.body_a!r}; it would close nothing")
     faults += _tree_faults(bodies, joints)
@@ -74,13 +85,13 @@ def structure_faults(
     return faults
 
 
-def _unknown(who: str, names: Iterable[str], known: Iterable[str]) -> list[str]:
+def _unknown(who: str, names: Iterable[str], known: Set[str], suggestions: Suggestions) -> list[str]:
     out = []
     for name in names:
         if name not in known:
-            near = nearest(name, known)
-            hint = f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(sorted(known))}"
-            out.append(f"{who}: unknown body {name!r}{hint}")
+            near = suggestions.near(name, known)
+            few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _FEW else "; declare it"
+            out.append(f"{who}: unknown body {name!r}" + (f"; did you mean {near!r}?" if near else few))
     return out
 
 
@@ -125,21 +136,28 @@ def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterat
 
 def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
     out = []
-    carriers = Counter(j.child for j in joints)
-    for name, count in carriers.items():
-        if count > 1 and name != "world":
-            told = ", ".join(repr(j.name) for j in joints if j.child == name)
-            out.append(f"body {name!r}: carried by {count} joints ({told}); keep one and close the loop with add_loop")
+    carriers: dict[str, list[Joint]] = {}
+    carried: dict[str, list[Joint]] = {}
+    for joint in joints:
+        carriers.setdefault(joint.child, []).append(joint)
+        carried.setdefault(joint.parent, []).append(joint)
+    for name, several in carriers.items():
+        if len(several) > 1 and name != "world":
+            told = ", ".join(repr(j.name) for j in several)
+            out.append(
+                f"body {name!r}: carried by {len(several)} joints ({told}); keep one and close the loop with add_loop"
+            )
     reached = {"world"}
-    grew = True
-    while grew:
-        new = {j.child for j in joints if j.parent in reached} - reached
-        reached |= new
-        grew = bool(new)
+    stack = ["world"]
+    while stack:
+        for joint in carried.get(stack.pop(), ()):
+            if joint.child not in reached:
+                reached.add(joint.child)
+                stack.append(joint.child)
     for body in bodies:
         if body.name in reached:
             continue
-        if carriers[body.name]:
+        if body.name in carriers:
             out.append(f"body {body.name!r}: not connected to the world; its joints form a cycle or hang in the air")
         else:
             out.append(f"body {body.name!r}: no joint carries it; add a joint with child={body.name!r}")
@@ -149,22 +167,26 @@ def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
 def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
     out = []
     by_name = {j.name: j for j in joints}
+    suggestions = Suggestions()
+    # Joints from which following the leaders ends.
+    ends: set[str] = set()
     for joint in joints:
         if joint.mimic is None:
             continue
         who = f"joint {joint.name!r}"
         leader = by_name.get(joint.mimic.joint)
         if leader is None:
-            near = nearest(joint.mimic.joint, by_name)
-            out.append(f"{who}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near[0]!r}" if near else ""))
+            near = suggestions.near(joint.mimic.joint, by_name)
+            out.append(f"{who}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near!r}" if near else ""))
             continue
         if joint.type.nv != 1 or leader.type.nv != 1:
             out.append(f"{who}: mimics {leader.name!r}, but both must have one velocity")
         seen, at = {joint.name}, leader
-        while at.mimic is not None and at.mimic.joint in by_name:
+        while at.name not in ends and at.mimic is not None and at.mimic.joint in by_name:
             if at.name in seen:
                 out.append(f"{who}: mimics in a circle through {at.name!r}")
                 break
             seen.add(at.name)
             at = by_name[at.mimic.joint]
+        ends |= seen
     return out

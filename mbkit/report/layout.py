@@ -24,7 +24,8 @@ def columns(*heads: str | tuple[str, str]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for told in heads:
         head, justify = (told, "left") if isinstance(told, str) else told
-        table.add_column(Text(head), justify=justify, no_wrap=justify == "right")  # type: ignore[arg-type]
+        # A long name goes on in the next line; an ellipsis would make it another name.
+        table.add_column(Text(head), justify=justify, no_wrap=justify == "right", overflow="fold")  # type: ignore[arg-type]
     return table
 
 

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from mbkit.report import figures, importers, precision, stress
 from mbkit.report.numbers import count_text, error_text, plain, time_text
-from mbkit.report.reading import allowances, by_term, failures, headline, judged, notices, omission_state, told
+from mbkit.report.reading import (
+    allowances,
+    by_term,
+    failures,
+    headline,
+    judged,
+    notices,
+    omission_state,
+    saving_text,
+    told,
+)
 from mbkit.report.stress_figures import stable_steps
 from mbkit.report.stress_map import section
 from mbkit.report.stress_methods import methods
@@ -100,7 +110,7 @@ def _study(result: WorkPrecision) -> dict[str, Any]:
         "result": result,
         "figure": Markup(precision.error_against_time(result)) if result.front else None,
         "front": precision.front_names(result),
-        "levels": precision.levels(result),
+        "leads": precision.leads(result),
         "lines": precision.curve_lines(result),
         "order_tolerance": precision.ORDER_TOLERANCE,
         "notices": notices(result.refusals),
@@ -206,6 +216,7 @@ def _environment() -> Environment:
         fact=_three_digits,
         limit=_limit,
         unchanged=omission_state,
+        saving=saving_text,
         setting=precision.setting_text,
         value=stress.value_text,
         held=stress.held_text,

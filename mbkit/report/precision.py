@@ -9,18 +9,20 @@ from dataclasses import dataclass
 from typing import Final
 
 from mbkit.report.drawing import PAGE, page_style, svg
-from mbkit.report.numbers import time_text
+from mbkit.report.numbers import count_text, time_text
 from mbkit.studies.precision_figure import USEFUL, figure
 from mbkit.studies.precision_result import Curve, PrecisionPoint, WorkPrecision
 
 __all__ = [
     "CurveLine",
+    "Lead",
     "Level",
     "curve_lines",
     "curve_name",
     "error_against_time",
     "front_names",
     "headline",
+    "leads",
     "levels",
     "picture",
     "setting_text",
@@ -34,7 +36,15 @@ _DOTS_PER_INCH: Final = 160
 
 @dataclass(frozen=True)
 class Level:
-    """Who reaches an error in the least time, and who is first among the other engines."""
+    """Who reaches an error in the least time, and who is first among the other engines.
+
+    Attributes
+    ----------
+    error : float
+    curve, point : Curve, PrecisionPoint
+    next : (Curve, PrecisionPoint) or None
+        The fastest of another engine that reaches this error.
+    """
 
     error: float
     curve: Curve
@@ -45,6 +55,45 @@ class Level:
     def factor(self) -> float:
         """How many times as long the next engine takes; NaN where none reaches the error."""
         return self.next[1].seconds / self.point.seconds if self.next else math.nan
+
+    @property
+    def next_engine(self) -> str:
+        """The engine of `next`; empty where there is none."""
+        return self.next[0].engine if self.next else ""
+
+
+@dataclass(frozen=True)
+class Lead:
+    """One run, and all the errors for which it is the fastest: from the largest to the least."""
+
+    levels: tuple[Level, ...]
+
+    @property
+    def curve(self) -> Curve:
+        """Engine and method."""
+        return self.levels[0].curve
+
+    @property
+    def point(self) -> PrecisionPoint:
+        """The run."""
+        return self.levels[0].point
+
+    @property
+    def errors(self) -> str:
+        """The errors, as a range where there are several."""
+        first, last = f"{self.levels[0].error:.0e}", f"{self.levels[-1].error:.0e}"
+        return first if len(self.levels) == 1 else f"{first} to {last}"
+
+    @property
+    def nexts(self) -> list[tuple[str, str, str]]:
+        """Engine, methods and times as long of the fastest of other engines, which may change with the error."""
+        out = []
+        for engine, group in itertools.groupby(self.levels, key=lambda x: x.next_engine):
+            some = list(group)
+            methods = ", ".join(dict.fromkeys(x.next[0].method for x in some if x.next))
+            factors = dict.fromkeys(count_text(x.factor) for x in (some[0], some[-1]))
+            out.append((engine or "none", methods, " to ".join(factors)))
+        return out
 
 
 @dataclass(frozen=True)
@@ -78,6 +127,11 @@ def levels(result: WorkPrecision) -> list[Level]:
             break
         out.append(Level(error, *first, _fastest_beside(first[0].engine, result, error)))
     return out
+
+
+def leads(result: WorkPrecision) -> list[Lead]:
+    """Return the fastest runs, each once, with the errors for which it is the fastest."""
+    return [Lead(tuple(group)) for _, group in itertools.groupby(levels(result), key=lambda level: id(level.point))]
 
 
 def _fastest_beside(engine: str, result: WorkPrecision, error: float) -> tuple[Curve, PrecisionPoint] | None:
@@ -116,15 +170,16 @@ def setting_text(point: PrecisionPoint) -> str:
 def headline(result: WorkPrecision) -> str:
     """Return who is fastest at which error, in one sentence."""
     stopped = "" if result.complete else "interrupted; what was finished: "
+    missing = "".join(f"; {x}" for x in result.shortened if x != "interrupted")
     found = levels(result)
     if not found:
-        return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m"
+        return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m{missing}"
     parts = []
     for name, group in itertools.groupby(found, key=lambda level: curve_name(level.curve)):
         first, *rest = [f"{level.error:.0e}" for level in group]
         parts.append(f"{name} for an error of {first}" + (f" to {rest[-1]}" if rest else ""))
     count = f"{len(result.curves)} curve{'s' * (len(result.curves) != 1)}"
-    return f"{stopped}fastest of {count}: {', '.join(parts)}"
+    return f"{stopped}fastest of {count}: {', '.join(parts)}{missing}"
 
 
 def error_against_time(result: WorkPrecision) -> str:

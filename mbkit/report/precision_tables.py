@@ -8,8 +8,8 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from mbkit.report.layout import bullet, columns, right, titled
-from mbkit.report.numbers import count_text, error_text, inline, time_text
-from mbkit.report.precision import Level, curve_lines, headline, levels, setting_text
+from mbkit.report.numbers import error_text, inline, time_text
+from mbkit.report.precision import Lead, curve_lines, headline, leads, setting_text
 from mbkit.report.reading import notices
 from mbkit.studies.precision_result import WorkPrecision
 
@@ -41,25 +41,25 @@ def bench(result: WorkPrecision, asked: str = "") -> RenderableType:
 def study(result: WorkPrecision) -> list[RenderableType]:
     """Return the fastest run for each error, and how the errors were known."""
     table = columns(*right("error ≤"), "engine", "method", *right("setting", "run time", "first run"), "next engine")
-    for level in levels(result):
+    for lead in leads(result):
         table.add_row(
-            f"{level.error:.0e}",
-            Text(inline(level.curve.engine)),
-            Text(inline(level.curve.method)),
-            setting_text(level.point),
-            time_text(level.point.seconds),
-            time_text(level.curve.compile + level.point.seconds) or "–",
-            Text(_next(level), style="dim"),
+            lead.errors,
+            Text(inline(lead.curve.engine)),
+            Text(inline(lead.curve.method)),
+            setting_text(lead.point),
+            time_text(lead.point.seconds),
+            time_text(lead.curve.compile + lead.point.seconds) or "–",
+            Text(_next(lead), style="dim"),
         )
-    cut = f", cut from {result.asked:g} s" if result.duration < result.asked else ""
     known = f"known to {error_text(result.floor)}" if math.isfinite(result.floor) else "known to an unknown error"
-    below = bullet("", f"{inline(result.reference, 300)}; {known}{cut}", "i")
+    below = bullet("", f"{inline(result.reference, 300)}; {known}", "i")
+    missing = [Text(f"  ! {inline('; '.join(result.shortened), 400)}", style="bold yellow")] if result.shortened else []
     title = f"Error against run time, {result.duration:g} s of motion: the fastest with an error of q (rad or m)"
-    return titled(title, table if table.rows else Text("  no run reached 1e-02", style="dim"), below)
+    return titled(title, *missing, table if table.rows else Text("  no run reached 1e-02", style="dim"), below)
 
 
-def _next(level: Level) -> str:
-    return f"{inline(level.next[0].engine)} × {count_text(level.factor)}" if level.next else "none"
+def _next(lead: Lead) -> str:
+    return ", ".join(f"{inline(engine)} × {factor}" if factor else engine for engine, _, factor in lead.nexts)
 
 
 def _curves(result: WorkPrecision) -> list[RenderableType]:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from mbkit.report.numbers import time_text
 from mbkit.studies.result import Comparison, Omission, Refusal, RolloutRow, Row
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "judged",
     "notices",
     "omission_state",
+    "saving_text",
     "told",
 ]
 
@@ -46,12 +48,10 @@ class Notice:
 
 def headline(result: Comparison) -> str:
     """Return the verdict in one sentence that stays short however much differs."""
-    if not result.rows:
+    if result.nothing:
         return result.verdict
-    absent = [r.engine for r in result.refusals if not r.term and r.engine not in result.engines]
-    without = f"; {', '.join(dict.fromkeys(absent))} left out, see the notes" if absent else ""
-    if result.passed:
-        return result.verdict + without
+    if result.passed or result.only_known_defects:
+        return result.verdict
     parts = []
     for some, all_, what in (
         (sum(not r.passed for r in result.rows), len(result.rows), "comparisons of terms"),
@@ -59,7 +59,18 @@ def headline(result: Comparison) -> str:
         (sum(not o.unchanged for o in result.omissions), len(result.omissions), "omissions"),
     ):
         parts += [f"{some} of {all_} {what}"] if some else []
-    return f"{', '.join(result.engines)} differ: {', '.join(parts)}{without}"
+    # Rows are measured by the oracle: what differs is who fails. Rollouts are measured by MuJoCo's own.
+    rows = [r for r in result.rows if not r.passed]
+    who = dict.fromkeys([*(r.engine for r in rows), *(r.engine for r in result.rollouts if not r.passed)])
+    known = len([r for r in rows if r.defect])
+    by_defect = f" ({known} by a known defect of {_engines(r for r in rows if r.defect)})" if known else ""
+    missing = "".join(f"; {x}" for x in result.shortened)
+    subject = f"{', '.join(who)} differ{'s' * (len(who) == 1)}: " if who else ""
+    return f"{subject}{', '.join(parts)}{by_defect}{missing}"
+
+
+def _engines(rows: Iterable[Row]) -> str:
+    return ", ".join(dict.fromkeys(r.engine for r in rows))
 
 
 def judged(result: Comparison) -> list[RolloutRow]:
@@ -70,6 +81,15 @@ def judged(result: Comparison) -> list[RolloutRow]:
 def told(result: Comparison) -> list[RolloutRow]:
     """Return the rollouts that are there for information, with an infinite tolerance."""
     return [r for r in result.rollouts if not math.isfinite(r.tolerance)]
+
+
+def saving_text(omission: Omission) -> str:
+    """Return the time that leaving a thing out saves at each call, with its spread, where it can be measured."""
+    if math.isnan(omission.saved_ns):
+        return ""
+    if not omission.measurable:
+        return "not measurable"
+    return f"{time_text(omission.saved_ns * 1e-9)} ± {time_text(omission.saved_spread * 1e-9)}"
 
 
 def omission_state(omission: Omission) -> Literal["on", "same", "chosen", "changed"]:

@@ -20,6 +20,7 @@ from mbkit.report.reading import (
     judged,
     notices,
     omission_state,
+    saving_text,
     told,
 )
 from mbkit.studies.all_robots import Sweep
@@ -96,6 +97,8 @@ def _term_cell(row: Row | None) -> Text:
         return Text("refused", style="dim")
     # Where the oracle has no value, an engine stands in for it.
     own = row.engine == row.reference
+    if row.zero and row.passed and not own:
+        return Text.assemble(("–    zero", "dim"), f" {time_text(row.ns * 1e-9):>8}")
     mark, style = ("", "") if own else _MARK[row.passed] if not (row.passed and row.reason) else _ALLOWED
     error = "" if own else error_text(row.relative)
     spent = time_text(row.ns * 1e-9)
@@ -143,7 +146,7 @@ def _omissions(result: Comparison) -> list[RenderableType]:
         table.add_row(
             Text(inline(o.need), no_wrap=True),
             "yes" if o.present else "no",
-            Text(time_text(o.saved_ns * 1e-9) or "–"),
+            Text(saving_text(o) or "–", style="" if o.measurable else "dim"),
             Text(time_text(o.saved_setup) or "–"),
             Text("–" if state == "on" else f"{mark} {error_text(o.change):>7}", style=style),
             Text(inline(o.what), style="dim"),

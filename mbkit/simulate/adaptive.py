@@ -22,7 +22,7 @@ from mbkit.errors import FunctionError, MbkitError
 from mbkit.model import Model
 from mbkit.simulate.asked import Asked
 from mbkit.simulate.events import State, Watch
-from mbkit.simulate.members import Member, gathered
+from mbkit.simulate.members import Member, gathered, member_of
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.rates import Rates, unit_quaternions
@@ -97,7 +97,8 @@ def run_scipy(asked: Asked) -> Outcome:
             watch = Watch(asked.events, which) if asked.events else None
             saved = None if save is None else tuple(save.tolist())
             task = _Task(asked.start, start, stops, saved, torque.of_member(which), torque.held, watch)
-            members.append(solve.member(task, asked.report(i)))
+            member = member_of(dyn, which, asked.start, asked.duration)
+            members.append(solve.member(task, member, asked.report(i)))
             if members[-1].error is not None:
                 break
     return gathered(
@@ -117,7 +118,7 @@ class _Solve:
     """Integrates one trajectory after the other."""
 
     def __init__(self, dyn: Dynamics, scheme: _Scheme, tolerances: Tolerances) -> None:
-        self.rates = Rates(dyn)
+        self.rates = Rates(dyn, explicit=not scheme.implicit)
         self._model: Model = dyn.model
         self._scheme, self._tolerances = scheme, tolerances
         self._jacobian: _Jacobian | None = None
@@ -136,9 +137,8 @@ class _Solve:
         if self._jacobian is not None:
             self._jacobian.only(member)
 
-    def member(self, task: _Task, done: Callable[[float], None]) -> Member:
+    def member(self, task: _Task, member: Member, done: Callable[[float], None]) -> Member:
         """Return what comes of one trajectory."""
-        member = Member(reached=task.t0)
         try:
             self._integrate(member, task, done)
         except FunctionError as error:
@@ -168,7 +168,10 @@ class _Solve:
                 member.steps += 1
                 member.reached = float(solver.t)
                 self._keep(member, task, solver)
+                member.saw(member.reached, solver.y[: self._model.nq])
                 done(member.reached)
+                if member.crawls():
+                    return
 
     def _anew(self, task: _Task, last: Any, force: Force, stop: float) -> Any:
         t, y = (task.t0, task.y0) if last is None else (float(last.t), last.y)

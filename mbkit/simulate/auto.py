@@ -55,7 +55,7 @@ def run_auto(asked: Asked) -> Outcome:
     outcome = outcome_of(asked.dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
     told = outcome.ended in ("finished", "event")
     doubts = tuple(dict.fromkeys(course.doubt for course in courses if course.doubt and told))
-    return replace(outcome, chosen=_chosen(courses, batch), doubts=doubts)
+    return replace(outcome, chosen=_chosen(courses, batch), doubts=(*outcome.doubts, *doubts))
 
 
 class _Group:

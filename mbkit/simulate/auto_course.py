@@ -27,6 +27,7 @@ from mbkit.simulate.auto_scene import EXPLICIT, IMPLICIT, LEAST, Gauge, Scene
 from mbkit.simulate.embedded import Track, march
 from mbkit.simulate.embedded_trials import ROUNDS, Stretch, Trials
 from mbkit.simulate.events import Event
+from mbkit.simulate.members import member_of
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.stiffness import Stiffness, linearized, stiffness_of
 
@@ -114,7 +115,8 @@ class Course:
 
     def __init__(self, scene: Scene, index: int, nq: int, save: Array | None, events: tuple[Event, ...]) -> None:
         self._scene, self._index = scene, index
-        self.track = _Track(scene.space, nq, index, scene.batch, save, events, scene.tolerances, scene.start)
+        member = member_of(scene.dyn, None if scene.batch is None else index, scene.start, scene.duration)
+        self.track = _Track(scene.space, nq, index, scene.batch, save, events, scene.tolerances, member)
         self.doubt = ""
         # As asked for or loosened, and as tightened.
         self._base, self._tolerances = scene.tolerances, scene.granted(EXPLICIT, scene.tolerances)

@@ -78,7 +78,7 @@ class Scene:
     """
 
     def __init__(self, asked: Asked, space: Space, stops: Sequence[float]) -> None:
-        self._dyn, self._torque, self.batch = asked.dyn, asked.torque, asked.batch
+        self.dyn, self._torque, self.batch = asked.dyn, asked.torque, asked.batch
         self.space, self.tolerances, self.stops = space, asked.tolerances, stops
         self.start, self.end, self.duration = asked.start, asked.end, asked.duration
         self._trials: list[Trials] = []
@@ -86,7 +86,7 @@ class Scene:
 
     def make(self, method: str, tolerances: Tolerances) -> Trials:
         """Return what tries a method's steps; its evaluations are counted with all others."""
-        given = self._dyn, self.space, tolerances, self._torque, self.duration, self.batch
+        given = self.dyn, self.space, tolerances, self._torque, self.duration, self.batch
         made = make_trials(method, *given)
         self._trials.append(made)
         self.pace = _COMPILED if made.rounds > 1 else _IN_PYTHON

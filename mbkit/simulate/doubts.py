@@ -20,11 +20,12 @@ from mbkit.model.space import Space
 from mbkit.simulate.along import along
 from mbkit.simulate.balance import is_damped, kinetic_energy, potential_energy
 from mbkit.simulate.methods import Method, Tolerances
+from mbkit.simulate.rates import unit_quaternions
 from mbkit.simulate.size import size_of
 from mbkit.simulate.stability import STEPS, growth, lost
 from mbkit.simulate.stiffness import linearized
 
-__all__ = ["doubts", "halved"]
+__all__ = ["doubts", "halved", "idle"]
 
 _EPS: Final = float(np.finfo(float).eps)
 #: States and trajectories of a batch that are looked at.
@@ -50,6 +51,8 @@ _SUM: Final = 1e-3
 _OF_START: Final = "taylor"
 #: Who solves with the mass matrix, whatever accelerations come from.
 _BY_MASSES: Final = ("rodas5", "implicit_midpoint")
+#: Least eigenvalue of a mass matrix beside its largest, in units in which it has ones at a random configuration.
+_IDLE: Final = 1e-7
 #: m or rad: what engineers still call a position.
 _POSITION: Final = 1e-6
 
@@ -122,6 +125,26 @@ def doubts(
             # An engine that lacks a term, or has none there, has no opinion on it.
             continue
     return found
+
+
+def idle(dyn: Dynamics, q: Array) -> str:
+    """Return which joints move next to no mass at a configuration, to stand behind a message; empty where all do."""
+    model = dyn.model
+    if model.written is not None or dyn.samples is not None or not model.nv:
+        return ""
+    try:
+        there = dyn.mass_matrix(model.random_state(np.random.default_rng(0))[0])
+        scale = np.sqrt(np.diag(there))
+        values, vectors = np.linalg.eigh(dyn.mass_matrix(unit_quaternions(model, q)[0]) / scale[:, None] / scale)
+    except (MbkitError, np.linalg.LinAlgError):
+        return ""
+    if not values[0] < _IDLE * values[-1]:
+        return ""
+    part = np.abs(vectors[:, 0])
+    found = [j for j in model.independent_joints if part[model.layout.v[j.name]].max(initial=0.0) > 0.5 * part.max()]
+    names = " and ".join(repr(j.name) for j in found)
+    lock = " (gimbal lock)" if any(len(j.type.angular) > 1 for j in found) else ""
+    return f"; there joint {names} moves next to no mass{lock}, so that the mass matrix is nearly singular"
 
 
 def halved(

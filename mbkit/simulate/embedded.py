@@ -23,7 +23,7 @@ from mbkit.simulate.embedded_stages import StageTrials
 from mbkit.simulate.embedded_trials import Stretch, Trials
 from mbkit.simulate.events import Event, Hit, State, Watch
 from mbkit.simulate.grid import Indices
-from mbkit.simulate.members import Member, gathered
+from mbkit.simulate.members import Member, gathered, member_of
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.steps import RAN_AWAY, credible
@@ -44,7 +44,10 @@ def run_embedded(asked: Asked) -> Outcome:
     dyn, tolerances, batch, save = asked.dyn, asked.tolerances, asked.batch, asked.save
     q0, v0, space = asked.q, asked.v, Space(asked.dyn.model)
     trials = make_trials(asked.method, dyn, space, tolerances, asked.torque, asked.duration, batch)
-    tracks = [Track(space, q0.shape[1], i, batch, save, asked.events, tolerances, asked.start) for i in range(len(q0))]
+    tracks = []
+    for i in range(len(q0)):
+        member = member_of(dyn, asked.member(i), asked.start, asked.duration)
+        tracks.append(Track(space, q0.shape[1], i, batch, save, asked.events, tolerances, member))
     stops = stops_of(asked)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), trials.width):
@@ -141,11 +144,6 @@ class Track:
     save : (K,) array or None
     events : tuple of Event
     tolerances : Tolerances
-    start : float
-        Time of the first state, s.
-
-    Attributes
-    ----------
     member : Member
         Of which this holds the states.
     """
@@ -159,10 +157,10 @@ class Track:
         save: Array | None,
         events: tuple[Event, ...],
         tolerances: Tolerances,
-        start: float,
+        member: Member,
     ) -> None:
         which = None if batch is None else index
-        self.member, self._nq, self._start = Member(reached=start), nq, start
+        self.member, self._nq, self._start = member, nq, member.reached
         self._space, self._save, self._tolerances = space, save, tolerances
         self._watch = Watch(events, which) if events else None
         self._kept: list[tuple[Array, Array, Array]] = []
@@ -202,6 +200,8 @@ class Track:
             until = float(made.t[0])
         member.steps += steps
         member.reached = until
+        for k in range(1 if member.poses is not None else max(steps, 1), steps + 1):
+            member.saw(float(made.t[k]), made.q[k])
         if hit is not None:
             self._stop_at(hit)
         elif lost:
@@ -218,7 +218,7 @@ class Track:
             own = "" if atol == rtol else f", atol = {atol:g}"
             told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
             self.member.stop("step_too_small", told)
-        return stuck is not None
+        return stuck is not None or (self.member.ended == "finished" and self.member.crawls())
 
     def _look(self, trials: Trials, place: int, made: Stretch, steps: int) -> Hit | None:
         if self._watch is None:

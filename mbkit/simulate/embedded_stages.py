@@ -11,6 +11,7 @@ from mbkit._check import Array
 from mbkit._step_control import GROWTH, LAST, SAFETY, SHRINK
 from mbkit.engines import Dynamics
 from mbkit.model.space import Space
+from mbkit.simulate.consistent import LOOSEST
 from mbkit.simulate.embedded_trials import Stretch, first_length
 from mbkit.simulate.methods import Tolerances
 from mbkit.simulate.steps import RAN_AWAY, DivergenceError, Field
@@ -25,6 +26,10 @@ class _OneOf(Field):
 
     def one(self, member: int) -> None:
         self._use(self._dyn.of_samples([member]))
+
+    def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ beside a single state."""
+        return super().consistent(t, q, w, force).reshape(-1)
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ of a single state; one of a batch with parameters of its own is a batch of one."""
@@ -58,6 +63,8 @@ class StageTrials:
         self._force: Force = np.zeros(nv)
         self._h = self._t = self._stop = 0.0
         self._why = ""
+        # What the tolerance is multiplied by.
+        self._slack = 1.0
 
     @property
     def evaluations(self) -> int:
@@ -123,7 +130,10 @@ class StageTrials:
             grown = step * min(factor, self._most)
             # A step that was short only because the end was near says little.
             self._h = self._h if 2 * step < self._h and grown < self._h else grown
-            self._last = max(root, LAST)
+            self._last, self._slack = max(root, LAST), 1.0
+        elif self._field.near_singular and self._slack * self._tolerances.rtol < LOOSEST and self._error >= 1:
+            # Near a singular pose shorter steps are no better: their stages are nearer to it, and rounding grows.
+            self._slack, self._h = 10 * self._slack, 0.8 * step
         else:
             self._h = step * (SAFETY / under if SHRINK * under < SAFETY else SHRINK)
         self._most = GROWTH if good else 1.0
@@ -151,7 +161,7 @@ class StageTrials:
         sizes = np.concatenate(
             [np.maximum(space.sizes(self._q, u), space.sizes(q, u)), np.maximum(np.abs(self._w), np.abs(w))]
         )
-        scale = atol + rtol * sizes
+        scale = self._slack * (atol + rtol * sizes)
         fifth, third = (float(np.sum((e @ self._rates / scale) ** 2)) for e in self._tableau.errors)
         total = fifth + 0.01 * third
         return q, w, 0.0 if total == 0 else step * fifth / math.sqrt(total * len(scale))
@@ -165,7 +175,7 @@ class StageTrials:
             moved = (h * A[i, :i]) @ rates[:i]
             u, w_i = moved[:nv], w + moved[nv:]
             rates[i, :nv] = space.rate(u, w_i)
-            rates[i, nv:] = self._field(t + self._c[i] * h, space.move(q, u), w_i, self._force)
+            rates[i, nv:] = self._field.consistent(t + self._c[i] * h, space.move(q, u), w_i, self._force)
         moved = (h * self._tableau.b) @ rates
         return space.move(q, moved[:nv]), w + moved[nv:], moved[:nv]
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from math import inf
+from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, InputError
 from mbkit.model import Model
+from mbkit.simulate.consistent import SingularPoses
 from mbkit.simulate.events import Hit
 from mbkit.simulate.grid import check_room
 from mbkit.simulate.outcome import Outcome
@@ -17,7 +21,12 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.rates import unit_quaternions
 from mbkit.simulate.stats import Ended
 
-__all__ = ["Member", "check_save", "gathered", "reporter"]
+__all__ = ["Member", "check_save", "gathered", "member_of", "reporter"]
+
+#: Tried steps between two looks at the time that they covered, and the least part of the run that they must cover.
+#: A run at that pace takes 2e10 steps.
+_TRIED: Final = 20_000
+_COVERED: Final = 1e-6
 
 
 @dataclass
@@ -37,6 +46,12 @@ class Member:
     message : str
     events : list of Hit
     error : FunctionError or None
+    duration : float
+        Of the whole run, s.
+    poses : SingularPoses or None
+        Where constraints act.
+    last : (nq,) array or None
+        Configuration of the last good state.
     """
 
     t: list[float] = field(default_factory=list)
@@ -48,6 +63,30 @@ class Member:
     message: str = ""
     events: list[Hit] = field(default_factory=list)
     error: FunctionError | None = None
+    duration: float = inf
+    poses: SingularPoses | None = None
+    last: Array | None = None
+    _look: tuple[int, float] = (0, 0.0)
+
+    def saw(self, t: float, q: Array) -> None:
+        """Take in the end of a step that is part of the run."""
+        self.last = q
+        if self.poses is not None:
+            self.poses.saw(t, q)
+
+    def crawls(self) -> bool:
+        """End the run where many steps cover next to none of it; return whether they do."""
+        tried, (before, since) = self.steps + self.rejected, self._look
+        if tried - before < _TRIED:
+            return False
+        covered = self.reached - since
+        self._look = tried, self.reached
+        if covered < _COVERED * self.duration:
+            self.stop(
+                "step_too_small", f"{tried - before} steps covered {covered:.2g} s alone: stiff, singular or diverging"
+            )
+            return True
+        return False
 
     def keep(self, t: float, y: Array) -> None:
         """Keep a state."""
@@ -68,6 +107,21 @@ class Member:
     def fail(self, error: FunctionError) -> None:
         """End where a torque or event function failed."""
         self.ended, self.message, self.error = "function_failed", str(error), error
+
+
+def member_of(dyn: Dynamics, which: int | None, start: float, duration: float) -> Member:
+    """Return what comes of one trajectory that has not begun.
+
+    Parameters
+    ----------
+    dyn : Dynamics
+    which : int or None
+        Its place in a batch.
+    start, duration : float
+        s.
+    """
+    poses = SingularPoses(dyn if which is None else dyn.of_samples([which])) if dyn.model.constrained else None
+    return Member(reached=start, duration=duration, poses=poses, _look=(0, start))
 
 
 def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
@@ -135,6 +189,8 @@ def gathered(
         jacobians=jacobians,
         events=tuple(hit for member in members for hit in member.events),
         error=next((member.error for member in members if member.error), None),
+        last=next((member.last for member in members if member.ended in ("diverged", "step_too_small")), None),
+        doubts=tuple(dict.fromkeys(member.poses.told() for member in members if member.poses and member.poses.times)),
     )
 
 

@@ -16,6 +16,8 @@ __all__ = ["Outcome"]
 class Outcome:
     """Kept states and the figures of a run; `reached` has shape () or (N,).
 
+    `last` is the last good configuration of the first trajectory that could not go on, where the method tells it.
+
     The `error` of a torque or event function is handed on with what was computed before it.
     """
 
@@ -33,3 +35,4 @@ class Outcome:
     error: FunctionError | None = None
     chosen: str = ""
     doubts: tuple[str, ...] = ()
+    last: Array | None = None

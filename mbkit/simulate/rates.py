@@ -9,7 +9,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
-from mbkit.simulate.consistent import settled
+from mbkit.simulate.consistent import Approach, beside, settled
 from mbkit.simulate.steps import RUNAWAY
 from mbkit.simulate.torque import Force
 
@@ -30,7 +30,8 @@ class Rates:
         What the engine said when it last failed.
     """
 
-    def __init__(self, dyn: Dynamics) -> None:
+    def __init__(self, dyn: Dynamics, *, explicit: bool = False) -> None:
+        self._explicit, self._approach = explicit, Approach()
         self._dyn, self._model, self._own = dyn, dyn.model, dyn
         self._forward, self._timed = dyn.forward_dynamics, dyn.model.clock is not None
         layout = dyn.model.layout
@@ -40,7 +41,7 @@ class Rates:
 
     def only(self, member: int) -> None:
         """Go on with this member of a batch."""
-        self._own = self._dyn.of_samples([member])
+        self._own, self._approach = self._dyn.of_samples([member]), Approach()
         self._forward = self._own.forward_dynamics
 
     def settled(self, t: float, y: Array) -> Array:
@@ -48,7 +49,10 @@ class Rates:
         if not self._model.constrained:
             return y
         nq = self._model.nq
-        return np.concatenate(settled(self._own, t, y[:nq], y[nq:]))
+        q, v = settled(self._own, t, y[:nq], y[nq:])
+        if self._explicit:
+            self._approach.saw(self._own, t, q)
+        return np.concatenate([q, v])
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
@@ -58,6 +62,9 @@ class Rates:
         nq = self._model.nq
         q, lengths = unit_quaternions(self._model, y[:nq])
         v = y[nq:]
+        if self._explicit and self._model.constrained and self._approach.near:
+            # One of a batch with parameters of its own is a batch of one.
+            q, v = (x.reshape(-1) for x in beside(self._own, t, q, v))
         tau = force if isinstance(force, np.ndarray) else force(t, q, v)
         self.evaluations += 1
         if self._timed:

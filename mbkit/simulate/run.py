@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,7 +19,7 @@ from mbkit.model import Model
 from mbkit.simulate.applied import Applied, TorqueFunction
 from mbkit.simulate.asked import Asked
 from mbkit.simulate.consistent import along_constraints, from_consistent
-from mbkit.simulate.doubts import doubts, halved
+from mbkit.simulate.doubts import doubts, halved, idle
 from mbkit.simulate.events import Event, as_events
 from mbkit.simulate.grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.methods import METHODS, Method, Tolerances, method_of
@@ -170,7 +171,8 @@ def simulate(
             chosen = method_of(method)
             start, duration, dt = _times(dyn.dynamics, chosen, t0, duration, dt)
             given = q0, v0, start, duration, dt, rtol, atol, torque, save, as_events(events)
-            return run_on_charts(dyn, chosen, *given)
+            bar = Progress(progress, f"{dyn.model.name}: {method} on independent coordinates")
+            return run_on_charts(dyn, chosen, *given, bar)
         raise no_dynamics(dyn)
     chosen = method_of(method)
     model = dyn.model
@@ -201,6 +203,8 @@ def simulate(
     seconds = time.perf_counter() - started
     setting = dt if chosen.kind != "adaptive" else _tolerances(dyn, chosen, rtol, atol)
     outcome = along_constraints(dyn, outcome)
+    if outcome.last is not None:
+        outcome = replace(outcome, message=outcome.message + idle(dyn, outcome.last))
     found: list[str] = []
     if doubt and outcome.ended in ("finished", "event"):
         states = _from_start(outcome, start, q, v)

@@ -21,7 +21,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.clock import at_time
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.space import Space
-from mbkit.simulate.consistent import settled
+from mbkit.simulate.consistent import Approach, beside, settled
 from mbkit.simulate.grid import Indices
 from mbkit.simulate.tableau import RK4, Tableau
 from mbkit.simulate.torque import Force
@@ -72,10 +72,26 @@ class Field:
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.clock is not None
+        self._approach = Approach()
+
+    @property
+    def near_singular(self) -> bool:
+        """Whether constraints may soon depend on each other."""
+        return self._own.model.constrained and self._approach.near
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
-        return settled(self._own, t, q, w) if self._own.model.constrained else (q, w)
+        if not self._own.model.constrained:
+            return q, w
+        q, w = settled(self._own, t, q, w)
+        self._approach.saw(self._own, t, q)
+        return q, w
+
+    def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
+        if self.near_singular:
+            q, w = beside(self._own, t, q, w)
+        return self(t, q, w, force)
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""
@@ -144,12 +160,12 @@ def _runge_kutta(tableau: Tableau, field: Field, space: Space) -> Step:
         rates = np.empty((s, *w.shape[:-1], 2 * nv))
         flat = rates.reshape(s, -1)
         rates[0, ..., :nv] = w
-        rates[0, ..., nv:] = field(t, q, w, force)
+        rates[0, ..., nv:] = field.consistent(t, q, w, force)
         for i in range(1, s):
             moved = ((h * A[i, :i]) @ flat[:i]).reshape(rates.shape[1:])
             u, w_i = moved[..., :nv], w + moved[..., nv:]
             rates[i, ..., :nv] = space.rate(u, w_i)
-            rates[i, ..., nv:] = field(t + c[i] * h, space.move(q, u), w_i, force)
+            rates[i, ..., nv:] = field.consistent(t + c[i] * h, space.move(q, u), w_i, force)
         moved = ((h * b) @ flat).reshape(rates.shape[1:])
         return space.move(q, moved[..., :nv]), w + moved[..., nv:]
 

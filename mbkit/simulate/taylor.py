@@ -14,13 +14,14 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.taylor import Precision, TaylorSystem, precision, taylor_system
+from mbkit.engines.clock import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.asked import Asked
 from mbkit.simulate.events import State, Watch
-from mbkit.simulate.members import Member, gathered
+from mbkit.simulate.members import Member, gathered, member_of
 from mbkit.simulate.outcome import Outcome
 from mbkit.simulate.rates import Rates, unit_quaternions
 from mbkit.simulate.size import size_of
@@ -71,7 +72,8 @@ def run_taylor(asked: Asked) -> Outcome:
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             steps = TaylorSteps(system, integrator, kind, _behind(own, kind), settled)
             watch = Watch(asked.events, which) if asked.events else None
-            one = _Run(own, steps, save, watch, asked.report(i))
+            member = member_of(dyn, which, asked.start, asked.duration)
+            one = _Run(own, steps, save, watch, member, asked.report(i))
             members.append(one.all(asked.start, start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
     return gathered(dyn.model, members, asked.batch, save, evaluations=evaluations)
@@ -218,7 +220,9 @@ class TaylorSteps:
     def _jumped(self, h: float, force: Array) -> bool:
         """Return whether the rates at the end of a step of length h are others than the series says."""
         nq, state = self._system.rates.size1_in(0), _rounded(self._integrator.state)
-        behind = [_rounded(self._behind)] if self._system.rates.n_in() > 3 else []
+        behind = [_rounded(self._behind).copy()] if self._system.rates.n_in() > 3 else []
+        if self._system.clock is not None:
+            behind[0][self._system.clock] = float(self._integrator.time)
         found = self._system.rates(state[:nq], state[nq:], force, *behind)
         rate = np.concatenate([np.asarray(x).ravel() for x in found])
         series = _rounded(self._integrator.tc)
@@ -246,11 +250,12 @@ class _Run:
         steps: TaylorSteps,
         save: Array | None,
         watch: Watch | None,
+        member: Member,
         done: Callable[[float], None],
     ) -> None:
         self._dyn, self._steps, self._watch, self._done = dyn, steps, watch, done
         self._save = None if save is None else save.tolist()
-        self._member = Member()
+        self._member = member
 
     def all(self, t0: float, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> Member:
         """Return what comes of it."""
@@ -267,7 +272,10 @@ class _Run:
                     return member
                 member.reached = t
                 self._keep(t)
+                member.saw(t, _rounded(steps.y)[: self._dyn.model.nq])
                 self._done(t)
+                if member.crawls():
+                    return member
         except StoppedError as error:
             interval = int(np.searchsorted(stops, steps.t, side="right"))
             why = self._reason(force(min(interval, len(stops) - 1))) if error.ended == "diverged" else ""
@@ -308,7 +316,7 @@ class _Run:
             try:
                 q, v = _state(self._dyn.model, y)
                 # One of a batch with parameters of its own is a batch of one.
-                self._dyn.forward_dynamics(q, v, force)
+                at_time(self._dyn, self._steps.t).forward_dynamics(q, v, force)
             except NumericalError as error:
                 return str(error)
         return RAN_AWAY

@@ -83,8 +83,9 @@ class Sweep:
 
     @property
     def passed(self) -> bool:
-        """Whether all were reached, and each ended in agreement or was refused for a named reason."""
-        return len(self.outcomes) == self.expected and all(o.status in ("agree", "refused") for o in self.outcomes)
+        """Whether all were reached, one agrees at least, and each other does too or is refused with a reason."""
+        states = {o.status for o in self.outcomes}
+        return len(self.outcomes) == self.expected and "agree" in states and states <= {"agree", "refused"}
 
     @property
     def verdict(self) -> str:
@@ -212,7 +213,7 @@ def outcome_of(
         result = compare(model, engines, samples, seed, terms_only=True)
     told = (f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in result.refusals)
     refused = "; ".join(dict.fromkeys(told))
-    if not result.rows:
+    if result.nothing:
         return RobotOutcome(name, "refused", refused or result.verdict, result)
     if result.passed:
         allowed = [f"{r.engine}, {r.term}: {r.reason}" for r in result.rows if r.reason]

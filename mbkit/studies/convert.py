@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -27,6 +29,8 @@ FORMATS: Final = ("mjcf", "urdf")
 #: What rounding of rotations and of principal axes may cost.
 _TOLERANCE: Final = 1e-11
 _STATES: Final = 5
+# What is no character of XML 1.0 (W3C 2008, production 2).
+_NO_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,17 @@ def convert(model: Model, to: str) -> Converted:
     if model.parameters:
         model.require_values("convert")
         model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
+    _check_names(model, to)
     return _to_mjcf(model) if to == "mjcf" else _to_urdf(model)
+
+
+def _check_names(model: Model, to: str) -> None:
+    """Raise for names that XML 1.0 cannot hold, not even escaped."""
+    parts: Sequence[Any] = (*model.bodies, *model.joints, *model.frames, *model.springs, *model.loops)
+    bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if _NO_XML.search(name)]
+    if bad:
+        told = ", ".join(repr(n) for n in bad[:10]) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
+        raise UnsupportedError(f"convert: {to} is XML, which cannot hold the control characters of {told}; rename them")
 
 
 def _head(model: Model, to: str) -> str:
@@ -173,11 +187,13 @@ def _to_urdf(model: Model) -> Converted:
             back = load(path, gravity=model.gravity, nonphysical="warn")
     found = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
     acting: tuple[Cause, ...] = found.acting
-    if not found.agree or acting:
+    if acting or not (found.agree or found.massless):
         told = "; ".join(str(c) for c in acting) or found.verdict
         raise MbkitError(
             f"convert: what was written of {model.name} reads back otherwise: {told}; please report this model"
         )
+    if found.massless:
+        notes.append("no body has mass, so that reading back compares no forces, but bodies and joints alone")
     order = [c.says for c in found.causes if c.kind == "joint order"]
     return Converted(model.name, "urdf", text, found.gaps, (*notes, *order))
 

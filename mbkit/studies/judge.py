@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 import numpy as np
@@ -21,11 +21,13 @@ from mbkit.studies.states import States
 from mbkit.studies.terms import TERMS, Term
 from mbkit.studies.timing import interleaved
 
-__all__ = ["Judge"]
+__all__ = ["Judge", "announced"]
 
 _EPS: Final = float(np.finfo(float).eps)
 # Each of the largest terms went through about this many roundings on the way.
 _ROUNDINGS: Final = 4.0
+#: Where a warning of a known defect goes on with the joints of this model.
+_AS_IT_IS: Final = "; returned as it is"
 Progress = Callable[[float, str], None]
 
 
@@ -37,9 +39,17 @@ class Judge:
     """
 
     def __init__(
-        self, model: Model, made: dict[str, Dynamics], oracle: OracleDynamics, at: States, tolerance: float
+        self,
+        model: Model,
+        made: dict[str, Dynamics],
+        oracle: OracleDynamics,
+        at: States,
+        tolerance: float,
+        defects: Mapping[str, str] | None = None,
     ) -> None:
         self.model, self.made, self.oracle = model, made, oracle
+        #: What engines announced when they were made, of all their terms.
+        self.defects = defects or {}
         self.at, self.tolerance = at, tolerance
         self.refusals: list[Refusal] = []
         acting = np.abs(at.tau)
@@ -65,7 +75,7 @@ class Judge:
             self._refuse(engine, "power balance", error)
 
         for name, errors in power_rows(self.made, self.oracle, self.at, self.scales, refuse):
-            rows.append(self._row("power balance", name, errors, (np.nan, np.nan), ""))
+            rows.append(self._row("power balance", name, errors, (np.nan, np.nan), self.defects.get(name, "")))
         return rows, self.refusals
 
     def _term(self, term: Term) -> list[Row]:
@@ -81,7 +91,7 @@ class Judge:
                     broken[name] = str(error).removeprefix(f"{name}: ")
                 except MbkitError as error:
                     self._refuse(name, term.name, error)
-            defects[name] = "; ".join({str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)})
+            defects[name] = announced(caught) or self.defects.get(name, "")
         if broken and not values:
             # All alike: the model, not an engine. Named, and not counted as agreement.
             self.refusals += [Refusal(name, term.name, why) for name, why in broken.items()]
@@ -94,7 +104,8 @@ class Judge:
         for name, value in values.items():
             errors = term.errors((value - high) - low, high, self.scales)
             allowed = self._allowed(term, name, errors)
-            rows.append(self._row(term.name, name, errors, times[name], defects[name], allowed, reference))
+            zero = not high.any()
+            rows.append(self._row(term.name, name, errors, times[name], defects[name], allowed, reference, zero))
         return rows
 
     def _reference(self, term: Term, values: dict[str, Array]) -> tuple[str, Array, Array]:
@@ -148,6 +159,7 @@ class Judge:
         defect: str,
         allowed: float | None = None,
         reference: str | None = None,
+        zero: bool = False,
     ) -> Row:
         allowed = self.tolerance if allowed is None else allowed
         worst = errors.worst
@@ -185,4 +197,11 @@ class Judge:
             passed=passed,
             reason=reason,
             allowed=allowed,
+            defect="" if passed else defect.split(_AS_IT_IS)[0],
+            zero=zero,
         )
+
+
+def announced(caught: Iterable[warnings.WarningMessage]) -> str:
+    """Return the known defects among recorded warnings, in words."""
+    return "; ".join(dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)))

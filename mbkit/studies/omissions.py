@@ -81,20 +81,15 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
         flag = next((f for n, f, _, _ in _FLAGS if n == need), "")
         present = bool(flag) and needs[flag]
         if need in kept:
-            rows.append(Omission(need, True, kept[need], math.nan, math.nan, math.nan, True))
+            rows.append(Omission(need, True, kept[need], math.nan, math.nan, math.nan, math.nan, True))
             continue
         saved = times[need][0] - times["lean"][0]
         spread = math.hypot(times[need][1], times["lean"][1])
         # Dry friction that is there would act: leaving it out is a choice, said aloud.
         chosen = need == "dry friction" and present
-        note = f"± {spread:.0f} ns"
-        if chosen:
-            note += "; this model has dry friction: it is off in every engine, so that the smooth terms compare"
-        rows.append(
-            Omission(
-                need, present, told[need], saved, math.nan, changes[need], chosen or changes[need] <= _UNCHANGED, note
-            )
-        )
+        note = "it is off in every engine, so that the smooth terms compare" if chosen else ""
+        unchanged = chosen or changes[need] <= _UNCHANGED
+        rows.append(Omission(need, present, told[need], saved, spread, math.nan, changes[need], unchanged, note))
     return rows
 
 
@@ -117,8 +112,8 @@ def _coriolis(model: Model, q: Array, v: Array) -> Omission:
         False,
         "C(q, v) is derived only when asked; C v comes without it",
         times["matrix"][0] - times["nle"][0],
+        math.hypot(times["matrix"][1], times["nle"][1]),
         setup,
         change,
         change <= _UNCHANGED,
-        f"± {math.hypot(times['matrix'][1], times['nle'][1]):.0f} ns",
     )

@@ -80,6 +80,8 @@ class Curve:
     compile : float
         Seconds from nothing (no cache) to the first step: deriving, compiling, building;
         NaN where that failed. Of a method that is compiled for each tolerance, for one.
+    ended : str
+        Why there are no finer settings, where time ran out.
     """
 
     engine: str
@@ -89,6 +91,7 @@ class Curve:
     order_points: int
     expected: float
     compile: float
+    ended: str = ""
 
     @property
     def name(self) -> str:
@@ -158,6 +161,24 @@ class WorkPrecision:
                 yield curve, point
 
     @property
+    def shortened(self) -> tuple[str, ...]:
+        """What is missing: the curves left out, those that time ended, a horizon that was cut."""
+        out = [] if self.complete else ["interrupted"]
+        if self.refusals:
+            names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in self.refusals))
+            out.append(f"{_counted(len(names), 'curve')} left out: {', '.join(names)}")
+        ended = [f"{c.engine} {c.method}" for c in self.curves if c.ended]
+        if ended:
+            out.append(f"{_counted(len(ended), 'curve')} ended by time: {', '.join(ended)}")
+        # Each setting that was asked for is there, and some were not run.
+        lost = sum(math.isnan(p.seconds) for _, p in self.rows())
+        if lost:
+            out.append(f"{_counted(lost, 'setting')} not run")
+        if self.duration < self.asked * (1 - 1e-9):
+            out.append(f"horizon cut from {self.asked:g} s to {self.duration:g} s")
+        return tuple(out)
+
+    @property
     def front(self) -> tuple[tuple[Curve, PrecisionPoint], ...]:
         """The Pareto front: points that none beats in both error and run time, fastest first."""
         out: list[tuple[Curve, PrecisionPoint]] = []
@@ -175,7 +196,7 @@ class WorkPrecision:
 
     def to_dict(self) -> dict[str, Any]:
         """Return all of it as plain data, with the front by name and first-run times."""
-        out = asdict(self)
+        out = asdict(self) | {"shortened": list(self.shortened)}
         for told, curve in zip(out["curves"], self.curves, strict=True):
             for p, point in zip(told["points"], curve.points, strict=True):
                 p["first_run"] = curve.compile + point.seconds
@@ -203,7 +224,7 @@ class WorkPrecision:
         """
         try:
             return cls._from_plain(json.loads(text))
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
             raise InputError(
                 f"text: expected the JSON of a WorkPrecision, such as Path(...).read_text() of a file "
                 f"that to_json wrote; it has no such content ({type(error).__name__}: {error})"
@@ -243,12 +264,15 @@ class WorkPrecision:
 
     def to_markdown(self) -> str:
         """Return the front and the curves as tables."""
-        lines = [f"**{self.model}**, {self.duration:g} s: {self.reference}", ""]
+        missing = f" ({'; '.join(self.shortened)})" if self.shortened else ""
+        lines = [f"**{self.model}**, {self.duration:g} s{missing}: {self.reference}", ""]
         lines += ["| error ≤ | fastest | setting | run time | first run |", "|---:|---|---|---:|---:|"]
-        for exponent in range(-2, -14, -2):
-            found = self.fastest(10.0**exponent)
-            if found:
-                c, p = found
+        found = {exponent: self.fastest(10.0**exponent) for exponent in range(-2, -14, -2)}
+        # One row for each run, with the least error that it is fastest for.
+        last = {id(x[1]): exponent for exponent, x in found.items() if x}
+        for exponent, x in found.items():
+            if x and last[id(x[1])] == exponent:
+                c, p = x
                 first = f"{c.compile + p.seconds:.3g} s"
                 lines.append(f"| 1e{exponent} | {c.name} | {p.setting} {p.value:g} | {p.seconds:.3g} s | {first} |")
         lines += ["", "| engine and method | order | expected | least error | its run time | compile |"]
@@ -270,7 +294,9 @@ class WorkPrecision:
 
     def __repr__(self) -> str:
         count = sum(len(c.points) for c in self.curves)
-        return f"<WorkPrecision of {self.model!r}: {len(self.curves)} curves, {count} points, {self.duration:g} s>"
+        missing = "".join(f"; {x}" for x in self.shortened)
+        curves = _counted(len(self.curves), "curve")
+        return f"<WorkPrecision of {self.model!r}: {curves}, {count} points, {self.duration:g} s{missing}>"
 
     def _repr_html_(self) -> str:
         rows = []
@@ -278,8 +304,13 @@ class WorkPrecision:
             numbers = f"<td>{p.error:.1e}</td><td>{p.seconds:.3g} s</td><td>{c.compile + p.seconds:.3g} s</td>"
             rows.append(f"<tr><td>{html.escape(c.name)}</td><td>{p.setting} {p.value:g}</td>{numbers}</tr>")
         head = "<tr><th>on the front</th><th>setting</th><th>error</th><th>run time</th><th>first run</th></tr>"
-        told = f"<p><b>{html.escape(self.model)}</b>, {self.duration:g} s. {html.escape(self.reference)}</p>"
+        missing = f" <b>{html.escape('; '.join(self.shortened))}.</b>" if self.shortened else ""
+        told = f"<p><b>{html.escape(self.model)}</b>, {self.duration:g} s.{missing} {html.escape(self.reference)}</p>"
         return f"{told}<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
 
 
 class InterruptedSweepError(KeyboardInterrupt):

@@ -55,6 +55,10 @@ class Row:
     allowed : float
         The error that passes: the comparison's tolerance, or more where the
         engine's own formula cannot do better.
+    defect : str
+        The engine's known defect, where the row failed with one announced.
+    zero : bool
+        Whether the reference is zero in every entry at every state, so that the row is no evidence.
     """
 
     term: str
@@ -74,6 +78,8 @@ class Row:
     passed: bool
     reason: str = ""
     allowed: float = math.nan
+    defect: str = ""
+    zero: bool = False
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,8 @@ class RolloutRow:
     note : str
     judged : bool
         False where too few steps are well conditioned to say anything.
+    asked : float
+        The horizon that was to be compared, s.
     """
 
     method: str
@@ -126,6 +134,12 @@ class RolloutRow:
     passed: bool
     note: str = ""
     judged: bool = True
+    asked: float = math.nan
+
+    @property
+    def cut(self) -> bool:
+        """Whether the compared horizon is shorter than the one asked for."""
+        return self.duration < self.asked * (1 - 1e-9)
 
 
 @dataclass(frozen=True)
@@ -140,7 +154,9 @@ class Omission:
     what : str
         What was off, in words.
     saved_ns : float
-        Nanoseconds saved per evaluation; NaN where it saves set-up time only.
+        Nanoseconds saved per evaluation, the difference of two medians; NaN where nothing was timed.
+    saved_spread : float
+        Half the interquartile range of that difference, ns.
     saved_setup : float
         Seconds of set-up saved; NaN where none.
     change : float
@@ -154,10 +170,16 @@ class Omission:
     present: bool
     what: str
     saved_ns: float
+    saved_spread: float
     saved_setup: float
     change: float
     unchanged: bool
     note: str = ""
+
+    @property
+    def measurable(self) -> bool:
+        """Whether the time saved stands out from the spread of the timings, by twice that."""
+        return abs(self.saved_ns) > 2 * self.saved_spread
 
 
 @dataclass(frozen=True)
@@ -209,9 +231,9 @@ class Comparison:
 
     @property
     def passed(self) -> bool:
-        """Whether at least two engines were compared and nothing differed."""
-        told = bool(self.rows) and all(r.passed for r in self.rows)
-        return told and all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
+        """Whether at least two engines were compared, in terms that are not all zero, and nothing differed."""
+        agreed = bool(self.rows) and not self.nothing and all(r.passed for r in self.rows)
+        return agreed and all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
 
     @property
     def worst(self) -> Row | None:
@@ -220,17 +242,59 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """One sentence: agree, and to how many digits, or who differs in what."""
-        if not self.rows:
-            return f"nothing compared: {'; '.join(r.reason for r in self.refusals) or 'no engines'}"
+        """One sentence: agree, and to how many digits, or who differs in what, and by which known defect."""
+        if self.nothing:
+            return f"nothing compared: {self.nothing}"
+        missing = "".join(f"; {x}" for x in self.shortened)
         if self.passed:
-            left = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
-            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits{left}"
-        failed = [r for r in self.rows if not r.passed]
-        parts = [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
+            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits{missing}"
+        known: dict[tuple[str, str], list[str]] = {}
+        for r in self.rows:
+            if r.defect:
+                known.setdefault((r.engine, r.defect), []).append(r.term)
+        parts = [f"{engine} differs in {', '.join(terms)}: {defect}" for (engine, defect), terms in known.items()]
+        if self.only_known_defects:
+            return f"{'; '.join(parts)}; all else agrees to {self.digits:.1f} digits{missing}"
+        failed = [r for r in self.rows if not r.passed and not r.defect]
+        parts += [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
         parts += [f"rollout {r.method} on {r.engine} differs" for r in self.rollouts if not r.passed]
         parts += [f"leaving out {o.need} changes the accelerations" for o in self.omissions if not o.unchanged]
-        return "; ".join(parts)
+        return "; ".join(parts) + missing
+
+    @property
+    def nothing(self) -> str:
+        """Why the comparison says nothing although no row differs; empty where it does say something."""
+        if not self.rows:
+            return "; ".join(r.reason for r in self.refusals) or "no engines"
+        if any(not r.passed for r in self.rows):
+            return ""
+        if any(r.zero for r in self.rows if r.term == "M"):
+            return "the mass matrix is zero at every state, as no joint moves any mass"
+        return "every term is zero at every state" if all(r.zero for r in self.rows) else ""
+
+    @property
+    def only_known_defects(self) -> bool:
+        """Whether something differs, and all of it by known defects of engines."""
+        failed = [r for r in self.rows if not r.passed]
+        beyond = all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
+        return bool(failed) and all(r.defect for r in failed) and beyond
+
+    @property
+    def shortened(self) -> tuple[str, ...]:
+        """What is missing: terms, engines, whole studies, curves, and horizons that were cut."""
+        out = [f"not compared: {', '.join(self.not_compared)}"] if self.not_compared else []
+        absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
+        out += [f"{', '.join(absent)} left out"] if absent else []
+        out += [f"no {r.term}" for r in self.refusals if not r.engine]
+        unjudged = [r for r in self.rollouts if not r.judged]
+        cut = [r for r in self.rollouts if r.judged and r.cut]
+        out += [f"{len(unjudged)} of {len(self.rollouts)} rollouts not judged"] if unjudged else []
+        if cut:
+            least = min(r.duration for r in cut)
+            out.append(f"{len(cut)} of {len(self.rollouts)} rollouts cut, to {least:.3g} s at the least")
+        if self.precision is not None:
+            out += [f"error against run time: {x}" for x in self.precision.shortened]
+        return tuple(out)
 
     @property
     def not_compared(self) -> tuple[str, ...]:
@@ -240,8 +304,8 @@ class Comparison:
 
     @property
     def digits(self) -> float:
-        """Decimal digits on which all terms agree, at most 16."""
-        errors = [r.relative for r in self.rows]
+        """Decimal digits on which all terms agree, known defects apart, at most 16; zeros are no evidence."""
+        errors = [r.relative for r in self.rows if not r.zero and not r.defect]
         if not errors or any(math.isnan(e) for e in errors):
             return math.nan
         return -math.log10(max(*errors, 1e-16))
@@ -250,7 +314,9 @@ class Comparison:
         """Return everything as plain data."""
         precision = self.precision.to_dict() if self.precision is not None else None
         judged = {"passed": self.passed, "verdict": self.verdict, "digits": self.digits}
-        return asdict(self) | {"precision": precision} | judged
+        judged["shortened"] = list(self.shortened)
+        omissions = [asdict(o) | {"measurable": o.measurable} for o in self.omissions]
+        return asdict(self) | {"precision": precision, "omissions": omissions} | judged
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Return the result as JSON, and write it to `path` if given. NaN becomes null."""
@@ -267,7 +333,7 @@ class Comparison:
         head = "| term | engine | worst | median | per joint | joint | ns | |\n|---|---|---|---|---|---|---|---|"
         lines = [
             f"| {r.term} | {r.engine} | {r.relative:.1e} | {r.median:.1e} | {r.per_joint:.1e} | {r.joint} | "
-            f"{r.ns:.0f} | {'agree' if r.passed else r.reason} |"
+            f"{r.ns:.0f} | {_outcome(r)} |"
             for r in self.rows
         ]
         told = [f"- {r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in self.refusals]
@@ -277,7 +343,7 @@ class Comparison:
         cells = "".join(
             f"<tr><td>{html.escape(r.term)}</td><td>{r.engine}</td><td>{r.relative:.1e}</td><td>{r.median:.1e}</td>"
             f"<td>{html.escape(r.joint)}</td><td>{r.ns:.0f}</td>"
-            f"<td>{'agree' if r.passed else html.escape(r.reason)}</td></tr>"
+            f"<td>{html.escape(_outcome(r))}</td></tr>"
             for r in self.rows
         )
         head = "".join(f"<th>{h}</th>" for h in ("term", "engine", "worst", "median", "joint", "ns", ""))
@@ -289,6 +355,10 @@ class Comparison:
 
     def __repr__(self) -> str:
         return f"<Comparison of {self.model!r}: {self.verdict}>"
+
+
+def _outcome(row: Row) -> str:
+    return row.reason if not row.passed else "zero in all states" if row.zero else "agree"
 
 
 def _finite(value: Any) -> Any:

@@ -167,6 +167,7 @@ def _row(
         passed=not judged or (n > last and error <= tolerance),
         note="; ".join(notes),
         judged=judged,
+        asked=DURATION,
     )
 
 

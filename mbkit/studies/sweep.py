@@ -19,6 +19,9 @@ _COARSEST: Final = 0.05
 _FINEST: Final = 1e-7
 #: Ratio of neighbouring steps, by the method's order: an error falls by 4 to 16 at each.
 _RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
+#: Methods that call the dynamics from Python on every engine, and what such a call costs beside a compiled one.
+_FROM_PYTHON: Final = frozenset({"dop853", "radau", "bdf", "lsoda", "gauss4", "gauss6"})
+_CALL: Final = 8
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Plan:
         Steps, s, or tolerances.
     asked : bool
         Whether somebody asked for these values, so that each has to be accounted for;
-        else the sweep ends where finer ones bring nothing or take too long.
+        else the sweep ends where finer ones bring nothing or take too much work.
     """
 
     engine: str
@@ -46,6 +49,12 @@ class Plan:
     def kind(self) -> Method:
         """The method as data."""
         return METHODS[self.method]
+
+    def work(self, steps: int, evaluations: int) -> int:
+        """Return what a run costs, in compiled evaluations of the forward dynamics; the same on every machine."""
+        compiled = self.kind.kind == "native" or self.method.startswith("drake_") or self.engine == "lagrangian"
+        each = 1 if compiled and self.method not in _FROM_PYTHON else _CALL
+        return each * (evaluations or steps * max(self.kind.stages, 1))
 
 
 def save_grid(duration: float) -> np.ndarray:

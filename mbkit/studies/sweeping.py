@@ -6,14 +6,14 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final, Protocol
 
 from mbkit.studies.precision_result import Curve
 from mbkit.studies.result import Refusal
 from mbkit.studies.sweep import Plan
-from mbkit.studies.walk import Scene, Walk, explore, repeat
+from mbkit.studies.walk import OUT_OF_TIME, Scene, Walk, explore, repeat
 from mbkit.studies.workers import run
 
 __all__ = ["Allowance", "Alone", "Found", "Shared", "Sweeping"]
@@ -25,22 +25,36 @@ Found = tuple[Curve | None, Refusal | None]
 #: the next every setting has been run once; the rest is for repetitions.
 _READY: Final = 0.5
 _EXPLORED: Final = 0.65
-#: And no run of our own grid takes more than this part.
-_LONGEST: Final = 0.01
 #: What each of these has at the least, however long the others took.
 _AT_LEAST: Final = 0.2
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """The time that a sweep may take, s, counted from when this is made."""
+    """What a sweep may take, in seconds of the processor: a machine that does other things too ends no sweep.
+
+    Attributes
+    ----------
+    seconds : float
+        After which nothing is begun, counted from when this is made.
+    usual : float
+        After which runs are not timed again.
+    work : float
+        Counted work of a run of our own grid; see `Plan.work`.
+    """
 
     seconds: float
-    begun: float = field(default_factory=time.perf_counter)
+    usual: float
+    work: float
+    begun: float = field(default_factory=time.process_time)
 
     def until(self, part: float, least: float = 0.0) -> float:
-        """Return when a part of it is over, and not before there was a least part for what follows."""
-        return max(self.begun + part * self.seconds, time.perf_counter() + least * self.seconds)
+        """Return when a part of the seconds is over, and not before there was a least part for what follows."""
+        return max(self.begun + part * self.seconds, time.process_time() + least * self.seconds)
+
+    def timed_until(self, least: float) -> float:
+        """Return when to stop timing runs again, and not before there was a least part of the usual time for it."""
+        return max(self.begun + self.usual, time.process_time() + least * self.usual)
 
 
 class Sweeping(Protocol):
@@ -80,17 +94,17 @@ class Alone:
         # What takes long to derive, Jacobians most of all, must not keep the others from having any time at all.
         for k, walk in enumerate(sorted(self._walks, key=_how_long_to_derive)):
             yield 0.2 * k / len(self._walks), f"compiling {walk.plan.method} on {walk.plan.engine}"
-            if k and time.perf_counter() > until:
-                walk.give_up("not run: the time allowed was used up")
+            if k and time.process_time() > until:
+                walk.give_up(OUT_OF_TIME)
             elif not walk.over:
                 walk.make_ready()
-        begun, until = time.perf_counter(), self._allowance.until(_EXPLORED, _AT_LEAST)
-        for walk in explore(self._walks, until, _LONGEST * self._allowance.seconds):
+        begun, until = time.process_time(), self._allowance.until(_EXPLORED, _AT_LEAST)
+        for walk in explore(self._walks, until, self._allowance.work):
             # Cheap settings are done in no time: the root of the time shows how far it is.
-            done = ((time.perf_counter() - begun) / (until - begun)) ** 0.5
+            done = ((time.process_time() - begun) / (_EXPLORED * self._allowance.usual)) ** 0.5
             yield 0.2 + 0.4 * min(done, 1.0), f"{walk.plan.method} on {walk.plan.engine}"
         yield 0.6, "timing"
-        for k in repeat(self._walks, self._repeats, self._allowance.until(1.0, _AT_LEAST), self._seed):
+        for k in repeat(self._walks, self._repeats, self._allowance.timed_until(_AT_LEAST), self._seed):
             yield 0.6 + 0.4 * (k + 1) / self._repeats, f"timing, round {k + 1} of {self._repeats}"
 
 
@@ -119,8 +133,9 @@ class Shared:
         allowance: Allowance,
     ) -> None:
         self._executor, self._wanted = executor, wanted
-        left = allowance.until(1.0, 2 * _AT_LEAST) - time.perf_counter()
-        part = left / max(len(wanted), 1)
+        left = allowance.until(1.0, 2 * _AT_LEAST) - time.process_time()
+        each = 1 / max(len(wanted), 1)
+        part = replace(allowance, seconds=left * each, usual=min(allowance.usual, left) * each)
         self._calls = {str(i): partial(_one, scene, plan, repeats, seed, part) for i, plan in enumerate(wanted)}
         self._found: dict[int, Found] = {}
 
@@ -143,9 +158,9 @@ class Shared:
                 yield len(self._found) / len(self._wanted), f"{plan.method} on {plan.engine}"
 
 
-def _one(scene: Scene, plan: Plan, repeats: int, seed: int, seconds: float) -> Found:
+def _one(scene: Scene, plan: Plan, repeats: int, seed: int, allowance: Allowance) -> Found:
     """Measure one curve, wherever this is."""
-    alone = Alone(scene, [plan], repeats, seed, Allowance(seconds))
+    alone = Alone(scene, [plan], repeats, seed, replace(allowance, begun=time.process_time()))
     for _ in alone.steps():
         pass
     return alone.found()[0]

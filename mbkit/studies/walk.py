@@ -22,7 +22,9 @@ from mbkit.studies.result import Refusal
 from mbkit.studies.rollouts import TooLongError, patience, quiet_simulate
 from mbkit.studies.sweep import Plan
 
-__all__ = ["Scene", "Walk", "explore", "repeat"]
+__all__ = ["OUT_OF_TIME", "Scene", "Walk", "explore", "repeat"]
+
+OUT_OF_TIME: Final = "not run: the time allowed was used up"
 
 #: A run shorter than this is repeated within a round, s.
 _SHORT: Final = 2e-3
@@ -156,6 +158,9 @@ class Walk:
         self._dyn: Dynamics | None = None
         self._compile = math.nan
         self._over = False
+        #: The last run, which is not among the points if it took the same steps as the one before.
+        self._last: _Point | None = None
+        self._ended = ""
         if not self._left:
             self.refuse(f"takes no tolerance below {plan.kind.least:.3g}, and none above was asked for")
 
@@ -167,17 +172,24 @@ class Walk:
     @property
     def expected(self) -> float:
         """Seconds that the next run will take, guessed from the last; 0 before the first."""
-        if not self._points:
-            return 0.0
-        last = self._points[-1]
+        return 0.0 if self._last is None else self._last.once * self._growth(self._last)
+
+    @property
+    def work(self) -> float:
+        """The counted work of the next run, guessed from the last; 0 before the first."""
+        last = self._last
+        return 0.0 if last is None else self.plan.work(last.steps, last.evaluations) * self._growth(last)
+
+    def _growth(self, last: _Point) -> float:
+        """Return how many times as many steps the next setting takes."""
         finer = last.value / self._left[0]
         # A method of order p takes finer**(1/p) as many steps; 2 per decade is p = 3.
-        return last.once * (finer if self.plan.setting == "dt" else finer**0.3)
+        return finer if self.plan.setting == "dt" else float(finer**0.3)
 
     @property
     def ahead(self) -> float:
         """Seconds until the next run will be done, with what has to be made for it."""
-        return self.expected + (self._points[-1].before if self._points else 0.0)
+        return self.expected + (self._last.before if self._last else 0.0)
 
     def make_ready(self) -> None:
         """Derive, compile and build, timed."""
@@ -196,7 +208,10 @@ class Walk:
         point = _Point(self._left.pop(0))
         with self._refusals():
             self._run(point, bound)
-            self._points.append(point)
+            before, self._last = self._last, point
+            # Coarse tolerances that bind no step are one run: its first setting stands for all.
+            if before is None or self.plan.asked or not _same_steps(before, point):
+                self._points.append(point)
             self._over = self._over or (not self.plan.asked and self._in_vain())
 
     def _run(self, point: _Point, bound: float) -> None:
@@ -210,7 +225,8 @@ class Walk:
         except TooLongError as error:
             point.once, point.note = time.perf_counter() - begun, str(error)
             # What is finer takes longer still.
-            self._over = not self.plan.asked
+            if not self.plan.asked:
+                self.end(point.note)
             return
         except UnsupportedError:
             raise
@@ -249,7 +265,11 @@ class Walk:
             self._points += [_Point(value, note=why) for value in self._left]
         elif not self._points and self.refusal is None:
             self.refusal = self._refused(why)
-        self._left, self._over = [], True
+        self.end(why)
+
+    def end(self, why: str) -> None:
+        """Run no finer setting, for this reason."""
+        self._left, self._over, self._ended = [], True, why
 
     def _refusals(self) -> _Refusals:
         return _Refusals(self)
@@ -289,7 +309,16 @@ class Walk:
         )
         expected = plan.kind.order if fixed and plan.kind.order is not None else math.nan
         points = tuple(self._frozen(p) for p in self._points)
-        return Curve(plan.engine, plan.method, points, seen.order, seen.points, float(expected), compile=self._compile)
+        return Curve(
+            plan.engine,
+            plan.method,
+            points,
+            seen.order,
+            seen.points,
+            float(expected),
+            compile=self._compile,
+            ended=self._ended,
+        )
 
     def _frozen(self, p: _Point) -> PrecisionPoint:
         # The first run of all counts only where there is no other.
@@ -307,6 +336,11 @@ class Walk:
             repeats=len(times) if math.isfinite(times[0]) else 0,
             note=p.note,
         )
+
+
+def _same_steps(a: _Point, b: _Point) -> bool:
+    both = math.isfinite(a.error) and math.isfinite(b.error)
+    return both and 0 < a.evaluations == b.evaluations and a.steps == b.steps
 
 
 @dataclass(frozen=True)
@@ -338,7 +372,7 @@ class _Refusals:
         return True
 
 
-def explore(walks: Sequence[Walk], until: float, longest: float) -> Iterator[Walk]:
+def explore(walks: Sequence[Walk], until: float, most: float) -> Iterator[Walk]:
     """Run each setting once, the cheapest next run of all walks first; yield whose it was.
 
     All curves get about as far to the right of the figure, and whatever is coarse is
@@ -348,19 +382,19 @@ def explore(walks: Sequence[Walk], until: float, longest: float) -> Iterator[Wal
     ----------
     walks : sequence of Walk
     until : float
-        On `time.perf_counter`; nothing is begun that would probably not be done by then.
-    longest : float
-        Seconds that a run of our own grid may take.
+        On `time.process_time`; nothing is begun that would probably not be done by then.
+    most : float
+        Counted work that a run of our own grid may take, so that the curves are the same on a slow machine.
     """
     while going := [w for w in walks if not w.over]:
         walk = min(going, key=lambda w: w.expected)
-        left = until - time.perf_counter()
+        left = until - time.process_time()
         if walk.ahead > left:
             for other in going:
-                other.give_up("not run: the time allowed was used up")
+                other.give_up(OUT_OF_TIME)
             return
-        if walk.expected > longest and not walk.plan.asked:
-            walk.give_up(f"not run: it would take more than {longest:.2g} s")
+        if walk.work > most and not walk.plan.asked:
+            walk.end("")
             continue
         # A guess is a guess: one run must not take all that is left.
         walk.step(bound=float(f"{max(left / 4, 2 * walk.expected, 0.1):.2g}"))
@@ -375,11 +409,11 @@ def repeat(walks: Sequence[Walk], repeats: int, until: float, seed: int) -> Iter
     times.
     """
     runs = [x for walk in walks for x in walk.timed]
-    counts = shares([max(once, _SHORT) for once, _ in runs], repeats, until - time.perf_counter())
+    counts = shares([max(once, _SHORT) for once, _ in runs], repeats, until - time.process_time())
     rng = np.random.default_rng(seed)
     for k in range(repeats):
         for i in rng.permutation(len(runs)):
-            if k < counts[i] and time.perf_counter() + runs[i][0] < until:
+            if k < counts[i] and time.process_time() + runs[i][0] < until:
                 runs[i][1]()
         yield k
 

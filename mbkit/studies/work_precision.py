@@ -32,10 +32,15 @@ from mbkit.studies.sweeping import Allowance, Alone, Shared, Sweeping
 
 __all__ = ["work_precision"]
 
-#: Seconds that a study may take when nobody says, and what each velocity adds, up to the most.
-_ALLOWED: Final = 60.0
+#: Seconds that a study usually takes, and what each velocity adds, up to the most.
+_USUAL: Final = 60.0
 _EACH: Final = 10.0
 _MOST: Final = 120.0
+#: Times as long, a study that was given no time ends all the same.
+_AT_THE_LATEST: Final = 5.0
+#: Counted work of a run, for so many velocities; of more it is less, as each evaluation takes longer.
+_WORK: Final = 200_000
+_VELOCITIES: Final = 8
 #: The part of it that a reference may take.
 _FOR_REFERENCE: Final = 0.25
 _ALONE: Final = "interleaved in one process"
@@ -56,6 +61,7 @@ def work_precision(
     tolerances: Sequence[float] | None = None,
     repeats: int = 5,
     seconds: float | None = None,
+    work: int | None = None,
     executor: Executor | None = None,
     reference: Reference | Exact | None = None,
     progress: Progress | None = None,
@@ -91,9 +97,14 @@ def work_precision(
         Timings of each setting, in rounds over all of them; fewer of long ones where
         time is short.
     seconds : float, optional
-        What the study may take, the reference and all compiling included; when not
-        given, between 60 and 120, by the number of joints. Nothing that is being
-        compiled is broken off, and a part is always left to the runs.
+        What the study may take of the processor's time at the most, the reference and all compiling included.
+        What is left out for that is told first, in the repr and the reports. Nothing that is being compiled is
+        broken off, and a part is always left to the runs. When not given, `work` alone decides on the settings,
+        and five times the usual 60 to 120 s end the study of a model that takes too long to derive.
+    work : int, optional
+        Evaluations of the forward dynamics that a run of the study's own steps and tolerances may take; one
+        that is called from Python counts eight. So the curves do not depend on the machine's speed. By default
+        200,000, and less beyond 8 velocities.
     executor : concurrent.futures.Executor, optional
         Who measures, a curve each: a pool of processes, Dask's or MPI's. Errors do not
         depend on it. Run times do: workers share the cores, and each has the time
@@ -130,7 +141,7 @@ def work_precision(
     each, so they take ten at the least). Everything that belongs to the model is
     first derived, compiled and built from nothing, whatever the caches hold, and that
     is timed apart. Then all settings are run once, the cheapest next run of all curves
-    first, until finer settings bring nothing or the time allowed is used up, and then timed
+    first, until finer settings bring nothing or would take too much work, and then timed
     in rounds over all of them, each round in another order. The observed order is
     taken as `mbkit.studies.orders` says.
 
@@ -147,9 +158,12 @@ def work_precision(
     >>> round(curve.order), len(curve.points)
     (4, 3)
     """
+    begun = time.perf_counter()
     _check_model(model)
-    usual = min(_ALLOWED + _EACH * model.nv, _MOST)
-    allowance = Allowance(usual if seconds is None else real("seconds", seconds, positive=True))
+    usual = min(_USUAL + _EACH * model.nv, _MOST)
+    limit = _AT_THE_LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
+    most = _WORK * min(1.0, _VELOCITIES / model.nv) if work is None else count("work", work, least=1)
+    allowance = Allowance(limit, min(usual, limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     _check_executor(executor, torque)
     keeper = Keeper(progress, checkpoint)
@@ -165,8 +179,13 @@ def work_precision(
         seed,
         reference,
         lambda done: keeper.tell(0.1 * done, "reference"),
-        _FOR_REFERENCE * allowance.seconds,
+        _FOR_REFERENCE * allowance.usual,
     )
+    if scene.motion == 0.0:
+        raise InputError(
+            "q0, v0: expected a start from which something moves, got one at rest in equilibrium, where every method "
+            "is exact; choose another start"
+        )
     wanted = plans(wanted_pairs, float(scene.times[1]), *grids)
     sweeping: Sweeping
     if executor is None:
@@ -180,6 +199,7 @@ def work_precision(
         "seed": seed,
         "repeats": repeats,
         "allowed": allowance.seconds,
+        "work": allowance.work,
         "steps": grids[0],
         "tolerances": grids[1],
         "torque": "function" if callable(scene.torque) else None if scene.torque is None else scene.torque.tolist(),
@@ -204,7 +224,7 @@ def work_precision(
             complete=complete,
             versions=stamp.versions(),
             processor=stamp.processor(),
-            seconds=time.perf_counter() - allowance.begun,
+            seconds=time.perf_counter() - begun,
             settings=settings,
         )
 

@@ -2,7 +2,9 @@
 
 Where a body's frame is drawn is nobody's physics: a frame may turn freely about whatever its
 joint is, and slide along the joint's axis. Importers and converters make use of that. A frame
-is moved to where the other description has it if fewer numbers differ then.
+is moved to where the other description has it, if nothing of its joint and body differs then, or at least
+two parts less. One part less is no evidence: of two different robots, a frame can always be slid to where the
+other's stands, and its centre of mass and the next joint then have numbers that are in neither file.
 """
 
 from __future__ import annotations
@@ -89,9 +91,13 @@ def aligned(b: Compact, a: Model, near: Near) -> Aligned:
     moved: dict[str, tuple[Array, Array]] = {"world": (np.eye(3), np.zeros(3))}
     made: dict[str, tuple[Joint, Body]] = {}
     reframed = []
+    carried: dict[str, list[tuple[Joint, Joint]]] = {}
+    for joint in b.model.joints:
+        if joint.name in joints:
+            carried.setdefault(joint.parent, []).append((joint, joints[joint.name]))
     for joint in b.model.tree:
         R, p = moved[joint.parent]
-        there = replace(joint, rotation=R.T @ joint.rotation, translation=R.T @ (joint.translation - p))
+        there = _seen_joint(joint, R, p)
         body = own[joint.child]
         moved[joint.child] = np.eye(3), np.zeros(3)
         made[joint.name] = there, body
@@ -108,7 +114,12 @@ def aligned(b: Compact, a: Model, near: Near) -> Aligned:
         if not shift.any() and np.array_equal(turn, np.eye(3)):
             continue
         other = _moved(there, body, turn, shift)
-        if _differing(*other, like, matter[like.child], near) < _differing(there, body, like, matter[like.child], near):
+        own_before = _differing(there, body, like, matter[like.child], near)
+        own_after = _differing(*other, like, matter[like.child], near)
+        gain = own_before - own_after
+        for child, like_child in carried.get(joint.child, ()):
+            gain += _misplaced(child, like_child, near) - _misplaced(_seen_joint(child, turn, shift), like_child, near)
+        if gain > 0 and (gain > 1 or not own_after):
             made[joint.name] = other
             moved[joint.child] = turn, shift
             reframed.append(joint.name)
@@ -152,13 +163,21 @@ def _moved(joint: Joint, body: Body, R: Array, p: Array) -> tuple[Joint, Body]:
 def _differing(joint: Joint, body: Body, like: Joint, matter: Body, near: Near) -> int:
     return sum(
         (
-            not near.vector(joint.rotation, like.rotation),
-            not near.point(joint.translation, like.translation),
+            _misplaced(joint, like, near),
             not near.vector(joint.axes, like.axes),
             not near.point(body.com, matter.com),
             not near.inertia(body.inertia, matter.inertia, matter.mass),
         )
     )
+
+
+def _misplaced(joint: Joint, like: Joint, near: Near) -> int:
+    return (not near.vector(joint.rotation, like.rotation)) + (not near.point(joint.translation, like.translation))
+
+
+def _seen_joint(joint: Joint, R: Array, p: Array) -> Joint:
+    """Return a joint as it stands in its parent's frame after that was moved by R, p."""
+    return replace(joint, rotation=R.T @ joint.rotation, translation=R.T @ (joint.translation - p))
 
 
 def _seen(moved: dict[str, tuple[Array, Array]], body: str, point: Array) -> Array:

@@ -12,12 +12,12 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.solids import NOTHING, Lump
-from mbkit.studies.causes.compact import Member, composite
+from mbkit.studies.causes.compact import Compact, Member, composite
 from mbkit.studies.causes.hypothesis import Guess, angle_of, told
 from mbkit.studies.causes.near import Near
 from mbkit.studies.causes.turns import reordered
 
-__all__ = ["blind", "by_link", "named"]
+__all__ = ["blind", "by_link", "named", "paired"]
 
 _UNITS: Final = ((1e3, "1000 times too large, as grams or millimetres"), (1e-3, "1000 times too small"))
 #: kg/m³.
@@ -152,59 +152,73 @@ def _balls(at: Lump) -> Iterator[Guess]:
 def named(members: Sequence[Member], R_PJ: Array, b: Lump, near: Near, *, base: bool = False) -> list[Guess]:
     """Return the mistakes that make a body's matter that of the other side, with names as exact as can be.
 
-    One mistake for all of it is sought first, then one each for mass, centre of mass and inertia.
+    One mistake for all of it is sought first, then one each for mass, centre of mass and inertia. The value of
+    each has the fields of the matter that it concerns, as the other side has them, and no two share a field.
     """
     a = composite(members)
+    everything = {"mass": b.mass, "com": b.com, "inertia": b.inertia}
     guesses = list(blind(members, R_PJ, base=base))
     for guess in guesses:
         if near.lump(guess.value, b):
-            return [guess]
+            return [replace(guess, value=everything)]
     if _fits(_scaled(a, b), b, near):
         says = f"has {told(b.mass / a.mass)} times the mass, and the inertia with it"
-        return [Guess("mass", says, b)]
+        return [Guess("mass", says, everything)]
     if not a.mass and not a.inertia.any():
-        return [Guess("added body", "has matter in it", b)]
+        return [Guess("added body", "has matter in it", everything)]
     out = []
-    at = a
     if not near.number(a.mass, b.mass):
-        step = Lump(b.mass, at.com, at.inertia)
-        out.append(_first(guesses, step, near) or Guess("mass", _change("mass", a.mass, b.mass, "kg"), step))
-        at = step
+        found = _first(guesses, Lump(b.mass, a.com, a.inertia), near)
+        kind, says = (found.kind, found.says) if found else ("mass", _change("mass", a.mass, b.mass, "kg"))
+        out.append(Guess(kind, says, {"mass": b.mass}))
     if not near.point(a.com, b.com):
-        step = Lump(at.mass, b.com, at.inertia)
-        same = Lump(a.mass, b.com, a.inertia)
-        found = _first(guesses, same, near)
-        says = found.says if found else _change("centre of mass", a.com, b.com, "m")
-        out.append(Guess(found.kind if found else "centre of mass", says, step))
-        at = step
+        found = _first(guesses, Lump(a.mass, b.com, a.inertia), near)
+        what = "centre of mass"
+        kind, says = (found.kind, found.says) if found else (what, _change(what, a.com, b.com, "m"))
+        out.append(Guess(kind, says, {"com": b.com}))
     if not near.inertia(a.inertia, b.inertia, a.mass):
         kind, says = _inertia(a, b, guesses, near)
-        out.append(Guess(kind, says, b))
+        out.append(Guess(kind, says, {"inertia": b.inertia}))
     return out
 
 
 def by_link(ours: Sequence[Member], theirs: Sequence[Member], near: Near) -> list[tuple[str, Guess]] | None:
     """Return (link, mistake) where both sides still know the links that a body was made of; else None.
 
-    The mistake's value is the link's matter in the body's axes.
+    The members are those that `paired` returns.
     """
     there = {m.name: m for m in theirs}
-    if len(ours) < 2 or not all(m.name in there for m in ours) or len(ours) != len(theirs):
+    if len(ours) < 2 or there.keys() != {m.name for m in ours}:
         return None
     out = []
     for m in ours:
-        other = there[m.name]
-        if near.lump(m.lump, other.lump):
-            continue
-        drawn_alike = near.vector(m.R, other.R) and near.point(m.p, other.p)
-        own = m if drawn_alike else replace(m, R=np.eye(3), p=np.zeros(3), matter=m.lump)
-        wanted = other.matter if drawn_alike else other.lump
-        alone = replace(own, R=np.eye(3), p=np.zeros(3))
-        out += [
-            (m.name, replace(guess, value=guess.value.moved(own.R, own.p)))
-            for guess in named([alone], np.eye(3), wanted, near)
-        ]
+        wanted = there[m.name].matter
+        if not near.lump(m.matter, wanted):
+            alone = replace(m, R=np.eye(3), p=np.zeros(3))
+            out += [(m.name, guess) for guess in named([alone], np.eye(3), wanted, near)]
     return out
+
+
+def paired(one: Compact, other: Compact, near: Near) -> tuple[Compact, Compact]:
+    """Return both descriptions with the links that they share in the same axes.
+
+    A link whose frame stands elsewhere in the second description is given in its body's axes in both.
+    """
+    sides: tuple[dict[str, tuple[Member, ...]], ...] = (dict(one.members), dict(other.members))
+    for name in sides[0].keys() & sides[1].keys():
+        there = {m.name: m for m in sides[1][name]}
+        apart = {
+            m.name
+            for m in sides[0][name]
+            if m.name in there and not (near.vector(m.R, there[m.name].R) and near.point(m.p, there[m.name].p))
+        }
+        for side in sides:
+            side[name] = tuple(_in_body_axes(m) if m.name in apart else m for m in side[name])
+    return Compact(one.model, sides[0]), Compact(other.model, sides[1])
+
+
+def _in_body_axes(m: Member) -> Member:
+    return Member(m.name, np.eye(3), np.zeros(3), m.lump)
 
 
 def _first(guesses: Sequence[Guess], value: Lump, near: Near) -> Guess | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from mbkit._check import Array
 from mbkit.load.solids import NOTHING, Lump, together
 from mbkit.model import Body, Joint, Model
 
-__all__ = ["Compact", "Member", "compact", "composite", "with_lump"]
+__all__ = ["Compact", "Member", "compact", "composite", "with_link", "with_lump", "with_matter"]
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,18 @@ def composite(members: Iterable[Member]) -> Lump:
 def with_lump(model: Model, name: str, lump: Lump) -> Model:
     """Return the description with other matter in one body."""
     return replace(model, bodies=tuple(_body(name, lump) if b.name == name else b for b in model.bodies))
+
+
+def with_matter(x: Compact, name: str, fields: Mapping[str, Any]) -> Compact:
+    """Return the description with another mass, centre of mass or inertia in one body."""
+    body = x.model.body(name)
+    return replace(x, model=with_lump(x.model, name, replace(Lump(body.mass, body.com, body.inertia), **fields)))
+
+
+def with_link(x: Compact, name: str, link: str, fields: Mapping[str, Any]) -> Compact:
+    """Return the description with other matter in one link of a body, in the link's axes."""
+    members = tuple(replace(m, matter=replace(m.matter, **fields)) if m.name == link else m for m in x.members[name])
+    return Compact(with_lump(x.model, name, composite(members)), {**x.members, name: members})
 
 
 def _body(name: str, lump: Lump) -> Body:

@@ -48,16 +48,20 @@ def engine_causes(a: Model | Dynamics, b: Model | Dynamics, out: Explanation) ->
     study = _Engines(one, other, out)
     causes = [*study.defects(), *study.causes()]
     before, after = study.before, study.after
-    left = () if after.worst <= out.tolerance else after.terms
     known = [c for c in causes if c.kind == "engine defect"]
+    # Terms that only some engines give have no other explanation than a known defect.
+    named = {term for c in known for term in c.effects}
+    beside = [g for g in study.beside if g.term not in named]
+    left = _larger(after.terms, beside)
+    explained = max((g.relative for g in left), default=np.inf) <= out.tolerance
     return replace(
         out,
-        agree=out.agree and before.worst <= out.tolerance and not known,
+        agree=out.agree and max(before.worst, *(g.relative for g in study.beside), 0.0) <= out.tolerance,
         gaps=_larger(out.gaps, (*before.terms, *study.beside)),
         causes=(*out.causes, *causes),
-        explained=out.explained and not left,
-        left=(*out.left, *left),
-        subtree=out.subtree or (study.subtree() if left else ()),
+        explained=out.explained and explained,
+        left=_larger(out.left, left),
+        subtree=out.subtree or (study.subtree() if not after.worst <= out.tolerance else ()),
     )
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +14,11 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.load.solids import Lump
 from mbkit.model import Joint, Model
-from mbkit.spatial import skew
 from mbkit.studies.causes import bodies, joints, whole
-from mbkit.studies.causes.alignment import aligned, renamed
-from mbkit.studies.causes.compact import Compact, Member, compact, composite, with_lump
+from mbkit.studies.causes.alignment import Aligned, aligned, renamed
+from mbkit.studies.causes.compact import Compact, compact, with_link, with_matter
 from mbkit.studies.causes.engines import engine_causes
-from mbkit.studies.causes.hypothesis import Hypothesis, told, with_joint
+from mbkit.studies.causes.hypothesis import Guess, Hypothesis, told, with_joint
 from mbkit.studies.causes.matching import Match, Matching
 from mbkit.studies.causes.near import Near
 from mbkit.studies.causes.result import Cause, Explanation, plain
@@ -29,8 +30,6 @@ __all__ = ["explain"]
 
 #: Numbers that differ by less are as if written with five digits.
 _ROUNDED = 2e-5
-#: Above so many causes only the whole is evaluated, not each by itself.
-_MOST = 60
 
 
 def explain(
@@ -44,11 +43,13 @@ def explain(
 ) -> Explanation:
     """Say why two descriptions, or two engines, differ.
 
-    The usual causes are applied to the first side, and those are named with which the difference
-    vanishes: armature, damping, friction, springs, gravity, a lost, fused or changed body, inertia about
-    the wrong point or in the wrong axes, a joint's place, axis, zero or pitch, quaternion and joint order,
-    mimic joints, velocity frames, a known defect of an engine. Joints are matched by structure and name,
-    and frames that are only drawn elsewhere are no difference.
+    Every difference between the descriptions is named: armature, damping, friction, springs, gravity, a
+    lost, fused or changed body, inertia about the wrong point or in the wrong axes, a joint's place, axis,
+    zero or pitch, quaternion and joint order, mimic joints, velocity frames, a known defect of an engine.
+    Joints are matched by structure and name, and frames that are only drawn elsewhere are no difference.
+
+    What each difference does is measured: it is put alone into the first description, and taken alone out of
+    the second. What remains with all of them put into the first is measured too.
 
     Parameters
     ----------
@@ -119,29 +120,24 @@ class _Descriptions:
         by_name = self._by_name(one, other)
         one, other, matching, structural = settled(self.a, self.b, near)
         theirs = renamed(other, one.model, matching)
-        found = aligned(theirs, one.model, near)
+        found = self._aligned(theirs, one.model, near)
         before = by_name or self._gaps(one.model, theirs.model)
+        one, target = bodies.paired(one, found.compact, near)
+        hypotheses = _hypotheses(one, target, near) if one.model.nv else []
+        made = _applied(one, hypotheses)
+        after = self._gaps(made.model, target.model)
         causes = [self._cause(h, {"M": np.inf}) for h in structural]
         causes += self._name_causes(one, other, matching, by_name)
-        hypotheses, allowed = self._hypotheses(one, found.compact, near)
-        target = found.compact.model
-        made = _applied(one.model, hypotheses)
-        after = self._gaps(made, target)
-        for k, h in enumerate(hypotheses):
-            if h.kind in joints.DATA_ONLY:
-                effects: dict[str, float] = {}
-            elif len(hypotheses) > _MOST:
-                effects = {"M": np.nan}
-            else:
-                without = _applied(one.model, [x for i, x in enumerate(hypotheses) if i != k])
-                effects = _effects(self._gaps(without, target))
-            causes.append(self._cause(h, effects))
-        causes += self._ground(one, found.compact, near)
-        left = () if after.worst <= allowed else after.terms
+        causes += [self._measured(h, one, target) for h in hypotheses]
+        causes += self._ground(one, target, near)
+        constrained = any(c.kind in whole.CONSTRAINTS for c in causes)
+        massless = bool(one.model.nv) and self._massless(one.model) and self._massless(target.model)
+        agree = not (structural or constrained or massless) and before.worst <= self.tolerance
+        explained = after.worst <= self.tolerance and (agree or massless or any(c.acts for c in causes))
         return Explanation(
             a=self.names[0],
             b=self.names[1],
-            agree=not structural and before.worst <= self.tolerance,
+            agree=agree,
             gaps=before.terms,
             comparable=before.comparable and not structural,
             matches=matching.pairs,
@@ -149,16 +145,41 @@ class _Descriptions:
             only_b=matching.only_b,
             causes=tuple(causes),
             notes=tuple(self._notes(one, found.reframed, matching)),
-            explained=after.worst <= allowed,
-            left=left,
-            subtree=self._subtree(made, target, allowed) if after.worst > allowed else (),
+            explained=explained,
+            left=after.terms,
+            subtree=() if explained else self._subtree(made.model, target.model),
             samples=self.samples,
             seed=self.seed,
             tolerance=self.tolerance,
+            massless=massless,
         )
 
+    def _massless(self, model: Model) -> bool:
+        M = model_terms(model, states_of(model, self.samples, self.seed)).get("M")
+        return M is not None and not M.any()
+
+    def _aligned(self, theirs: Compact, like: Model, near: Near) -> Aligned:
+        """Return a description with its frames where the other has them, if no term changes with that."""
+        found = aligned(theirs, like, near)
+        if not found.reframed or self._gaps(theirs.model, found.compact.model).worst <= self.tolerance:
+            return found
+        return Aligned(theirs, ())
+
+    def _measured(self, h: Hypothesis, one: Compact, target: Compact) -> Cause:
+        """Return a difference as a cause, with the larger of its effects on the two descriptions.
+
+        It is put alone into the first description, and taken alone out of the second.
+        """
+        if h.kind in whole.CONSTRAINTS:
+            return self._cause(h, {})
+        effects: dict[str, float] = {}
+        for model, changed in ((one.model, h.apply(one).model), (target.model, h.revert(target).model)):
+            for term, relative in _effects(self._gaps(model, changed)).items():
+                effects[term] = max(relative, effects.get(term, 0.0))
+        return self._cause(h, effects)
+
     def _gaps(self, a: Model, b: Model) -> Gaps:
-        if a.velocity_names != b.velocity_names:
+        if a.velocity_names != b.velocity_names or not a.nv:
             return Gaps((), comparable=False)
         at = states_of(b, self.samples, self.seed)
         owners = [j.name for j in a.independent_joints for _ in range(j.type.nv)]
@@ -173,7 +194,7 @@ class _Descriptions:
         return self._gaps(one.model, renamed(other, one.model, Matching(pairs, (), ())).model)
 
     def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
-        acts = h.kind not in joints.DATA_ONLY and any(not x <= self.tolerance for x in effects.values())
+        acts = h.kind in whole.CONSTRAINTS or any(not x <= self.tolerance for x in effects.values())
         head = f"{h.subject}: " if h.subject else ""
         return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", plain(h.a), plain(h.b), effects, acts)
 
@@ -185,11 +206,11 @@ class _Descriptions:
         other_names = [m for m in matching.pairs if m.how == "structure" and m.b not in ours]
         if exchanged:
             says = "calls joints by each other's names: " + ", ".join(f"{m.a!r} is {m.b!r}" for m in exchanged)
-            h = Hypothesis("names exchanged", "", says, lambda m: m)
+            h = Hypothesis("names exchanged", "", says)
             out.append(self._cause(h, _effects(by_name) if by_name else {"M": np.inf}))
         if other_names:
             says = "calls joints otherwise: " + ", ".join(f"{m.a!r} is {m.b!r}" for m in other_names)
-            out.append(self._cause(Hypothesis("renamed", "", says, lambda m: m), {}))
+            out.append(self._cause(Hypothesis("renamed", "", says), {}))
         places = {n: k for k, n in enumerate(j.name for j in other.model.independent_joints)}
         order = [m.b for m in matching.pairs if m.b in places]
         there = sorted(order, key=places.__getitem__)
@@ -199,21 +220,8 @@ class _Descriptions:
                 says = f"has joints {moved[0]!r} and {moved[1]!r} in each other's place in q and v"
             else:
                 says = f"has q and v in another order: {', '.join(there)}"
-            out.append(self._cause(Hypothesis("joint order", "", says, lambda m: m), {}))
+            out.append(self._cause(Hypothesis("joint order", "", says), {}))
         return out
-
-    def _hypotheses(self, one: Compact, other: Compact, near: Near) -> tuple[list[Hypothesis], float]:
-        """Return the mistakes that make one the other, and to what they explain it."""
-        fine = _differences(one, other, near)
-        if len(fine) > 4:
-            coarse = _differences(one, other, replace(near, tolerance=_ROUNDED))
-            if len(coarse) <= len(fine) // 2:
-                kept = {h.subject for h in coarse}
-                small = [h for h in fine if h.subject not in kept]
-                says = f"has rounded numbers: {len(small)} of them differ, by less than {_ROUNDED:.0e} of their size"
-                rounding = Hypothesis("rounding", "", says, lambda m: _applied(m, small))
-                return [*coarse, rounding], max(self.tolerance, 10 * _ROUNDED)
-        return fine, self.tolerance
 
     def _ground(self, one: Compact, other: Compact, near: Near) -> list[Cause]:
         """Return what differs in the matter that stands still."""
@@ -228,33 +236,56 @@ class _Descriptions:
             says = f"has other matter of the same mass standing still{': ' if links else ''}{', '.join(links)}"
         else:
             says = f"has {told(b.mass)} kg standing still for {told(a.mass)} kg"
-        return [self._cause(Hypothesis("base mass", "the base", says, lambda m: m, a.mass, b.mass), {})]
+        return [self._cause(Hypothesis("base mass", "the base", says, a=a.mass, b=b.mass), {})]
 
     def _notes(self, one: Compact, reframed: Sequence[str], matching: Matching) -> list[str]:
         out = []
         if reframed:
             frames = f"{len(reframed)} of {len(one.model.joints)} frames" if len(reframed) > 3 else ", ".join(reframed)
-            out.append(f"frames drawn elsewhere, which moves nothing: {frames}")
+            out.append(f"frames drawn elsewhere, which changes no term: {frames}")
         if any(m.how == "structure" for m in matching.pairs):
             by_place = sum(m.how == "structure" for m in matching.pairs)
             out.append(f"{by_place} of {len(matching.pairs)} joints were matched by structure, the others by name")
         return out
 
-    def _subtree(self, a: Model, b: Model, allowed: float) -> tuple[str, ...]:
+    def _subtree(self, a: Model, b: Model) -> tuple[str, ...]:
         def differs(names: set[str]) -> bool:
-            return self._gaps(part(a, names), part(b, names)).worst > allowed
+            return self._gaps(part(a, names), part(b, names)).worst > self.tolerance
 
         return smallest(a, differs)
 
 
-def _applied(model: Model, hypotheses: Iterable[Hypothesis]) -> Model:
+def _applied(x: Compact, hypotheses: Iterable[Hypothesis]) -> Compact:
     for h in hypotheses:
-        model = h.apply(model)
-    return model
+        x = h.apply(x)
+    return x
 
 
 def _effects(found: Gaps) -> dict[str, float]:
     return {g.term: g.relative for g in found.terms} if found.comparable else {"M": np.inf}
+
+
+def _hypotheses(one: Compact, other: Compact, near: Near) -> list[Hypothesis]:
+    """Return the differences that make one description the other; many small ones are one, called rounding."""
+    fine = _differences(one, other, near)
+    if len(fine) <= 4:
+        return fine
+    coarse = _differences(one, other, replace(near, tolerance=max(_ROUNDED, near.tolerance)))
+    if len(coarse) > len(fine) // 2:
+        return fine
+    large = {(h.subject, field) for h in coarse for field in h.theirs}
+    less = [h.without({field for subject, field in large if subject == h.subject}) for h in fine]
+    small = [h for h in less if h.theirs]
+    says = f"has rounded numbers: {len(small)} of them differ, by less than {_ROUNDED:.0e} of their size"
+
+    def put(x: Compact, sides: Mapping[str, Sequence[Hypothesis]]) -> Compact:
+        for h in sides.get("in", ()):
+            x = h.apply(x)
+        for h in sides.get("out", ()):
+            x = h.revert(x)
+        return x
+
+    return [*coarse, Hypothesis("rounding", "", says, put, {"out": small}, {"in": small})]
 
 
 def _differences(one: Compact, other: Compact, near: Near) -> list[Hypothesis]:
@@ -269,75 +300,60 @@ def _differences(one: Compact, other: Compact, near: Near) -> list[Hypothesis]:
 
 
 def _joint(a: Joint, b: Joint, near: Near) -> list[Hypothesis]:
-    return [
-        Hypothesis(
-            g.kind,
-            f"joint {a.name!r}",
-            g.says,
-            lambda m, g=g: with_joint(m, a.name, **g.value),  # type: ignore[misc]
-            *_numbers(a, b, g.value),
-        )
-        for g in joints.named(a, b, near)
-    ]
+    def put(x: Compact, fields: Mapping[str, Any]) -> Compact:
+        return replace(x, model=with_joint(x.model, a.name, **fields))
+
+    out = []
+    for g in joints.named(a, b, near):
+        ours = {field: getattr(a, field) for field in g.value}
+        theirs = {field: getattr(b, field) for field in g.value}
+        out.append(Hypothesis(g.kind, f"joint {a.name!r}", g.says, put, ours, theirs, *_numbers(ours, theirs)))
+    return out
 
 
-def _numbers(a: Joint, b: Joint, fields: dict[str, object]) -> tuple[object, object]:
-    if len(fields) != 1 or not isinstance(next(iter(fields.values())), (float, np.ndarray)):
+def _numbers(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the numbers of the two sides, where a difference is in one field of numbers."""
+    if len(ours) != 1:
         return None, None
-    name = next(iter(fields))
-    return getattr(a, name), getattr(b, name)
+    sides = next(iter(ours.values())), next(iter(theirs.values()))
+    return sides if all(isinstance(x, (float, np.ndarray)) for x in sides) else (None, None)
 
 
 def _body(one: Compact, joint: Joint, other: Compact, near: Near) -> list[Hypothesis]:
-    members = one.members[joint.child]
-    there = other.model.body(joint.child)
-    b = Lump(there.mass, there.com, there.inertia)
-    if near.lump(composite(members), b):
+    body = joint.child
+    members, (a, b) = one.members[body], (_lump(x.model, body) for x in (one, other))
+    if near.lump(a, b):
         return []
-    links = bodies.by_link(members, other.members[joint.child], near)
+    links = bodies.by_link(members, other.members[body], near)
     if links:
+        own = {m.name: m.matter for m in members}
+        there = {m.name: m.matter for m in other.members[body]}
         return [
-            Hypothesis(
-                g.kind,
-                f"link {name!r}, fixed to {joint.child!r}" if name != joint.child else f"link {name!r}",
-                g.says,
-                _with_link(members, joint.child, name, g.value),
+            _matter(
+                g,
+                f"link {name!r}, fixed to {body!r}" if name != body else f"link {name!r}",
+                partial(_put_link, body, name),
+                own[name],
+                there[name],
             )
             for name, g in links
         ]
-    return [
-        Hypothesis(
-            g.kind,
-            f"body {joint.child!r}",
-            g.says,
-            lambda m, g=g: with_lump(m, joint.child, g.value),  # type: ignore[misc]
-        )
-        for g in bodies.named(members, joint.rotation, b, near, base=_base(joint))
-    ]
+    guesses = bodies.named(members, joint.rotation, b, near, base=_base(joint))
+    return [_matter(g, f"body {body!r}", lambda x, fields: with_matter(x, body, fields), a, b) for g in guesses]
 
 
-def _with_link(members: Sequence[Member], body: str, link: str, lump: Lump) -> Callable[[Model], Model]:
-    """Return what gives a body other matter in one of its links, and leaves the others as they are then."""
-    own = next(m.lump for m in members if m.name == link)
-    change = [(1.0, lump), (-1.0, own)]
-
-    def apply(model: Model) -> Model:
-        at = model.body(body)
-        return with_lump(model, body, _sum([(1.0, Lump(at.mass, at.com, at.inertia)), *change]))
-
-    return apply
+def _put_link(body: str, link: str, x: Compact, fields: Mapping[str, Any]) -> Compact:
+    return with_link(x, body, link, fields)
 
 
-def _sum(parts: Sequence[tuple[float, Lump]]) -> Lump:
-    """Return matter added and taken away, about the common centre of mass."""
-    mass = sum(s * x.mass for s, x in parts)
-    moment = sum((s * x.mass * x.com for s, x in parts), np.zeros(3))
-    com = moment / mass if abs(mass) > 1e-12 * max(x.mass for _, x in parts) else np.zeros(3)
-    inertia = np.zeros((3, 3))
-    for s, x in parts:
-        d = skew(x.com - com)
-        inertia += s * (x.inertia - x.mass * d @ d)
-    return Lump(mass, com, inertia)
+def _matter(g: Guess, subject: str, put: Callable[[Compact, Any], Compact], a: Lump, b: Lump) -> Hypothesis:
+    ours, theirs = ({field: getattr(x, field) for field in g.value} for x in (a, b))
+    return Hypothesis(g.kind, subject, g.says, put, ours, theirs, *_numbers(ours, theirs))
+
+
+def _lump(model: Model, name: str) -> Lump:
+    body = model.body(name)
+    return Lump(body.mass, body.com, body.inertia)
 
 
 def _base(joint: Joint) -> bool:

@@ -1,8 +1,8 @@
-"""A usual mistake, as something that can be done to a description to see whether a difference vanishes."""
+"""A difference between two descriptions, as something that can be put into one and taken out of the other."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.load.solids import Lump
 from mbkit.model import Joint, Model
+from mbkit.studies.causes.compact import Compact
 
 __all__ = ["Guess", "Hypothesis", "angle_of", "told", "with_joint"]
 
@@ -26,7 +27,7 @@ class Guess:
     says : str
         What whoever made it did, beginning with a verb.
     value : Any
-        The part as it would then be: a `Lump`, or fields of a `Joint`.
+        The part as it would then be: a `Lump`, or some fields of a `Joint` or of a `Lump`.
     """
 
     kind: str
@@ -34,15 +35,24 @@ class Guess:
     value: Any
 
 
+def _unchanged(x: Compact, _: Mapping[str, Any]) -> Compact:
+    return x
+
+
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that would make the first description the second.
+    """A difference between two descriptions: fields of one part, and a name for it.
+
+    Each hypothesis owns its fields alone, so that any of them can be put into the first description or
+    taken out of the second without the others.
 
     Attributes
     ----------
     kind, subject, says : str
-    apply : callable
-        Makes the mistake in a description.
+    put : callable
+        (description, fields) -> the description with these fields in the part.
+    ours, theirs : mapping
+        The fields as the first and the second description have them.
     a, b : Any
         The numbers of the two sides, where they are numbers.
     """
@@ -50,9 +60,24 @@ class Hypothesis:
     kind: str
     subject: str
     says: str
-    apply: Callable[[Model], Model] = field(compare=False)
+    put: Callable[[Compact, Mapping[str, Any]], Compact] = field(default=_unchanged, compare=False)
+    ours: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    theirs: Mapping[str, Any] = field(default_factory=dict, compare=False)
     a: Any = None
     b: Any = None
+
+    def apply(self, x: Compact) -> Compact:
+        """Put the difference into a description."""
+        return self.put(x, self.theirs)
+
+    def revert(self, x: Compact) -> Compact:
+        """Take the difference out of a description that has it."""
+        return self.put(x, self.ours)
+
+    def without(self, fields: Container[str]) -> Hypothesis:
+        """Return the hypothesis with less fields."""
+        ours, theirs = ({k: x for k, x in side.items() if k not in fields} for side in (self.ours, self.theirs))
+        return replace(self, ours=ours, theirs=theirs)
 
 
 def with_joint(model: Model, name: str, **changes: Any) -> Model:

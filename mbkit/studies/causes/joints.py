@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +14,7 @@ from mbkit.studies.causes.hypothesis import Guess, angle_of, told
 from mbkit.studies.causes.near import Near
 from mbkit.studies.causes.turns import misread
 
-__all__ = ["DATA_ONLY", "HINGES", "blind", "named"]
+__all__ = ["HINGES", "blind", "named"]
 
 _TURN: Final = 2 * np.pi
 _DEGREE: Final = np.pi / 180
@@ -23,8 +23,6 @@ _NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "fr
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
 #: What differs in its limits alone.
 HINGES: Final = frozenset({"revolute", "continuous"})
-#: What no smooth term holds.
-DATA_ONLY: Final = frozenset({"friction", "limits"})
 
 
 def blind(joint: Joint) -> Iterator[Guess]:
@@ -137,7 +135,7 @@ def _fitting(guesses: Sequence[Guess], wanted: dict[str, Any], near: Near) -> Gu
     """Return the first mistake that makes these fields so, and no others."""
     for guess in guesses:
         if guess.value.keys() == wanted.keys() and all(_same(near, n, guess.value[n], x) for n, x in wanted.items()):
-            return guess
+            return replace(guess, value=wanted)
     return None
 
 

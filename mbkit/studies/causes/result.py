@@ -37,11 +37,11 @@ class Cause:
     a, b : float, list or None
         The numbers of the two sides, where they are numbers.
     effects : dict
-        Term -> relative difference that this cause alone makes, all others being set right;
-        infinite where the two sides have other coordinates because of it, and NaN where there
-        are too many causes to look at each.
+        Term -> relative difference that this cause alone makes: the larger of two, where it is put into the
+        first side, and where it is taken out of the second. Infinite where the coordinates are then others.
+        Empty where no term can show it: other names, matter that stands still, a constraint.
     acts : bool
-        Whether any of that is above the tolerance; else it is data that moves nothing.
+        Whether any of that is above the tolerance, or it is a constraint.
     """
 
     kind: str
@@ -65,7 +65,7 @@ class Explanation:
     a, b : str
         What the two sides are called.
     agree : bool
-        Whether all terms agree by joint name.
+        Whether all terms agree by joint name, and all joints and constraints are there.
     gaps : tuple of Gap
         How far each term is apart, joints matched by name where they have the same names.
     comparable : bool
@@ -80,12 +80,14 @@ class Explanation:
     explained : bool
         Whether the difference vanishes once all causes are applied to one side.
     left : tuple of Gap
-        What remains then.
+        What remains of each term then; empty where the coordinates are not the same.
     subtree : tuple of str
         Where something remains: the joints of the smallest part that still differs.
     samples, seed : int
     tolerance : float
         Relative difference of a term above which two sides differ.
+    massless : bool
+        Whether M is zero on both sides at every state, so that equal terms are no agreement.
     """
 
     a: str
@@ -104,6 +106,7 @@ class Explanation:
     samples: int
     seed: int
     tolerance: float
+    massless: bool = False
 
     @property
     def acting(self) -> tuple[Cause, ...]:
@@ -116,22 +119,33 @@ class Explanation:
         return max((g.relative for g in self.gaps), default=0.0) if self.comparable else math.inf
 
     @property
+    def remainder(self) -> float:
+        """The largest relative difference with all causes applied to one side; infinite without any term."""
+        return max((g.relative for g in self.left), default=math.inf)
+
+    @property
     def verdict(self) -> str:
         """One sentence: the same, or why not."""
-        silent = len(self.causes) - len(self.acting)
-        beside = f"; {silent} difference{'s' if silent > 1 else ''} in data that move nothing" if silent else ""
+        count, silent = len(self.acting), len(self.causes) - len(self.acting)
+        beside = f"; {_counted(silent, 'difference')} that change{'s' * (silent == 1)} no term" if silent else ""
         if self.agree:
-            return f"{self.b} moves as {self.a} does (to {self.worst:.1e}){beside}"
-        apart = f"by {self.worst:.1e}" if self.comparable else "in its coordinates"
+            cancel = f"; {_counted(count, 'difference')} that cancel" if count else ""
+            return f"{self.b} moves as {self.a} does (to {self.worst:.1e}){cancel}{beside}"
+        apart = "in its coordinates"
+        if self.comparable:
+            apart = f"by {self.worst:.1e}" if self.worst > self.tolerance else "in its constraints"
         head = f"{self.b} differs from {self.a} {apart}"
+        if self.massless:
+            return f"{self.b} and {self.a} are not compared: the mass matrix is zero on both sides{beside}"
+        if not self.matches:
+            return f"{head}; they have no joint in common, so no term was compared"
         if not self.explained:
             where = f"; the smallest part that still differs: {', '.join(self.subtree)}" if self.subtree else ""
-            found = (
-                f"{len(self.acting)} causes found do not explain it all" if self.acting else "no usual cause does it"
-            )
-            return f"{head}, and {found}{where}"
-        count = len(self.acting)
-        return f"{head}, for {'one reason' if count == 1 else f'{count} reasons'}{beside}"
+            rest = f": {self.remainder:.1e} remains" if self.left else ""
+            some = f"{_counted(count, 'cause')} found do not explain it all" if count else "no usual cause does it"
+            return f"{head}, and {some}{rest}{where}"
+        left = f"; with {'it' if count == 1 else 'all of them'} applied the terms agree to {self.remainder:.1e}"
+        return f"{head}, for {_counted(count, 'reason')}{left}{beside}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
@@ -168,13 +182,17 @@ class Explanation:
         return f"<Explanation: {self.verdict}>"
 
 
+def _counted(n: int, what: str) -> str:
+    return f"{'one' if n == 1 else n} {what}{'s' * (n != 1)}"
+
+
 def effect(cause: Cause) -> str:
     """Return what a cause does, in a few words."""
     if not cause.acts:
-        return "moves nothing"
+        return "changes no term"
+    if not cause.effects:
+        return "a constraint, which no term holds"
     term, largest = max(cause.effects.items(), key=lambda x: x[1])
-    if math.isnan(largest):
-        return "one of many"
     return "other coordinates" if math.isinf(largest) else f"{term} by {largest:.1e}"
 
 
@@ -190,7 +208,8 @@ def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:
             continue
         largest = max(some, key=lambda c: max(c.effects.values(), default=0.0))
         names = ", ".join(c.subject.split("'")[1] if "'" in c.subject else c.subject for c in some)
-        out.append((kind, f"{len(some)} times, first {some[0].says}; in all: {names}", effect(largest)))
+        most = f"up to {effect(largest)}" if largest.acts and largest.effects else effect(largest)
+        out.append((kind, f"{len(some)} times, first {some[0].says}; in all: {names}", most))
     return out
 
 

@@ -126,8 +126,8 @@ def _said(how: str, name: str, model: Model, side: int) -> Hypothesis:
     subject = f"joint {name!r}"
     if how == "still":
         says = "holds it still" if side == 0 else "lets it move, which stands still on the other side"
-        return Hypothesis("joint held still", subject, says, lambda m: m)
+        return Hypothesis("joint held still", subject, says)
     below = len([j for j in model.joints if j.name in _below(model, name) and j.type.nv])
     more = f" and the {below - 1} joints below it" if below > 1 else ""
     says = f"lacks it{more}" if side == 0 else f"has it{more} besides"
-    return Hypothesis("lost joint" if side == 0 else "added joint", subject, says, lambda m: m)
+    return Hypothesis("lost joint" if side == 0 else "added joint", subject, says)

@@ -124,7 +124,9 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
         measured = errors(b[term] - a[term], a[term], scales)
         per = measured.per_velocity
         joint = joints[int(np.argmax(per))] if per.size and per.max() > 0 else ""
-        out.append(Gap(term, float(measured.relative.max(initial=0.0)), joint))
+        largest = float(measured.relative.max(initial=0.0))
+        # NaN passes no comparison, and would be lost in a maximum.
+        out.append(Gap(term, np.inf if np.isnan(largest) else largest, joint))
     return Gaps(tuple(out))
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.model import Model
+from mbkit.studies.causes.compact import Compact
 from mbkit.studies.causes.hypothesis import Guess, Hypothesis, told
 from mbkit.studies.causes.near import Near
 
-__all__ = ["gravities", "named", "with_gravity"]
+__all__ = ["CONSTRAINTS", "gravities", "named", "with_gravity"]
+
+#: What acts on the motion through no term, but through constraints.
+CONSTRAINTS: Final = frozenset({"loop", "prescribed motion"})
 
 
 def with_gravity(model: Model, gravity: Array) -> Model:
@@ -34,8 +38,8 @@ def named(a: Model, b: Model, near: Near) -> list[Hypothesis]:
     if not near.vector(a.gravity, b.gravity, max(1.0, float(np.abs(a.gravity).max()))):
         says = next((g.says for g in gravities(a.gravity) if near.vector(g.value, b.gravity)), None)
         says = says or f"has the gravity {told(b.gravity)} m/s² for {told(a.gravity)}"
-        gravity = b.gravity
-        out.append(Hypothesis("gravity", "", says, lambda m: with_gravity(m, gravity), a.gravity, b.gravity))
+        sides = {"gravity": a.gravity}, {"gravity": b.gravity}
+        out.append(Hypothesis("gravity", "", says, _with_fields, *sides, a.gravity, b.gravity))
     for field, kind, what in (
         ("springs", "point spring", "spring"),
         ("couplings", "joint coupling", "coupling"),
@@ -55,17 +59,23 @@ def _parts(a: Model, b: Model, field: str, kind: str, what: str, near: Near) -> 
         if one is not None and other is not None and _alike(one, other, near):
             continue
         says = "lacks it" if other is None else "has it besides" if one is None else "has other numbers for it"
-        out.append(Hypothesis(kind, f"{what} {name!r}", says, _exchange(field, key, name, other)))
+        put = _exchange(field, key)
+        out.append(Hypothesis(kind, f"{what} {name!r}", says, put, {name: one}, {name: other}))
     return out
 
 
-def _exchange(field: str, key: str, name: str, part: Any) -> Any:
-    def apply(model: Model) -> Model:
-        kept = [x for x in getattr(model, field) if getattr(x, key) != name]
-        changes: Any = {field: tuple(kept if part is None else [*kept, part])}
-        return replace(model, **changes)
+def _with_fields(x: Compact, fields: Mapping[str, Any]) -> Compact:
+    return replace(x, model=replace(x.model, **fields))
 
-    return apply
+
+def _exchange(field: str, key: str) -> Callable[[Compact, Mapping[str, Any]], Compact]:
+    """Return what exchanges springs, loops or prescribed motions by name; None takes one away."""
+
+    def put(x: Compact, parts: Mapping[str, Any]) -> Compact:
+        kept = [p for p in getattr(x.model, field) if getattr(p, key) not in parts]
+        return _with_fields(x, {field: (*kept, *(p for p in parts.values() if p is not None))})
+
+    return put
 
 
 def _alike(a: Any, b: Any, near: Near) -> bool:

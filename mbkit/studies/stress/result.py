@@ -340,7 +340,7 @@ class StressResult:
         try:
             data = json.loads(text)
             made: StressResult = remade(cls, data | {"cases": tuple(_case(told) for told in data["cases"])})
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
             raise InputError(
                 f"text: expected the JSON of a StressResult, such as Path(...).read_text() of a file "
                 f"that to_json wrote; it has no such content ({type(error).__name__}: {error})"

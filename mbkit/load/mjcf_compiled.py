@@ -1,0 +1,215 @@
+"""Numbers of an MJCF that MuJoCo's compiler infers: the inertia of meshes and shells, and ``springdamper``.
+
+The compiler is given the description again, with less in it. Of all the files that it names, only the
+meshes stay that give a body its inertia. mbkit opens these, and hands over their bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from mbkit import spatial
+from mbkit.load.mjcf_scene import Scene
+from mbkit.load.solids import Lump
+from mbkit.load.xml import MOST_BYTES, Element
+
+__all__ = ["infer_inertias", "infer_springs", "listed"]
+
+_BODIES: Final = ("default", "asset", "worldbody")
+_BODIES_AND_FORCES: Final = (*_BODIES, "tendon", "actuator")
+# Elements without effect on masses, springs and damping.
+_UNUSED: Final = frozenset({"camera", "light", "plugin", "texture", "material", "hfield", "skin", "model"})
+# Settings that name files, or that would rename or move bodies.
+_UNUSED_SETTINGS: Final = frozenset(
+    {"meshdir", "texturedir", "assetdir", "strippath", "discardvisual", "fusestatic", "coordinate"}
+)
+
+
+def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
+    """Give the bodies of ``scene.inferred`` their inertia, and return a note about it.
+
+    Faults are kept in ``scene.read``.
+    """
+    if not scene.inferred or scene.read.faults:
+        return ""
+    who = f"the inertia of {listed(scene.inferred)}"
+    text = _Text(mujoco, path, scene)
+    made = text.compiled(_BODIES, who, scaled=False)
+    if made is None:
+        return ""
+    for body in scene.bodies:
+        if body.name in scene.inferred:
+            body.lump = _lump(made.body(body.name))
+    bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
+    within = f", within {' and '.join(bounds)}" if bounds else ""
+    files = f"; mesh files read: {listed(text.opened)}" if text.opened else ""
+    return f"{who} was inferred from meshes or shells by MuJoCo's compiler{within}{files}"
+
+
+def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[float, float]]:
+    """Return the stiffness and damping of each joint that has a ``springdamper``.
+
+    They follow from the mass matrix of the whole system, where the file draws it. Faults are kept in ``scene.read``.
+    """
+    joints = []
+    for joint in (j for b in scene.bodies for j in b.joints):
+        who = f"joint {joint.name!r}"
+        values = scene.read.numbers(joint.element, "springdamper", who, count=2, default=(0.0, 0.0))
+        if any(values):
+            joints.append(joint.name)
+        if any(values) and min(values) <= 0:
+            scene.read.fault(
+                f"{who}: springdamper: expected a time constant and a damping ratio above 0", joint.element
+            )
+    if not joints or scene.read.faults:
+        return {}
+    made = _Text(mujoco, path, scene).compiled(_BODIES_AND_FORCES, f"springdamper of {listed(joints)}", scaled=True)
+    if made is None:
+        return {}
+    views = {name: made.joint(name) for name in joints}
+    return {n: (float(np.ravel(j.stiffness)[0]), float(np.ravel(j.damping)[0])) for n, j in views.items()}
+
+
+class _Text:
+    """A description as the compiler is given it, with the meshes that it needs."""
+
+    def __init__(self, mujoco: Element, path: Path, scene: Scene) -> None:
+        self.mujoco, self.path, self.scene = mujoco, path, scene
+        self.settings: dict[str, str] = {}
+        for compiler in mujoco.all("compiler"):
+            self.settings.update(compiler.attributes)
+        self.counted = {id(geom) for geoms in scene.inferred.values() for geom, _ in geoms}
+        self.meshes: dict[str, Element] = {}
+        for asset in mujoco.all("asset"):
+            for mesh in asset.all("mesh"):
+                stem = PurePosixPath(mesh.attributes.get("file", "").replace("\\", "/")).stem
+                self.meshes[mesh.attributes.get("name") or stem] = mesh
+        self.needed: dict[int, dict[str, str]] = {}
+        self.opened: list[str] = []
+        self.assets: dict[str, bytes] = {}
+
+    def compiled(self, sections: Iterable[str], who: str, *, scaled: bool) -> Any:
+        """Return the compiled model, or None after a fault; `scaled` says whether settotalmass applies."""
+        read = self.scene.read
+        before = len(read.faults)
+        for body, geoms in self.scene.inferred.items():
+            for geom, mesh in geoms:
+                if mesh:
+                    self._need(mesh, f"body {body!r}: mesh {mesh!r}", geom)
+        if len(read.faults) > before:
+            return None
+        unused = _UNUSED_SETTINGS if scaled else _UNUSED_SETTINGS | {"settotalmass"}
+        settings = {k: v for k, v in self.settings.items() if k not in unused}
+        inside = "".join(self._written(e, None) for e in self.mujoco.children if e.tag in sections)
+        text = f"<mujoco>{_tag('compiler', settings)}{inside}</mujoco>"
+        # Few files need the compiler.
+        import mujoco
+
+        heard = mujoco.get_mju_user_warning()
+        # Its warnings would be printed, and kept in a file of the working folder.
+        mujoco.set_mju_user_warning(lambda _: None)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                return mujoco.MjModel.from_xml_string(text, assets=self.assets)
+        except ValueError as error:
+            # The line is one of the shortened text.
+            told = re.sub(r",? line -?\d+", "", " ".join(str(error).split()))
+            read.fault(f"{who}: MuJoCo's compiler refuses: {told}")
+            return None
+        finally:
+            mujoco.set_mju_user_warning(heard)
+
+    def _need(self, name: str, who: str, geom: Element) -> None:
+        """Read the file of a mesh, once."""
+        read = self.scene.read
+        mesh = self.meshes.get(name)
+        if mesh is None:
+            read.fault(f"{who}: no such <mesh> in <asset>", geom)
+            return
+        if id(mesh) in self.needed:
+            return
+        attributes = {**mesh.attributes, "name": name}
+        self.needed[id(mesh)] = attributes
+        file = attributes.get("file")
+        if file is None:
+            return
+        found = self._file(file)
+        try:
+            # A pipe or a device would be read for ever.
+            if not found.is_file():
+                read.fault(f"{who}: no such file: {found}", mesh)
+                return
+            if found.stat().st_size > MOST_BYTES:
+                read.fault(f"{who}: {found}: expected up to {MOST_BYTES} bytes", mesh)
+                return
+            content = found.read_bytes()
+        except (OSError, ValueError) as error:
+            read.fault(f"{who}: {found}: cannot be read ({error})", mesh)
+            return
+        self.opened.append(
+            str(found.relative_to(self.path.parent) if found.is_relative_to(self.path.parent) else found)
+        )
+        # MuJoCo caches meshes by name, so a name stands for its content.
+        attributes["file"] = hashlib.sha256(content).hexdigest() + found.suffix
+        self.assets[attributes["file"]] = content
+
+    def _file(self, file: str) -> Path:
+        """Return the path of a mesh by MuJoCo's rules."""
+        relative = PurePosixPath(file.replace("\\", "/"))
+        if self.settings.get("strippath") == "true":
+            relative = PurePosixPath(relative.name)
+        folder = self.settings.get("meshdir", self.settings.get("assetdir", ""))
+        return self.path.parent / folder.replace("\\", "/") / relative
+
+    def _written(self, element: Element, childclass: str | None) -> str:
+        """Return an element and what is inside, without what the compiler need not see.
+
+        The class is that of the elements around it, in the <worldbody>.
+        """
+        tag, given = element.tag, {k: v for k, v in element.attributes.items() if k not in ("material", "texture")}
+        if tag == "worldbody":
+            childclass = "main"
+        if tag == "geom" and childclass and id(element) not in self.counted:
+            full = self.scene.defaults.filled(element, childclass).attributes
+            if "mesh" in full or full.get("type") in ("mesh", "sdf", "hfield"):
+                return ""
+        if id(element) in self.counted:
+            # What does not collide needs no convex hull.
+            given |= {"contype": "0", "conaffinity": "0"}
+        childclass = given.get("childclass", given.get("class", childclass) if tag == "frame" else childclass)
+        given |= self.needed.get(id(element), {})
+        if id(element) in self.scene.called:
+            given["name"] = self.scene.called[id(element)]
+        return _tag(tag, given, "".join(self._written(e, childclass) for e in self._kept(element)))
+
+    def _kept(self, element: Element) -> Iterator[Element]:
+        for child in element.children:
+            unopened = element.tag == "asset" and child.tag == "mesh" and id(child) not in self.needed
+            if child.tag not in _UNUSED and not unopened:
+                yield child
+
+
+def _tag(tag: str, attributes: dict[str, str], inside: str = "") -> str:
+    return f"<{tag}{''.join(f' {k}={quoteattr(v)}' for k, v in attributes.items())}>{inside}</{tag}>"
+
+
+def _lump(body: Any) -> Lump:
+    """Return the inertia of a compiled body in its own axes."""
+    w, x, y, z = (float(c) for c in body.iquat)
+    axes = spatial.matrix_from_quaternion(np.array([x, y, z, w]))
+    return Lump(float(body.mass[0]), np.array(body.ipos), axes @ np.diag(body.inertia) @ axes.T)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return the first names, and how many more there are."""
+    every = list(names)
+    return ", ".join(map(repr, every[:6])) + (f" and {len(every) - 6} more" if len(every) > 6 else "")
