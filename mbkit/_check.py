@@ -42,6 +42,8 @@ def all_finite(array: Array) -> bool:
 def _as_float(name: str, value: ArrayLike) -> Array:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise InputError(f"{name}: expected an array of numbers, got a masked array with masked entries; fill them")
     try:
         raw = np.asarray(value)
     except (ValueError, TypeError) as error:

@@ -195,7 +195,9 @@ def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterabl
         lines.append(f"  worst state ({worst[0].worst_kind}): q = {_numbers(worst[0].worst_q)}")
         lines.append(f"                v = {_numbers(worst[0].worst_v)}")
     packages = {"pinocchio": "pin", "mujoco": "mujoco", "drake": "drake", "lagrangian": "casadi"}
-    lines.append(f"  {', '.join(f'{packages[e]} {result.versions[packages[e]]}' for e in result.engines)}")
+    # A user's own engine goes by its own name.
+    versions = (f"{packages[e]} {result.versions[packages[e]]}" if e in packages else e for e in result.engines)
+    lines.append(f"  {', '.join(versions)}")
     lines.append(f"  to see it all: mbkit.compare(model, {result.engines}, {result.samples}, {result.seed})")
     return "\n".join(lines)
 

@@ -8,21 +8,23 @@ import stat
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.derivation import cache
+from mbkit.derivation import cache, lanes, sources
 from mbkit.derivation import compiled as module
-from tests.random_trees import states
+from tests.random_trees import random_tree, states
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A cache of this test's own, and a process that holds no functions."""
     monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(module._HELD, "functions", {})
+    monkeypatch.setattr(module, "_HELD", {})
     module._batch_object.cache_clear()
     yield tmp_path / "cache"
     module._batch_object.cache_clear()
@@ -33,7 +35,7 @@ MODEL = mb.catalog.double_pendulum()
 
 def evaluated(*, derives: bool) -> np.ndarray:
     """Return inverse dynamics from a new engine, and see whether it derived anything."""
-    module._HELD.functions.clear()
+    module._HELD.clear()
     module._batch_object.cache_clear()
     dyn = mb.dynamics(MODEL, "lagrangian", compile=True)
     q, v, a, _ = states(MODEL, 4)
@@ -109,6 +111,25 @@ def test_a_link_and_another_users_file_are_not_followed(folder):
         assert cache.folder() is None
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_in_the_place_of_an_entry_is_replaced_and_not_waited_for(folder):
+    first = evaluated(derives=True)
+    names = sorted(path.name for path in folder.iterdir())
+    for name in names:
+        (folder / name).unlink()
+        os.mkfifo(folder / name, 0o600)
+    with ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(evaluated, derives=True)
+        try:
+            np.testing.assert_array_equal(reading.result(60), first)
+        finally:
+            # A reader that waits gets the end of the file.
+            for name in names:
+                with suppress(OSError):
+                    os.close(os.open(folder / name, os.O_WRONLY | os.O_NONBLOCK))
+    assert sorted(path.name for path in folder.iterdir() if path.is_file()) == names
+
+
 def test_a_folder_that_others_may_enter_is_closed(folder):
     folder.mkdir()
     folder.chmod(0o755)
@@ -168,3 +189,55 @@ def test_processes_that_start_at_once_agree(folder):
     out = {tuple(json.loads(p.communicate(timeout=120)[0])) for p in running}
     assert len(out) == 1
     assert not [p for p in folder.iterdir() if p.name.startswith(".new-")]
+
+
+@pytest.mark.usefixtures("folder")
+def test_the_fingerprint_holds_all_code_that_decides_what_is_compiled(monkeypatch):
+    """Whatever runs between the request for machine code and LLVM counts, wherever it stands."""
+    root = Path(mb.__file__).parent
+    ran = set()
+
+    def note(frame, event, _argument):
+        if event == "call":
+            ran.add(Path(frame.f_code.co_filename))
+
+    def traced(make):
+        def made(*arguments):
+            sys.setprofile(note)
+            try:
+                return make(*arguments)
+            finally:
+                sys.setprofile(None)
+
+        return made
+
+    for where in (module, lanes):
+        monkeypatch.setattr(where, "_made", traced(where._made))
+    tree = random_tree(1, 2, ("ball", "helical"))
+    q, v, _, tau = (x[0] for x in states(tree, 1))
+    mb.dynamics(tree, "lagrangian", compile=True).forward_dynamics(q, v, tau)
+    paper = mb.lagrangian.systems.get("pendulum")().dynamics(options={"compile": True})
+    for method, options in (("rk4", {"dt": 0.01}), ("rk853", {})):
+        q = np.full((2, 1), 0.3)
+        mb.simulate(paper, q, np.zeros((2, 1)), 0.02, method=method, save=[0.0, 0.02], **options)
+    ran = {path for path in ran if path.is_relative_to(root)}
+    assert {path.parent.name for path in ran} >= {"derivation", "model", "lagrangian"}
+    assert ran <= set(sources.source_files())
+
+
+def test_the_fingerprint_changes_with_every_listed_file(tmp_path):
+    (tmp_path / "pack" / "inner").mkdir(parents=True)
+    files = [tmp_path / "pack" / "a.py", tmp_path / "pack" / "inner" / "b.py", tmp_path / "alone.py"]
+    for path in files:
+        path.write_text("x = 1")
+    found = {sources.fingerprint(tmp_path, ("pack", "alone.py"))}
+    for path in files:
+        path.write_text("x = 2")
+        found.add(sources.fingerprint(tmp_path, ("pack", "alone.py")))
+    files[1].rename(tmp_path / "pack" / "b.py")
+    found.add(sources.fingerprint(tmp_path, ("pack", "alone.py")))
+    assert len(found) == 5
+    for missing in ("gone", "gone.py"):
+        with pytest.raises(FileNotFoundError, match=missing):
+            sources.fingerprint(tmp_path, ("pack", missing))
+    assert sources.fingerprint() == sources.SOURCES

@@ -9,6 +9,7 @@ import resource
 import stat
 import threading
 import warnings
+import weakref
 from pathlib import Path
 
 import casadi as ca
@@ -228,6 +229,36 @@ def test_memory_stays_flat_over_ten_thousand_batches():
     assert calls(10_000) - before < 2000  # kB; a leak of one result of 1 kB a call would be 20,000
 
 
+def test_compiling_leaves_no_memory_behind():
+    """`validation/memory.py` measures the slope over 2,000 models; here a pass manager and constants would show."""
+
+    def compiled_functions(n: int) -> float:
+        for k in range(n):
+            x = ca.SX.sym("x")
+            jit.program_object(program(ca.Function("f", [x], [ca.sin(x) * (k + 0.5)])))
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * resource.getpagesize() / 1000
+
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("resident memory is read from /proc")
+    before = compiled_functions(10)
+    assert compiled_functions(40) - before < 40 * 15  # kB; it was 60 kB for each
+
+
+@pytest.mark.parametrize("method", ["rk4", "rk853", "rodas5", "implicit_midpoint", "taylor"])
+def test_equations_are_released_after_a_run(method):
+    if method == "taylor":
+        pytest.importorskip("heyoka")
+    dyn = mb.dynamics(mb.catalog.pendulum(), "lagrangian", compile=True)
+    released = weakref.ref(dyn.equations)
+    step = {"dt": 0.01} if method in ("rk4", "implicit_midpoint") else {}
+    mb.simulate(dyn, [0.3], [0.0], 0.02, method=method, **step)
+    del dyn
+    gc.collect()
+    assert released() is None
+
+
 @pytest.mark.parametrize("to_code", [True, False])
 @pytest.mark.parametrize("seed", [0])
 def test_the_engine_agrees_with_its_own_expressions_in_every_shape(seed, to_code):
@@ -382,28 +413,42 @@ def test_a_far_angle_leaves_its_neighbours_as_they_are():
     np.testing.assert_array_equal(code(far)[0][near], alone[near])
 
 
-@pytest.mark.parametrize("to_code", [True, False])
-def test_a_child_forked_during_another_threads_call_computes(to_code):
+def _compile_anew() -> None:
+    x = ca.SX.sym("x", 40)
+    built(ca.Function("sums", [x], [ca.densify(ca.sin(x) * ca.cumsum(x))]))
+
+
+@pytest.mark.parametrize("work", ["compiling", "compiled", "interpreted", "mujoco", "drake"])
+def test_a_child_forked_during_another_threads_work_computes(work):
     if "fork" not in multiprocessing.get_all_start_methods():
         pytest.skip("this system does not fork")
     model = mb.load("panda")
-    dyn = mb.dynamics(model, "lagrangian", compile=to_code)
+    if work in ("mujoco", "drake"):
+        pytest.importorskip("pydrake" if work == "drake" else "mujoco")
+        dyn = mb.dynamics(model, work)
+    else:
+        dyn = mb.dynamics(model, "lagrangian", compile=work != "interpreted")
     q, v, _, _ = states(model, 1)
     expected = dyn.nle(q[0], v[0])
     done = threading.Event()
 
     def calls() -> None:
         while not done.is_set():
-            dyn.nle(q[0], v[0])
+            _compile_anew() if work == "compiling" else dyn.nle(q, v)
+
+    def compute() -> None:
+        if work == "compiling":
+            _compile_anew()
+        np.testing.assert_array_equal(dyn.nle(q[0], v[0]), expected)
 
     other = threading.Thread(target=calls)
     other.start()
     context = multiprocessing.get_context("fork")
     try:
-        for _ in range(30):
+        for _ in range(12):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)
-                child = context.Process(target=lambda: np.testing.assert_array_equal(dyn.nle(q[0], v[0]), expected))
+                child = context.Process(target=compute)
                 child.start()
             child.join(30)
             if child.exitcode is None:

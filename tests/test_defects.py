@@ -11,6 +11,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import KnownDefectWarning
+from mbkit.model.kinds import KINDS
 from mbkit.report.page import check_page
 from mbkit.report.reading import headline
 from tests.random_trees import off, random_tree, states
@@ -76,6 +77,22 @@ def test_pinocchios_kinetic_energy_without_armature_is_failed_by_name(axis):
     failed = [r for r in result.rows if not r.passed]
     assert [(r.term, r.engine) for r in failed] == [("kinetic energy", "pinocchio")]
     assert "armature" in failed[0].reason
+
+
+@pytest.mark.parametrize("armature", [0.0, 1e-8, 0.8])
+@pytest.mark.parametrize("kind", [name for name, kind in KINDS.items() if kind.nv == 1])
+def test_a_wrong_kinetic_energy_never_comes_without_a_warning(kind, armature):
+    pitch = {"pitch": 0.2} if kind == "helical" else {}
+    for axis in [*np.eye(3), (0, 0, -1), (1, 2, 0)]:
+        model = one_joint(kind, armature, axis=axis, **pitch)
+        q, v, _, _ = (x[0] for x in states(model, 1))
+        dyn = mb.dynamics(model)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            value = dyn.kinetic_energy(q, v)
+        right = 0.5 * v @ dyn.mass_matrix(q) @ v
+        assert [w.category for w in caught] == [KnownDefectWarning] * int(abs(value - right) > 1e-11), (axis, value)
+        assert all("'odd'" in str(w.message) and "'plain'" not in str(w.message) for w in caught)
 
 
 def test_models_that_the_defects_do_not_touch_get_no_warning():

@@ -14,6 +14,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines import ENGINES
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.testing import STRICT, assert_baseline, assert_engines_agree, assert_same_dynamics
 
 TOP = Path(__file__).parent.parent
@@ -66,6 +67,7 @@ MISTAKES = """
 import pytest
 import mbkit as mb
 from mbkit.engines import ENGINES
+from mbkit.engines.lagrangian import LagrangianDynamics
 
 ENGINES["drake"] = ("no_such_engine", "Dynamics", "mbkit[drake]")
 
@@ -184,6 +186,22 @@ def test_asserts_say_what_differs():
     with pytest.raises(AssertionError, match=r"joint 'hinge': model_b has armature 0 for 0\.5"):
         assert_same_dynamics(model, model.without("armature"))
     assert assert_same_dynamics(model, model).agree
+
+
+class Heavy(LagrangianDynamics):
+    """A user's own engine, with 1 % too much gravity."""
+
+    engine = "heavy"
+
+    def _gravity(self, q):
+        return 1.01 * super()._gravity(q)
+
+
+def test_asserts_take_an_engine_of_ones_own(monkeypatch):
+    monkeypatch.setitem(ENGINES, "heavy", (__name__, "Heavy", "heavy"))
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare"], "COMPARABLE", ("lagrangian", "heavy"))
+    with pytest.raises(AssertionError, match=r"heavy, g: differs by(.|\n)*casadi .*, heavy"):
+        assert_engines_agree(mb.catalog.pendulum(), ("lagrangian", "heavy"), samples=1)
 
 
 def test_a_missing_engine_skips_or_fails(monkeypatch, tmp_path):

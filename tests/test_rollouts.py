@@ -67,7 +67,7 @@ def planar() -> LagrangianDynamics:
 @pytest.fixture
 def in_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(marching, "_ONE_PIECE", 0)
-    monkeypatch.setattr(rollout, "_PLANS", {})
+    monkeypatch.setattr(rollout, "_plan", marching.Plan)
 
 
 def start(dyn: LagrangianDynamics, n: int | None = None, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -187,7 +187,7 @@ def test_rollouts_in_stages_are_the_stepwise_runs(method: str, floating: Lagrang
     tau = np.random.default_rng(1).standard_normal((11, 50, floating.model.nv))
     run = simulate(floating, q, v, 0.05, method, torque=tau)
     assert_same(run, stepwise(floating, q, v, 0.05, method, torque=tau))
-    assert len(rollout._PLANS[floating.equations][method].parts) > 1
+    assert len(rollout._plan(floating, method).parts) > 1
 
 
 def test_robots_are_mujocos_rollouts() -> None:
@@ -342,7 +342,7 @@ def test_a_model_that_cannot_move_says_who_is_to_blame() -> None:
     b.add_joint("plane", "planar", parent="world", child="mass")
     b.add_spring("string", body_a="world", body_b="mass", stiffness=1.0, rest_length=0.5)
     dyn = dynamics(b.build(), "lagrangian", compile=True)
-    with pytest.warns(MbkitWarning, match="point spring of no length there has no direction: 'string'"):
+    with pytest.warns(MbkitWarning, match=r"point spring.*direction.*'string'"):
         run = simulate(dyn, np.zeros(3), np.zeros(3), 0.1)
     assert run.stats.reached == 0.0
     assert run.q.shape == (1, 3)

@@ -90,10 +90,11 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
         return None
     path = at / key
     try:
-        # Not through a link, which may lead out of the folder.
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+        # Not through a link, which may lead out of the folder; and a pipe would be waited for.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
         with os.fdopen(handle, "rb") as file:
-            if hasattr(os, "getuid") and os.fstat(file.fileno()).st_uid != os.getuid():
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode) or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
                 return None
             content = file.read()
         with suppress(OSError):

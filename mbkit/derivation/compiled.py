@@ -248,10 +248,10 @@ def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
         Derives the function; called only if it has not been compiled before.
     """
     key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, jit.host()))
-    with _HELD.lock:
-        found = None if disk.forgotten(key) else _HELD.functions.get(key)
+    with jit.COMPILING:
+        found = None if disk.forgotten(key) else _HELD.get(key)
         if found is None:
-            found = _HELD.functions[key] = _from_disk(key) or _made(key, make)
+            found = _HELD[key] = _from_disk(key) or _made(key, make)
     return found
 
 
@@ -279,17 +279,5 @@ def _made(key: str, make: Callable[[], ca.Function]) -> Compiled:
     return Compiled(about, code)
 
 
-class _Held:
-    """Functions in use by anyone in this process; a forked child starts with a free lock."""
-
-    def __init__(self) -> None:
-        self.functions: WeakValueDictionary[str, Compiled] = WeakValueDictionary()
-        self.renew()
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=self.renew)
-
-    def renew(self) -> None:
-        self.lock = threading.RLock()
-
-
-_HELD: Final = _Held()
+#: Functions in use by anyone in this process.
+_HELD: Final[WeakValueDictionary[str, Compiled]] = WeakValueDictionary()

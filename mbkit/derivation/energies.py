@@ -73,7 +73,7 @@ def spring_energy(kin: Kinematics) -> Any:
         if is_zero(spring.rest_length):
             total += 0.5 * spring.stiffness * dot3(gap, gap)
         else:
-            stretch = ca.sqrt(dot3(gap, gap)) - spring.rest_length
+            stretch = _length(gap) - spring.rest_length
             total += 0.5 * spring.stiffness * stretch * stretch
     return total
 
@@ -89,10 +89,15 @@ def damping_forces(kin: Kinematics) -> Any:
         dissipation += 0.5 * kin.values.couplings[coupling.name].damping * rate * rate
     for spring, gap in _gaps(kin):
         if not is_zero(spring.damping):
-            length = ca.sqrt(dot3(gap, gap))
-            rate = ca.jtimes(length, kin.q, kin.qdot)
+            rate = ca.jtimes(_length(gap), kin.q, kin.qdot)
             dissipation += 0.5 * spring.damping * rate * rate
     return -ca.gradient(dissipation, kin.v)
+
+
+def _length(gap: list[Any]) -> Any:
+    # CasADi makes |x| of the root of x², with the derivative 0 at x = 0, where a length has none.
+    # The factor, which rounds nothing, prevents that: the derivative is NaN there.
+    return 0.5 * ca.sqrt(4.0 * dot3(gap, gap))
 
 
 def _gaps(kin: Kinematics) -> list[tuple[Any, list[Any]]]:

@@ -91,6 +91,16 @@ class Equations:
         self.tau = ca.SX.sym("tau", model.nv)
 
     @cached_property
+    def kept(self) -> dict[str, Any]:
+        """What integrators make of these equations once, by names of their own.
+
+        It lives as long as the equations, which all dynamics of one model at different values
+        of its parameters share. A table from equations to what refers to them, weak or not,
+        would keep both for ever.
+        """
+        return {}
+
+    @cached_property
     def kinetic_energy(self) -> Any:
         """T(q, v)."""
         return energies.kinetic_energy(self.kin)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -11,14 +12,17 @@ from typing import TYPE_CHECKING, Final
 
 import casadi as ca
 
+from mbkit._fork import fork_safe
 from mbkit.derivation.machine import Machine
 from mbkit.errors import NoCompilerWarning
 
 if TYPE_CHECKING:
     from mbkit.derivation.compiled import Compiled
 
-__all__ = ["compile_by_default", "executable", "has_compiler"]
+__all__ = ["DERIVING", "compile_by_default", "executable", "has_compiler"]
 
+#: One thread derives at a time; a fork waits for it. Python 3.11's cached properties hold locks meanwhile.
+DERIVING: Final = fork_safe(threading.RLock())
 
 #: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not
 #: spent unasked: a Coriolis matrix of a hundred joints has twice as many, and is

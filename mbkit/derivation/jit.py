@@ -7,19 +7,20 @@ again, by this process or another one on the same kind of processor.
 from __future__ import annotations
 
 import ctypes
-import os
 import threading
 from functools import cache
 from typing import Any, Final, NamedTuple
 
 import llvmlite
 from llvmlite import binding as llvm
+from llvmlite.binding.newpassmanagers import NewPassManager
 
+from mbkit._fork import fork_safe
 from mbkit.derivation.batch_code import MOST_ARRAYS, RUN, batch_code
 from mbkit.derivation.program import Program
 from mbkit.derivation.vector_code import vector_code
 
-__all__ = ["Host", "Loaded", "batch_object", "host", "load", "object_code", "program_object"]
+__all__ = ["COMPILING", "Host", "Loaded", "batch_object", "host", "load", "object_code", "program_object"]
 
 _SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
@@ -44,19 +45,11 @@ class Loaded:
         self.run = _SIGNATURE(engine.get_function_address(RUN))
 
 
-class _Lock:
-    """LLVM's own tables are shared by the process; a forked child starts with a free lock."""
-
-    def __init__(self) -> None:
-        self.renew()
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=self.renew)
-
-    def renew(self) -> None:
-        self.held = threading.RLock()
-
-
-_LOCK: Final = _Lock()
+#: One thread compiles at a time: LLVM's own tables are shared by the process.
+COMPILING: Final = fork_safe(threading.RLock())
+if hasattr(llvm.ffi.lib, "_lock"):
+    # Modules are also freed outside of COMPILING, under the lock of llvmlite itself.
+    fork_safe(llvm.ffi.lib._lock)
 
 
 @cache
@@ -77,10 +70,19 @@ def _target() -> Any:
 
 def object_code(text: str) -> bytes:
     """Return the object file of LLVM's textual code."""
-    with _LOCK.held:
-        module, target = llvm.parse_assembly(text), _target()
+    # LLVM keeps the constants and types of what it compiles as long as the context, of which a global one
+    # would grow for ever.
+    with COMPILING, llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
+        target = _target()
         builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
-        builder.getModulePassManager().run(module, builder)
+        passes = builder.getModulePassManager()
+        try:
+            passes.run(module, builder)
+        finally:
+            # llvmlite 0.50 frees no pass manager: ObjectRef's empty _dispose hides NewPassManager's.
+            if type(passes)._dispose is llvm.ffi.ObjectRef._dispose:
+                NewPassManager._dispose(passes)
+            passes.close()
         return bytes(target.emit_object(module))
 
 
@@ -101,7 +103,7 @@ def batch_object() -> bytes:
 def load(*objects: bytes) -> Loaded:
     """Return the function of object files that belong together."""
     host()
-    with _LOCK.held:
+    with COMPILING:
         # llvmlite's memory manager keeps all sections within reach of one another.
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target(), use_lmm=True)
         for code in objects:

@@ -6,16 +6,15 @@ times, and where there is no compiler. `Compiled` has the same face.
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Final
-from weakref import WeakSet
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from mbkit._check import Array, all_finite
+from mbkit._fork import fork_safe
 
 __all__ = ["Machine"]
 
@@ -41,14 +40,9 @@ class Machine:
         self.inputs = tuple(function.size1_in(i) for i in range(function.n_in()))
         self.shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
         self.operations = int(function.n_instructions())
-        self.renew()
-        _MACHINES.add(self)
-
-    def renew(self) -> None:
-        """Start with new buffers, as a forked child must: a thread of its parent may have been in a call."""
         self._sizes: dict[int, tuple[Any, Any, list[Any], list[Any]]] = {}
         # CasADi's buffers belong to one call at a time.
-        self._lock = threading.Lock()
+        self._lock = fork_safe(threading.RLock())
 
     def _prepared(self, n: int) -> tuple[Any, Any, list[Any], list[Any]]:
         if n not in self._sizes:
@@ -104,15 +98,3 @@ class Machine:
                 held[:] = given
             run()
             return [x[0].T.copy() if single else x.swapaxes(1, 2).copy() for x in outputs]
-
-
-_MACHINES: Final[WeakSet[Machine]] = WeakSet()
-
-
-def _renew_all() -> None:
-    for machine in _MACHINES:
-        machine.renew()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew_all)

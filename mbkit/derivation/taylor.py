@@ -20,12 +20,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._fork import fork_safe
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.program import Operation, program
@@ -48,6 +48,12 @@ _SAME: Final = (
     *("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
     *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
 )
+#: heyoka's default limit of the machine code that it keeps in memory, bytes, and the one that replaces it:
+#: enough for some hundred systems.
+_HEYOKAS_MEMORY: Final = 2**31
+_MEMORY: Final = 2**26
+#: heyoka's compiler has locks of its own, which a forked child must not find held.
+_COMPILING: Final = fork_safe(threading.RLock())
 _REMEDY: Final = "method='rk853' and method='dop853' go without it"
 
 
@@ -116,6 +122,8 @@ def _heyoka() -> Any:
             "taylor: heyoka is not installed; pip install heyoka (Linux), or conda install -c conda-forge heyoka.py; "
             + _REMEDY
         ) from None
+    if heyoka.llvm_state.get_memcache_limit() == _HEYOKAS_MEMORY:
+        heyoka.llvm_state.set_memcache_limit(_MEMORY)
     return heyoka
 
 
@@ -195,7 +203,6 @@ class TaylorSystem:
         variables = [variables] if self._nq + self._nv == 1 else list(variables)
         self._system = list(zip(variables, self._expressions(heyoka, made, variables), strict=True))
         self._idle: dict[tuple[int, int], list[Any]] = {}
-        self._lock = threading.Lock()
 
     def _expressions(self, heyoka: Any, made: Any, variables: list[Any]) -> list[Any]:
         functions, clock = _functions(heyoka), self.clock
@@ -226,31 +233,31 @@ class TaylorSystem:
         when there is none to lend; heyoka keeps what it compiled in memory and on disk.
         """
         key = (kind.bits, order_of(tolerance))
-        with self._lock:
-            idle = self._idle.setdefault(key, [])
-            made = idle.pop() if idle else None
-        if made is None:
+        idle = self._idle.setdefault(key, [])
+        try:
+            made = idle.pop()
+        except IndexError:
             made = self._compiled(kind, tolerance)
         yield made
         # One whose run ended in an error is not lent again.
-        with self._lock:
-            idle.append(made)
+        idle.append(made)
 
     def _compiled(self, kind: Precision, tolerance: float) -> Any:
         n = self._nq + self._nv
         # Beyond double the arithmetic itself takes so long that loops cost nothing.
         compact = kind.bits > 53 or self.operations * order_of(tolerance) ** 2 > _UNROLLED
-        return _heyoka().taylor_adaptive(
-            self._system,
-            np.zeros(n).astype(kind.dtype),
-            pars=np.zeros(len(self._places)).astype(kind.dtype),
-            tol=kind.dtype(max(tolerance, kind.eps)),
-            fp_type=float if kind.bits == 53 else kind.dtype,
-            compact_mode=compact,
-            # In loops more optimization takes half as long again, and gains nothing; where every
-            # operation is a call, any takes three times as long.
-            opt_level=0 if kind.bits == 113 else 1 if compact else 3,
-        )
+        with _COMPILING:
+            return _heyoka().taylor_adaptive(
+                self._system,
+                np.zeros(n).astype(kind.dtype),
+                pars=np.zeros(len(self._places)).astype(kind.dtype),
+                tol=kind.dtype(max(tolerance, kind.eps)),
+                fp_type=float if kind.bits == 53 else kind.dtype,
+                compact_mode=compact,
+                # In loops more optimization takes half as long again, and gains nothing; where every
+                # operation is a call, any takes three times as long.
+                opt_level=0 if kind.bits == 113 else 1 if compact else 3,
+            )
 
     def fill(self, integrator: Any, *arguments: Any) -> None:
         """Write tau, and what else stands behind (q, v), into an integrator's parameters."""
@@ -259,14 +266,12 @@ class TaylorSystem:
                 integrator.pars[place] = arguments[which - 2][at]
 
 
-_SYSTEMS: Final[WeakKeyDictionary[Equations, TaylorSystem]] = WeakKeyDictionary()
-
-
 def taylor_system(equations: Equations) -> TaylorSystem:
     """Return the Taylor system of equations, made once for all dynamics that share them."""
-    if equations not in _SYSTEMS:
-        _SYSTEMS[equations] = TaylorSystem(equations)
-    return _SYSTEMS[equations]
+    if "taylor" not in equations.kept:
+        equations.kept["taylor"] = TaylorSystem(equations)
+    made: TaylorSystem = equations.kept["taylor"]
+    return made
 
 
 def _functions(heyoka: Any) -> dict[str, Any]:

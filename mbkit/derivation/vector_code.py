@@ -14,6 +14,7 @@ stays zero in a lane until one of them is not finite, whether a graph reads it o
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -104,10 +105,11 @@ def _is_zero(program: Program, k: int) -> bool:
 
 
 def _seen(program: Program) -> set[tuple[int, ...]]:
-    """Return the entries of the arguments whose NaN or infinity shows in some result by itself.
+    """Return the entries of the arguments whose NaN or infinity shows in some result.
 
-    All that is read does where nothing hides it: sums, products, sines, roots and logarithms
-    of what is not finite are not finite.
+    An entry that the program reads shows where no operation hides it: sums, products, sines,
+    roots and logarithms of NaN or infinity are not finite. An entry that is itself a result
+    shows too, because every result but a finite constant is watched.
     """
     if any(o.name in _HIDING for o in program.operations):
         return set()
@@ -201,7 +203,8 @@ class Piece:
         places = self._outputs.get(k, [])
         for i, j in places:
             self._store(self._names[k], self._place("out", "os", i, j))
-        if places and self._program.operations[k].name not in ("input", "const"):
+        operation = self._program.operations[k]
+        if places and not (operation.name == "const" and math.isfinite(operation.value)):
             self._watched.append(self._names[k])
 
     def _store(self, value: str, pointer: str) -> None:

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.model import Model
+from mbkit.model import Joint, Model
 
-__all__ = ["QUANTITIES", "Dynamics"]
+__all__ = ["QUANTITIES", "Dynamics", "per_sample", "unknown_joint"]
 
 QUANTITIES: Final = (
     "mass_matrix",
@@ -322,14 +322,25 @@ class Dynamics(ABC):
         more = f" and {len(suspects) - 3} more" if len(suspects) > 3 else ""
         if suspects:
             return f"; suspect: {', '.join(suspects[:3])}{more}"
-        springs = [repr(s.name) for s in self.model.springs if s.rest_length or s.damping]
+        springs = [repr(s.name) for s in self.model.springs if s.needs_direction]
         if springs:
-            return f"; perhaps a point spring of no length there has no direction: {', '.join(springs[:3])}"
+            return (
+                f"; possible cause: a point spring with a damper or a rest length has no direction where "
+                f"its length is zero: {', '.join(springs[:3])}"
+            )
         return "; perhaps links without mass, or numbers so large that they overflow"
 
     @staticmethod
     def _scalar(value: Array) -> Any:
         return float(value) if value.ndim == 0 else value
+
+
+def unknown_joint(engine: str, joint: Joint) -> UnsupportedError:
+    """Return the error for a joint of a type that an adapter has no counterpart of."""
+    return UnsupportedError(
+        f"{engine}: joint {joint.name!r} is {joint.kind}, a type that this engine does not have; "
+        "the lagrangian engine takes every joint type"
+    )
 
 
 def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:

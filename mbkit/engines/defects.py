@@ -46,14 +46,14 @@ CORIOLIS: Final = Defect(
     "pinocchio",
     "coriolis_matrix",
     "4.1.0",
-    "computeCoriolisMatrix leaves C v + g different from nle for spherical-ZYX and universal joints (pinocchio#2053)",
+    "computeCoriolisMatrix leaves C v + g different from nle for some joint types (pinocchio#2053)",
     "nle is right",
 )
 KINETIC_ENERGY: Final = Defect(
     "pinocchio",
     "kinetic_energy",
     "4.1.0",
-    "computeKineticEnergy leaves out the armature of revolute joints whose axis is not exactly +x, +y or +z",
+    "computeKineticEnergy leaves out the armature of some joint types",
     "half vᵀ M v is right",
 )
 TINY_MASS: Final = Defect(

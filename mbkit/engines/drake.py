@@ -20,6 +20,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit._fork import fork_safe
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.drake_model import build
 from mbkit.errors import NumericalError
@@ -52,7 +53,7 @@ class DrakeDynamics(Dynamics):
         self._context = self.plant.CreateDefaultContext()
         self._applied = self.plant.get_applied_generalized_force_input_port()
         self._acceleration = self.plant.get_generalized_acceleration_output_port()
-        self._lock = threading.RLock()
+        self._lock = fork_safe(threading.RLock())
         self._rotations: list[tuple[Array, int, int | None]] = []
 
     def _evaluate(self, quantity: str, method: Any, **arguments: ArrayLike) -> Array:

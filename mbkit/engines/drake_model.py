@@ -8,7 +8,7 @@ only its q̇ is singular, which nothing here uses.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
 
 from mbkit._check import Array
+from mbkit.engines.base import unknown_joint
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.parts import PointSpring
@@ -68,7 +69,8 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
     Raises
     ------
     UnsupportedError
-        A body or a spring that Drake refuses, a joint whose damping it cannot hold, or a joint coupling; named.
+        A body or a spring that Drake refuses, a joint of a type or with damping that it cannot hold, or a joint
+        coupling; named.
     """
     if description.couplings:
         names = ", ".join(repr(c.name) for c in description.couplings)
@@ -134,12 +136,14 @@ def _add(plant: Any, joint: Joint, bodies: dict[str, Any]) -> list[Any]:
     """Add a joint, as a stack where it has several real coordinates; return Drake's joints."""
     parent, child = bodies[joint.parent], bodies[joint.child]
     X_PJ = RigidTransform(RotationMatrix(np.array(joint.rotation)), joint.translation)
+    if joint.kind not in _STEPS:
+        raise unknown_joint("drake", joint)
     if joint.kind == "fixed":
         return [plant.AddJoint(tree.WeldJoint(joint.name, parent.body_frame(), child.body_frame(), X_PJ))]
     frame = plant.AddFrame(tree.FixedOffsetFrame(f"{joint.name}.fixed", parent, X_PJ))
-    if joint.kind in ("ball", "free"):
+    steps = _STEPS[joint.kind](joint)
+    if not steps:
         return [plant.AddJoint(_turning(joint, frame, child.body_frame()))]
-    steps = _steps(joint)
     out = []
     for k, (kind, axis) in enumerate(steps):
         name = joint.name if len(steps) == 1 else f"{joint.name}.{k}"
@@ -150,14 +154,19 @@ def _add(plant: Any, joint: Joint, bodies: dict[str, Any]) -> list[Any]:
     return out
 
 
-def _steps(joint: Joint) -> Sequence[tuple[str, Array]]:
-    if joint.kind == "universal":
-        return [("revolute", axis) for axis in joint.axes]
-    if joint.kind == "spherical_zyx":
-        return [("revolute", axis) for axis in (_Z, _Y, _X)]
-    if joint.kind == "planar":
-        return [("prismatic", _X), ("prismatic", _Y), ("revolute", _Z)]
-    return [("revolute" if joint.kind == "continuous" else joint.kind, joint.axes[0])]
+#: Joint type -> type and axis of each one-coordinate joint of its stack; none where it is one joint of Drake's.
+_STEPS: Final[dict[str, Callable[[Joint], Sequence[tuple[str, Array]]]]] = {
+    "fixed": lambda _: (),
+    "revolute": lambda joint: [("revolute", joint.axes[0])],
+    "continuous": lambda joint: [("revolute", joint.axes[0])],
+    "prismatic": lambda joint: [("prismatic", joint.axes[0])],
+    "helical": lambda joint: [("helical", joint.axes[0])],
+    "universal": lambda joint: [("revolute", axis) for axis in joint.axes],
+    "spherical_zyx": lambda _: [("revolute", axis) for axis in (_Z, _Y, _X)],
+    "ball": lambda _: (),
+    "planar": lambda _: [("prismatic", _X), ("prismatic", _Y), ("revolute", _Z)],
+    "free": lambda _: (),
+}
 
 
 def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at: Any, body: Any) -> Any:

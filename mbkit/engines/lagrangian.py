@@ -14,7 +14,7 @@ from mbkit._check import Array, count
 from mbkit.derivation.conditioning import loses_digits
 from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
 from mbkit.derivation.equations import Equations, equations_of
-from mbkit.derivation.execution import compile_by_default, executable
+from mbkit.derivation.execution import DERIVING, compile_by_default, executable
 from mbkit.derivation.factorize import elimination_size
 from mbkit.derivation.machine import Machine
 from mbkit.engines.base import Dynamics
@@ -113,7 +113,8 @@ class LagrangianDynamics(Dynamics):
                     return getattr(self.equations, name)(*extra)
                 return self.equations.function(name)
 
-            code = executable((self.form, *key), derive, compile=self.compile)
+            with DERIVING:
+                code = executable((self.form, *key), derive, compile=self.compile)
             if name in _TRIM and not isinstance(code, Machine):
                 self._short[name] = short_way(self.model, code, _TRIM[name], self.threads)
             self._machines[key] = code

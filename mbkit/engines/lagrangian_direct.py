@@ -44,13 +44,12 @@ def short_way(model: Model, code: Compiled, trim: Callable[[Array], Array], thre
     ones = [(n,) for n in sizes]
 
     def call(*given: Any) -> Any:
-        try:
-            if [x.shape for x in given] == ones:
-                return single(given) if not starts or _unit(given[0], starts) else None
-            if not _is_batch(given, sizes) or (starts and not _all_unit(given[0], starts)):
-                return None
-        except AttributeError:
-            # Not arrays.
+        # A subclass may be masked, and `is` would refuse the dtype of an array that was unpickled.
+        if not all(type(x) is np.ndarray and x.dtype == _FLOAT for x in given):
+            return None
+        if [x.shape for x in given] == ones:
+            return single(given) if not starts or _unit(given[0], starts) else None
+        if not _is_batch(given, sizes) or (starts and not _all_unit(given[0], starts)):
             return None
         results, finite = code.watched(*given, threads=threads)
         return trim(results[0]) if finite else None
@@ -80,8 +79,6 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
         views, run, watch, copy = held
         try:
             for view, x in zip(views, arguments, strict=True):
-                if x.dtype is not _FLOAT:
-                    return None
                 view[:] = x
             run()
             if watch[0] != 0.0:
@@ -96,7 +93,7 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
 
 def _is_batch(given: tuple[Any, ...], sizes: tuple[int, ...]) -> bool:
     n = given[0].shape[0] if given[0].ndim else 0
-    return all(x.shape == (n, size) and x.dtype is _FLOAT for x, size in zip(given, sizes, strict=True))
+    return all(x.shape == (n, size) for x, size in zip(given, sizes, strict=True))
 
 
 def _unit(q: Array, starts: tuple[int, ...]) -> bool:

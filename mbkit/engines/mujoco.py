@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, real
+from mbkit._fork import fork_safe
 from mbkit.engines import defects
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.mujoco_api import full_mass_matrix, heard_warnings
@@ -60,7 +61,7 @@ class MujocoDynamics(Dynamics):
         self.disabled = self._made.disabled
         self._d = mujoco.MjData(self._m)
         self._reduced = model.layout.reduced
-        self._lock = threading.RLock()
+        self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
         if quantity in _OF_MASS and self.model.couplings and self._torn_couplings:
@@ -132,6 +133,19 @@ class MujocoDynamics(Dynamics):
 
     def _force(self, f: Array) -> Array:
         return np.asarray(self._columns(f[None, :])[0])
+
+    @cached_property
+    def _lines(self) -> list[int]:
+        """Tendons of the point springs that need a direction; springs are the first tendons."""
+        return [k for k, spring in enumerate(self.model.springs) if spring.needs_direction]
+
+    def _directed(self, x: np.ndarray) -> Array:
+        """Return what contains spring forces; NaN where a spring that needs a direction has no length.
+
+        MuJoCo takes the x axis for the direction of a shorter line than mjMINVAL.
+        """
+        lengths = self._d.ten_length[self._lines]
+        return np.full_like(x, np.nan) if (lengths < mujoco.mjMINVAL).any() else np.asarray(x)
 
     def _positions(self) -> None:
         mujoco.mj_fwdPosition(self._m, self._d)
@@ -216,7 +230,7 @@ class MujocoDynamics(Dynamics):
         def one(q: Array, v: Array) -> Array:
             self._set(q, v)
             self._velocities()
-            return self._force(self._d.qfrc_passive)
+            return self._directed(self._force(self._d.qfrc_passive))
 
         return per_sample(one, q, v)
 
@@ -225,7 +239,7 @@ class MujocoDynamics(Dynamics):
             _, b = self._set(q, v)
             self._d.qacc[:] = self._to_mujoco(a) + b
             mujoco.mj_inverse(self._m, self._d)
-            return self._force(self._d.qfrc_inverse)
+            return self._directed(self._force(self._d.qfrc_inverse))
 
         return per_sample(one, q, v, a)
 
@@ -238,7 +252,7 @@ class MujocoDynamics(Dynamics):
         self._d.qfrc_applied[:] = self._to_mujoco(tau)
         mujoco.mj_forward(self._m, self._d)
         self._d.qfrc_applied[:] = 0.0
-        return self._force(self._d.qacc - b)
+        return self._directed(self._force(self._d.qacc - b))
 
     def _forward_reduced(self, q: Array, v: Array, tau: Array) -> Array:
         # A mimic joint inside MuJoCo would be a soft equality: reduce instead.
@@ -246,7 +260,7 @@ class MujocoDynamics(Dynamics):
         _, b = self._set(q, v)
         self._velocities()
         rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
-        return np.asarray(np.linalg.solve(M, tau + rest))
+        return self._directed(np.linalg.solve(M, tau + rest))
 
     def _kinetic_energy(self, q: Array, v: Array) -> Array:
         def one(q: Array, v: Array) -> Any:
@@ -362,6 +376,8 @@ class MujocoDynamics(Dynamics):
         count("steps", steps)
         if tau is not None and np.shape(tau) not in ((steps, self.model.nv), (size, steps, self.model.nv)):
             raise InputError(f"tau: expected shape ({steps}, {self.model.nv}), one row a step, got {np.shape(tau)}")
+        if self._lines:
+            self.passive(q0, v0)  # raises where a spring has no direction to start in
         model = copy.copy(self._m)
         if euler_damping:
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)

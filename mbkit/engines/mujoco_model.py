@@ -10,6 +10,7 @@ between two joints becomes such a stack too.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,13 +19,14 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit.engines.base import unknown_joint
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco_api import heard_warnings
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.physical import static_bodies
 
-__all__ = ["MujocoModel", "Placed", "build", "mapped", "specified"]
+__all__ = ["JOINT_TYPES", "MujocoModel", "Placed", "build", "mapped", "specified"]
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
@@ -76,8 +78,8 @@ def build(description: Model, *, spheres: bool = False) -> MujocoModel:
     Raises
     ------
     UnsupportedError
-        For a helical joint, an unevenly damped free joint, or a body that
-        MuJoCo's compiler refuses; the message names it.
+        For a joint of a type that MuJoCo does not have (helical), an unevenly damped
+        free joint, or a body that MuJoCo's compiler refuses; the message names it.
     """
     spec, placed, disabled = specified(description)
     if spheres:
@@ -126,11 +128,11 @@ def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
     Raises
     ------
     UnsupportedError
-        For a helical joint or an unevenly damped free joint.
+        For a joint of a type that MuJoCo does not have or an unevenly damped free joint.
     """
     for joint in description.joints:
-        if joint.kind == "helical":
-            raise UnsupportedError(f"mujoco: joint {joint.name!r} is helical, and MuJoCo has no helical joint")
+        if joint.kind not in JOINT_TYPES:
+            raise unknown_joint("mujoco", joint)
         if joint.kind == "free" and np.ptp(joint.damping[:3]) > 0:
             raise UnsupportedError(
                 f"mujoco: free joint {joint.name!r} is damped differently along its body axes; "
@@ -251,6 +253,20 @@ def _give_inertia(made: Any, body: Body, description: Model, placed: Placed) -> 
         made.inertia = np.ones(3)
 
 
+#: Joint type -> MuJoCo's type, axis and name suffix of each joint of its stack.
+JOINT_TYPES: Final[dict[str, Callable[[Joint], list[tuple[Any, Array, str]]]]] = {
+    "fixed": lambda _: [],
+    "revolute": lambda joint: [(_HINGE, joint.axes[0], "")],
+    "continuous": lambda joint: [(_HINGE, joint.axes[0], "")],
+    "prismatic": lambda joint: [(_SLIDE, joint.axes[0], "")],
+    "universal": lambda joint: [(_HINGE, joint.axes[0], ".1"), (_HINGE, joint.axes[1], ".2")],
+    "spherical_zyx": lambda _: [(_HINGE, _Z, ".z"), (_HINGE, _Y, ".y"), (_HINGE, _X, ".x")],
+    "ball": lambda _: [(_BALL, _Z, "")],
+    "planar": lambda _: [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_HINGE, _Z, ".theta")],
+    "free": lambda _: [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_SLIDE, _Z, ".z"), (_BALL, _Z, ".ball")],
+}
+
+
 def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, at_origin: bool) -> None:
     """Add the joint, whose fixed frame at q = 0 is (R, p) in the body."""
     names: list[str] = []
@@ -269,30 +285,12 @@ def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, a
                 j.limited, j.range = 1, [max(low, -_OPEN), min(high, _OPEN)]
         names.append(name)
 
-    kind = joint.kind
-    if kind in ("revolute", "continuous"):
-        add(_HINGE, joint.axes[0], 0, "")
-    elif kind == "prismatic":
-        add(_SLIDE, joint.axes[0], 0, "")
-    elif kind == "universal":
-        add(_HINGE, joint.axes[0], 0, ".1")
-        add(_HINGE, joint.axes[1], 1, ".2")
-    elif kind == "spherical_zyx":
-        for k, (axis, suffix) in enumerate(((_Z, ".z"), (_Y, ".y"), (_X, ".x"))):
-            add(_HINGE, axis, k, suffix)
-    elif kind == "planar":
-        for k, (type_, axis, suffix) in enumerate(((_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_HINGE, _Z, ".theta"))):
-            add(type_, axis, k, suffix)
-    elif kind == "ball":
-        add(_BALL, _Z, 0, "")
-    elif kind == "free":
-        if at_origin:
-            # A true free joint's qpos is the pose in the world, ours too then.
-            add(_FREE, _Z, 0, "")
-        else:
-            for k, (axis, suffix) in enumerate(((_X, ".x"), (_Y, ".y"), (_Z, ".z"))):
-                add(_SLIDE, axis, k, suffix)
-            add(_BALL, _Z, 0, ".ball")
+    steps = JOINT_TYPES[joint.kind](joint)
+    if joint.kind == "free" and at_origin:
+        # A true free joint's qpos is the pose in the world, ours too then.
+        steps = [(_FREE, _Z, "")]
+    for k, (type_, axis, suffix) in enumerate(steps):
+        add(type_, axis, k, suffix)
     placed.joints[joint.name] = names
 
 

@@ -17,7 +17,7 @@ from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.base import Dynamics
 from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.mujoco_api import heard_warnings
-from mbkit.engines.mujoco_model import MujocoModel, Placed, mapped, specified
+from mbkit.engines.mujoco_model import JOINT_TYPES, MujocoModel, Placed, mapped, specified
 from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 
@@ -100,8 +100,8 @@ def read_back(model: Model, text: str) -> ReadBack:
 def _unsayable(model: Model) -> Iterator[str]:
     for joint in model.joints:
         who = f"joint {joint.name!r}"
-        if joint.kind == "helical":
-            yield f"{who} is helical"
+        if joint.kind not in JOINT_TYPES:
+            yield f"{who} is {joint.kind}"
         parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
         if any(np.ptp(x) > 0 for x in parts):
             yield f"{who} is damped differently along its body axes"

@@ -8,12 +8,15 @@ coordinates (Pinocchio's own planar joint has four numbers and body velocities).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
+from mbkit.engines.base import unknown_joint
 from mbkit.model import Body, Joint, Model
 
 __all__ = ["PinModel", "build"]
@@ -36,8 +39,6 @@ class PinModel:
         Whether both orders are the identity.
     ground_moment : (3,) array
         Σ m p over bodies fixed to the world: Pinocchio's energy leaves them out.
-    unaligned_armature : tuple of str
-        Revolute joints off the positive axes that have armature.
     """
 
     model: pin.Model
@@ -46,11 +47,16 @@ class PinModel:
     v_order: np.ndarray
     ordered: bool
     ground_moment: Array
-    unaligned_armature: tuple[str, ...]
 
 
 def build(description: Model) -> PinModel:
-    """Return the description as Pinocchio holds it."""
+    """Return the description as Pinocchio holds it.
+
+    Raises
+    ------
+    UnsupportedError
+        For a joint of a type that Pinocchio does not have; named.
+    """
     made = pin.Model()
     made.name = description.name
     made.gravity = pin.Motion(np.array(description.gravity), np.zeros(3))
@@ -58,21 +64,20 @@ def build(description: Model) -> PinModel:
     bodies: dict[str, tuple[int, Array, Array]] = {"world": (0, np.eye(3), np.zeros(3))}
     q_order: list[int] = []
     v_order: list[int] = []
-    unaligned: list[str] = []
     ground = np.zeros(3)
     for joint in description.tree:
         carrier, R, p = bodies[joint.parent]
         R, p = R @ joint.rotation, p + R @ joint.translation
-        if joint.kind != "fixed":
-            for suffix, motion in _motions(joint):
+        if joint.kind not in _STEPS:
+            raise unknown_joint("pinocchio", joint)
+        if joint.type.nv:
+            for suffix, motion in _STEPS[joint.kind](joint):
                 carrier = made.addJoint(carrier, motion, pin.SE3(R, p), joint.name + suffix)
                 R, p = np.eye(3), np.zeros(3)
             first = made.joints[carrier].idx_v + made.joints[carrier].nv - joint.type.nv
             armature = np.array(made.armature)
             armature[first : first + joint.type.nv] = joint.armature
             made.armature = armature
-            if np.any(joint.armature) and isinstance(motion, pin.JointModelRevoluteUnaligned):
-                unaligned.append(joint.name)
         bodies[joint.child] = (carrier, R, p)
         body = description.body(joint.child)
         if carrier:
@@ -82,27 +87,7 @@ def build(description: Model) -> PinModel:
         q_order.extend(range(layout.full_q[joint.name].start, layout.full_q[joint.name].stop))
         v_order.extend(range(layout.full_v[joint.name].start, layout.full_v[joint.name].stop))
     ordered = q_order == list(range(len(q_order)))
-    return PinModel(made, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground, tuple(unaligned))
-
-
-def _motions(joint: Joint) -> list[tuple[str, object]]:
-    """Return name suffix and Pinocchio joint of each step of a joint."""
-    kind = joint.kind
-    if kind in ("revolute", "continuous"):
-        return [("", _aligned(joint, "R", pin.JointModelRevoluteUnaligned))]
-    if kind == "prismatic":
-        return [("", _aligned(joint, "P", pin.JointModelPrismaticUnaligned))]
-    if kind == "helical":
-        return [("", pin.JointModelHelicalUnaligned(np.array(joint.axes[0]), joint.pitch))]
-    if kind == "universal":
-        return [("", pin.JointModelUniversal(np.array(joint.axes[0]), np.array(joint.axes[1])))]
-    if kind == "spherical_zyx":
-        return [("", pin.JointModelSphericalZYX())]
-    if kind == "ball":
-        return [("", pin.JointModelSpherical())]
-    if kind == "planar":
-        return [(".x", pin.JointModelPX()), (".y", pin.JointModelPY()), (".theta", pin.JointModelRZ())]
-    return [("", pin.JointModelFreeFlyer())]
+    return PinModel(made, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground)
 
 
 def _inertia(body: Body) -> pin.Inertia:
@@ -119,3 +104,18 @@ def _aligned(joint: Joint, letter: str, general: type) -> object:
         if np.array_equal(joint.axes[0], unit):
             return getattr(pin, f"JointModel{letter}{name}")()
     return general(np.array(joint.axes[0]))
+
+
+#: Joint type -> name suffix and Pinocchio joint of each step of a joint of this type.
+_STEPS: Final[dict[str, Callable[[Joint], list[tuple[str, object]]]]] = {
+    "fixed": lambda _: [],
+    "revolute": lambda joint: [("", _aligned(joint, "R", pin.JointModelRevoluteUnaligned))],
+    "continuous": lambda joint: [("", _aligned(joint, "R", pin.JointModelRevoluteUnaligned))],
+    "prismatic": lambda joint: [("", _aligned(joint, "P", pin.JointModelPrismaticUnaligned))],
+    "helical": lambda joint: [("", pin.JointModelHelicalUnaligned(np.array(joint.axes[0]), joint.pitch))],
+    "universal": lambda joint: [("", pin.JointModelUniversal(np.array(joint.axes[0]), np.array(joint.axes[1])))],
+    "spherical_zyx": lambda _: [("", pin.JointModelSphericalZYX())],
+    "ball": lambda _: [("", pin.JointModelSpherical())],
+    "planar": lambda _: [(".x", pin.JointModelPX()), (".y", pin.JointModelPY()), (".theta", pin.JointModelRZ())],
+    "free": lambda _: [("", pin.JointModelFreeFlyer())],
+}

@@ -47,7 +47,7 @@ class PointSprings:
             length = float(np.linalg.norm(gap))
             pull = spring.stiffness * gap
             with np.errstate(invalid="ignore", divide="ignore"):
-                if spring.rest_length:
+                if spring.stiffness and spring.rest_length:
                     pull = pull - spring.stiffness * spring.rest_length * (gap / length)
                 if spring.damping:
                     pull = pull + spring.damping * (gap / length) * float(gap @ (J @ v)) / np.float64(length)

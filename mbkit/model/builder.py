@@ -227,6 +227,10 @@ class ModelBuilder:
     ) -> None:
         """Add a spring and damper along the line between two points.
 
+        Where the points meet, a damper or a rest length has no direction to act in: there
+        every engine raises `NumericalError`, because the limit depends on the way there.
+        A joint's own spring and damper have no such pose.
+
         Parameters
         ----------
         name : str

@@ -152,6 +152,10 @@ class PointSpring(_Frozen):
 
     The pull is stiffness * (l - rest_length) + damping * dl/dt, with l the
     distance. Points are in body axes; a body may be ``"world"``.
+
+    Where l = 0 the line has no direction. A spring without damping and rest length
+    pulls with zero force there; the force of any other one is not defined, and every
+    engine raises `NumericalError` for the quantities that contain it.
     """
 
     name: str
@@ -162,6 +166,11 @@ class PointSpring(_Frozen):
     stiffness: float
     rest_length: float
     damping: float
+
+    @property
+    def needs_direction(self) -> bool:
+        """Whether the force is undefined where the two points meet."""
+        return self.damping != 0 or (self.stiffness != 0 and self.rest_length != 0)
 
 
 _OF_COUPLING: Final = ("stiffness", "rest_length", "damping", "armature")

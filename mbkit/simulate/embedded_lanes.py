@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Final
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -90,12 +89,8 @@ def _scheme(method: str) -> _Scheme:
     )
 
 
-# Equations are shared by dynamics of one model at different values of its parameters.
-_CODES: Final[WeakKeyDictionary[Equations, dict[str, Lanes]]] = WeakKeyDictionary()
-
-
 def _code(dyn: LagrangianDynamics, scheme: _Scheme) -> Lanes:
-    made = _CODES.setdefault(dyn.equations, {})
+    made: dict[str, Lanes] = dyn.equations.kept.setdefault("lanes", {})
     if scheme.name not in made:
         made[scheme.name] = lanes(
             (dyn.form, scheme.name, disk.key_of(repr(scheme.coefficients))),

@@ -13,13 +13,10 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation import Equations
 from mbkit.derivation.compiled import cores
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.space import Space
@@ -32,9 +29,6 @@ from mbkit.simulate.steps import RUNAWAY, credible, reason
 from mbkit.simulate.torque import Torque
 
 __all__ = ["run_rollout"]
-
-# Equations are shared by dynamics of one model at different values of its parameters.
-_PLANS: Final[WeakKeyDictionary[Equations, dict[str, Plan]]] = WeakKeyDictionary()
 
 
 def run_rollout(
@@ -64,7 +58,7 @@ def run_rollout(
 
 
 def _plan(dyn: LagrangianDynamics, method: str) -> Plan:
-    plans = _PLANS.setdefault(dyn.equations, {})
+    plans: dict[str, Plan] = dyn.equations.kept.setdefault("rollout", {})
     if method not in plans:
         plans[method] = Plan(dyn, method)
     return plans[method]
