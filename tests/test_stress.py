@@ -404,7 +404,7 @@ def test_the_command_prints_and_writes(study, here, monkeypatch):
     assert result.exit_code == 130
     assert json.loads(result.stdout)["complete"] is False
     assert "interrupted: " in result.stderr
-    assert Path("out/ending-stress.html").exists()
+    assert Path("out/stress.html").exists()
 
 
 @pytest.mark.usefixtures("here")

@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 from scipy.special import ellipj, ellipk
 
 import mbkit as mb
+from mbkit._escape import csv_text
 from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
@@ -664,7 +665,9 @@ def test_results_survive_json_and_csv(result):
     rows = list(csv.DictReader(io.StringIO(result.to_csv())))
     assert len(rows) == len(list(result.rows()))
     for row, (curve, point) in zip(rows, result.rows(), strict=True):
-        assert (row["engine"], row["method"], row["note"]) == (curve.engine, curve.method, point.note)
+        assert (row["engine"], row["method"], row["note"]) == tuple(
+            csv_text(x) for x in (curve.engine, curve.method, point.note)
+        )
         assert row["error"] == ("" if math.isnan(point.error) else repr(point.error))
     assert sum(int(r["front"]) for r in rows) == len(result.front)
 

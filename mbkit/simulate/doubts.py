@@ -112,7 +112,7 @@ def doubts(
     ]
     if not isinstance(setting, Tolerances) and method.name in STEPS:
         # The cause is told before what came of it.
-        looks.insert(0, _step(dyn, method.name, setting, float(t[-1]), ends))
+        looks.insert(0, _step(dyn, method.name, setting, float(t[-1] - t[0]), ends))
     if isinstance(setting, Tolerances) and method.name == _OF_START:
         looks.append(_outgrown(q, v, setting))
     if isinstance(setting, Tolerances) and method.name in _TO_THE_FULL:
@@ -136,7 +136,8 @@ def idle(dyn: Dynamics, q: Array) -> str:
         there = dyn.mass_matrix(model.random_state(np.random.default_rng(0))[0])
         scale = np.sqrt(np.diag(there))
         values, vectors = np.linalg.eigh(dyn.mass_matrix(unit_quaternions(model, q)[0]) / scale[:, None] / scale)
-    except (MbkitError, np.linalg.LinAlgError):
+    except (MbkitError, np.linalg.LinAlgError, NotImplementedError):
+        # An engine of a user's own may lack the mass matrix.
         return ""
     if not values[0] < _IDLE * values[-1]:
         return ""
