@@ -3,7 +3,8 @@
 Every function takes keyword parameters in SI units, numbers or `mbkit.Parameter`;
 its docstring gives the coordinates, the zero pose and the source. Planar systems move in the x-z plane,
 gravity along -z, with angles from the downward vertical that grow towards +x: a
-right-handed turn about -y. Planar systems without gravity move in the x-y plane.
+right-handed turn about -y. Planar systems without gravity move in the x-y plane. Engines take all but
+`slider_crank`, which has a loop: `mbkit.lagrangian.from_model` solves it.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from mbkit.catalog.furuta_pendulum import furuta_pendulum
 from mbkit.catalog.gyroscope import gyroscope
 from mbkit.catalog.heavy_top import heavy_top
 from mbkit.catalog.pendulum import pendulum
+from mbkit.catalog.slider_crank import slider_crank
 from mbkit.catalog.spacecraft_with_wheels import spacecraft_with_wheels
 from mbkit.catalog.spherical_pendulum import spherical_pendulum
 from mbkit.errors import UnknownNameError
@@ -41,6 +43,7 @@ __all__ = [
     "gyroscope",
     "heavy_top",
     "pendulum",
+    "slider_crank",
     "spacecraft_with_wheels",
     "spherical_pendulum",
     "systems",
@@ -63,6 +66,7 @@ _SYSTEMS: dict[str, Callable[..., Model]] = {
         spacecraft_with_wheels,
         clamped_beam,
         flexible_spacecraft,
+        slider_crank,
     )
 }
 

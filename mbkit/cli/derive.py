@@ -53,7 +53,8 @@ def derive(
 
     SYSTEM is a catalog system, a system on paper such as kepler, a small robot, a path to a URDF or MJCF file, or
     package.module:function for a function that returns a Model or a Lagrangian. Where catalog and paper
-    have the same name, this is the catalog's; mbkit.lagrangian.systems:NAME is the other.
+    have the same name, NAME is the catalog's, or paper's where the catalog's has a quaternion or a loop;
+    mbkit.catalog:NAME and mbkit.lagrangian.systems:NAME are always the one and the other.
     """
     if as_json and form:
         raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
@@ -93,7 +94,7 @@ def derive(
 
 
 def _model(name: str, options: dict[str, Any]) -> Model:
-    """Return what a name stands for; one that only paper has, or the catalog has with quaternions, is paper's."""
+    """Return what a name stands for; one that the catalog lacks, or has with quaternions or loops, is paper's."""
     from mbkit import catalog
     from mbkit.errors import UnknownNameError
     from mbkit.lagrangian import systems
@@ -101,8 +102,11 @@ def _model(name: str, options: dict[str, Any]) -> Model:
     from mbkit.studies.target import model_of
 
     made = catalog.systems()[name]() if name in catalog.systems() and not options else None
-    if name in systems.names() and not options and (made is None or made.quaternions):
-        if made is not None:
+    if name in systems.names() and not options and (made is None or made.quaternions or made.loops):
+        if made is not None and made.loops:
+            told = f"the catalog's has bodies and a loop, and mbkit derive mbkit.catalog:{name} takes that one"
+            say("note", f"{name} is in independent coordinates here; {told}")
+        elif made is not None:
             say("note", f"{name} is in Euler angles here; the catalog's has a quaternion, which mbkit check takes")
         say("note", _described(systems.get(name)))
         return systems.get(name)().model

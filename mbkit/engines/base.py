@@ -36,6 +36,9 @@ QUANTITIES: Final = (
     "function",
 )
 
+#: Loops or prescribed joints that a refusal names.
+_NAMED: Final = 3
+
 
 class Dynamics(ABC):
     """A model evaluated by one engine; made by `mbkit.dynamics`.
@@ -70,13 +73,14 @@ class Dynamics(ABC):
             )
         if not self.takes_parameters:
             model.require_values(self.engine)
-        for needed, told in ((model.needs.loops, "loop closures"), (model.needs.time, "motions prescribed in time")):
-            if needed:
-                remedy = "loops" if told.startswith("loop") else "prescribed"
+        for feature, told in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
+            parts = getattr(model, feature)
+            if parts:
+                names = ", ".join(repr(x.name) for x in parts[:_NAMED]) + (", ..." if parts[_NAMED:] else "")
                 raise UnsupportedError(
-                    f"{self.engine}: {model.name} has {told}, and an engine takes the tree alone; "
+                    f"{self.engine}: {model.name} has {told} ({names}), and an engine takes the tree alone; "
                     "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
-                    f"and model.without({remedy!r}) is the tree without them"
+                    f"and model.without({feature!r}) is the tree without them"
                 )
         self.model = model
 

@@ -48,6 +48,7 @@ _SYMBOLS: Final[dict[str, dict[str, str | tuple[str, str, str]]]] = {
         "inner_inertia": ("A_i", "B_i", "C_i"),
         "outer_inertia": "J_o",
     },
+    "slider_crank": {"crank": "L1", "rod": "L2", "crank_mass": "m1", "rod_mass": "m2", "piston_mass": "m3"},
 }
 #: Of coordinates that the catalog calls by a word.
 _LETTERS: Final = {
@@ -163,7 +164,7 @@ def _form(model: Model) -> Any:
         [b.name for b in model.bodies],
         joints,
         [*(s.name for s in model.springs), *(c.name for c in model.couplings)],
-        len(model.loops),
+        [(x.name, x.kind, x.body_a, x.body_b) for x in model.loops],
     )
 
 
@@ -227,3 +228,5 @@ def _numbers(model: Model) -> Iterator[np.ndarray]:
         yield from (s.point_a, s.point_b, np.array([s.stiffness, s.rest_length, s.damping]))
     for c in model.couplings:
         yield np.array([*c.factors, c.stiffness, c.rest_length, c.damping, c.armature])
+    for x in model.loops:
+        yield from (x.rotation_a, x.translation_a, x.rotation_b, x.translation_b)
