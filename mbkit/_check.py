@@ -117,7 +117,10 @@ def generator(name: str, value: Any) -> np.random.Generator:
 
 def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = False) -> float:
     """Return `value` as a finite float, optionally of a required sign."""
-    if isinstance(value, (str, bytes, bytearray, bool, np.bool_)) or (isinstance(value, np.ndarray) and value.ndim):
+    if isinstance(value, np.ndarray) and not value.ndim:
+        value = value[()]
+    # NumPy would cut a complex number to its real part.
+    if isinstance(value, (str, bytes, bytearray, bool, np.bool_, np.ndarray, np.complexfloating)):
         raise InputError(f"{name}: expected a number, got {shown(value)}")
     try:
         number = float(value)

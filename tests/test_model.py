@@ -53,10 +53,13 @@ def nested(depth):
 
 HOSTILE = [
     *(10**400, -(10**400), Decimal("1e500"), Decimal("sNaN"), Fraction(10**400, 3), 1j, None, True, int, {}, [], {1}),
+    *({"j": 10**400}, {"j": None}, {1: 1.0}, {None: 1.0}, {"\ud800": 1.0}, {"j": mb.Parameter("p")}, {"k": 1.0}),
+    *({"j": 1e200}, {"j": [1.0, 2.0]}, {"j": True}, {("j",): 1.0}, dict.fromkeys(range(1000), 1.0)),
     *([[1, [2]]], nested(10_000), b"1", bytearray(b"1"), math.nan, math.inf, 1e200, [1e160] * 3, "\ud800", "a\0b", ""),
     *(np.zeros((2, 2)), np.array([10**400, 1, 2], dtype=object), np.array([1j, 0, 0]), np.array(["a", "b", "c"])),
     *(np.array([True, False, True]), np.arange(3).astype(">f8"), Rude(), "x" * 100_000, mb.Parameter("p")),
     *(mb.Parameter("p", 1e300), np.datetime64("2020"), mb.Parameter("p", 1e200) * 1e100),
+    *(np.complex128(1 + 1j), np.array(1 + 1j)),
 ]
 METHODS = {
     "__init__": {"name": "m"},
@@ -64,6 +67,7 @@ METHODS = {
     "add_joint": {"name": "j", "kind": "revolute", "parent": "world", "child": "b", "axis": (0, 1, 0)},
     "add_frame": {"name": "f", "body": "b"},
     "add_spring": {"name": "s", "body_a": "b", "body_b": "world", "stiffness": 1.0},
+    "add_coupling": {"name": "c", "factors": {"j": 1.0}, "stiffness": 1.0},
     "add_loop": {"name": "l", "kind": "point", "body_a": "b", "body_b": "world"},
     "prescribe": {"joint": "j"},
     "note": {"text": "words"},
@@ -72,9 +76,7 @@ METHODS = {
 PLACES = [(m, a) for m in METHODS for a in inspect.signature(getattr(mb.ModelBuilder, m)).parameters if a != "self"]
 
 
-@given(wrong=st.dictionaries(st.sampled_from(PLACES), st.sampled_from(HOSTILE), min_size=1, max_size=3))
-@settings(max_examples=150, deadline=None)
-def test_whatever_a_builder_is_given_is_built_or_refused_by_name(wrong):
+def built_or_refused(wrong):
     def arguments(method):
         return METHODS[method] | {a: x for (m, a), x in wrong.items() if m == method}
 
@@ -90,6 +92,28 @@ def test_whatever_a_builder_is_given_is_built_or_refused_by_name(wrong):
     else:
         assert len(model.digest) == 64
         assert np.isfinite(sample_mass_matrix(model)).all() or model.parameters
+
+
+@given(wrong=st.dictionaries(st.sampled_from(PLACES), st.sampled_from(HOSTILE), min_size=2, max_size=3))
+@settings(max_examples=150, deadline=None)
+def test_whatever_a_builder_is_given_is_built_or_refused_by_name(wrong):
+    built_or_refused(wrong)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_argument_of_a_builder_is_built_or_refused_by_name(method):
+    for place in (p for p in PLACES if p[0] == method):
+        for value in HOSTILE:
+            built_or_refused({place: value})
+
+
+@pytest.mark.parametrize("value", [np.complex128(1 + 1j), np.complex64(2), np.array(1 + 1j)])
+def test_a_complex_number_is_not_cut_to_its_real_part(value):
+    b = pendulum()
+    b.add_body("c", mass=value)
+    b.add_joint("k", "fixed", parent="bob", child="c")
+    with pytest.raises(ModelError, match="body 'c': mass"):
+        b.build()
 
 
 def test_numbers_whose_mass_matrix_overflows_are_refused_by_name():

@@ -291,7 +291,7 @@ class ModelBuilder:
         """
         name = self._read.name("coupling name", name)
         who = f"coupling {name!r}"
-        if not hasattr(factors, "items"):
+        if not isinstance(factors, Mapping):
             told = shown(factors)
             self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {told}")
             return
