@@ -418,14 +418,24 @@ def _compile_anew() -> None:
     built(ca.Function("sums", [x], [ca.densify(ca.sin(x) * ca.cumsum(x))]))
 
 
-@pytest.mark.parametrize("work", ["compiling", "compiled", "interpreted", "mujoco", "drake"])
+@pytest.mark.parametrize("work", ["compiling", "compiled", "interpreted", "mujoco", "drake", "mujoco's text", "drake's reading"])
 def test_a_child_forked_during_another_threads_work_computes(work):
     if "fork" not in multiprocessing.get_all_start_methods():
         pytest.skip("this system does not fork")
     model = mb.load("panda")
+    if "mujoco" in work or "drake" in work:
+        pytest.importorskip("pydrake" if "drake" in work else "mujoco")
     if work in ("mujoco", "drake"):
-        pytest.importorskip("pydrake" if work == "drake" else "mujoco")
         dyn = mb.dynamics(model, work)
+    elif work == "mujoco's text":
+        from mbkit.engines.mujoco_text import mjcf_text, read_back
+
+        dyn = read_back(model, mjcf_text(model, ""))
+    elif work == "drake's reading":
+        from mbkit.engines import import_drake
+
+        dyn = import_drake.read(mb.convert(mb.catalog.double_pendulum(), "urdf").text, "urdf").terms.__self__
+        model = dyn.model
     else:
         dyn = mb.dynamics(model, "lagrangian", compile=work != "interpreted")
     q, v, _, _ = states(model, 1)

@@ -19,6 +19,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 
 from mbkit._check import Array
+from mbkit._fork import fork_safe
 from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.drake import DrakeDynamics
 from mbkit.engines.drake_model import DrakeModel
@@ -106,7 +107,7 @@ class _Read(DrakeDynamics):
         Dynamics.__init__(self, model)
         self.made, self.plant = made, made.plant
         self._context = self.plant.CreateDefaultContext()
-        self._lock = threading.RLock()
+        self._lock = fork_safe(threading.RLock())
         self._rotations: list[tuple[Array, int, int | None]] = []
 
     def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:  # noqa: ARG002

@@ -14,6 +14,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
+from mbkit._fork import fork_safe
 from mbkit.engines.base import Dynamics
 from mbkit.engines.mujoco import MujocoDynamics
 from mbkit.engines.mujoco_api import heard_warnings
@@ -43,7 +44,7 @@ class ReadBack(MujocoDynamics):
         self.disabled = ()
         self._d = mujoco.MjData(self._m)
         self._reduced = model.layout.reduced
-        self._lock = threading.RLock()
+        self._lock = fork_safe(threading.RLock())
 
 
 def mjcf_text(model: Model, comment: str) -> str:

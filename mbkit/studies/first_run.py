@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any, Final
 
+from mbkit._fork import fork_safe
 from mbkit.catalog import pendulum
 from mbkit.derivation.cache import anew
 from mbkit.engines import Dynamics, dynamics
@@ -21,7 +22,7 @@ __all__ = ["made_ready"]
 
 #: heyoka has one switch for all threads: what it was when each of those came that are in the block.
 _BEFORE: Final[list[bool]] = []
-_SWITCHING: Final = threading.Lock()
+_SWITCHING: Final = fork_safe(threading.RLock())
 
 
 def made_ready(model: Model, engine: str, method: str, first: Callable[[Dynamics], Any]) -> tuple[Dynamics, float]:
