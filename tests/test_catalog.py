@@ -189,6 +189,8 @@ BAD = [
     ("free_body", "sides", (0.1, 0.0, 0.2)),
     ("free_body", "sides", 1.0),
     ("free_body", "mass", None),
+    ("slider_crank", "rod", 0.0),
+    ("slider_crank", "rod_mass", -1.0),
 ]
 
 
@@ -201,7 +203,7 @@ def test_bad_parameters_are_named(name: str, parameter: str, value: Any) -> None
 def test_registry() -> None:
     names = (
         "pendulum double_pendulum cart_pole spherical_pendulum elastic_pendulum acrobot furuta_pendulum chain "
-        "heavy_top gyroscope free_body spacecraft_with_wheels clamped_beam flexible_spacecraft"
+        "heavy_top gyroscope free_body spacecraft_with_wheels clamped_beam flexible_spacecraft slider_crank"
     )
     assert set(catalog.systems()) == set(names.split())
     assert catalog.get("cart_pole") is catalog.cart_pole
@@ -210,6 +212,12 @@ def test_registry() -> None:
         catalog.get("cartpole")
     catalog.systems().clear()
     assert catalog.systems(), "the registry was handed out, not a copy"
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_engines_refuse_a_system_with_a_loop_by_its_name(engine: str) -> None:
+    with pytest.raises(UnsupportedError, match=r"slider_crank.*'pin'.*from_model\(model\)"):
+        dynamics(catalog.slider_crank(), engine)
 
 
 @pytest.mark.parametrize("name", catalog.systems())

@@ -34,7 +34,7 @@ def bar(b: mb.ModelBuilder, name: str, length, mass=1.0, part=1.0, thick=1e-3) -
 
 
 def slider_crank(*changes) -> mb.Model:
-    """Crank, rod and piston of `systems.rigid_slider_crank`, and a pin."""
+    """Crank, rod and piston of `mbkit.catalog.slider_crank` with named parameters, and what else is added."""
     L1, L2, m1, m2 = P("L1", 0.1), P("L2", 0.3), P("m1", 0.2), P("m2", 0.2)
     b = mb.ModelBuilder("slider_crank", gravity=(0, 0, 0))
     bar(b, "crank", L1, m1, thick=0.0)
@@ -42,7 +42,7 @@ def slider_crank(*changes) -> mb.Model:
     b.add_body("piston", mass=P("m3", 0.4))
     b.add_joint("theta", "continuous", parent="world", child="crank", **ABOUT_Z)
     b.add_joint("phi", "continuous", parent="crank", child="rod", translation=(L1, 0, 0), **ABOUT_Z)
-    b.add_joint("x", "prismatic", parent="world", child="piston", axis=(1, 0, 0))
+    b.add_joint("x", "prismatic", parent="world", child="piston", axis=(1, 0, 0), translation=(L1 + L2, 0, 0))
     b.add_loop("pin", "point", body_a="rod", translation_a=(L2, 0, 0), body_b="piston")
     for change in changes:
         change(b)
@@ -51,18 +51,19 @@ def slider_crank(*changes) -> mb.Model:
 
 def at_angle(th: float) -> np.ndarray:
     phi = -th - math.asin(math.sin(th) / 3)
-    return np.array([th, phi, 0.1 * math.cos(th) + 0.3 * math.cos(th + phi)])
+    return np.array([th, phi, 0.1 * math.cos(th) + 0.3 * math.cos(th + phi) - 0.4])
 
 
 @pytest.fixture(scope="module")
 def crank():
-    return from_model(slider_crank())
+    return from_model(mb.catalog.slider_crank())
 
 
 def test_a_slider_crank_closes_as_in_the_textbook(crank):
     L1, L2, th, phi, x = sp.symbols("L1 L2 theta phi x")
-    row = L1 * sp.cos(th) + L2 * sp.cos(th + phi) - x, L1 * sp.sin(th) + L2 * sp.sin(th + phi)
+    row = L1 * (sp.cos(th) - 1) + L2 * (sp.cos(th + phi) - 1) - x, L1 * sp.sin(th) + L2 * sp.sin(th + phi)
     assert [sp.expand(a - b) for a, b in zip(crank.constraints, row, strict=True)] == [0, 0]
+    assert {s.name: value for s, value in crank.parameters.items()} == slider_crank().parameters
     told, one = published()["rigid_slider_crank"], systems.rigid_slider_crank().dynamics(options=OWN)
     embedded = crank.embedded(["theta"])
     for angle, J in ((0.0, told["J0"]), (0.7, None), (math.pi / 2, told["J_half_pi"]), (2.5, None)):

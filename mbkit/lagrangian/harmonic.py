@@ -36,10 +36,20 @@ class Space:
         else is not a number, and coordinates.
     most : int
         Products of terms that are not too many.
+    instead : str
+        What to do where there are more, for the message.
     """
 
-    def __init__(self, name: str, angles: Sequence[sp.Expr], generators: Sequence[sp.Expr], most: int = MOST) -> None:
-        self.name, self.angles, self.generators, self.most = name, tuple(angles), tuple(generators), most
+    def __init__(
+        self,
+        name: str,
+        angles: Sequence[sp.Expr],
+        generators: Sequence[sp.Expr],
+        most: int = MOST,
+        instead: str = "shorten it",
+    ) -> None:
+        self.name, self.angles, self.generators = name, tuple(angles), tuple(generators)
+        self.most, self.instead = most, instead
         self._angle = {x: i for i, x in enumerate(self.angles)}
         self._generator = {x: i for i, x in enumerate(self.generators)}
         self.still = (0,) * len(self.angles)
@@ -99,10 +109,7 @@ class Space:
         """Count products of terms, and refuse too many of them."""
         self.cost += products
         if self.cost > self.most:
-            raise UnsupportedError(
-                f"{self.name}: its energies have too many terms to be written out; "
-                'mbkit.dynamics(model, "lagrangian") computes the same without writing them'
-            )
+            raise UnsupportedError(f"{self.name}: its energies have too many terms to be written out; {self.instead}")
 
 
 class Harmonic:

@@ -11,7 +11,7 @@ import sympy as sp
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.closures import closure
 from mbkit.lagrangian.prescribed import motion
-from mbkit.lagrangian.symbolic_kinematics import SymbolicKinematics
+from mbkit.lagrangian.symbolic_kinematics import SymbolicKinematics, instead_of_writing
 from mbkit.lagrangian.symbols import velocity_of
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.textbook import in_symbols
@@ -164,12 +164,9 @@ def _check(model: Model) -> None:
     bound = model.needs.loops or model.needs.time
     most = _MOST_BOUND if bound else _MOST
     if model.nv > most:
-        other = (
-            "leave out bodies" if bound else 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
-        )
         raise UnsupportedError(
             f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of "
-            f"{model.name}; {other}"
+            f"{model.name}; {instead_of_writing(model)}"
         )
 
 

@@ -86,7 +86,7 @@ def of_one_angle(x: Harmonic) -> Iterator[Harmonic]:
         angle = sp.Add(*(k * a for k, a in zip(direction, space.angles, strict=True)))
         # SymPy writes sin(b - a) as -sin(a - b).
         sign = -1 if sp.sin(angle).is_Mul else 1
-        wider = Space(space.name, [*space.angles, sign * angle], space.generators, space.most)
+        wider = Space(space.name, [*space.angles, sign * angle], space.generators, space.most, space.instead)
         terms = {}
         for (kind, turns, powers), value in x.terms.items():
             along = any(turns) and _direction(turns) == direction

@@ -19,7 +19,7 @@ from mbkit.lagrangian.harmonic import Harmonic, Key, Space
 from mbkit.model import Joint, JointCoupling, Model
 from mbkit.model.kinds import cross3
 
-__all__ = ["SymbolicKinematics"]
+__all__ = ["SymbolicKinematics", "instead_of_writing"]
 
 Vector = list[Any]
 #: (linear, angular) velocity per unit of one velocity.
@@ -34,6 +34,18 @@ _FIELDS: Final = {
 }
 #: What rounded rotations leave of a term that is zero.
 _DUST: Final = Fraction(1, 10**15)
+
+
+def instead_of_writing(model: Model) -> str:
+    """Return what computes a model that is too large to be written out, for a message."""
+    features = [f for f in ("loops", "prescribed") if getattr(model, f)]
+    if not features:
+        return 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+    told = ", ".join(map(repr, features))
+    return (
+        f"leave out bodies, as engines do not take its {' and '.join(features)}; "
+        f'mbkit.dynamics(model.without({told}), "lagrangian") computes the tree without them'
+    )
 
 
 class SymbolicKinematics:
@@ -76,7 +88,7 @@ class SymbolicKinematics:
         }
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
         self.coordinates = coordinates
-        self.space = Space(model.name, angles, generators)
+        self.space = Space(model.name, angles, generators, instead=instead_of_writing(model))
         self.values = {
             (where, part.name): self._read(where, part, fields)
             for where, fields in _FIELDS.items()
