@@ -165,6 +165,16 @@ def test_a_catalog_system_a_file_and_a_model_itself(here):
 
 
 @pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("arguments", [("check", *QUICK), ("bench",), ("export",), ("convert", "--to", "mjcf")])
+def test_commands_that_need_an_engine_name_a_loop_and_refuse(arguments):
+    result = call(arguments[0], "slider_crank", *arguments[1:])
+    assert result.exit_code == 2
+    reason = " ".join(result.stderr.split())
+    assert reason.count("from_model(model)") == (arguments[0] != "convert")
+    assert "loop" in reason
+
+
+@pytest.mark.usefixtures("here")
 def test_options_of_files_are_refused_for_what_is_no_file():
     result = call("check", "pendulum", "--floating-base")
     assert result.exit_code == 2

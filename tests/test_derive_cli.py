@@ -57,6 +57,18 @@ def test_a_slider_crank_reads_as_in_a_textbook():
     assert equation in " ".join(text.split())
 
 
+def test_the_name_of_a_slider_crank_means_one_system():
+    out = derive("slider_crank")
+    # Which system, its zero and its direction.
+    for said in ("massless crank and rod", "dead centre", "farthest", "counterclockwise", "mbkit.catalog:slider_crank"):
+        assert said in out.stderr
+    assert derive("mbkit.lagrangian.systems:slider_crank").stdout == out.stdout
+    loop = derive("mbkit.catalog:slider_crank")
+    assert "coordinates θ, φ, x" in loop.stdout
+    assert "m₃ ẍ = -λ₁" in loop.stdout
+    assert "massless" not in loop.stderr
+
+
 def test_terms_and_factors_stand_where_one_writes_them():
     acrobot = derive("mbkit.lagrangian.systems:acrobot").stdout
     assert "V = -(m₁ l_c₁ + m₂ l₁) g cos θ₁ - m₂ g l_c₂ cos(θ₁ + θ₂)\n" in acrobot

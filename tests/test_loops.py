@@ -93,6 +93,25 @@ def test_a_slider_crank_reaches_the_published_digits(crank):
     assert np.abs(crank.constraint(run.q)).max() < 1e-14
 
 
+def test_a_slider_crank_of_massless_rods_is_the_classic_text_s():
+    lag = from_model(mb.catalog.slider_crank(crank_mass=0.0, rod_mass=0.0, piston_mass=1.3))
+    one = systems.slider_crank(mass=1.3).dynamics(options=OWN)
+    for th, rate in ((0.7, 2.0), (4.0, -5.0)):
+        tilt = math.asin(math.sin(th) / 3)
+        slope = math.cos(th) / (3 * math.cos(tilt))
+        v = rate * np.array([1.0, -1.0 - slope, -0.1 * math.sin(th) - 0.3 * math.sin(tilt) * slope])
+        got = lag.dynamics(options=OWN).forward_dynamics(at_angle(th), v, [0.1, 0, 0])
+        assert got[0] == pytest.approx(one.forward_dynamics([th], [rate], [0.1])[0], rel=1e-12)
+
+
+def test_symbols_stand_for_the_numbers_of_the_loop_too():
+    model = mb.catalog.slider_crank(rod=0.5)
+    assert {s.name: x for s, x in from_model(model).parameters.items()}["L2"] == 0.5
+    # A pin inside the rod is another system, of numbers.
+    inside = replace(model, loops=(replace(model.loops[0], translation_a=np.array([0.45, 0.0, 0.0])),))
+    assert not from_model(inside).parameters
+
+
 # Andrews' squeezing mechanism: seven bodies, three loops
 
 

@@ -18,7 +18,7 @@ from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Joint, Model
 
-__all__ = ["QUANTITIES", "Dynamics", "per_sample", "unknown_joint"]
+__all__ = ["QUANTITIES", "Dynamics", "per_sample", "require_tree", "unknown_joint"]
 
 QUANTITIES: Final = (
     "mass_matrix",
@@ -38,6 +38,19 @@ QUANTITIES: Final = (
 
 #: Loops or prescribed joints that a refusal names.
 _NAMED: Final = 3
+
+
+def require_tree(model: Model, who: str) -> None:
+    """Refuse a model with loops or prescribed motions, where `who` takes trees alone."""
+    for feature, told in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
+        parts = getattr(model, feature)
+        if parts:
+            names = ", ".join(repr(x.name) for x in parts[:_NAMED]) + (", ..." if parts[_NAMED:] else "")
+            raise UnsupportedError(
+                f"{who}: {model.name} has {told} ({names}), and an engine takes the tree alone; "
+                "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
+                f"and model.without({feature!r}) is the tree without them"
+            )
 
 
 class Dynamics(ABC):
@@ -73,15 +86,7 @@ class Dynamics(ABC):
             )
         if not self.takes_parameters:
             model.require_values(self.engine)
-        for feature, told in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
-            parts = getattr(model, feature)
-            if parts:
-                names = ", ".join(repr(x.name) for x in parts[:_NAMED]) + (", ..." if parts[_NAMED:] else "")
-                raise UnsupportedError(
-                    f"{self.engine}: {model.name} has {told} ({names}), and an engine takes the tree alone; "
-                    "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
-                    f"and model.without({feature!r}) is the tree without them"
-                )
+        require_tree(model, self.engine)
         self.model = model
 
     @property

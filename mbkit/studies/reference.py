@@ -18,6 +18,7 @@ from mbkit._check import Array, real
 from mbkit.derivation.machine import Machine
 from mbkit.derivation.taylor import order_of, precision, taylor_system
 from mbkit.engines import dynamics
+from mbkit.engines.base import require_tree
 from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.expected import expect_model
@@ -141,7 +142,7 @@ def reference(
     InputError
         A wrong shape, state, time or torque.
     UnsupportedError
-        Neither heyoka nor two engines for this model are at hand.
+        Neither heyoka nor two engines for this model are at hand, or it has loops or prescribed motions.
 
     Notes
     -----
@@ -178,6 +179,7 @@ def reference(
 def _checked(model: Model, q0: ArrayLike, v0: ArrayLike, duration: float, save: ArrayLike, torque: Any) -> Motion:
     expect_model(model)
     model.require_values("a reference")
+    require_tree(model, "reference")
     q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
     if q.ndim != 1 or v.ndim != 1:
         raise InputError(f"q0, v0: expected one state, got shapes {q.shape} and {v.shape}; give one after the other")

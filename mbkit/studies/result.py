@@ -265,7 +265,8 @@ class Comparison:
     def nothing(self) -> str:
         """Why the comparison says nothing although no row differs; empty where it does say something."""
         if not self.rows:
-            return "; ".join(r.reason for r in self.refusals) or "no engines"
+            # Engines that refuse a model for the same reason say so once.
+            return "; ".join(dict.fromkeys(r.reason for r in self.refusals)) or "no engines"
         if any(not r.passed for r in self.rows):
             return ""
         if any(r.zero for r in self.rows if r.term == "M"):

@@ -127,6 +127,8 @@ def work_precision(
     ------
     InputError, UnknownNameError
         For unusable arguments. What an engine or method cannot do is in `refusals`.
+    UnsupportedError
+        A reference is searched, and the model has loops or prescribed motions, which engines do not take.
     NumericalError
         No two ways to compute this motion agree even at its beginning.
     InterruptedSweepError
