@@ -418,7 +418,9 @@ def _compile_anew() -> None:
     built(ca.Function("sums", [x], [ca.densify(ca.sin(x) * ca.cumsum(x))]))
 
 
-@pytest.mark.parametrize("work", ["compiling", "compiled", "interpreted", "mujoco", "drake", "mujoco's text", "drake's reading"])
+@pytest.mark.parametrize(
+    "work", ["compiling", "compiled", "interpreted", "mujoco", "drake", "mujoco's text", "drake's reading"]
+)
 def test_a_child_forked_during_another_threads_work_computes(work):
     if "fork" not in multiprocessing.get_all_start_methods():
         pytest.skip("this system does not fork")

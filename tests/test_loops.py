@@ -8,12 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sympy as sp
+from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.lagrangian import from_model, systems
-from mbkit.model.parts import Prescribed
+from mbkit.lagrangian.constraints import manifold_of
+from mbkit.lagrangian.redundancy import refuse_unreachable
+from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import off, random_tree
 from validation.closed_forms import published
 
@@ -282,6 +285,29 @@ def test_a_frame_closed_in_space_moves_as_the_point_does(linkage):
         for x, state in ((lag, (q, v)), (weld, (q_w, v_w)))
     )
     assert np.abs(one.q - two.q[:, :4]).max() < 1e-10
+
+
+def test_seven_joints_closed_in_space_are_judged_at_the_pose_that_is_given():
+    b, E = mb.ModelBuilder("seven", gravity=(0, 0, 0)), np.eye(3)
+    bodies = ["world", *(f"b{i}" for i in range(7))]
+    for i, kind in enumerate("PRRRPRP"):
+        b.add_body(bodies[i + 1])
+        place = {"axis": E[(2 * i + i // 3) % 3], "translation": 0.5 * E[i % 3] + 0.25 * (i % 2) * E[(i + 1) % 3]}
+        name = {"R": "revolute", "P": "prismatic"}[kind]
+        b.add_joint(f"j{i}", name, parent=bodies[i], child=bodies[i + 1], armature=1.0 + i, **place)
+    tree, q = b.build(), np.array([0.3, -0.5, 0.7, 0.2, -0.4, 0.6, 0.9])
+    X = mb.dynamics(tree).pose(q, "b6")
+    loop = Loop("closed", "frame", "b6", E, np.zeros(3), "world", X[:3, :3], X[:3, 3])
+    dyn = from_model(replace(tree, loops=(loop,))).dynamics(options=OWN)
+    a = dyn.forward_dynamics(q, np.zeros(7), np.ones(7))
+    # One freedom is left, along which M a = tau.
+    J = manifold_of(dyn).jacobian(q)
+    assert np.linalg.matrix_rank(J) == 6
+    (free,) = null_space(J).T
+    assert a == pytest.approx(free * (free.sum() / (free**2 @ np.arange(1.0, 8.0))), abs=1e-12)
+    # The false closures that a search from elsewhere ends in, half a turn off, have dependent rows.
+    with pytest.raises(InputError, match="redundant"):
+        refuse_unreachable(dyn)
 
 
 def test_a_plane_that_is_carried_along_stays_one():
