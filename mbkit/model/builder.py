@@ -291,8 +291,9 @@ class ModelBuilder:
         """
         name = self._read.name("coupling name", name)
         who = f"coupling {name!r}"
-        if not isinstance(factors, Mapping):
-            told = shown(factors)
+        given: Any = factors
+        if not isinstance(given, Mapping):
+            told = shown(given)
             self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {told}")
             return
         numbers = self._numbers(
