@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
     from mbkit.errors import MbkitError as MbkitError
-    from mbkit.lagrangian.equilibrium import equilibrium as equilibrium
+    from mbkit.lagrangian.statics.equilibrium import equilibrium as equilibrium
     from mbkit.load import load as load
     from mbkit.load import robots as robots
     from mbkit.model import Mimic as Mimic
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import simulate as simulate
     from mbkit.studies import baseline as baseline
-    from mbkit.studies.causes import explain as explain
-    from mbkit.studies.compare import compare as compare
+    from mbkit.studies.compare.study import compare as compare
     from mbkit.studies.convert import convert as convert
-    from mbkit.studies.parsers import compare_parsers as compare_parsers
+    from mbkit.studies.explain import explain as explain
+    from mbkit.studies.importers import compare_parsers as compare_parsers
     from mbkit.studies.stress.study import stress as stress
-    from mbkit.studies.work_precision import work_precision as work_precision
+    from mbkit.studies.work_precision.study import work_precision as work_precision
 
 
 _HOME = {
@@ -53,11 +53,11 @@ _HOME = {
     "Parameter": "mbkit.model",
     "Trajectory": "mbkit.simulate",
     "compare": "mbkit.studies",
-    "compare_parsers": "mbkit.studies.parsers",
+    "compare_parsers": "mbkit.studies.importers",
     "convert": "mbkit.studies.convert",
     "dynamics": "mbkit.engines",
-    "equilibrium": "mbkit.lagrangian.equilibrium",
-    "explain": "mbkit.studies.causes",
+    "equilibrium": "mbkit.lagrangian.statics.equilibrium",
+    "explain": "mbkit.studies.explain",
     "load": "mbkit.load",
     "robots": "mbkit.load",
     "stress": "mbkit.studies",

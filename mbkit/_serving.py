@@ -1,4 +1,4 @@
-"""How a process that `mbkit.studies.child` starts begins: bounded, quiet, and never outliving who asked for it."""
+"""How a process that `mbkit.studies._processes` starts begins: bounded, quiet, and never outliving who asked for it."""
 
 from __future__ import annotations
 

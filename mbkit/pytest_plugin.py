@@ -135,7 +135,7 @@ def _target(text: str, request: pytest.FixtureRequest) -> str:
 
 def _load(target: str, options: Mapping[str, Any]) -> Model:
     __tracebackhide__ = True
-    from mbkit.studies.target import model_of
+    from mbkit.studies._targets import model_of
 
     return _told(lambda: model_of(target, options))
 
@@ -144,7 +144,7 @@ def _load(target: str, options: Mapping[str, Any]) -> Model:
 def mbkit_engine(request: pytest.FixtureRequest) -> str:
     """One of the engines of the test's marker; the test is skipped where it is not installed."""
     __tracebackhide__ = True
-    from mbkit.studies.installed import not_installed
+    from mbkit.studies._targets import not_installed
 
     name = str(request.param)
     for why in not_installed([name]).values():
@@ -265,7 +265,7 @@ class MbkitBaseline:
         robot = getattr(self._request.node, "callspec", None) and self._request.node.callspec.params.get("mbkit_model")
         if not isinstance(robot, (str, os.PathLike)) or self._request.getfixturevalue("mbkit_model") is not model:
             return "", {}
-        from mbkit.studies.baseline.target import kept
+        from mbkit.studies._targets import kept
 
         options = {k: x for k, x in _asked(self._request.node).items() if k not in ("robots", "engines")}
         return kept(_target(os.fspath(robot), self._request), path), options

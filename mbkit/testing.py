@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.studies.baseline import BaselineResult
-    from mbkit.studies.causes import Explanation
-    from mbkit.studies.result import Comparison, Row
+    from mbkit.studies.compare.result import Comparison, Row
+    from mbkit.studies.explain import Explanation
 
 __all__ = ["STRICT", "assert_baseline", "assert_engines_agree", "assert_same_dynamics"]
 
@@ -71,7 +71,7 @@ def assert_engines_agree(
     """
     __tracebackhide__ = True
     from mbkit.studies import compare
-    from mbkit.studies.installed import not_installed
+    from mbkit.studies._targets import not_installed
 
     missing = {} if isinstance(engines, str) else not_installed(engines)
     present = [name for name in engines if name not in missing]
@@ -107,7 +107,7 @@ def assert_same_dynamics(
     Returns
     -------
     Explanation
-        What `mbkit.studies.causes.explain` returns.
+        What `mbkit.studies.explain.explain` returns.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def assert_same_dynamics(
     True
     """
     __tracebackhide__ = True
-    from mbkit.studies.causes import explain
+    from mbkit.studies.explain import explain
 
     names = (model_a.name, model_b.name) if model_a.name != model_b.name else ("model_a", "model_b")
     found = explain(model_a, model_b, samples=samples, seed=seed, tolerance=rtol, names=names)

@@ -2,6 +2,7 @@
 
     python -m tests.referee record before.json
     python -m tests.referee check before.json
+    python -m tests.referee names               # records tests/public_names.json again
 
 A record holds for one machine and one set of versions, since the last bits depend on both. The part that does not,
 public names with their signatures, is kept in `tests/public_names.json` and checked by the suite.
@@ -42,7 +43,9 @@ PACKAGES = (
     "mbkit.testing",
 )
 #: What a study measures in seconds, or what names the machine.
-TIMED = re.compile(r"ns|seconds?|.*_seconds|.*_ns|time|spread|stamp|environment|ratio|version|versions|processor|date")
+TIMED = re.compile(
+    r"ns|ns_.*|.*_ns|seconds?|.*_seconds|saved_.*|setup|first_run|compile|front|spread|ratio|versions?|processor|date"
+)
 
 
 def public_names() -> dict[str, Any]:
@@ -224,6 +227,10 @@ def differences(before: Any, after: Any, where: str = "") -> Iterator[str]:
 
 def main() -> int:
     """Record, or compare with a record; status 1 where something differs."""
+    if sys.argv[1:] == ["names"]:
+        text = json.dumps(public_names(), indent=1)
+        Path(__file__).with_name("public_names.json").write_text(text + "\n", encoding="utf-8")
+        return 0
     what, path = sys.argv[1], Path(sys.argv[2])
     found = json.loads(json.dumps(record()))
     if what == "record":

@@ -10,7 +10,8 @@ import numpy as np
 
 import mbkit as mb
 from mbkit.errors import MbkitWarning, UnsupportedError
-from mbkit.studies.stress import Case, Problem, runs
+from mbkit.studies.stress import Case, Problem
+from mbkit.studies.stress import measure as runs
 
 SIMULATE = runs.simulate
 

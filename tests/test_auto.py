@@ -17,9 +17,9 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, TorqueError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Trajectory, at_section, simulate, stiffness
-from mbkit.simulate.auto_scene import Gauge
-from mbkit.simulate.embedded_trials import Stretch
-from mbkit.studies.stress.cases._pendulums import cart_pole as light_cart_pole
+from mbkit.simulate.solvers.auto import Gauge
+from mbkit.simulate.solvers.step_attempts import Stretch
+from mbkit.studies.stress.cases.exact_motions import cart_pole as light_cart_pole
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from mbkit import errors
 from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
-from mbkit.load import load, xml
-from mbkit.load.names import find
+from mbkit.load import load, xml_reader
+from mbkit.load.robot_data import find
 from mbkit.load.urdf_links import read_links
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
@@ -101,20 +101,20 @@ def test_texts_that_are_no_description(case, tmp_path, capfd):
 def test_text_is_written_once_however_often_elements_interrupt_it(monkeypatch):
     written = []
 
-    class Counted(xml.Element):
+    class Counted(xml_reader.Element):
         def __setattr__(self, name, value):
             if name == "text":
                 written.append(len(value))
             super().__setattr__(name, value)
 
-    monkeypatch.setattr(xml, "Element", Counted)
+    monkeypatch.setattr(xml_reader, "Element", Counted)
     content = b"<robot>" + b"<a/>word" * 1000 + b"</robot>"
-    assert xml.parse(content, "x").text == "word" * 1000
+    assert xml_reader.parse(content, "x").text == "word" * 1000
     assert sum(written) < len(content)
 
 
 def test_more_elements_than_any_robot_has_are_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(xml, "MOST_ELEMENTS", 100)
+    monkeypatch.setattr(xml_reader, "MOST_ELEMENTS", 100)
     error = raised(tmp_path, b'<robot name="r">' + b"<a/>" * 100 + b"</robot>")
     assert isinstance(error, LoadError)
     assert "100 elements" in str(error)
@@ -294,8 +294,8 @@ COMPLETE = robot(
         '<mimic joint="j" multiplier="2" offset="1"/>',
     )
 )
-ELEMENTS = {element.tag for element in xml.parse(COMPLETE.encode(), "").walk()} - {"robot"}
-ATTRIBUTES = {name for element in xml.parse(COMPLETE.encode(), "").walk() for name in element.attributes}
+ELEMENTS = {element.tag for element in xml_reader.parse(COMPLETE.encode(), "").walk()} - {"robot"}
+ATTRIBUTES = {name for element in xml_reader.parse(COMPLETE.encode(), "").walk() for name in element.attributes}
 
 
 @pytest.mark.parametrize("name", sorted(ELEMENTS | ATTRIBUTES))

@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 
 from mbkit.cli import cli
 from mbkit.errors import OutputError
-from mbkit.studies.precision_result import InterruptedSweepError
+from mbkit.studies.work_precision.result import InterruptedSweepError
 
 SHORT = ("--engines", "pinocchio,mujoco", "--methods", "rk4,mujoco_rk4", "--quick", "--seconds", "30", "--repeats", "1")
 
@@ -132,7 +132,7 @@ def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     def full(*_: object, **__: object) -> Path:
         raise OutputError("cannot write there: No space left on device")
 
-    monkeypatch.setattr("mbkit.report.folder.write", full)
+    monkeypatch.setattr("mbkit.report.output_folder.write", full)
     result = call("bench", "pendulum", *SHORT, "--json")
     assert result.exit_code == 2
     assert "No space left" in result.stderr

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.derivation import cache, lanes, sources
-from mbkit.derivation import compiled as module
+from mbkit.codegen import compiled as module
+from mbkit.codegen import disk_cache, step_loop
+from mbkit.derivation import fingerprint as sources
 from tests.random_trees import random_tree, states
 
 
@@ -89,10 +90,10 @@ def test_an_entry_under_another_name_is_not_trusted(folder):
 def test_whole_entries_of_another_form_are_made_again(folder):
     first = evaluated(derives=True)
     for path in folder.iterdir():
-        found = cache.read(path.name)
+        found = disk_cache.read(path.name)
         assert found is not None
         if "inputs" in found[0]:
-            cache.write(path.name, {"inputs": "?"}, found[1])
+            disk_cache.write(path.name, {"inputs": "?"}, found[1])
     np.testing.assert_array_equal(evaluated(derives=True), first)
 
 
@@ -108,7 +109,7 @@ def test_a_link_and_another_users_file_are_not_followed(folder):
             os.chown(path, 65534, 65534)
         evaluated(derives=True)
         os.chown(folder, 65534, 65534)
-        assert cache.folder() is None
+        assert disk_cache.folder() is None
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
@@ -156,19 +157,19 @@ def test_a_changed_number_is_another_entry():
 
 
 def test_the_oldest_entries_go_when_the_folder_is_full(folder, monkeypatch):
-    monkeypatch.setattr(cache, "_MOST", 3000)
+    monkeypatch.setattr(disk_cache, "_MOST", 3000)
     for k in range(6):
-        cache.write(f"{k:064x}", {"k": k}, b"x" * 900)
+        disk_cache.write(f"{k:064x}", {"k": k}, b"x" * 900)
         os.utime(folder / f"{k:064x}", (k, k))
-    assert cache.read(f"{0:064x}") is None
-    assert cache.read(f"{5:064x}") == ({"k": 5, "key": f"{5:064x}"}, b"x" * 900)
+    assert disk_cache.read(f"{0:064x}") is None
+    assert disk_cache.read(f"{5:064x}") == ({"k": 5, "key": f"{5:064x}"}, b"x" * 900)
     assert sum(p.stat().st_size for p in folder.iterdir()) <= 3000
 
 
 def test_many_writers_of_one_entry_leave_a_whole_one(folder):
     def write(k: int) -> None:
-        cache.write("a" * 64, {"k": k}, bytes([k]) * 200_000)
-        found = cache.read("a" * 64)
+        disk_cache.write("a" * 64, {"k": k}, bytes([k]) * 200_000)
+        found = disk_cache.read("a" * 64)
         assert found is not None
         assert found[1] == bytes([found[0]["k"]]) * 200_000
 
@@ -211,7 +212,7 @@ def test_the_fingerprint_holds_all_code_that_decides_what_is_compiled(monkeypatc
 
         return made
 
-    for where in (module, lanes):
+    for where in (module, step_loop):
         monkeypatch.setattr(where, "_made", traced(where._made))
     tree = random_tree(1, 2, ("ball", "helical"))
     q, v, _, tau = (x[0] for x in states(tree, 1))
@@ -221,7 +222,7 @@ def test_the_fingerprint_holds_all_code_that_decides_what_is_compiled(monkeypatc
         q = np.full((2, 1), 0.3)
         mb.simulate(paper, q, np.zeros((2, 1)), 0.02, method=method, save=[0.0, 0.02], **options)
     ran = {path for path in ran if path.is_relative_to(root)}
-    assert {path.parent.name for path in ran} >= {"derivation", "model", "lagrangian"}
+    assert {path.relative_to(root).parts[0] for path in ran} >= {"derivation", "codegen", "model", "lagrangian"}
     assert ran <= set(sources.source_files())
 
 

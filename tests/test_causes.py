@@ -14,12 +14,12 @@ import pytest
 import mbkit as mb
 from mbkit import spatial
 from mbkit.engines.base import per_sample
-from mbkit.engines.mujoco import MujocoDynamics
-from mbkit.engines.pinocchio import PinocchioDynamics
+from mbkit.engines.mujoco.engine import MujocoDynamics
+from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.model import Body, Joint, Loop, Mimic, Model
-from mbkit.studies.causes.compact import compact
-from mbkit.studies.parsers.compare import written
+from mbkit.studies.explain.merged_links import compact
+from mbkit.studies.importers.study import written
 from tests.random_trees import random_tree
 
 ROBOTS = ("panda", "ur5", "solo8", "so100", "kinova")

@@ -15,9 +15,9 @@ from click.testing import CliRunner, Result
 
 from mbkit.cli import cli
 from mbkit.errors import OutputError, UnknownNameError
-from mbkit.studies import all_robots as sweeps
-from mbkit.studies.all_robots import RobotOutcome, all_robots
-from mbkit.studies.workers import WorkerDiedError, run
+from mbkit.studies._processes import WorkerDiedError, run
+from mbkit.studies.compare import all_robots as sweeps
+from mbkit.studies.compare.all_robots import RobotOutcome, all_robots
 
 QUICK = ("--no-rollouts", "--samples", "4")
 
@@ -156,7 +156,7 @@ def test_a_catalog_system_a_file_and_a_model_itself(here):
     assert call("check", "cart_pole", *QUICK).exit_code == 0
     module(here, "ready", "import mbkit\nmodel = mbkit.catalog.pendulum()")
     assert call("check", "ready:model", *QUICK).exit_code == 0
-    from mbkit.load.names import find
+    from mbkit.load.robot_data import find
 
     robot = find("ur5")
     assert robot is not None
@@ -329,7 +329,7 @@ def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     def full(*_: object, **__: object) -> Path:
         raise OutputError("cannot write there: No space left on device")
 
-    monkeypatch.setattr("mbkit.report.folder.write", full)
+    monkeypatch.setattr("mbkit.report.output_folder.write", full)
     for more in ((), ("--json",)):
         result = call("check", "pendulum", *QUICK, *more)
         assert result.exit_code == 2

@@ -15,16 +15,15 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.engines.mujoco import MujocoDynamics
+from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.engines.pinocchio import PinocchioDynamics
+from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, NumericalError, OutputError, UnknownNameError
-from mbkit.studies.all_robots import RobotOutcome, Sweep
-from mbkit.studies.measure import Scales, acceleration_errors, force_errors, matrix_errors
-from mbkit.studies.rollouts import rollouts
-from mbkit.studies.states import states as study_states
-from mbkit.studies.terms import TERMS
-from mbkit.studies.timing import interleaved
+from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
+from mbkit.studies.compare.errors import Scales, acceleration_errors, force_errors, interleaved, matrix_errors
+from mbkit.studies.compare.rollouts import rollouts
+from mbkit.studies.compare.terms import TERMS
+from mbkit.studies.compare.terms import states as study_states
 from mbkit.testing import assert_engines_agree
 from tests.random_trees import random_tree
 
@@ -35,7 +34,7 @@ SOUND_IN_BOTH = ("revolute", "continuous", "prismatic", "ball", "planar", "free"
 @pytest.fixture
 def brief(monkeypatch):
     """Leave little time to error against run time, where a test asks for something else."""
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare"], "_SECONDS", 0.5)
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_SECONDS", 0.5)
 
 
 def terms(model, **kwargs):
@@ -343,7 +342,7 @@ def test_a_whole_comparison_has_rollouts_run_times_and_omissions():
     assert study.complete
     assert study.floor < 1e-12
     # Every curve is there, however slow the machine.
-    wanted = {(e, m) for e, methods in sys.modules["mbkit.studies.compare"]._METHODS.items() for m in methods}
+    wanted = {(e, m) for e, methods in sys.modules["mbkit.studies.compare.study"]._METHODS.items() for m in methods}
     assert {(c.engine, c.method) for c in study.curves} == wanted
     assert not result.shortened
     rk4 = next(c for c in study.curves if c.method == "mujoco_rk4")
@@ -353,7 +352,7 @@ def test_a_whole_comparison_has_rollouts_run_times_and_omissions():
 
 def test_what_was_left_out_would_show_if_it_mattered():
     """Limits that act at the state, switched on, must change the accelerations."""
-    from mbkit.engines.mujoco_variants import Variant
+    from mbkit.engines.mujoco.variants import Variant
 
     b = mb.ModelBuilder("stopped")
     b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))

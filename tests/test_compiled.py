@@ -20,10 +20,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
-from mbkit.derivation import cache, execution, jit, vector_code
-from mbkit.derivation.compiled import Compiled, compiled
-from mbkit.derivation.machine import Machine
-from mbkit.derivation.program import program
+from mbkit.codegen import backend, disk_cache, jit, simd_kernel
+from mbkit.codegen.compiled import Compiled, compiled
+from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.program import program
 from tests.random_trees import random_tree, states
 
 EPS = np.finfo(float).eps
@@ -139,7 +139,7 @@ def test_every_width_of_register_gives_the_same_numbers(monkeypatch, width):
         pytest.skip(f"this processor's registers hold {here.width} doubles")
     expected = built(mixed())
     monkeypatch.setattr(jit, "host", lambda: here._replace(width=width))
-    from mbkit.derivation import compiled as module
+    from mbkit.codegen import compiled as module
 
     monkeypatch.setattr(module, "_batch_object", jit.batch_object)
     narrow = built(mixed())
@@ -156,8 +156,8 @@ def test_a_program_in_pieces_gives_the_same_numbers_as_a_whole(monkeypatch):
     function = mb.dynamics(model, "lagrangian", compile=False).function("forward_dynamics")
     q, v, _, tau = states(model, 17)
     whole = built(function)(q, v, tau)[0]
-    monkeypatch.setattr(vector_code, "_WHOLE", 100)
-    monkeypatch.setattr(vector_code, "_PIECE", 150)
+    monkeypatch.setattr(simd_kernel, "_WHOLE", 100)
+    monkeypatch.setattr(simd_kernel, "_PIECE", 150)
     pieces = built(function)(q, v, tau)[0]
     np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e3 * EPS * np.abs(whole).max())
 
@@ -342,8 +342,8 @@ def test_without_a_compiler_the_same_numbers_come_and_one_warning(monkeypatch):
     model = mb.load("ur5")
     q, v, a, _ = states(model, 3)
     expected = mb.dynamics(model, "lagrangian", compile=True).inverse_dynamics(q, v, a)
-    monkeypatch.setattr(execution.importlib.util, "find_spec", lambda _: None)
-    execution._compiler.cache_clear()
+    monkeypatch.setattr(backend.importlib.util, "find_spec", lambda _: None)
+    backend._compiler.cache_clear()
     try:
         dyn = mb.dynamics(model, "lagrangian", compile=True)
         with pytest.warns(mb.errors.NoCompilerWarning, match="pip install llvmlite"):
@@ -352,7 +352,7 @@ def test_without_a_compiler_the_same_numbers_come_and_one_warning(monkeypatch):
             warnings.simplefilter("error")
             mb.dynamics(model, "lagrangian", compile=True).nle(q, v)
     finally:
-        execution._compiler.cache_clear()
+        backend._compiler.cache_clear()
     assert isinstance(dyn.code("inverse_dynamics"), Machine)
     np.testing.assert_allclose(got, expected, rtol=0, atol=50 * EPS * np.abs(expected).max())
 
@@ -430,13 +430,13 @@ def test_a_child_forked_during_another_threads_work_computes(work):
     if work in ("mujoco", "drake"):
         dyn = mb.dynamics(model, work)
     elif work == "mujoco's text":
-        from mbkit.engines.mujoco_text import mjcf_text, read_back
+        from mbkit.engines.mujoco.mjcf_writer import mjcf_text, read_back
 
         dyn = read_back(model, mjcf_text(model, ""))
     elif work == "drake's reading":
-        from mbkit.engines import import_drake
+        from mbkit.engines.drake import importer
 
-        dyn = import_drake.read(mb.convert(mb.catalog.double_pendulum(), "urdf").text, "urdf").terms.__self__
+        dyn = importer.read(mb.convert(mb.catalog.double_pendulum(), "urdf").text, "urdf").terms.__self__
         model = dyn.model
     else:
         dyn = mb.dynamics(model, "lagrangian", compile=work != "interpreted")
@@ -473,19 +473,19 @@ def test_a_child_forked_during_another_threads_work_computes(work):
 
 def test_a_folder_of_other_files_is_neither_closed_nor_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(cache, "_MOST", 1000)
+    monkeypatch.setattr(disk_cache, "_MOST", 1000)
     mine = tmp_path / "thesis.dat"
     mine.write_bytes(b"x" * 3000)
     os.utime(mine, (1, 1))
     tmp_path.chmod(0o755)
-    cache.write("a" * 64, {}, b"code")
+    disk_cache.write("a" * 64, {}, b"code")
     assert stat.S_IMODE(tmp_path.stat().st_mode) == 0o755
     assert list(tmp_path.iterdir()) == [mine]
     tmp_path.chmod(0o700)
-    cache.write("a" * 64, {}, b"code")
-    cache.write("b" * 64, {}, b"x" * 2000)
+    disk_cache.write("a" * 64, {}, b"code")
+    disk_cache.write("b" * 64, {}, b"x" * 2000)
     assert mine.exists()
-    assert cache.read("a" * 64) is None
+    assert disk_cache.read("a" * 64) is None
 
 
 def test_a_user_without_a_home_has_no_cache(monkeypatch):
@@ -493,9 +493,9 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch):
         raise RuntimeError("could not determine the home directory")
 
     monkeypatch.delenv("MBKIT_CACHE_DIR")
-    monkeypatch.setattr(cache, "user_cache_path", homeless)
-    assert cache.folder() is None
-    assert cache.read("a" * 64) is None
+    monkeypatch.setattr(disk_cache, "user_cache_path", homeless)
+    assert disk_cache.folder() is None
+    assert disk_cache.read("a" * 64) is None
 
 
 def test_what_never_moves_is_evaluated_and_not_exported():

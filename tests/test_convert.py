@@ -12,7 +12,7 @@ import mbkit as mb
 from mbkit import spatial
 from mbkit.cli import cli
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
-from mbkit.load import xml
+from mbkit.load import xml_reader
 from tests.random_trees import IN_MUJOCO, random_tree
 
 
@@ -121,7 +121,7 @@ def test_a_name_is_written_so_that_xml_reads_it_or_refused(character: str, where
     b.add_joint(names["joint"], "continuous", parent="world", child=names["body"], axis=(0, 1, 0))
     model = b.build()
     if character.isprintable() or character in "\n\t\x85":
-        root = xml.parse(mb.convert(model, to).text.encode(), "text")
+        root = xml_reader.parse(mb.convert(model, to).text.encode(), "text")
         assert any(names[where] in element.attributes.values() for element in root.walk())
     else:
         with pytest.raises(UnsupportedError) as caught:

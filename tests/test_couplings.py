@@ -16,14 +16,14 @@ import pytest
 
 import mbkit as mb
 from mbkit.derivation import Equations
-from mbkit.derivation.factorize import elimination_order, elimination_size
-from mbkit.engines import import_mujoco
+from mbkit.derivation.mass_matrix_solve import elimination_order, elimination_size
+from mbkit.engines.mujoco import importer
 from mbkit.errors import KnownDefectWarning, ModelError, UnsupportedError
 from mbkit.model import JointCoupling, Model, ModelBuilder
-from mbkit.model.physical import sample_mass_matrix
-from mbkit.simulate.balance import is_damped
+from mbkit.model.validation import sample_mass_matrix
+from mbkit.simulate.along_trajectory import is_damped
 from mbkit.studies.baseline.description import described
-from mbkit.studies.causes.subtree import part
+from mbkit.studies.explain.terms import part
 from tests.random_trees import ALL, SOUND, random_tree
 
 EPS = np.finfo(float).eps
@@ -499,7 +499,7 @@ def test_a_coupling_of_a_joint_that_the_other_model_lacks():
 @pytest.mark.parametrize("seed", range(6))
 def test_the_importer_of_mujoco_reads_the_same(seed, tmp_path):
     text = random_transmissions(seed)
-    model, imported = loaded(tmp_path, text), import_mujoco.read(text, "mjcf").model
+    model, imported = loaded(tmp_path, text), importer.read(text, "mjcf").model
     q, v = model.random_state(np.random.default_rng(seed))
     one, other = (mb.dynamics(m, "pinocchio") for m in (model.without("springs", "damping"), imported))
     assert_near(one.mass_matrix(q), other.mass_matrix(q))

@@ -11,9 +11,9 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import KnownDefectWarning
-from mbkit.model.kinds import KINDS
+from mbkit.model.joint_types import KINDS
+from mbkit.report.compare_view import headline
 from mbkit.report.page import check_page
-from mbkit.report.reading import headline
 from tests.random_trees import off, random_tree, states
 
 PINOCCHIO = version("pin")

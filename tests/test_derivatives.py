@@ -8,9 +8,8 @@ import pinocchio as pin
 import pytest
 
 import mbkit as mb
-from mbkit.derivation.arithmetic import arithmetic
-from mbkit.derivation.extended import Extended
-from mbkit.derivation.program import program
+from mbkit.codegen.extended_precision import Extended, arithmetic
+from mbkit.codegen.program import program
 from mbkit.errors import InputError, NumericalError
 from tests.random_trees import off, random_tree, states
 

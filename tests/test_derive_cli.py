@@ -14,12 +14,11 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.lagrangian import systems
-from mbkit.lagrangian.account import Account
-from mbkit.lagrangian.blackboard import Blackboard, written
-from mbkit.lagrangian.layout import folded
-from mbkit.lagrangian.python_code import python_code
-from mbkit.lagrangian.textbook import with_plain_turns
-from mbkit.load.names import find
+from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
+from mbkit.lagrangian.printing.numpy_module import python_code
+from mbkit.lagrangian.printing.printer import Blackboard, folded, written
+from mbkit.lagrangian.printing.summary import Account
+from mbkit.load.robot_data import find
 
 
 def derive(*arguments, status=0):

@@ -9,10 +9,10 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning
-from mbkit.simulate.doubts import idle
-from mbkit.simulate.members import Member
-from mbkit.simulate.stability import STEPS, growth
-from mbkit.studies.stress.cases._pendulums import pendulum
+from mbkit.simulate.diagnostics.checks import idle
+from mbkit.simulate.diagnostics.stability import STEPS, growth
+from mbkit.simulate.solvers.trajectory_record import Member
+from mbkit.studies.stress.cases.exact_motions import pendulum
 
 
 def hinge(stiffness=0.0, damping=0.0, **kw):

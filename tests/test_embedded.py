@@ -16,14 +16,14 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
+from mbkit.methods.registry import Tolerances
+from mbkit.methods.tableaus import EmbeddedTableau, dormand_prince_853
 from mbkit.model import Model, ModelBuilder
-from mbkit.model.space import Space
+from mbkit.model.integration_space import Space
 from mbkit.simulate import Event, Trajectory, at_section, simulate
-from mbkit.simulate.embedded_lanes import LaneTrials
-from mbkit.simulate.embedded_stages import StageTrials
-from mbkit.simulate.embedded_trials import Stretch
-from mbkit.simulate.methods import Tolerances
-from mbkit.simulate.tableau import EmbeddedTableau, dormand_prince_853
+from mbkit.simulate.solvers.adaptive_compiled import LaneTrials
+from mbkit.simulate.solvers.adaptive_numpy import StageTrials
+from mbkit.simulate.solvers.step_attempts import Stretch
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 

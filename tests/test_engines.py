@@ -16,7 +16,7 @@ import mbkit as mb
 from mbkit.engines import ENGINES, QUANTITIES, Dynamics
 from mbkit.errors import InputError, MbkitError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import kind_of
-from mbkit.model.kinds import KINDS
+from mbkit.model.joint_types import KINDS
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
 
 VECTORS = {

@@ -18,9 +18,9 @@ from click.testing import CliRunner
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.derivation import FUNCTIONS, export_c
-from mbkit.derivation.c_code import c_body
-from mbkit.derivation.program import program
+from mbkit.codegen.c_source import c_body, export_c
+from mbkit.codegen.program import program
+from mbkit.derivation import FUNCTIONS
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from tests.random_trees import off, random_tree, states
 

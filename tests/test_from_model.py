@@ -10,11 +10,11 @@ import sympy as sp
 
 import mbkit as mb
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.compact import number
-from mbkit.lagrangian.on_paper import from_model
-from mbkit.lagrangian.reading import shortened
-from mbkit.lagrangian.textbook import in_symbols, letters
-from mbkit.lagrangian.tidy import tidy
+from mbkit.lagrangian.from_description import from_model
+from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
+from mbkit.lagrangian.trig.from_sympy import shortened
+from mbkit.lagrangian.trig.shortest_form import number
+from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import off, random_tree, states
 

@@ -19,19 +19,18 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from mbkit.catalog import double_pendulum
-from mbkit.derivation import c_code, extended, jit, taylor, vector_code
-from mbkit.derivation import lanes as lanes_module
-from mbkit.derivation import program as program_module
-from mbkit.derivation.arithmetic import arithmetic
-from mbkit.derivation.c_code import c_body
-from mbkit.derivation.compiled import aligned, compiled
-from mbkit.derivation.extended import Extended
-from mbkit.derivation.lane_calls import CALLS
-from mbkit.derivation.lanes import Lanes
-from mbkit.derivation.machine import Machine
-from mbkit.derivation.program import program
-from mbkit.derivation.step import Part
-from mbkit.derivation.taylor import TaylorSystem, precision
+from mbkit.codegen import c_source, extended_precision, jit, simd_kernel, taylor
+from mbkit.codegen import program as program_module
+from mbkit.codegen import step_loop as lanes_module
+from mbkit.codegen.c_source import c_body
+from mbkit.codegen.compiled import aligned, compiled
+from mbkit.codegen.extended_precision import Extended, arithmetic
+from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.llvm_ir import CALLS
+from mbkit.codegen.program import program
+from mbkit.codegen.step_loop import Lanes
+from mbkit.codegen.taylor import TaylorSystem, precision
+from mbkit.derivation.steps.fixed import Part
 from mbkit.errors import UnsupportedError
 from tests.test_compiled import built
 from tests.test_export import C99, needs_cc
@@ -360,16 +359,16 @@ def test_every_width_of_register_gives_the_same_bits(monkeypatch: pytest.MonkeyP
     points = columns(np.random.default_rng(5).uniform(0.05, 0.95, (21, 2)))
     expected = built(everything())(*points)[0]
     monkeypatch.setattr(jit, "host", lambda: here._replace(width=width))
-    monkeypatch.setattr("mbkit.derivation.compiled._batch_object", jit.batch_object)
+    monkeypatch.setattr("mbkit.codegen.compiled._batch_object", jit.batch_object)
     np.testing.assert_array_equal(built(everything())(*points)[0], expected)
 
 
 def test_pieces_give_the_same_bits_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     points = columns(np.random.default_rng(6).uniform(0.05, 0.95, (21, 2)))
     expected = built(everything())(*points)[0]
-    monkeypatch.setattr(vector_code, "_WHOLE", 10)
-    monkeypatch.setattr(vector_code, "_PIECE", 12)
-    assert len(vector_code.pieces_of(program(everything()))) > 5
+    monkeypatch.setattr(simd_kernel, "_WHOLE", 10)
+    monkeypatch.setattr(simd_kernel, "_PIECE", 12)
+    assert len(simd_kernel.pieces_of(program(everything()))) > 5
     np.testing.assert_array_equal(built(everything())(*points)[0], expected)
 
 
@@ -392,8 +391,8 @@ def test_states_side_by_side_get_the_same_bits() -> None:
 
 _LOADS = """
 import sys, numpy as np
-from mbkit.derivation import cache
-from mbkit.derivation.compiled import Compiled
+from mbkit.codegen import disk_cache as cache
+from mbkit.codegen.compiled import Compiled
 x, y = np.frombuffer(bytes.fromhex(sys.argv[1])).reshape(2, -1, 1)
 kept = [cache.read(path.name) for path in cache.folder().iterdir()]
 (found,) = [entry for entry in kept if "inputs" in entry[0]]
@@ -513,5 +512,5 @@ def test_every_operation_has_a_place_in_every_backend() -> None:
     heyoka = pytest.importorskip("heyoka")
     names = {*program_module._UNARY.values(), *program_module._BINARY.values()}
     assert {o.name for o in program(everything()).operations} >= {*CALLS, *DECIDED} - {"if_else"}
-    for known in (c_code._FORMS, extended._functions(arithmetic()), taylor._functions(heyoka)):
+    for known in (c_source._FORMS, extended_precision._functions(arithmetic()), taylor._functions(heyoka)):
         assert known.keys() == names

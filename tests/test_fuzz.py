@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines import import_mujoco
+from mbkit.engines.mujoco import importer
 from tests.random_files import errors, mujoco_terms, mutant, random_mjcf
 from validation import fuzz
 
@@ -46,7 +46,7 @@ def test_random_mjcfs_are_those_of_mujocos_compiler(tmp_path: Path, monkeypatch:
 def test_mujocos_importer_describes_what_mujoco_computes(seed: int) -> None:
     text = random_mjcf(seed)
     reference = mujoco_terms(text, 2, seed)
-    made = import_mujoco.read(text, "mjcf")
+    made = importer.read(text, "mjcf")
     own = made.terms(reference.q, reference.v, ())
     assert max(errors(reference, own["M"], own["nle"], own["passive"]).values()) < 10
     found = fuzz.values(made.model, reference.q, reference.v)

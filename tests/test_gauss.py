@@ -14,12 +14,12 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.errors import InputError, MbkitWarning, TorqueError
+from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model import Model, ModelBuilder
-from mbkit.model.space import Space
+from mbkit.model.integration_space import Space
 from mbkit.simulate import METHODS, simulate
-from mbkit.simulate.gauss import gauss_legendre
-from mbkit.simulate.steps import Field, make_step
-from mbkit.simulate.tableau import ImplicitTableau, Tableau
+from mbkit.simulate.solvers.gauss import gauss_legendre
+from mbkit.simulate.solvers.runge_kutta import Field, make_step
 from tests.random_trees import random_tree
 
 EPS = np.finfo(float).eps

@@ -24,8 +24,8 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit import _escape
 from mbkit.cli import cli
-from mbkit.lagrangian.account import Account
-from mbkit.lagrangian.python_code import python_code
+from mbkit.lagrangian.printing.numpy_module import python_code
+from mbkit.lagrangian.printing.summary import Account
 
 #: Code for every reader of an output, and what a terminal obeys. XML can hold the first of them.
 SEEN = (

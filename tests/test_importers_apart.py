@@ -14,7 +14,7 @@ import pytest
 import mbkit as mb
 from mbkit.engines import imported
 from mbkit.errors import InputError
-from mbkit.studies.parsers import process
+from mbkit.studies.importers import process
 
 ROBOT = (
     '<robot name="{0}"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.1"/><mass value="2"/>'
@@ -41,7 +41,7 @@ def read(text, format_, floating_base, files):
         sys.exit("a demand that fails")
     if name == "fault":
         raise IndexError("list index out of range")
-    from mbkit.engines.import_pinocchio import read as sound
+    from mbkit.engines.pinocchio.importer import read as sound
     made = sound(text, format_, floating_base, files)
     if name == "later":
         return type(made)(made.model, lambda q, v, without: os.abort(), ("a note",))
@@ -113,7 +113,7 @@ def test_in_a_script_without_a_guard_in_its_forks_and_after_its_end(tmp_path: Pa
             """
             import os
             import mbkit as mb
-            from mbkit.studies.parsers import process
+            from mbkit.studies.importers import process
 
             def pid():
                 assert mb.compare_parsers("r.urdf", ("mujoco",)).importers[0].agrees

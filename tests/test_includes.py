@@ -11,7 +11,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import LoadError, MbkitError, ModelError
-from mbkit.load.stripped import strip
+from mbkit.load.sanitized_text import strip
 
 DEFAULTS = '<default><joint damping="0.2" armature="0.01"/><geom density="700"/><default class="light"><geom density="300"/></default></default>'
 ASSETS = (
@@ -169,6 +169,6 @@ def test_levels_and_bytes_are_bounded_over_all_files(tmp_path: Path, monkeypatch
     with pytest.raises(LoadError, match="nested more than 250 deep, with what is included"):
         mb.load(files(tmp_path, main=world(include("c0.xml")), **chain))
     path = files(tmp_path, main=world(include("f0.xml")))
-    monkeypatch.setattr("mbkit.load.includes.MOST_BYTES", 3000)
+    monkeypatch.setattr("mbkit.load.xml_reader.MOST_BYTES", 3000)
     with pytest.raises(MbkitError, match="up to 3000 bytes of included files"):
         mb.load(path)

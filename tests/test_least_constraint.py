@@ -13,10 +13,8 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.derivation.conditioning import cancellation
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.factorize import elimination_order
-from mbkit.derivation.inertia_squares import inertia_squares
-from mbkit.derivation.least_constraint import LeastConstraint
-from mbkit.derivation.squares import squares
+from mbkit.derivation.least_squares_solve import LeastConstraint, inertia_squares, squares
+from mbkit.derivation.mass_matrix_solve import elimination_order
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import NonPhysicalWarning, NumericalError
 from mbkit.studies.stress.cases.mass_ratio import CASES

@@ -33,11 +33,11 @@ from mbkit.errors import (
 )
 from mbkit.load import load, robots
 from mbkit.load.mjcf_schema import rules as mjcf_rules
-from mbkit.load.names import find
-from mbkit.load.snap import Snapper
-from mbkit.load.solids import solid
+from mbkit.load.robot_data import find
+from mbkit.load.shapes import solid
+from mbkit.load.urdf import Snapper
 from mbkit.model import Mimic
-from mbkit.model.physical import sample_mass_matrix
+from mbkit.model.validation import sample_mass_matrix
 from mbkit.studies import compare
 
 EPS = np.finfo(float).eps

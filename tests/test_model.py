@@ -19,7 +19,7 @@ import mbkit as mb
 from mbkit.engines import ENGINES
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, UnknownNameError
 from mbkit.model import KINDS, Mimic
-from mbkit.model.physical import idle_joints, sample_mass_matrix
+from mbkit.model.validation import idle_joints, sample_mass_matrix
 from tests.random_trees import off, random_tree, states
 
 I3 = (1.0, 1.0, 1.0)

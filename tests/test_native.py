@@ -12,7 +12,7 @@ import pytest
 
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
-from mbkit.engines.mujoco_rollout import INTEGRATORS
+from mbkit.engines.mujoco.rollout import INTEGRATORS
 from mbkit.errors import MbkitWarning
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import METHODS, simulate
@@ -122,7 +122,7 @@ def test_dampers_are_implicit_in_three_and_springs_in_one(tmp_path: Path, monkey
 def test_no_log_is_left_in_the_working_folder(tmp_path: Path) -> None:
     code = """
 import mbkit as mb, numpy as np, mujoco, warnings
-from mbkit.engines.mujoco_variants import Variant
+from mbkit.engines.mujoco.variants import Variant
 dyn = mb.dynamics(mb.catalog.pendulum(), "mujoco")
 for call in (lambda q: Variant(dyn).accelerations(q, q), lambda q: mujoco.mj_step(dyn.mj_model, data(q))):
     def data(q):
@@ -169,7 +169,7 @@ def test_a_run_is_interrupted_between_its_parts_and_does_not_depend_on_them(
     torque = np.sin(np.arange(100.0)[:, None] * [0.1, 0.2])
     runs = []
     for period in (0.0, 1e9):
-        monkeypatch.setattr("mbkit.engines.mujoco_rollout._PERIOD", period)
+        monkeypatch.setattr("mbkit.engines.mujoco.rollout._PERIOD", period)
         runs.append(simulate(dyn, *start, 0.1, method, torque=torque))
     assert np.array_equal(runs[0].q, runs[1].q)
     assert np.array_equal(runs[0].v, runs[1].v)
@@ -180,7 +180,7 @@ def test_a_run_is_interrupted_between_its_parts_and_does_not_depend_on_them(
         seen.append(fraction)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mbkit.engines.mujoco_rollout._PERIOD", 0.0)
+    monkeypatch.setattr("mbkit.engines.mujoco.rollout._PERIOD", 0.0)
     monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
     with pytest.raises(KeyboardInterrupt):
         simulate(dyn, *start, 1.0, method, progress=interrupt)

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.derivation.arithmetic import arithmetic, mpmath_context
-from mbkit.derivation.extended import Extended
-from mbkit.derivation.program import program
+from mbkit.codegen.extended_precision import Extended, arithmetic, mpmath_context
+from mbkit.codegen.program import program
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from tests.random_trees import ALL, random_tree, states

@@ -16,9 +16,9 @@ from sympy.physics.mechanics import dynamicsymbols
 import mbkit as mb
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import Lagrangian
-from mbkit.lagrangian.probe import vanishes
-from mbkit.lagrangian.reading import forms
-from mbkit.lagrangian.tidy import tidy
+from mbkit.lagrangian.trig.from_sympy import forms
+from mbkit.lagrangian.trig.simplify import tidy
+from mbkit.lagrangian.trig.zero_test import vanishes
 from mbkit.simulate import METHODS as METHODS_OF
 
 EPS = np.finfo(float).eps

@@ -13,16 +13,17 @@ from click.testing import CliRunner
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.engines import import_mujoco, imported
+from mbkit.engines import imported
+from mbkit.engines.mujoco import importer
 from mbkit.errors import InputError, LoadError, ModelError, UnknownNameError
-from mbkit.load import xml
-from mbkit.load.names import find
-from mbkit.load.stripped import strip
+from mbkit.load import xml_reader
+from mbkit.load.robot_data import find
+from mbkit.load.sanitized_text import strip
 from mbkit.load.urdf_links import urdf_links
-from mbkit.load.xml import Element
-from mbkit.report.causes import meaning
+from mbkit.load.xml_reader import Element
 from mbkit.report.page import importers_page
-from mbkit.studies.parsers.result import TERMS
+from mbkit.report.terminal import meaning
+from mbkit.studies.importers.result import TERMS
 
 LINK = (
     '<link name="{0}"><inertial><origin xyz="0 0.01 0.1" rpy="0.1 0 0"/><mass value="{1}"/>'
@@ -203,7 +204,7 @@ def test_the_verdict_on_mujoco_is_that_of_its_own_terms(case: str, tmp_path: Pat
     pinocchio = mb.dynamics(model)
     data, M = mujoco.MjData(made), np.empty((made.nv, made.nv))
     worst = 0.0
-    read = import_mujoco.read(path.read_text(encoding="utf-8"), "mjcf")
+    read = importer.read(path.read_text(encoding="utf-8"), "mjcf")
     for q, v in zip(*model.random_state(np.random.default_rng(1), 3), strict=True):
         # The free joint's turn is left out, so that its velocities are MuJoCo's.
         q[9:], v[8:] = (0, 0, 0, 1), 0
@@ -283,7 +284,7 @@ def test_lines_in_messages_are_those_of_the_file(tmp_path: Path) -> None:
     )
     for name, text in (("bad.xml", bad), ("tall.urdf", tall)):
         stripped = strip(write(tmp_path, text, name))
-        kept = lines(xml.parse(stripped.text.encode(), name))
+        kept = lines(xml_reader.parse(stripped.text.encode(), name))
         assert set(kept) <= set(lines(stripped.root))
         assert len(kept) > 20
     line = bad[: bad.index("<geom\n")].count("\n") + 1
@@ -416,7 +417,7 @@ def test_the_page_tells_it_all_and_obeys_nothing(tmp_path: Path) -> None:
 
 
 def test_every_kind_of_cause_has_a_meaning() -> None:
-    folder = Path(mb.__file__).parent / "studies" / "causes"
+    folder = Path(mb.__file__).parent / "studies" / "explain"
     source = "".join(p.read_text(encoding="utf-8") for p in folder.glob("*.py"))
     kinds = set(re.findall(r'(?:Guess|Hypothesis|Convention)\(\s*"([a-z ]+)"', source))
     assert len(kinds) > 25

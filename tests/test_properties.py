@@ -2,7 +2,7 @@
 
 Each tree is derived once and run in CasADi's own machine. Every property gives an
 error and a scale: the norms of the terms that meet in it, with ‖M‖ ‖v‖², ‖M‖ ‖a‖ and
-|g| √(m tr M) where those may have met inside a term (see `mbkit.studies.measure`).
+|g| √(m tr M) where those may have met inside a term (see `mbkit.studies.compare.errors`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mbkit.derivation import Equations
 from mbkit.derivation.kinematics import add
 from mbkit.model import Model
-from mbkit.model.kinds import cross3
+from mbkit.model.joint_types import cross3
 from tests.random_trees import random_tree, states
 
 EPS = np.finfo(float).eps

@@ -199,7 +199,7 @@ class Heavy(LagrangianDynamics):
 
 def test_asserts_take_an_engine_of_ones_own(monkeypatch):
     monkeypatch.setitem(ENGINES, "heavy", (__name__, "Heavy", "heavy"))
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare"], "COMPARABLE", ("lagrangian", "heavy"))
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "COMPARABLE", ("lagrangian", "heavy"))
     with pytest.raises(AssertionError, match=r"heavy, g: differs by(.|\n)*casadi .*, heavy"):
         assert_engines_agree(mb.catalog.pendulum(), ("lagrangian", "heavy"), samples=1)
 

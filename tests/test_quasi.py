@@ -12,7 +12,7 @@ import sympy as sp
 import mbkit as mb
 from mbkit.derivation.equations import equations_of
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.quasi import QuasiLagrangian
+from mbkit.lagrangian.reduction.quasi_velocities import QuasiLagrangian
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.spatial import rotate
 from validation import motions

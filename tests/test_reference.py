@@ -22,9 +22,16 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import simulate
-from mbkit.studies import reference as module
-from mbkit.studies.reference import Reference, reference
-from mbkit.studies.reference_runs import Deadline, LateError, gap, taylor_pair, two_engines
+from mbkit.studies.work_precision import reference as module
+from mbkit.studies.work_precision.reference import (
+    Deadline,
+    LateError,
+    Reference,
+    gap,
+    reference,
+    taylor_pair,
+    two_engines,
+)
 
 hy = pytest.importorskip("heyoka")
 # No test reads what an earlier run left, or leaves anything.
@@ -43,7 +50,7 @@ def summed(high: Any, low: Any) -> Any:
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops for all but the smallest systems: what is run once is not worth more."""
-    monkeypatch.setattr("mbkit.derivation.taylor._UNROLLED", 2000)
+    monkeypatch.setattr("mbkit.codegen.taylor._UNROLLED", 2000)
 
 
 def ample() -> Deadline:

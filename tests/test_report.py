@@ -14,17 +14,19 @@ from rich.console import Console
 
 from mbkit._escape import one_line, terminal
 from mbkit.errors import OutputError
-from mbkit.report import figures, precision, precision_tables, tables
-from mbkit.report.folder import check_writable, file_stem, write
-from mbkit.report.numbers import count_text, error_text, time_text
+from mbkit.report import figures, work_precision_view
+from mbkit.report import terminal as precision_tables
+from mbkit.report import terminal as tables
+from mbkit.report.compare_view import failures, headline, notices, omission_state
+from mbkit.report.figures import term_costs
+from mbkit.report.formatting import count_text, error_text, time_text
+from mbkit.report.output_folder import check_writable, file_stem, write
 from mbkit.report.page import bench_page, check_page, sweep_page
 from mbkit.report.progress import Bar
-from mbkit.report.reading import failures, headline, notices, omission_state
-from mbkit.report.terms_figure import term_costs
-from mbkit.studies.all_robots import RobotOutcome, Sweep
-from mbkit.studies.precision_figure import figure
-from mbkit.studies.precision_result import Curve, PrecisionPoint, WorkPrecision
-from mbkit.studies.result import Comparison, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
+from mbkit.studies.compare.result import Comparison, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.work_precision.figure import figure
+from mbkit.studies.work_precision.result import Curve, PrecisionPoint, WorkPrecision
 
 NAN = math.nan
 HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'
@@ -277,12 +279,12 @@ def test_what_a_study_left_out_is_said_first():
 
 def test_a_run_that_is_the_fastest_for_several_errors_is_one_row():
     # lagrangian rk4 at 0.1 / 2^k has errors of 1e-3 / 16^k, and nobody is faster.
-    found = precision.leads(STUDY)
+    found = work_precision_view.leads(STUDY)
     assert [x.errors for x in found] == ["1e-02", "1e-04", "1e-06"]
     far = replace(
         STUDY, curves=tuple(replace(c, points=(point(0.1, 1e-9, c.points[0].seconds),)) for c in STUDY.curves)
     )
-    (one,) = precision.leads(far)
+    (one,) = work_precision_view.leads(far)
     assert one.errors == "1e-02 to 1e-08"
     assert one.nexts == [("mujoco", "mujoco_rk4", "2")]
     rows = [line for line in printed(precision_tables.bench(far), 120).splitlines() if line.startswith("1e-")]
@@ -431,7 +433,7 @@ def test_a_comparison_of_nothing_still_has_a_page_and_a_table():
 
 
 def test_figures_are_the_same_every_time_and_scale():
-    for draw in (figures.digits, term_costs, lambda r: precision.error_against_time(r.precision)):
+    for draw in (figures.digits, term_costs, lambda r: work_precision_view.error_against_time(r.precision)):
         one, two = draw(AGREEING), draw(AGREEING)
         assert one == two
         assert "viewBox" in one
@@ -444,7 +446,7 @@ def test_figures_are_the_same_every_time_and_scale():
 
 @pytest.mark.parametrize("result", [STUDY, NASTY_STUDY, replace(STUDY, curves=STUDY.curves[:1], floor=0.0)])
 def test_the_figure_is_valid_svg_with_every_panel_named(result):
-    drawn = precision.error_against_time(result)
+    drawn = work_precision_view.error_against_time(result)
     root = ElementTree.fromstring(drawn)
     assert root.tag.endswith("svg")
     # What names parts inside is local, so nothing is loaded.
@@ -453,7 +455,7 @@ def test_the_figure_is_valid_svg_with_every_panel_named(result):
 
 
 def test_the_figure_names_the_front_and_puts_same_formulas_together():
-    drawn = precision.error_against_time(STUDY)
+    drawn = work_precision_view.error_against_time(STUDY)
     for told in ("best of lagrangian", "reference known to 1e-13", "run time of 0.5 s", "energy drift", "dashed"):
         assert told in drawn, told
     # MuJoCo's own RK4 stands in the panel of rk4, and has none of its own.
@@ -466,7 +468,7 @@ def test_without_energies_there_is_no_panel_of_energies():
     damped = tuple(
         replace(c, points=tuple(replace(p, energy=NAN, note="has dampers") for p in c.points)) for c in STUDY.curves
     )
-    assert "energy drift" not in precision.error_against_time(replace(STUDY, curves=damped))
+    assert "energy drift" not in work_precision_view.error_against_time(replace(STUDY, curves=damped))
 
 
 def test_a_colour_and_marker_belong_to_an_engine_whichever_others_there_are():
@@ -478,21 +480,21 @@ def test_a_colour_and_marker_belong_to_an_engine_whichever_others_there_are():
 
 
 def test_a_picture_is_png_and_the_same_every_time():
-    made = precision.picture(STUDY)
+    made = work_precision_view.picture(STUDY)
     assert made.startswith(b"\x89PNG")
-    assert made == precision.picture(STUDY)
+    assert made == work_precision_view.picture(STUDY)
 
 
 def test_levels_end_where_no_run_or_the_reference_ends():
-    found = precision.levels(STUDY)
+    found = work_precision_view.levels(STUDY)
     assert [f"{x.error:.0e}" for x in found] == ["1e-02", "1e-04", "1e-06"]
     assert {x.curve.engine for x in found} == {"lagrangian"}
     assert found[0].next is not None
     assert found[0].next[0].method == "mujoco_rk4"
     assert found[0].factor == pytest.approx(2)
     # An error that the reference itself may have is not told of.
-    assert len(precision.levels(replace(STUDY, floor=1e-5))) == 2
-    only = precision.levels(replace(STUDY, curves=STUDY.curves[:1]))
+    assert len(work_precision_view.levels(replace(STUDY, floor=1e-5))) == 2
+    only = work_precision_view.levels(replace(STUDY, curves=STUDY.curves[:1]))
     assert only[0].next is None
     assert math.isnan(only[0].factor)
 
@@ -501,20 +503,20 @@ def test_a_run_that_is_no_answer_is_on_no_front():
     wild = Curve("pinocchio", "semi_implicit_euler", (point(0.5, 8.0, 1e-4),), NAN, 0, 1.0, 0.1)
     result = replace(STUDY, curves=(wild, *STUDY.curves))
     assert result.front[0][0] is wild
-    assert precision.front_names(result) == ["lagrangian rk4"]
-    assert not precision.curve_lines(result)[0].on_front
+    assert work_precision_view.front_names(result) == ["lagrangian rk4"]
+    assert not work_precision_view.curve_lines(result)[0].on_front
 
 
 def test_the_headline_tells_where_the_lead_changes():
     late = Curve("mujoco", "rk853", (point(0.1, 1e-9, 0.012),), NAN, 0, NAN, 0.1)
-    told = precision.headline(replace(STUDY, curves=(*STUDY.curves, late)))
+    told = work_precision_view.headline(replace(STUDY, curves=(*STUDY.curves, late)))
     assert told.startswith(
         "fastest of 5 curves: lagrangian rk4 for an error of 1e-02, mujoco rk853 for an error of 1e-04 to 1e-08"
     )
 
 
 def test_an_order_that_is_off_is_flagged_and_one_that_was_not_seen_is_not():
-    assert [line.off for line in precision.curve_lines(STUDY)] == [False, True, False, False]
+    assert [line.off for line in work_precision_view.curve_lines(STUDY)] == [False, True, False, False]
     page = bench_page(STUDY)
     assert "! 3.55" in page
     assert "! 4.02" not in page
@@ -524,7 +526,7 @@ def test_an_order_that_is_off_is_flagged_and_one_that_was_not_seen_is_not():
 
 
 def test_the_least_error_is_the_fastest_of_those_that_the_reference_can_tell():
-    line = precision.curve_lines(replace(STUDY, floor=1e-5))[0]
+    line = work_precision_view.curve_lines(replace(STUDY, floor=1e-5))[0]
     assert line.best is STUDY.curves[0].points[2]
 
 

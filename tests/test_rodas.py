@@ -15,14 +15,14 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning
+from mbkit.methods.registry import Tolerances
+from mbkit.methods.tableaus import rodas5p
 from mbkit.model import ModelBuilder
-from mbkit.model.space import Space
+from mbkit.model.integration_space import Space
 from mbkit.simulate import at_section, simulate
-from mbkit.simulate.embedded_lanes import LaneTrials
-from mbkit.simulate.embedded_trials import Stretch
-from mbkit.simulate.methods import Tolerances
-from mbkit.simulate.rosenbrock_stages import RosenbrockTrials
-from mbkit.simulate.rosenbrock_tableau import rodas5p
+from mbkit.simulate.solvers.adaptive_compiled import LaneTrials
+from mbkit.simulate.solvers.adaptive_numpy import RosenbrockTrials
+from mbkit.simulate.solvers.step_attempts import Stretch
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms

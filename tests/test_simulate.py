@@ -27,11 +27,11 @@ from mbkit.errors import (
     UnknownNameError,
     UnsupportedError,
 )
-from mbkit.model import Model, ModelBuilder, rotation
-from mbkit.model.space import Space
+from mbkit.methods.tableaus import rooted_trees
+from mbkit.model import Model, ModelBuilder, quaternions
+from mbkit.model.integration_space import Space
 from mbkit.simulate import METHODS, RK4, Tableau, Trajectory, simulate
-from mbkit.simulate.grid import Grid
-from mbkit.simulate.tableau import rooted_trees
+from mbkit.simulate.time_grid import Grid
 from validation import closed_forms
 
 EPS = np.finfo(float).eps
@@ -108,11 +108,11 @@ def test_dexp_inverse_is_the_rate_of_the_rotation_vector() -> None:
             for s in (-1, 1)
         ]
         rate = (ends[1] - ends[0]) / (2 * h)
-        got = np.array(rotation.dexp_inverse(rotation.FLOATS, u.tolist(), w.tolist()))
+        got = np.array(quaternions.dexp_inverse(quaternions.FLOATS, u.tolist(), w.tolist()))
         assert got == pytest.approx(rate, abs=2e-9)
         # One state and a batch, and the repository's other formula, give the same.
         many = [np.full(2, x) for x in u], [np.full(2, x) for x in w]
-        batch = np.array(rotation.dexp_inverse(rotation.ARRAYS, *many))
+        batch = np.array(quaternions.dexp_inverse(quaternions.ARRAYS, *many))
         assert batch[:, 0] == pytest.approx(got, abs=8 * EPS)
         assert got == pytest.approx(spatial.left_jacobian_inverse(-u) @ w, abs=1e-13)
 

@@ -16,7 +16,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
 from mbkit.model import ModelBuilder
 from mbkit.simulate import METHODS, Event, simulate
-from mbkit.simulate.grid import Grid
+from mbkit.simulate.time_grid import Grid
 
 EPS = float(np.finfo(float).eps)
 ADAPTIVE = [m.name for m in METHODS.values() if m.kind == "adaptive"]

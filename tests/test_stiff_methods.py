@@ -16,8 +16,8 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, NumericalError, TorqueError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import simulate
-from mbkit.simulate.linearization import Linearization
-from mbkit.simulate.rates import Rates
+from mbkit.simulate.diagnostics.linearization import Linearization
+from mbkit.simulate.solvers.vector_field import Rates
 from tests.random_trees import ALL, random_tree
 from validation import closed_forms
 

@@ -15,6 +15,7 @@ import sys
 import textwrap
 import time
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +26,12 @@ import mbkit as mb
 from mbkit.cli import cli
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies import InterruptedSweepError, StressResult
-from mbkit.studies.rollouts import TooLongError
+from mbkit.studies.compare.rollouts import TooLongError
 from mbkit.studies.stress import Case, CaseResult, Cell, Row, stress
-from mbkit.studies.stress.limit import limited
 from mbkit.studies.stress.messages import Condition, Failed, Prepare, Prepared
-from mbkit.studies.stress.process import USED_UP, LostError
+from mbkit.studies.stress.reference import Search, condition, limited
 from mbkit.studies.stress.sweep import Bounds, CaseSweep
-from mbkit.studies.stress.terms import condition
-from mbkit.studies.stress.truths import Search
+from mbkit.studies.stress.worker import USED_UP, LostError
 from tests import stress_cases as own
 
 METHODS = ("rk4", *own.ENDS)
@@ -385,7 +384,9 @@ def call(*arguments):
 
 def test_the_command_prints_and_writes(study, here, monkeypatch):
     asked = {}
-    monkeypatch.setattr("mbkit.studies.stress.study.stress", lambda *a, **k: asked.update(k, a=a) or study)
+    monkeypatch.setattr(
+        import_module("mbkit.studies.stress.study"), "stress", lambda *a, **k: asked.update(k, a=a) or study
+    )
     result = call("joint_spring", "chain", "--quick", "--methods", "rk4", "--bar", "1e-3", "--budget", "50")
     assert result.exit_code == 0, result.output
     assert asked.pop("a") == (("joint_spring", "chain"), ("lagrangian", "pinocchio", "mujoco"), ("rk4",))
@@ -399,7 +400,7 @@ def test_the_command_prints_and_writes(study, here, monkeypatch):
     def stopped(*_: object, **__: object) -> None:
         raise InterruptedSweepError(one)
 
-    monkeypatch.setattr("mbkit.studies.stress.study.stress", stopped)
+    monkeypatch.setattr(import_module("mbkit.studies.stress.study"), "stress", stopped)
     result = call("--json", "--out", "out")
     assert result.exit_code == 130
     assert json.loads(result.stdout)["complete"] is False

@@ -14,18 +14,15 @@ from scipy.integrate._ivp import dop853_coefficients
 from mbkit import catalog
 from mbkit.engines import dynamics
 from mbkit.errors import UnknownNameError
-from mbkit.model.physical import sample_mass_matrix
+from mbkit.model.validation import sample_mass_matrix
 from mbkit.simulate import METHODS, simulate
-from mbkit.studies.reference_runs import gap
 from mbkit.studies.stress import cases
-from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.cases._pendulums import cart_pole, pendulum
-from mbkit.studies.stress.cases._rotations import precession
-from mbkit.studies.stress.cases._stability import largest_step
-from mbkit.studies.stress.cases._sweeps import stable_steps
+from mbkit.studies.stress.case import Case, problem_of, times_of
+from mbkit.studies.stress.cases._common import largest_step, stable_steps
+from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum, precession
 from mbkit.studies.stress.cases.length import straight_inertia
 from mbkit.studies.stress.cases.spin import box_spin
-from mbkit.studies.stress.problems import problem_of, times_of
+from mbkit.studies.work_precision.reference import gap
 from validation import closed_forms, elliptic
 
 ALL = tuple(cases.CASES.values())

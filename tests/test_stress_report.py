@@ -11,17 +11,14 @@ import pytest
 from rich.console import Console
 
 from mbkit.errors import UnknownNameError
-from mbkit.report import stress
+from mbkit.report import stress_view
 from mbkit.report.page import stress_page
-from mbkit.report.stress_figures import stable_steps
-from mbkit.report.stress_map import section
-from mbkit.report.stress_methods import methods
-from mbkit.report.stress_silent import avoid
-from mbkit.report.stress_steps import kinds, rules, steps
-from mbkit.report.stress_tables import summary
+from mbkit.report.stress_case import section
+from mbkit.report.stress_steps import kinds, rules, stable_steps, steps
+from mbkit.report.stress_terminal import summary
+from mbkit.report.stress_view import avoid, methods
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
-from mbkit.studies.stress.reading import best, lines, place, recommended
-from mbkit.studies.stress.result import CaseResult, Cell, Row, StressResult
+from mbkit.studies.stress.result import CaseResult, Cell, Row, StressResult, best, lines, place, recommended
 
 NAN, INF = math.nan, math.inf
 HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'
@@ -271,18 +268,18 @@ def test_dark_text_reads_on_every_shade_of_paper():
 def test_the_headline_says_who_held_furthest_and_how_much_was_silent():
     # Neither terms nor stable steps make a method the best.
     told = "lagrangian auto held furthest, or as far as any, in 1 of 1 case; 7 silent failures in 3 cases"
-    assert stress.headline(RESULT) == told
+    assert stress_view.headline(RESULT) == told
     twice = replace(RESULT, cases=(SPRING, replace(SPRING, rows=SPRING.rows[2:3])))
-    assert stress.headline(twice).startswith(
+    assert stress_view.headline(twice).startswith(
         "lagrangian auto and pinocchio radau held furthest, or as far as any, in 1 of 2"
     )
     quiet = replace(RESULT, cases=(replace(SPRING, rows=SPRING.rows[1:3]),))
-    assert stress.headline(quiet).endswith("in 1 of 1 case; no silent failures")
-    assert stress.headline(NOTHING) == "interrupted; what was finished: nothing was run"
+    assert stress_view.headline(quiet).endswith("in 1 of 1 case; no silent failures")
+    assert stress_view.headline(NOTHING) == "interrupted; what was finished: nothing was run"
     lost = replace(RESULT, cases=(replace(SPRING, rows=SPRING.rows[4:]),))
-    assert stress.headline(lost) == "nothing held in 1 case; no silent failures"
+    assert stress_view.headline(lost) == "nothing held in 1 case; no silent failures"
     # Without a run, terms are told of by engine.
-    assert stress.headline(replace(RESULT, cases=(TERMS,))).startswith("pinocchio held furthest")
+    assert stress_view.headline(replace(RESULT, cases=(TERMS,))).startswith("pinocchio held furthest")
 
 
 def test_what_to_avoid_is_told_by_method_with_where_it_begins():
@@ -293,7 +290,7 @@ def test_what_to_avoid_is_told_by_method_with_where_it_begins():
 
 
 def test_where_another_holds_further_than_auto_is_told():
-    assert not any(o.behind for o in stress.overview(RESULT))
+    assert not any(o.behind for o in stress_view.overview(RESULT))
     worse = Row("lagrangian", "auto", cells(STIFF, 1e-9, 1e-9, "slow", "slow"))
     result = replace(RESULT, cases=(replace(SPRING, rows=(worse, *SPRING.rows[2:])),))
     page = " ".join(Tags(stress_page(result)).text.split())
@@ -312,7 +309,7 @@ def test_methods_are_counted_by_family_with_their_price():
 
 
 def test_steps_are_set_against_linear_theory_and_make_a_rule():
-    found = steps(stress.overview(RESULT))
+    found = steps(stress_view.overview(RESULT))
     assert [(s.line.row.method, s.verdict) for s in found[0].lines] == [
         ("gauss4", "as theory says"),
         ("rk4", "as theory says"),
@@ -325,26 +322,28 @@ def test_steps_are_set_against_linear_theory_and_make_a_rule():
         "semi_implicit_euler": (0.0, "none tried held, the least 1 / ω"),
     }
     further = replace(STEP.rows[0], theory=1.2e-3)
-    (case,) = steps(stress.overview(replace(RESULT, cases=(replace(STEP, rows=(further,), facts=()),))))
+    (case,) = steps(stress_view.overview(replace(RESULT, cases=(replace(STEP, rows=(further,), facts=()),))))
     assert case.lines[0].verdict == "holds 1.7 × further"
     # Without a frequency there is no rule, and a step all the same.
     assert rules([case]) == []
     # What was too slow tells nothing of stability.
     slow = replace(STEP, rows=(replace(STEP.rows[0], cells=cells(STEPS, 1e-5, "slow")),))
-    (case,) = steps(stress.overview(replace(RESULT, cases=(slow,))))
+    (case,) = steps(stress_view.overview(replace(RESULT, cases=(slow,))))
     assert (case.lines[0].verdict, rules([case])) == ("", [])
 
 
 def test_a_damper_has_a_rule_of_its_own():
     damped = replace(STEP, name="damped", facts=({"fastest rate": 100.0},) * 4)
-    found = rules(steps(stress.overview(replace(RESULT, cases=(STEP, damped)))))
+    found = rules(steps(stress_view.overview(replace(RESULT, cases=(STEP, damped)))))
     assert kinds(found) == ["fastest frequency", "fastest rate"]
     told = {r.method: r.words for r in found}
     assert told["rk4"] == "dt ≤ 2 / ω (fastest frequency); dt ≤ 0.2 / ω (fastest rate)"
 
 
 def test_the_map_marks_where_it_breaks_and_where_theory_lets_it():
-    told = {(r.line.row.engine, r.line.row.method): r for o in stress.overview(RESULT)[:1] for r in section(o).rows}
+    told = {
+        (r.line.row.engine, r.line.row.method): r for o in stress_view.overview(RESULT)[:1] for r in section(o).rows
+    }
     assert [c.style for c in told["pinocchio", "rk4"].cells] == ["h1", "w3 brk", "gross lim", "end"]
     assert [c.style for c in told["mujoco", "rk4"].cells] == ["h1", "w3 brk", "gross sil lim", "gross sil"]
     assert [c.text for c in told["mujoco", "mujoco_euler"].cells] == ["1e-3", "NaN", "died", ""]
@@ -355,7 +354,7 @@ def test_the_map_marks_where_it_breaks_and_where_theory_lets_it():
 
 def test_an_interrupted_row_is_filled_with_empty_cells():
     cut = replace(SPRING, rows=(replace(SPRING.rows[1], cells=SPRING.rows[1].cells[:2]),))
-    told = section(stress.overview(replace(RESULT, cases=(cut,)))[0])
+    told = section(stress_view.overview(replace(RESULT, cases=(cut,)))[0])
     assert [c.style for c in told.rows[0].cells] == ["h0", "h0", "none", "none"]
     page = " ".join(Tags(stress_page(replace(RESULT, cases=(cut,), complete=False))).text.split())
     assert "auto, then not run" in page
@@ -469,7 +468,7 @@ def test_figures_draw_a_case_or_all_and_refuse_what_there_is_not():
 
 def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():
     for result in (RESULT, NASTY):
-        found = steps(stress.overview(result))
+        found = steps(stress_view.overview(result))
         drawn = stable_steps(found)
         assert drawn == stable_steps(found)
         assert ElementTree.fromstring(drawn).tag.endswith("svg")

@@ -10,10 +10,10 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
-from mbkit.derivation.midpoint import Midpoint, _MomentumSpace, eliminated
+from mbkit.derivation.steps.midpoint import Midpoint, _MomentumSpace, eliminated
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError, UnsupportedError
-from mbkit.model import Model, ModelBuilder, rotation
+from mbkit.model import Model, ModelBuilder, quaternions
 from mbkit.simulate import simulate
 from mbkit.spatial import rotate
 from tests.random_trees import random_tree
@@ -81,7 +81,7 @@ def canonical_step(model: Model, q: np.ndarray, v: np.ndarray, h: float) -> np.n
 
     m = space.arithmetic(u)
     q0 = space.toward(ca.DM(q), u)
-    body = turned(u, p, lambda x, y: rotation.dexp_inverse(m, [-c for c in x], y))
+    body = turned(u, p, lambda x, y: quaternions.dexp_inverse(m, [-c for c in x], y))
     residual, _ = system(q0, space.to_fixed(q0, body), w, zero, h)
     q1, pi1, *_ = end(q0, space.to_fixed(q0, body), w, w, w, zero, h, 0, 0)
 
@@ -96,9 +96,9 @@ def canonical_step(model: Model, q: np.ndarray, v: np.ndarray, h: float) -> np.n
         u1[b] = q1[a] - ca.DM(there[a])
     for a, b in space._turns:
         back = [-1.0, -1.0, -1.0, 1.0] * there[a]
-        space.put(u1, b, [2 * x for x in rotation.product(back.tolist(), space.components(q1, a))[:3]])
+        space.put(u1, b, [2 * x for x in quaternions.product(back.tolist(), space.components(q1, a))[:3]])
     p_body = space.to_body(q1, pi1)
-    p1 = p_body + 0.5 * (turned(u1, p_body, rotation.cross) - plain(space, p_body))
+    p1 = p_body + 0.5 * (turned(u1, p_body, quaternions.cross) - plain(space, p_body))
     z, z1 = ca.vertcat(u, p), ca.vertcat(u1, p1)
     at = [w0, np.zeros(nv), p0]
     by_z, by_w = (

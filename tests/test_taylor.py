@@ -17,17 +17,17 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
+from mbkit.codegen.program import program
+from mbkit.codegen.taylor import TaylorSystem, _functions, order_of, precision, rates, taylor_system
 from mbkit.derivation import Equations
-from mbkit.derivation.program import program
-from mbkit.derivation.taylor import TaylorSystem, _functions, order_of, precision, rates, taylor_system
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
+from mbkit.methods.registry import Tolerances
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, Trajectory, at_section, simulate
-from mbkit.simulate.asked import Asked
-from mbkit.simulate.methods import Tolerances
+from mbkit.simulate.problem import Asked
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.taylor import run_taylor
+from mbkit.simulate.solvers.taylor import run_taylor
 from mbkit.simulate.torque import Torque
 from tests.random_trees import random_tree
 
@@ -71,7 +71,7 @@ def double() -> Any:
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops for all but the smallest systems: what is run once is not worth more."""
-    monkeypatch.setattr("mbkit.derivation.taylor._UNROLLED", 2000)
+    monkeypatch.setattr("mbkit.codegen.taylor._UNROLLED", 2000)
 
 
 # Exact motions
@@ -367,7 +367,7 @@ def test_what_has_no_series_is_refused(swing: Any) -> None:
 
 
 def test_too_large_a_model_is_refused_before_it_is_derived(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbkit.derivation.taylor._MOST", 3)
+    monkeypatch.setattr("mbkit.codegen.taylor._MOST", 3)
     with pytest.raises(UnsupportedError, match=r"double_pendulum takes \d+ operations.*'rk853' or 'dop853'"):
         TaylorSystem(Equations(catalog.double_pendulum()))
 

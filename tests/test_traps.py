@@ -199,7 +199,7 @@ def test_the_base_links_mass_is_not_dropped(tmp_path, floating):
 
 def test_every_bodys_inertia_arrives_in_mujoco(monkeypatch):
     """The adapter checks this itself; here the check is checked."""
-    from mbkit.engines import mujoco_model
+    from mbkit.engines.mujoco import model as mujoco_model
 
     model = mb.load("ur5")
     monkeypatch.setattr(mujoco_model, "_set_constants", lambda made, *_: made.body_inertia.__imul__(1 + 1e-9))

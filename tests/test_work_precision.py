@@ -28,11 +28,9 @@ from mbkit._escape import csv_text
 from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
-from mbkit.studies.first_run import _heyoka_anew, made_ready
-from mbkit.studies.orders import observed_order
-from mbkit.studies.precision_result import Curve, PrecisionPoint, WorkPrecision
-from mbkit.studies.sweep import plans
-from mbkit.studies.walk import shares
+from mbkit.studies.work_precision.curve import _heyoka_anew, made_ready, observed_order, shares
+from mbkit.studies.work_precision.result import Curve, PrecisionPoint, WorkPrecision
+from mbkit.studies.work_precision.settings import plans
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]
 STEPS = [0.1 / 2**k for k in range(6)]
@@ -169,8 +167,7 @@ def test_a_slow_machine_measures_the_same_points(monkeypatch):
         perf_counter=lambda: 40 * clocks["perf_counter"]() - 39 * starts["perf_counter"],
         process_time=lambda: 40 * clocks["process_time"]() - 39 * starts["process_time"],
     )
-    for module in ("walk", "sweeping"):
-        monkeypatch.setattr(sys.modules[f"mbkit.studies.{module}"], "time", slow)
+    monkeypatch.setattr(sys.modules["mbkit.studies.work_precision.curve"], "time", slow)
     assert errors(few_runs()) == errors(quick)
     assert not quick.shortened
     # Work is counted, and a call from Python counts eight.
@@ -326,7 +323,7 @@ def test_methods_that_cannot_call_back_are_refused_by_name():
 
 
 def test_an_engine_that_breaks_loses_no_other(monkeypatch):
-    from mbkit.engines.mujoco import MujocoDynamics
+    from mbkit.engines.mujoco.engine import MujocoDynamics
 
     def broken(*_args, **_kwargs):
         raise RuntimeError("out of order")
@@ -445,7 +442,7 @@ def test_what_was_finished_is_kept_upon_an_interruption(calls, tmp_path, few):
 
 
 def test_a_checkpoint_gets_results_on_the_way_and_the_last(monkeypatch):
-    monkeypatch.setattr("mbkit.studies.keeper._BETWEEN", 0.0)
+    monkeypatch.setattr("mbkit.studies._checkpoint._BETWEEN", 0.0)
     got = []
     result = study(["pinocchio"], ["rk4"], checkpoint=got.append)
     assert [r.complete for r in got] == [False] * (len(got) - 1) + [True]

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 import mbkit as mb
 from mbkit.engines import Dynamics
 from mbkit.lagrangian import Lagrangian, systems
-from mbkit.lagrangian.symbols import velocity_of
-from mbkit.lagrangian.virtual_work import generalized_force
+from mbkit.lagrangian.energies.symbols import velocity_of
+from mbkit.lagrangian.statics.virtual_work import generalized_force
 from mbkit.model import Model
 from validation.textbook import MassiveSliderCrank, SliderCrank, WheeledSpacecraft
 

@@ -5,7 +5,7 @@ dynamics of each system at 64 random and some hard states with the oracle, throu
 the public interface, and writes ``validation/accuracy.json``. By default the own
 derivation is measured compiled, as users have it, which takes long the first time;
 with ``MBKIT_COMPILE=0`` as CasADi's machine runs it. An error is the worst
-of all states, normwise, as `mbkit.studies.measure` says; beside it stands the worst
+of all states, normwise, as `mbkit.studies.compare.errors` says; beside it stands the worst
 of a single joint by its own scale. The bars are those of the own derivation: 10 eps
 on robots, 50 eps on random trees of all joint kinds with up to 30 joints. Exit
 status 1 if one is missed.
@@ -29,11 +29,11 @@ from rich.table import Table
 import mbkit as mb
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError, MbkitWarning, ModelError
-from mbkit.studies.judge import Judge
-from mbkit.studies.stamp import processor, versions
-from mbkit.studies.states import states
-from mbkit.studies.terms import TERMS as ALL_TERMS
-from mbkit.studies.workers import run
+from mbkit.studies._processes import run
+from mbkit.studies._results import processor, versions
+from mbkit.studies.compare.study import Judge
+from mbkit.studies.compare.terms import TERMS as ALL_TERMS
+from mbkit.studies.compare.terms import states
 from tests.random_trees import random_tree
 
 HERE = Path(__file__).parent

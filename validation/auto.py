@@ -23,10 +23,10 @@ import warnings
 import numpy as np
 
 import mbkit as mb
-from mbkit.simulate.auto_scene import EXPLICIT, IMPLICIT
-from mbkit.simulate.methods import METHODS
-from mbkit.studies.rollouts import start_state
-from mbkit.studies.stamp import processor, versions
+from mbkit.methods.registry import METHODS
+from mbkit.simulate.solvers.auto import EXPLICIT, IMPLICIT
+from mbkit.studies._results import processor, versions
+from mbkit.studies.compare.rollouts import start_state
 from mbkit.studies.stress.cases import mass_ratio, stiffness
 
 GOAL, RTOL = 1e-6, 1e-8

@@ -39,10 +39,11 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
-from mbkit.derivation.compiled import cores
-from mbkit.derivation.program import program
-from mbkit.engines import mujoco_model, pinocchio_model
-from mbkit.studies.stamp import processor, versions
+from mbkit.codegen.compiled import cores
+from mbkit.codegen.program import program
+from mbkit.engines.mujoco import model as mujoco_model
+from mbkit.engines.pinocchio import model as pinocchio_model
+from mbkit.studies._results import processor, versions
 from tests.random_trees import random_tree
 
 HERE = Path(__file__).parent

@@ -33,7 +33,7 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
-from mbkit.engines.mujoco_text import mjcf_text
+from mbkit.engines.mujoco.mjcf_writer import mjcf_text
 from mbkit.errors import MbkitError, MbkitWarning, UnsupportedError
 from tests.random_files import EPS, errors, mujoco_terms, mutant, random_mjcf
 from tests.random_trees import ALL, random_tree, states

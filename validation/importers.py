@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from mbkit.engines.imported import IMPORTERS
-from mbkit.load import robots, xml
-from mbkit.load.xml import Element
-from mbkit.studies.causes.result import Cause, effect, grouped, plain
-from mbkit.studies.parsers import Parsed, compare_parsers
+from mbkit.load import robots, xml_reader
+from mbkit.load.xml_reader import Element
+from mbkit.studies.explain.result import Cause, effect, grouped, plain
+from mbkit.studies.importers import Parsed, compare_parsers
 
 HERE = Path(__file__).parent
 QUOTED = re.compile(r"'([^']+)'")
@@ -84,7 +84,7 @@ def main() -> None:
         result = compare_parsers(robot.path, floating_base=True)
         floating[robot.name] = {p.engine: briefly(p) for p in result.importers}
         result = compare_parsers(robot.path)
-        root, lines = xml.read(robot.path), robot.path.read_text(encoding="utf-8").splitlines()
+        root, lines = xml_reader.read(robot.path), robot.path.read_text(encoding="utf-8").splitlines()
         table[robot.name] = {p.engine: told(p, root, lines) for p in result.importers}
         print(f"{robot.name}: {result.verdict}", flush=True)
     for name, told_of in (("importers", table), ("importers_floating", floating)):

@@ -14,7 +14,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from mbkit.report.numbers import time_text
+from mbkit.report.formatting import time_text
 
 HERE = Path(__file__).parent
 COLOURS = {"pinocchio": "#0072b2", "lagrangian": "#d55e00", "mujoco": "#009e73"}

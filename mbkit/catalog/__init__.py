@@ -11,21 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mbkit.catalog.acrobot import acrobot
-from mbkit.catalog.cart_pole import cart_pole
-from mbkit.catalog.chain import chain
-from mbkit.catalog.clamped_beam import clamped_beam
-from mbkit.catalog.double_pendulum import double_pendulum
-from mbkit.catalog.elastic_pendulum import elastic_pendulum
-from mbkit.catalog.flexible_spacecraft import flexible_spacecraft
-from mbkit.catalog.free_body import free_body
-from mbkit.catalog.furuta_pendulum import furuta_pendulum
-from mbkit.catalog.gyroscope import gyroscope
-from mbkit.catalog.heavy_top import heavy_top
-from mbkit.catalog.pendulum import pendulum
+from mbkit.catalog.beams import clamped_beam
+from mbkit.catalog.pendulums import chain, double_pendulum, elastic_pendulum, pendulum, spherical_pendulum
+from mbkit.catalog.rigid_bodies import free_body, gyroscope, heavy_top
 from mbkit.catalog.slider_crank import slider_crank
-from mbkit.catalog.spacecraft_with_wheels import spacecraft_with_wheels
-from mbkit.catalog.spherical_pendulum import spherical_pendulum
+from mbkit.catalog.spacecraft import flexible_spacecraft, spacecraft_with_wheels
+from mbkit.catalog.underactuated import acrobot, cart_pole, furuta_pendulum
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 

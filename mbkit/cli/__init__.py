@@ -13,7 +13,7 @@ import click
 
 from mbkit._version import __version__
 from mbkit.cli import baseline, bench, check, convert, derive, diff, export, robots, stress
-from mbkit.cli.door import Door
+from mbkit.cli._shared import Door
 
 __all__ = ["cli", "main"]
 

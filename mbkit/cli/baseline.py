@@ -9,9 +9,21 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mbkit._escape import one_line
-from mbkit.cli.door import AGREE, DIFFER, DONE, MISUSE, leave, say, tell
-from mbkit.cli.options import check_engines, in_options, load_options, model_options, split
-from mbkit.cli.output import console
+from mbkit.cli._shared import (
+    AGREE,
+    DIFFER,
+    DONE,
+    MISUSE,
+    check_engines,
+    console,
+    in_options,
+    leave,
+    load_options,
+    model_options,
+    say,
+    split,
+    tell,
+)
 from mbkit.errors import BaselineError, InputError, MbkitError
 
 if TYPE_CHECKING:
@@ -73,8 +85,7 @@ def _record_one(
 ) -> None:
     from mbkit.report.progress import Bar
     from mbkit.studies import baseline as baselines
-    from mbkit.studies.baseline.target import kept
-    from mbkit.studies.target import model_of
+    from mbkit.studies._targets import kept, model_of
 
     model = model_of(target, options)
     with Bar(f"record {model.name}") as bar:
@@ -151,11 +162,10 @@ def _check_one(
     file: Path, target: str | None, options: dict[str, Any], strict: bool, rebaseline: bool, *, table: bool
 ) -> tuple[BaselineResult, bool]:
     """Return what was found, and whether it was recorded anew."""
-    from mbkit.report import baselines as tables
+    from mbkit.report import terminal as tables
     from mbkit.report.progress import Bar
     from mbkit.studies import baseline as baselines
-    from mbkit.studies.baseline.target import kept
-    from mbkit.studies.target import model_of
+    from mbkit.studies._targets import kept, model_of
 
     recorded = baselines.read(file)
     # A target of other options is recorded with them.
@@ -205,7 +215,7 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     Exit status: 0 the same robot with the same numbers, 1 something differs, 2 misuse or a file
     that cannot be read.
     """
-    from mbkit.report import baselines as tables
+    from mbkit.report import terminal as tables
     from mbkit.studies import baseline as baselines
 
     result = baselines.diff(path_a, path_b)
@@ -221,8 +231,8 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
 
 def _name(target: str) -> str:
     """Return what a target's file is called in a folder: as the robot, the file or the function."""
-    from mbkit.load.names import canonical
-    from mbkit.report.folder import file_stem
+    from mbkit.load.robot_data import canonical
+    from mbkit.report.output_folder import file_stem
 
     robot = canonical(target)
     path = robot is None and (Path(target).is_file() or "/" in target)
@@ -235,8 +245,7 @@ def _again(file: Path, target: str | None) -> str:
 
 
 def _model(recorded: Baseline, file: Path) -> Model:
-    from mbkit.studies.baseline.target import resolved
-    from mbkit.studies.target import is_code, model_of
+    from mbkit.studies._targets import is_code, model_of, resolved
 
     if not recorded.target:
         raise BaselineError(f"{file}: it was recorded of a model in Python, so there is nothing to load; give --target")

@@ -11,14 +11,25 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mbkit import _interrupt
-from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say
-from mbkit.cli.options import check_engines, force_option, load_options, model_options, split
-from mbkit.cli.output import File, show
+from mbkit.cli._shared import (
+    DONE,
+    INTERRUPTED,
+    MISUSE,
+    File,
+    check_engines,
+    force_option,
+    leave,
+    load_options,
+    model_options,
+    say,
+    show,
+    split,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from mbkit.studies.precision_result import WorkPrecision
+    from mbkit.studies.work_precision.result import WorkPrecision
 
 __all__ = ["bench"]
 
@@ -74,13 +85,13 @@ def bench(
     TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written.
     Ctrl-C ends the study early, and what is finished is written.
     """
-    from mbkit.load.names import canonical
-    from mbkit.report.folder import check_replaceable, check_writable, file_stem
+    from mbkit.load.robot_data import canonical
+    from mbkit.methods.registry import METHODS, method_of
+    from mbkit.report.output_folder import check_replaceable, check_writable, file_stem
     from mbkit.report.progress import Bar
-    from mbkit.simulate.methods import METHODS, method_of
     from mbkit.studies import work_precision
-    from mbkit.studies.precision_result import InterruptedSweepError
-    from mbkit.studies.target import model_of
+    from mbkit.studies._targets import model_of
+    from mbkit.studies.work_precision.result import InterruptedSweepError
 
     check_engines(engines, least=1)
     for name in methods:
@@ -121,7 +132,7 @@ def bench(
 
 @contextmanager
 def _workers(jobs: int | None) -> Iterator[Executor | None]:
-    from mbkit.studies.workers import Pool
+    from mbkit.studies._processes import Pool
 
     if jobs is None:
         yield None
@@ -132,9 +143,9 @@ def _workers(jobs: int | None) -> Iterator[Executor | None]:
 
 def _show(result: WorkPrecision, target: str, stem: str, out: Path, as_json: bool, force: bool) -> bool:
     def table() -> RenderableType:
-        from mbkit.report import precision_tables
+        from mbkit.report import terminal
 
-        return precision_tables.bench(result, target)
+        return terminal.bench(result, target)
 
     def page() -> str:
         from mbkit.report.page import bench_page
@@ -142,9 +153,9 @@ def _show(result: WorkPrecision, target: str, stem: str, out: Path, as_json: boo
         return bench_page(result, asked=target, data=f"{stem}.json", table=f"{stem}.csv")
 
     def picture() -> bytes:
-        from mbkit.report import precision
+        from mbkit.report import work_precision_view
 
-        return precision.picture(result)
+        return work_precision_view.picture(result)
 
     data = result.to_json()
     files = [File("data", f"{stem}.json", lambda: data + "\n"), File("table", f"{stem}.csv", result.to_csv)]

@@ -10,9 +10,21 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from mbkit import _interrupt
-from mbkit.cli.door import AGREE, DIFFER, INTERRUPTED, MISUSE, leave, say
-from mbkit.cli.options import check_engines, force_option, load_options, model_options, split
-from mbkit.cli.output import File, show
+from mbkit.cli._shared import (
+    AGREE,
+    DIFFER,
+    INTERRUPTED,
+    MISUSE,
+    File,
+    check_engines,
+    force_option,
+    leave,
+    load_options,
+    model_options,
+    say,
+    show,
+    split,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -66,7 +78,7 @@ def check(
         raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")
     if not everything and jobs is not None:
         raise click.UsageError("--jobs goes with --all")
-    from mbkit.report.folder import check_writable
+    from mbkit.report.output_folder import check_writable
 
     if own_parsers:
         check_writable(out)
@@ -94,11 +106,11 @@ def _check_one(
     out: Path,
     force: bool,
 ) -> None:
-    from mbkit.load.names import canonical
-    from mbkit.report.folder import check_replaceable, file_stem
+    from mbkit.load.robot_data import canonical
+    from mbkit.report.output_folder import check_replaceable, file_stem
     from mbkit.report.progress import Bar
     from mbkit.studies import compare
-    from mbkit.studies.target import model_of
+    from mbkit.studies._targets import model_of
 
     model = model_of(target, options)
     # Several robots' files hold the same name.
@@ -108,9 +120,9 @@ def _check_one(
         result = compare(model, engines, samples, seed, terms_only=no_rollouts, progress=bar)
 
     def table() -> RenderableType:
-        from mbkit.report import tables
+        from mbkit.report import terminal
 
-        return tables.comparison(result, target)
+        return terminal.comparison(result, target)
 
     def page() -> str:
         from mbkit.report.page import check_page
@@ -128,18 +140,18 @@ def _check_one(
 
 
 def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, out: Path, force: bool) -> None:
-    from mbkit.load.names import canonical
-    from mbkit.report.folder import check_replaceable, file_stem
-    from mbkit.studies.parsers import compare_parsers
+    from mbkit.load.robot_data import canonical
+    from mbkit.report.output_folder import check_replaceable, file_stem
+    from mbkit.studies.importers import compare_parsers
 
     stem = f"{file_stem(canonical(target) or Path(target).stem)}.importers"
     check_replaceable(out, f"{stem}.json", f"{stem}.html", force=force)
     result = compare_parsers(target, floating_base=floating_base, seed=seed)
 
     def table() -> RenderableType:
-        from mbkit.report import cause_tables
+        from mbkit.report import terminal
 
-        return cause_tables.importers(result)
+        return terminal.importers(result)
 
     def page() -> str:
         from mbkit.report.page import importers_page
@@ -167,9 +179,9 @@ def _check_all(
     force: bool,
 ) -> None:
     from mbkit.load import robots
-    from mbkit.report.folder import check_replaceable
+    from mbkit.report.output_folder import check_replaceable
     from mbkit.report.progress import Bar
-    from mbkit.studies.all_robots import RobotOutcome, Sweep, all_robots
+    from mbkit.studies.compare.all_robots import RobotOutcome, Sweep, all_robots
 
     check_replaceable(out, "all.json", "all.html", force=force)
     expected = len(robots())
@@ -195,9 +207,9 @@ def _check_all(
     )
 
     def table() -> RenderableType:
-        from mbkit.report import tables
+        from mbkit.report import terminal
 
-        return tables.sweep(result)
+        return terminal.sweep(result)
 
     def page() -> str:
         from mbkit.report.page import sweep_page

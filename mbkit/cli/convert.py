@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from mbkit.cli.door import say, tell
-from mbkit.cli.options import load_options, model_options
+from mbkit.cli._shared import load_options, model_options, say, tell
 from mbkit.errors import OutputError
 
 __all__ = ["convert"]
@@ -33,8 +32,8 @@ def convert(
     TARGET is what `mbkit check` takes. The text is read back with MuJoCo's or Pinocchio's own parser before
     it is written, and what the format cannot say is an error that names it.
     """
+    from mbkit.studies._targets import model_of
     from mbkit.studies.convert import convert as converted
-    from mbkit.studies.target import model_of
 
     if output is not None and output.exists() and not force:
         raise OutputError(f"{output} is there already; choose another with -o, or replace it with --force")

@@ -10,8 +10,7 @@ import click
 
 from mbkit._escape import json_text
 from mbkit._version import __version__
-from mbkit.cli.door import say, tell
-from mbkit.cli.options import load_options, model_options
+from mbkit.cli._shared import load_options, model_options, say, tell
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
@@ -58,7 +57,7 @@ def derive(
     """
     if as_json and form:
         raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
-    from mbkit.report.folder import check_writable
+    from mbkit.report.output_folder import check_writable
 
     if out is not None:
         check_writable(out)
@@ -66,9 +65,9 @@ def derive(
     if form == "c":
         _write_c(target, system, out or Path("mbkit-export"), force)
         return
-    from mbkit.lagrangian.on_paper import from_model
-    from mbkit.lagrangian.textbook import letters, with_plain_turns
-    from mbkit.lagrangian.written import WrittenModel
+    from mbkit.lagrangian.energies.model import WrittenModel
+    from mbkit.lagrangian.from_description import from_model
+    from mbkit.lagrangian.printing.catalog_symbols import letters, with_plain_turns
     from mbkit.report.progress import Bar
 
     if form != "python" and not isinstance(target, WrittenModel):
@@ -84,7 +83,7 @@ def derive(
     if out is None:
         tell(text)
         return
-    from mbkit.report.folder import file_stem, write
+    from mbkit.report.output_folder import file_stem, write
 
     if ending == ".txt":
         # By this line mbkit knows its own file.
@@ -98,8 +97,8 @@ def _model(name: str, options: dict[str, Any]) -> Model:
     from mbkit import catalog
     from mbkit.errors import UnknownNameError
     from mbkit.lagrangian import systems
-    from mbkit.load.names import find
-    from mbkit.studies.target import model_of
+    from mbkit.load.robot_data import find
+    from mbkit.studies._targets import model_of
 
     made = catalog.systems()[name]() if name in catalog.systems() and not options else None
     if name in systems.names() and not options and (made is None or made.quaternions or made.loops):
@@ -134,10 +133,10 @@ def _described(system: Callable[..., Lagrangian]) -> str:
 
 
 def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
-    from mbkit.derivation.export import c_identifier, export_c
-    from mbkit.lagrangian.textbook import in_symbols
-    from mbkit.lagrangian.written import WrittenModel
-    from mbkit.load.names import canonical
+    from mbkit.codegen.c_source import c_identifier, export_c
+    from mbkit.lagrangian.energies.model import WrittenModel
+    from mbkit.lagrangian.printing.catalog_symbols import in_symbols
+    from mbkit.load.robot_data import canonical
 
     if not isinstance(model, WrittenModel):
         model = in_symbols(model) or model
@@ -151,11 +150,11 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
 
 def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
     if form == "python":
-        from mbkit.lagrangian.python_code import python_code
+        from mbkit.lagrangian.printing.numpy_module import python_code
 
         bar(0.1, "equations")
         return python_code(lag).rstrip("\n"), ".py"
-    from mbkit.lagrangian.account import Account
+    from mbkit.lagrangian.printing.summary import Account
 
     account = Account(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text))
     if as_json:

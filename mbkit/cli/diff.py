@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from mbkit.cli.door import AGREE, DIFFER, leave, tell
-from mbkit.cli.options import check_engines, load_options, model_options, split
-from mbkit.cli.output import console
+from mbkit.cli._shared import AGREE, DIFFER, check_engines, console, leave, load_options, model_options, split, tell
 from mbkit.errors import MbkitError
 
 if TYPE_CHECKING:
@@ -56,7 +54,7 @@ def diff(
     elif second is None:
         raise click.UsageError("give two descriptions, or one and --engines A,B")
     from mbkit.engines import dynamics
-    from mbkit.studies.causes import explain
+    from mbkit.studies.explain import explain
 
     options = load_options(floating_base, mimic, nonphysical)
     models = [_model(target, options) for target in ([first] if second is None else [first, second])]
@@ -70,7 +68,7 @@ def diff(
     if as_json:
         tell(result.to_json())
     else:
-        from mbkit.report.cause_tables import explanation
+        from mbkit.report.terminal import explanation
 
         console().print(explanation(result))
     leave(AGREE if result.agree else DIFFER)
@@ -83,9 +81,9 @@ def _short(target: str) -> str:
 def _model(target: str, options: Mapping[str, Any]) -> Model:
     """Return a file as it is written where nothing else is asked for, and any other target as it loads."""
     from mbkit import catalog
-    from mbkit.load.names import find
-    from mbkit.studies.parsers.compare import written
-    from mbkit.studies.target import model_of
+    from mbkit.load.robot_data import find
+    from mbkit.studies._targets import model_of
+    from mbkit.studies.importers.study import written
 
     # A robot that is also a catalog system is told about where targets are told apart.
     plain = not options and (os.path.isfile(target) or (find(target) is not None and target not in catalog.systems()))

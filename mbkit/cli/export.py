@@ -7,8 +7,7 @@ from typing import Any
 
 import click
 
-from mbkit.cli.door import tell
-from mbkit.cli.options import load_options, model_options
+from mbkit.cli._shared import load_options, model_options, tell
 
 __all__ = ["export"]
 
@@ -46,9 +45,9 @@ def export(
     units, the conventions and the order of the joints. A file that mbkit wrote before is
     replaced; an unknown quantity lists those that there are.
     """
-    from mbkit.derivation.export import DEFAULT, c_identifier, export_c
-    from mbkit.load.names import canonical
-    from mbkit.studies.target import model_of
+    from mbkit.codegen.c_source import DEFAULT, c_identifier, export_c
+    from mbkit.load.robot_data import canonical
+    from mbkit.studies._targets import model_of
 
     model = model_of(target, load_options(floating_base, mimic, nonphysical))
     # Several robots' files hold the same name.

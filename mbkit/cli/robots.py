@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import click
 
-from mbkit.cli.door import tell
-from mbkit.cli.output import console
+from mbkit.cli._shared import console, tell
 
 __all__ = ["robots"]
 
@@ -24,6 +23,6 @@ def robots(as_json: bool) -> None:
         listed = [{f: getattr(r, f) for f in fields} | {"path": str(r.path)} for r in records()]
         tell(json.dumps(listed, indent=1))
         return
-    from mbkit.report import tables
+    from mbkit.report import terminal
 
-    console().print(tables.robots(records(), catalog.systems()))
+    console().print(terminal.robots(records(), catalog.systems()))

@@ -8,9 +8,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mbkit import _interrupt
-from mbkit.cli.door import DONE, INTERRUPTED, MISUSE, leave, say, tell
-from mbkit.cli.options import check_engines, force_option, split
-from mbkit.cli.output import File, console, show
+from mbkit.cli._shared import (
+    DONE,
+    INTERRUPTED,
+    MISUSE,
+    File,
+    check_engines,
+    console,
+    force_option,
+    leave,
+    say,
+    show,
+    split,
+    tell,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -64,11 +75,11 @@ def stress(
     if listing:
         _list(as_json=as_json)
         leave(DONE)
-    from mbkit.report.folder import check_replaceable, check_writable
+    from mbkit.methods.registry import method_of
+    from mbkit.report.output_folder import check_replaceable, check_writable
     from mbkit.report.progress import Bar
-    from mbkit.simulate.methods import method_of
-    from mbkit.studies.precision_result import InterruptedSweepError
     from mbkit.studies.stress.study import stress as study
+    from mbkit.studies.work_precision.result import InterruptedSweepError
 
     check_engines(engines, least=1)
     for name in methods:
@@ -95,9 +106,9 @@ def stress(
 def _show(result: StressResult, stem: str, out: Path, *, as_json: bool, force: bool) -> bool:
 
     def table() -> RenderableType:
-        from mbkit.report import stress_tables
+        from mbkit.report import stress_terminal
 
-        return stress_tables.summary(result)
+        return stress_terminal.summary(result)
 
     def page() -> str:
         from mbkit.report.page import stress_page
@@ -118,7 +129,7 @@ def _list(*, as_json: bool) -> None:
 
     from rich.text import Text
 
-    from mbkit.report.layout import columns
+    from mbkit.report.terminal import columns
     from mbkit.studies.stress.cases import CASES
 
     if as_json:

@@ -1,15 +1,17 @@
 """Energies to equations to functions: mbkit's own derivation."""
 
-from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
-from mbkit.derivation.equations import FUNCTIONS, Equations, equations_of
-from mbkit.derivation.export import CSource, export_c
+from mbkit.derivation.equations import (
+    FUNCTIONS,
+    Equations,
+    ForwardDynamicsDerivatives,
+    InverseDynamicsDerivatives,
+    equations_of,
+)
 
 __all__ = [
     "FUNCTIONS",
-    "CSource",
     "Equations",
     "ForwardDynamicsDerivatives",
     "InverseDynamicsDerivatives",
     "equations_of",
-    "export_c",
 ]

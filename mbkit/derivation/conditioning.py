@@ -18,8 +18,8 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.factorize import elimination_order, elimination_size
-from mbkit.derivation.squares import has_squares
+from mbkit.derivation.least_squares_solve import has_squares
+from mbkit.derivation.mass_matrix_solve import elimination_order, elimination_size
 from mbkit.model import Model
 from mbkit.spatial import skew
 

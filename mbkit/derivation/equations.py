@@ -9,30 +9,44 @@ For coordinate velocities D = 1 and the hamel term vanishes: Lagrange's own form
 d/dt p is one directional derivative along (D v, a).
 
 Forward dynamics solves that by the factors of M. Where those would lose digits (`mbkit.derivation.conditioning`) the
-same accelerations come from Gauss's principle (`mbkit.derivation.least_constraint`).
+same accelerations come from Gauss's principle (`mbkit.derivation.least_squares_solve`).
 """
 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import casadi as ca
+import numpy as np
 
-from mbkit.derivation import derivatives, energies
+from mbkit._check import Array
+from mbkit.derivation import equations
+from mbkit.derivation import kinematics as energies
 from mbkit.derivation.conditioning import loses_digits
-from mbkit.derivation.factorize import elimination_order, solve
+from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
 from mbkit.derivation.kinematics import Kinematics, add, constant_transposed_times
-from mbkit.derivation.least_constraint import LeastConstraint
-from mbkit.derivation.scalars import scalar
-from mbkit.derivation.sources import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
-from mbkit.derivation.squares import squares
-from mbkit.derivation.values import Constants
+from mbkit.derivation.least_squares_solve import LeastConstraint, squares
+from mbkit.derivation.mass_matrix_solve import elimination_order, solve
+from mbkit.derivation.model_values import Constants, scalar
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
-from mbkit.model.kinds import cross3
+from mbkit.model.joint_types import cross3
 
-__all__ = ["FUNCTIONS", "Equations", "equations_of"]
+if TYPE_CHECKING:
+    pass
+
+__all__ = [
+    "FUNCTIONS",
+    "Equations",
+    "ForwardDynamicsDerivatives",
+    "InverseDynamicsDerivatives",
+    "equations_of",
+    "forward_dynamics",
+    "inverse_dynamics",
+    "through_inverse",
+]
+
 
 #: Name of each quantity -> the arguments of its function.
 FUNCTIONS: Final = {
@@ -230,12 +244,12 @@ class Equations:
     @cached_property
     def inverse_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
         """∂ID/∂q on the manifold, ∂ID/∂v and ∂ID/∂a = M."""
-        return derivatives.inverse_dynamics(self)
+        return equations.inverse_dynamics(self)
 
     @cached_property
     def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
         """∂FD/∂q on the manifold, ∂FD/∂v and ∂FD/∂τ = M⁻¹."""
-        return derivatives.forward_dynamics(self)
+        return equations.forward_dynamics(self)
 
     def function(self, name: str) -> ca.Function:
         """Return a quantity as a function of its arguments, with repeated operations as they came."""
@@ -298,3 +312,89 @@ class Equations:
     def _frame(self, name: str) -> tuple[str, Any]:
         frame = self.model.frame(name)
         return frame.body, self.kin.values.frame(frame)
+
+
+# First partial derivatives of inverse and forward dynamics, for linearization and optimal control.
+#
+# The derivative with respect to q is the one along the configuration manifold:
+# column k is d/dt f(q ⊕ t e_k) at t = 0, with `Model.integrate`'s ⊕. Its tangent is
+# q̇ = D(q) e_k, so the column is one directional derivative along a column of D; for
+# joints whose velocities are their coordinates' rates it is plain ∂/∂q. Components
+# of v, a and τ are held fixed, those in moving axes (free and ball joints) too.
+#
+# Forward dynamics is never differentiated through its factorization. From
+# ID(q, v, FD(q, v, τ)) = τ follows, at a = FD (Carpentier and Mansard 2018, Analytical
+# Derivatives of Rigid Body Dynamics Algorithms)::
+#
+#     ∂FD/∂q = -M⁻¹ ∂ID/∂q      ∂FD/∂v = -M⁻¹ ∂ID/∂v      ∂FD/∂τ = M⁻¹
+
+
+class InverseDynamicsDerivatives(NamedTuple):
+    """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv).
+
+    Attributes
+    ----------
+    q : array
+        ∂τ/∂q along the manifold: column k is that of q ⊕ t e_k.
+    v : array
+        ∂τ/∂v.
+    a : array
+        ∂τ/∂a, the mass matrix.
+    """
+
+    q: Array
+    v: Array
+    a: Array
+
+
+class ForwardDynamicsDerivatives(NamedTuple):
+    """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv).
+
+    Attributes
+    ----------
+    q : array
+        ∂v̇/∂q along the manifold: column k is that of q ⊕ t e_k.
+    v : array
+        ∂v̇/∂v.
+    tau : array
+        ∂v̇/∂τ, the inverse of the mass matrix.
+    """
+
+    q: Array
+    v: Array
+    tau: Array
+
+
+def inverse_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
+    """Return ∂ID/∂q, ∂ID/∂v and ∂ID/∂a as expressions of (q, v, a)."""
+    tangent = ca.jacobian(eq.kin.qdot, eq.v)
+    by_q = ca.jtimes(eq.inverse_dynamics, eq.q, tangent)
+    return by_q, ca.jacobian(eq.inverse_dynamics, eq.v), eq.mass_matrix
+
+
+def forward_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
+    """Return ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ as expressions of (q, v, τ)."""
+    by_q, by_v, _ = inverse_dynamics(eq)
+    n = eq.model.nv
+    by_q, by_v = ca.substitute([by_q, by_v], [eq.a], [eq.forward_dynamics])
+    out = eq.over_mass(ca.horzcat(-by_q, -by_v, ca.SX.eye(n)))
+    by_q, by_v, by_tau = ca.horzsplit(out, [0, n, 2 * n, 3 * n])
+    return by_q, by_v, by_tau
+
+
+def through_inverse(inverse_derivatives: Array) -> Array:
+    """Return the three derivatives of forward dynamics from those of inverse dynamics.
+
+    Parameters
+    ----------
+    inverse_derivatives : (nv, 3 nv) or (N, nv, 3 nv) array
+        ∂ID/∂q, ∂ID/∂v and M side by side, at a = FD(q, v, τ).
+
+    Returns
+    -------
+    (nv, 3 nv) or (N, nv, 3 nv) array
+        ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ side by side.
+    """
+    by_q, by_v, M = np.split(inverse_derivatives, 3, axis=-1)
+    unit = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
+    return np.asarray(np.linalg.solve(M, np.concatenate([-by_q, -by_v, unit], axis=-1)))

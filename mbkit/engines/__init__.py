@@ -9,16 +9,16 @@ from typing import Any, Final
 from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.expected import expect_model
+from mbkit.model.builder import expect_model
 
 __all__ = ["ENGINES", "QUANTITIES", "Dynamics", "dynamics"]
 
 #: Engine name -> (module, class, package to install).
 ENGINES: Final = {
-    "pinocchio": ("mbkit.engines.pinocchio", "PinocchioDynamics", "pin"),
+    "pinocchio": ("mbkit.engines.pinocchio.engine", "PinocchioDynamics", "pin"),
     "lagrangian": ("mbkit.engines.lagrangian", "LagrangianDynamics", "casadi"),
-    "mujoco": ("mbkit.engines.mujoco", "MujocoDynamics", "mujoco"),
-    "drake": ("mbkit.engines.drake", "DrakeDynamics", "mbkit[drake]"),
+    "mujoco": ("mbkit.engines.mujoco.engine", "MujocoDynamics", "mujoco"),
+    "drake": ("mbkit.engines.drake.engine", "DrakeDynamics", "mbkit[drake]"),
     "oracle": ("mbkit.engines.oracle", "OracleDynamics", "mpmath"),
 }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,17 @@ from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Joint, Model
 
-__all__ = ["QUANTITIES", "Dynamics", "per_sample", "require_tree", "unknown_joint"]
+__all__ = [
+    "QUANTITIES",
+    "Dynamics",
+    "at_time",
+    "at_times",
+    "no_dynamics",
+    "per_sample",
+    "require_tree",
+    "unknown_joint",
+]
+
 
 QUANTITIES: Final = (
     "mass_matrix",
@@ -359,3 +369,52 @@ def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:
     if not len(arguments[0]):
         return np.empty((0, *np.shape(method(*(np.zeros(a.shape[1]) for a in arguments)))))
     return np.array([np.array(method(*row)) for row in zip(*arguments, strict=True)])
+
+
+# What was expected to be a system on an engine, and is not: told with the way to one.
+
+
+def no_dynamics(given: Any, name: str = "dyn") -> InputError:
+    """Return what to raise, with what makes a `Dynamics`: a `Lagrangian` on paper does it by itself.
+
+    Parameters
+    ----------
+    given : object
+    name : str
+        The argument's.
+    """
+    own = not isinstance(given, type) and callable(getattr(given, "dynamics", None))
+    way = "its .dynamics() makes one" if own else "mbkit.dynamics(model, engine) makes one"
+    return InputError(f"{name}: expected a Dynamics, got {type(given).__name__}; {way}")
+
+
+# Dynamics that depend on the time: the time is one of their model's parameters.
+
+Any_ = TypeVar("Any_", bound=Dynamics)
+
+
+def at_time(dyn: Any_, t: float) -> Any_:
+    """Return the dynamics at a time; the same ones where time does not enter."""
+    clock = dyn.model.clock
+    return dyn if clock is None else dyn.at(**{clock: t})  # type: ignore[return-value]  # of its own kind
+
+
+def at_times(dyn: Any_, t: Array, trajectories: int | None = None) -> Any_:
+    """Return the dynamics with a sample for each time of a run, where time enters.
+
+    Parameters
+    ----------
+    dyn : Dynamics
+    t : (K,) array
+    trajectories : int, optional
+        Size of a batch; there is one sample for each time of each trajectory then.
+    """
+    clock = dyn.model.clock
+    if clock is None:
+        return dyn
+    if not dyn.takes_parameters:
+        raise UnsupportedError(f"{dyn.engine}: holds one time; evaluate along a run with the lagrangian engine")
+    own = dyn
+    if trajectories is not None and dyn.samples is not None:
+        own = dyn.of_samples(np.repeat(np.arange(trajectories), len(t)))  # type: ignore[assignment]
+    return own.at(**{clock: np.tile(t, trajectories or 1)})  # type: ignore[return-value]

@@ -42,9 +42,9 @@ class Importer(NamedTuple):
 
 
 IMPORTERS = {
-    "pinocchio": Importer("mbkit.engines.import_pinocchio", "pinocchio", "pin", "pin"),
-    "mujoco": Importer("mbkit.engines.import_mujoco", "mujoco", "mujoco", "mujoco"),
-    "drake": Importer("mbkit.engines.import_drake", "pydrake", "drake", "mbkit[drake]"),
+    "pinocchio": Importer("mbkit.engines.pinocchio.importer", "pinocchio", "pin", "pin"),
+    "mujoco": Importer("mbkit.engines.mujoco.importer", "mujoco", "mujoco", "mujoco"),
+    "drake": Importer("mbkit.engines.drake.importer", "pydrake", "drake", "mbkit[drake]"),
 }
 # What mbkit's own loaders take.
 _LARGEST: Final = 1e30

@@ -2,28 +2,240 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
-from typing import Any, Final
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, count
+from mbkit._check import Array, count, finite_array
+from mbkit.codegen.backend import DERIVING, compile_by_default, executable
+from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.conditioning import loses_digits
-from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, through_inverse
-from mbkit.derivation.equations import Equations, equations_of
-from mbkit.derivation.execution import DERIVING, compile_by_default, executable
-from mbkit.derivation.factorize import elimination_size
-from mbkit.derivation.machine import Machine
+from mbkit.derivation.equations import (
+    Equations,
+    ForwardDynamicsDerivatives,
+    InverseDynamicsDerivatives,
+    equations_of,
+    through_inverse,
+)
+from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.engines.base import Dynamics
-from mbkit.engines.lagrangian_direct import short_way
-from mbkit.engines.parameters import ParameterValues
-from mbkit.errors import InputError
+from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 
-__all__ = ["LagrangianDynamics"]
+if TYPE_CHECKING:
+    from mbkit.codegen.compiled import Compiled
+
+__all__ = ["LagrangianDynamics", "ParameterValues", "short_way"]
+
+
+# The short way into machine code: what the good path needs and nothing else.
+#
+# The code itself finds NaN and infinity in all that it reads and writes. On any doubt
+# the answer is None, and the checked way of `Dynamics` repeats the call and says what
+# is wrong.
+
+_FLOAT: Final = np.dtype(np.float64)
+_NEAR_UNIT: Final = 1e-9
+Call = Callable[..., Any]
+
+
+def short_way(model: Model, code: Compiled, trim: Callable[[Array], Array], threads: int | None) -> Call:
+    """Return a call for float64 arrays that are one state or one batch; None is its answer to all else.
+
+    Parameters
+    ----------
+    model : Model
+    code : Compiled
+        Of one result, q its first argument.
+    trim : callable
+        Gives the code's (rows, columns) or (N, rows, columns) the quantity's shape.
+    threads : int, optional
+    """
+    single = _single(code, trim)
+    sizes = code.inputs
+    starts = tuple(start for start, _ in model.quaternions)
+    ones = [(n,) for n in sizes]
+
+    def call(*given: Any) -> Any:
+        # A subclass may be masked, and `is` would refuse the dtype of an array that was unpickled.
+        if not all(type(x) is np.ndarray and x.dtype == _FLOAT for x in given):
+            return None
+        if [x.shape for x in given] == ones:
+            return single(given) if not starts or _unit(given[0], starts) else None
+        if not _is_batch(given, sizes) or (starts and not _all_unit(given[0], starts)):
+            return None
+        results, finite = code.watched(*given, threads=threads)
+        return trim(results[0]) if finite else None
+
+    return call
+
+
+def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[Any, ...]], Any]:
+    ends = np.cumsum([0, *code.inputs]).tolist()
+    parts = [slice(a, b) for a, b in pairwise(ends)]
+    rows, columns = code.shapes[0]
+
+    def place() -> tuple[Any, ...]:
+        given, out = np.zeros((1, ends[-1])), np.zeros((1, rows * columns))
+        run, watch = code.bound([given[:, part] for part in parts], [out])
+        return [given[0, part] for part in parts], run, watch, trim(out.reshape(rows, columns)).copy
+
+    # A place belongs to one call at a time. Nobody waits for one: a forked child would
+    # for ever, if another thread held it when it forked.
+    free = [place()]
+
+    def call(arguments: tuple[Any, ...]) -> Any:
+        try:
+            held = free.pop()
+        except IndexError:
+            held = place()
+        views, run, watch, copy = held
+        try:
+            for view, x in zip(views, arguments, strict=True):
+                view[:] = x
+            run()
+            if watch[0] != 0.0:
+                watch[:] = 0.0
+                return None
+            return copy()
+        finally:
+            free.append(held)
+
+    return call
+
+
+def _is_batch(given: tuple[Any, ...], sizes: tuple[int, ...]) -> bool:
+    n = given[0].shape[0] if given[0].ndim else 0
+    return all(x.shape == (n, size) for x, size in zip(given, sizes, strict=True))
+
+
+def _unit(q: Array, starts: tuple[int, ...]) -> bool:
+    for start in starts:
+        x, y, z, w = q[start : start + 4].tolist()
+        if not -_NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < _NEAR_UNIT:
+            return False
+    return True
+
+
+def _all_unit(q: Array, starts: tuple[int, ...]) -> bool:
+    for start in starts:
+        x = q[:, start : start + 4]
+        # A NaN is not below anything.
+        if not bool((np.abs(np.einsum("ni,ni->n", x, x) - 1.0) < _NEAR_UNIT).all()):
+            return False
+    return True
+
+
+# The values of a model's named parameters during evaluation: one each, or one per sample.
+
+
+class ParameterValues:
+    """What a compiled function of a parametrised model gets as its argument ``"parameters"``.
+
+    Parameters
+    ----------
+    model : Model
+        Whose nominal values are those that all samples share.
+    batched : mapping of str to (N,) array, optional
+        Values that differ from sample to sample.
+    """
+
+    def __init__(self, model: Model, batched: Mapping[str, Array] | None = None) -> None:
+        self.model, self.batched = model, dict(batched or {})
+
+    def at(self, values: Mapping[str, ArrayLike]) -> ParameterValues:
+        """Return these values with some replaced.
+
+        Raises
+        ------
+        UnknownNameError, InputError, ModelError
+            No such parameter; not a finite number or (N,) of them; no such system
+            can exist (a batch is checked for finite numbers only).
+        """
+        for name in values:
+            if name not in self.model.parameters:
+                raise UnknownNameError("parameter", name, self.model.parameters)
+        many = {name: _column(name, x) for name, x in values.items() if np.ndim(x)}
+        kept = {name: x for name, x in self.batched.items() if name not in values}
+        batched = {**kept, **many}
+        if len({len(x) for x in batched.values()}) > 1:
+            told = ", ".join(f"{name} has {len(x)}" for name, x in batched.items())
+            raise InputError(f"parameters: batches of different sizes: {told}")
+        single: dict[str, Any] = {name: x for name, x in values.items() if name not in many}
+        return ParameterValues(self.model.with_nominal(single) if single else self.model, batched)
+
+    @property
+    def samples(self) -> int | None:
+        """Size of the batch that the values make, None where every sample has the same."""
+        return next((len(x) for x in self.batched.values()), None)
+
+    def of_samples(self, which: ArrayLike) -> ParameterValues:
+        """Return the values of these samples, by index; one of them may stand many times."""
+        index = np.asarray(which)
+        # A mask would be taken for the samples 0 and 1.
+        if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
+            raise InputError(
+                f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask"
+            )
+        index = index.astype(int)
+        return ParameterValues(self.model, {name: x[index] for name, x in self.batched.items()})
+
+    def bound(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that passes these values on, behind its own arguments."""
+        return (lambda *given: function(*given, *self.behind(given[0]))) if self.model.parameters else function
+
+    def behind(self, first: Any) -> tuple[Array, ...]:
+        """Return what a function takes behind its own arguments, of which the first is given: nothing, or one array.
+
+        Raises
+        ------
+        InputError
+            A parameter has no value.
+        """
+        if not self.model.parameters:
+            return ()
+        values = self.array
+        if values.ndim == 1 and np.ndim(first) == 2:
+            return (np.broadcast_to(values, (len(first), len(values))),)
+        return (values,)
+
+    @cached_property
+    def array(self) -> Array:
+        """The values in the order of `model.parameters`, shape (p,) or (N, p)."""
+        parameters = self.model.parameters
+        missing = [name for name, x in parameters.items() if x is None and name not in self.batched]
+        if missing:
+            told = ", ".join(f"{name}=..." for name in missing)
+            raise InputError(
+                f"{self.model.name}: no value for parameter {', '.join(map(repr, missing))}; "
+                f"give it with dynamics.at({told})"
+            )
+        columns = np.broadcast_arrays(*(np.asarray(self.batched.get(name, x)) for name, x in parameters.items()))
+        return np.stack(columns, axis=-1).astype(np.float64)
+
+    def spread(self, arguments: dict[str, ArrayLike]) -> dict[str, ArrayLike]:
+        """Return arguments of which at least one has a row per sample, if values differ between samples."""
+        n = self.samples
+        if n is None:
+            return arguments
+        out: dict[str, ArrayLike] = {}
+        for name, x in arguments.items():
+            if np.ndim(x) == 2 and len(np.asarray(x)) != n:
+                raise InputError(f"{name}: a batch of {len(np.asarray(x))}, but the parameters' values are {n}")
+            out[name] = np.broadcast_to(np.asarray(x), (n, *np.shape(x))) if np.ndim(x) == 1 else x
+        return out
+
+
+def _column(name: str, value: ArrayLike) -> Array:
+    if np.ndim(value) != 1:
+        raise InputError(f"parameter {name!r}: expected a number or shape (N,), got {np.shape(value)}")
+    return finite_array(f"parameter {name!r}", value, (len(np.asarray(value)),))
+
 
 # Written out, forward dynamics grows as the cube of a chain's length. Beyond these
 # many multiplications, forming M and solving in LAPACK is faster to make and run.

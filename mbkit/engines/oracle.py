@@ -22,12 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of
-from mbkit.derivation.arithmetic import Backend, arithmetic, digits
-from mbkit.derivation.derivatives import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
-from mbkit.derivation.equations import equations_of
-from mbkit.derivation.extended import Extended
-from mbkit.derivation.extended_solve import product, solve
-from mbkit.derivation.program import program
+from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digits, product, solve
+from mbkit.codegen.program import program
+from mbkit.derivation.equations import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, equations_of
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model

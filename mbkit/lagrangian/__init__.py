@@ -8,45 +8,39 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from mbkit.derivation import (
-    FUNCTIONS,
-    CSource,
-    Equations,
-    ForwardDynamicsDerivatives,
-    InverseDynamicsDerivatives,
-    export_c,
-)
+from mbkit.codegen.c_source import CSource, export_c
+from mbkit.derivation import FUNCTIONS, Equations, ForwardDynamicsDerivatives, InverseDynamicsDerivatives
 
 if TYPE_CHECKING:
     from mbkit.lagrangian import systems as systems
-    from mbkit.lagrangian.cyclic import ConservedQuantity as ConservedQuantity
-    from mbkit.lagrangian.embedding import Embedded as Embedded
-    from mbkit.lagrangian.equilibrium import Equilibrium as Equilibrium
-    from mbkit.lagrangian.hamilton import CanonicalEquations as CanonicalEquations
-    from mbkit.lagrangian.hamilton import Hamiltonian as Hamiltonian
-    from mbkit.lagrangian.motion import EquationsOfMotion as EquationsOfMotion
-    from mbkit.lagrangian.on_paper import from_model as from_model
-    from mbkit.lagrangian.particles import from_particles as from_particles
-    from mbkit.lagrangian.quasi import QuasiEquationsOfMotion as QuasiEquationsOfMotion
-    from mbkit.lagrangian.quasi import QuasiLagrangian as QuasiLagrangian
-    from mbkit.lagrangian.routh import Routhian as Routhian
+    from mbkit.lagrangian.constraints.independent_coordinates import Embedded as Embedded
+    from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion as EquationsOfMotion
+    from mbkit.lagrangian.from_description import from_model as from_model
+    from mbkit.lagrangian.reduction.conserved import ConservedQuantity as ConservedQuantity
+    from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
+    from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
+    from mbkit.lagrangian.reduction.quasi_velocities import QuasiEquationsOfMotion as QuasiEquationsOfMotion
+    from mbkit.lagrangian.reduction.quasi_velocities import QuasiLagrangian as QuasiLagrangian
+    from mbkit.lagrangian.reduction.routh import Routhian as Routhian
+    from mbkit.lagrangian.statics.equilibrium import Equilibrium as Equilibrium
+    from mbkit.lagrangian.statics.virtual_work import from_particles as from_particles
+    from mbkit.lagrangian.statics.virtual_work import generalized_force as generalized_force
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
-    from mbkit.lagrangian.virtual_work import generalized_force as generalized_force
 
 _HOME = {
-    "CanonicalEquations": "mbkit.lagrangian.hamilton",
-    "ConservedQuantity": "mbkit.lagrangian.cyclic",
-    "Embedded": "mbkit.lagrangian.embedding",
-    "EquationsOfMotion": "mbkit.lagrangian.motion",
-    "Equilibrium": "mbkit.lagrangian.equilibrium",
-    "Hamiltonian": "mbkit.lagrangian.hamilton",
+    "CanonicalEquations": "mbkit.lagrangian.reduction.hamilton",
+    "ConservedQuantity": "mbkit.lagrangian.reduction.conserved",
+    "Embedded": "mbkit.lagrangian.constraints.independent_coordinates",
+    "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
+    "Equilibrium": "mbkit.lagrangian.statics.equilibrium",
+    "Hamiltonian": "mbkit.lagrangian.reduction.hamilton",
     "Lagrangian": "mbkit.lagrangian.system",
-    "QuasiEquationsOfMotion": "mbkit.lagrangian.quasi",
-    "QuasiLagrangian": "mbkit.lagrangian.quasi",
-    "Routhian": "mbkit.lagrangian.routh",
-    "from_model": "mbkit.lagrangian.on_paper",
-    "from_particles": "mbkit.lagrangian.particles",
-    "generalized_force": "mbkit.lagrangian.virtual_work",
+    "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_velocities",
+    "QuasiLagrangian": "mbkit.lagrangian.reduction.quasi_velocities",
+    "Routhian": "mbkit.lagrangian.reduction.routh",
+    "from_model": "mbkit.lagrangian.from_description",
+    "from_particles": "mbkit.lagrangian.statics.virtual_work",
+    "generalized_force": "mbkit.lagrangian.statics.virtual_work",
 }
 
 __all__ = [

@@ -1,8 +1,7 @@
 """URDF, MJCF, and robots by name, to a `Model`."""
 
 from mbkit._callable import make_callable
-from mbkit.load.loader import load
-from mbkit.load.records import Robot, robots
+from mbkit.load.loader import Robot, load, robots
 
 __all__ = ["Robot", "load", "robots"]
 

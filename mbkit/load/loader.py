@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Final, Literal
 
@@ -13,14 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import shown
-from mbkit.errors import InputError, LoadError, MbkitWarning
-from mbkit.load import names, xml
-from mbkit.load.includes import expanded
-from mbkit.load.urdf_file import examine
+from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, ModelError
+from mbkit.load import robot_data, xml_reader
+from mbkit.load.robot_data import entries
+from mbkit.load.urdf_check import examine
+from mbkit.load.xml_reader import expanded
 from mbkit.model import Model
-from mbkit.model.physical import scale_doubts
+from mbkit.model.validation import scale_doubts
 
-__all__ = ["load"]
+__all__ = ["Robot", "load", "robots"]
+
 
 # A path has lost one of the strokes.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
@@ -105,7 +108,7 @@ def load(
         raise InputError(f"meshes: expected 'auto' or 'never', got {shown(meshes)}")
     path, by_name = _resolved(source)
     policy = nonphysical or ("warn" if by_name else "error")
-    root = xml.read(path)
+    root = xml_reader.read(path)
     if root.tag == "robot":
         # Pinocchio is loaded by whoever needs it.
         from mbkit.load.urdf import model_of
@@ -149,12 +152,87 @@ def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
         raise LoadError(f"{text}: this is a URL, and mbkit reads local files; download it and give its path")
     if isinstance(source, str):
         looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf"))
-        robot = None if looks_like_path else names.find(text)
+        robot = None if looks_like_path else robot_data.find(text)
         if robot is not None:
             return robot.path, True
         separated = "/" in text or os.sep in text
         if not looks_like_path and not separated and not os.path.exists(text):
-            raise names.unknown(text)
+            raise robot_data.unknown(text)
         if separated and not looks_like_path and not os.path.exists(text):
-            raise names.unknown(text)
+            raise robot_data.unknown(text)
     return Path(text), False
+
+
+# Records of the robots of example-robot-data, with their size or why they do not load.
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A URDF of example-robot-data; its size is read when first asked for.
+
+    Attributes
+    ----------
+    name : str
+        Folder and file, such as ``"panda_description/panda"``.
+    aliases : tuple of str
+        Shorter names, the usual one first.
+    path : pathlib.Path
+    """
+
+    name: str
+    aliases: tuple[str, ...]
+    path: Path
+
+    @cached_property
+    def _facts(self) -> tuple[int | None, int | None, float | None, str | None]:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", MbkitWarning)
+                model = load(self.name)
+        except ModelError as error:
+            return None, None, None, "; ".join(error.faults)
+        except MbkitError as error:
+            return None, None, None, str(error)
+        return model.nq, model.nv, model.mass, None
+
+    @property
+    def nq(self) -> int | None:
+        """Number of coordinates, mimic joints reduced; None if it does not load."""
+        return self._facts[0]
+
+    @property
+    def nv(self) -> int | None:
+        """Number of velocities; None if it does not load."""
+        return self._facts[1]
+
+    @property
+    def mass(self) -> float | None:
+        """Total mass in kg; None if it does not load."""
+        return self._facts[2]
+
+    @property
+    def reason(self) -> str | None:
+        """Why it does not load; None if it does."""
+        return self._facts[3]
+
+
+def robots() -> tuple[Robot, ...]:
+    """Return a record of every robot of example-robot-data, by name.
+
+    Returns
+    -------
+    tuple of Robot
+        Each with ``name``, ``aliases``, ``path``, and ``nq``, ``nv``, ``mass`` or the
+        ``reason`` why it does not load; the last four are found when first asked for.
+
+    Raises
+    ------
+    LoadError
+        example-robot-data is not installed.
+    """
+    return _records()
+
+
+@lru_cache(maxsize=1)
+def _records() -> tuple[Robot, ...]:
+    return tuple(Robot(*entry) for entry in entries())

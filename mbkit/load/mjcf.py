@@ -24,15 +24,14 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.errors import ModelError
-from mbkit.load.attributes import Reader
-from mbkit.load.floating import floated
+from mbkit.load.mjcf_attributes import HERE, Compiler, Defaults, about
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, listed
 from mbkit.load.mjcf_couplings import Transmissions
-from mbkit.load.mjcf_scene import KINDS, MjcfJoint, Scene, unfolded, walk
+from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, unfolded, walk
 from mbkit.load.mjcf_schema import check_names
-from mbkit.load.mjcf_values import HERE, Compiler, Defaults, about
-from mbkit.load.snap import Snapper
-from mbkit.load.xml import Element
+from mbkit.load.urdf import Snapper
+from mbkit.load.urdf_links import floated
+from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Model, ModelBuilder
 
 __all__ = ["model_of_mjcf"]

@@ -17,9 +17,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from mbkit import spatial
-from mbkit.load.mjcf_scene import Scene
-from mbkit.load.solids import Lump
-from mbkit.load.xml import MOST_BYTES, Element
+from mbkit.load.mjcf_reader import Scene
+from mbkit.load.shapes import Lump
+from mbkit.load.xml_reader import MOST_BYTES, Element
 
 __all__ = ["infer_inertias", "infer_springs", "listed"]
 

@@ -16,12 +16,11 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.load.attributes import LARGEST, Reader
-from mbkit.load.mjcf_scene import MjcfJoint, Scene, unfolded
-from mbkit.load.mjcf_values import HERE, pose
-from mbkit.load.xml import Element
+from mbkit.load.mjcf_attributes import HERE, pose
+from mbkit.load.mjcf_reader import MjcfJoint, Scene, unfolded
+from mbkit.load.xml_reader import LARGEST, Element, Reader
 from mbkit.model import Joint, JointCoupling, Model, PointSpring
-from mbkit.model.physical import sample_mass_matrix
+from mbkit.model.validation import sample_mass_matrix
 
 __all__ = ["Transmissions", "coupled"]
 

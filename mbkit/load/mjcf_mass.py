@@ -14,10 +14,9 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.load.attributes import Reader
-from mbkit.load.mjcf_values import ORIENTATIONS, Compiler, Pose, has_length, pose, z_to
-from mbkit.load.solids import NOTHING, SIZES, Lump, solid, together
-from mbkit.load.xml import Element
+from mbkit.load.mjcf_attributes import ORIENTATIONS, Compiler, Pose, has_length, pose, z_to
+from mbkit.load.shapes import NOTHING, SIZES, Lump, solid, together
+from mbkit.load.xml_reader import Element, Reader
 
 __all__ = ["body_lump", "counts"]
 

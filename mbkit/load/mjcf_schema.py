@@ -12,9 +12,8 @@ from functools import lru_cache
 from typing import Final
 
 from mbkit.errors import nearest
-from mbkit.load.attributes import Reader
-from mbkit.load.mjcf_values import ORIENTATIONS
-from mbkit.load.xml import Element
+from mbkit.load.mjcf_attributes import ORIENTATIONS
+from mbkit.load.xml_reader import Element, Reader
 
 __all__ = ["check_names", "rules"]
 

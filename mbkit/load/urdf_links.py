@@ -7,7 +7,8 @@ origin, rpy are turns about fixed x, y and z, and a missing axis is x.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,14 +16,93 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.load import xml
-from mbkit.load.floating import BASE_JOINT
-from mbkit.load.snap import Snapper
-from mbkit.load.urdf_file import examine, unbounded
-from mbkit.load.xml import Element
+from mbkit.load import xml_reader
+from mbkit.load.urdf import Snapper
+from mbkit.load.urdf_check import examine, unbounded
+from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Mimic, Model, ModelBuilder
 
-__all__ = ["urdf_links"]
+__all__ = ["BASE_JOINT", "floated", "urdf_links", "with_base"]
+
+
+# A description whose base stands still, written so that parsers can let it go.
+
+#: The joint on which a floating base moves.
+BASE_JOINT: Final = "root_joint"
+#: What a base link called "world" is called then: the ground has that name.
+_BASE_LINK: Final = "world_link"
+_JOINTS: Final = ("joint", "freejoint")
+
+
+def floated(mujoco: Element, read: Reader) -> Element:
+    """Return a <mujoco> element with a free joint for the one body that stands in the world.
+
+    Where that cannot be, a fault is kept and the element is returned as it is.
+    """
+    tops = [b for world in mujoco.all("worldbody") for b in _parts(world, ("body",))]
+    if not tops:
+        return mujoco
+    joints = [sum(1 for _ in _parts(b, _JOINTS)) for b in tops]
+    if len(tops) != 1 or joints[0]:
+        told = ", ".join(f"{_called(b)} ({n} joints)" for b, n in zip(tops, joints, strict=True))
+        read.fault(f"floating_base=True needs one body of the world, without joints; there are: {told}")
+        return mujoco
+    if any(e.tag in _JOINTS and e.attributes.get("name") == BASE_JOINT for e in mujoco.walk()):
+        read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")
+        return mujoco
+    joint = Element("freejoint", {"name": BASE_JOINT}, tops[0].line, file=tops[0].file)
+    return _replaced(mujoco, tops[0], replace(tops[0], children=[joint, *tops[0].children]))
+
+
+def with_base(robot: Element) -> tuple[Element, str]:
+    """Return a <robot> element whose base link is not called ``world``, and what that is called instead.
+
+    Parsers take a link of that name for the ground. The name is empty where nothing had to be done.
+    """
+    joints = robot.all("joint")
+    links = {e.attributes.get("name") for e in robot.all("link")}
+    if "world" not in links or any(e.attributes.get("link") == "world" for j in joints for e in j.all("child")):
+        return robot, ""
+    name = _BASE_LINK
+    while name in links:
+        name += "_"
+
+    def called(element: Element, attribute: str) -> Element:
+        if element.attributes.get(attribute) != "world":
+            return element
+        return replace(element, attributes={**element.attributes, attribute: name})
+
+    def child(element: Element) -> Element:
+        if element.tag == "link":
+            return called(element, "name")
+        if element.tag != "joint":
+            return element
+        return replace(element, children=[called(e, "link") if e.tag == "parent" else e for e in element.children])
+
+    return replace(robot, children=[child(e) for e in robot.children]), name
+
+
+def _parts(owner: Element, tags: tuple[str, ...]) -> Iterator[Element]:
+    """Yield the children of these tags, with those of <frame> elements."""
+    for child in owner.children:
+        if child.tag == "frame":
+            yield from _parts(child, tags)
+        elif child.tag in tags:
+            yield child
+
+
+def _called(body: Element) -> str:
+    name = body.attributes.get("name", "")
+    return repr(name) if name else f"one without a name, {body.place}"
+
+
+def _replaced(owner: Element, old: Element, new: Element) -> Element:
+    if owner is old:
+        return new
+    if owner.tag not in ("mujoco", "worldbody", "frame"):
+        return owner
+    return replace(owner, children=[_replaced(c, old, new) for c in owner.children])
+
 
 _KINDS: Final = {"floating": "free"}
 _SINGLE: Final = ("revolute", "continuous", "prismatic")
@@ -40,7 +120,7 @@ def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Mo
     """
     urdf = examine(root, source, floating_base=floating_base, mimic_matters=False, lenient=True)
     # What was examined is clean XML of known elements.
-    robot = xml.parse(urdf.text.encode(), source)
+    robot = xml_reader.parse(urdf.text.encode(), source)
     snap = Snapper()
     b = ModelBuilder(urdf.name)
     for link in robot.all("link"):
@@ -109,4 +189,4 @@ def _add_joint(b: ModelBuilder, joint: Element, mimics: Mapping[str, Mimic | Non
 
 def read_links(path: Path) -> Model:
     """Return `urdf_links` of a file."""
-    return urdf_links(xml.read(path), str(path))
+    return urdf_links(xml_reader.read(path), str(path))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from types import MappingProxyType
@@ -15,14 +17,106 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of, count, generator, rows, shown
 from mbkit._escape import html
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.model import manifold, substitution
-from mbkit.model.binding import Binding
-from mbkit.model.digest import digest
+from mbkit.model import manifold
+from mbkit.model import with_parameters as substitution
 from mbkit.model.layout import Layout
-from mbkit.model.needs import Needs
+from mbkit.model.parameters import Binding
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
 
-__all__ = ["Model"]
+__all__ = ["Model", "Needs", "digest"]
+
+
+# A fingerprint of a description that changes with every number in it.
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, np.ndarray):
+        return [_plain(x) for x in value.tolist()]
+    if isinstance(value, (list, tuple)):
+        return [_plain(x) for x in value]
+    if isinstance(value, float):
+        # + 0.0 makes one of the two zeros: they describe the same system.
+        return (value + 0.0).hex()
+    return value
+
+
+def digest(*parts: Any) -> str:
+    """Return the SHA-256, as 64 hexadecimal digits, of the parts' content."""
+    text = json.dumps([_plain(p) for p in parts], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+# What a description needs from an engine, so that the rest can be left out.
+
+
+@dataclass(frozen=True)
+class Needs:
+    """One flag per feature; True where the description has it.
+
+    Friction, limits (of coordinates, and of efforts and velocities) and loops are kept
+    as data and named here; the smooth terms of every engine leave friction and limits out.
+    """
+
+    gravity: bool
+    springs: bool
+    damping: bool
+    armature: bool
+    friction: bool
+    limits: bool
+    effort_limits: bool
+    mimic: bool
+    loops: bool
+    quaternions: bool
+    time: bool
+
+    @classmethod
+    def of(
+        cls,
+        gravity: Array,
+        joints: Iterable[Joint],
+        springs: Iterable[PointSpring],
+        couplings: Iterable[JointCoupling],
+        loops: Iterable[Loop],
+        prescribed: Iterable[Prescribed],
+        bound: Iterable[str] = (),
+    ) -> Needs:
+        """Read the flags off the parts of a description.
+
+        `bound` names the attributes that stand for parameters somewhere: what is
+        zero now may have another value when it is evaluated.
+        """
+        joints, bound = tuple(joints), frozenset(bound)
+        couplings = tuple(couplings)
+        between: tuple[PointSpring | JointCoupling, ...] = (*springs, *couplings)
+        return cls(
+            gravity="gravity" in bound or bool(np.any(gravity)),
+            springs="stiffness" in bound
+            or any(np.any(j.stiffness) for j in joints)
+            or any(s.stiffness for s in between),
+            damping="damping" in bound or any(np.any(j.damping) for j in joints) or any(s.damping for s in between),
+            armature="armature" in bound
+            or any(np.any(j.armature) for j in joints)
+            or any(c.armature for c in couplings),
+            friction=any(np.any(j.friction) for j in joints),
+            limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
+            effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),
+            mimic=any(j.mimic is not None for j in joints),
+            loops=bool(tuple(loops)),
+            quaternions=any(j.type.quaternion is not None for j in joints),
+            time=bool(tuple(prescribed)),
+        )
+
+    def as_dict(self) -> dict[str, bool]:
+        """Return the flags by name."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        present = [k for k, on in self.as_dict().items() if on]
+        absent = [k for k, on in self.as_dict().items() if not on]
+        return f"has {', '.join(present) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
+
 
 _PER_VELOCITY: Final = {
     "damping": "damping",
@@ -292,7 +386,7 @@ class Model:
 
     @property
     def rates(self) -> Any:
-        """How velocities become the coordinates' rates where no joint says it, for `mbkit.model.space`; else None."""
+        """The map from velocities to coordinate rates, where the joints do not give it; else None."""
         return None
 
     # Configurations

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.kinds import JointKind, kind_of
+from mbkit.model.joint_types import JointKind, kind_of
 
 __all__ = ["Body", "Frame", "Joint", "JointCoupling", "Loop", "Mimic", "PointSpring", "Prescribed"]
 

@@ -5,20 +5,82 @@ Engines differ by colour and by marker.
 
 from __future__ import annotations
 
+import io
 import math
-from typing import TYPE_CHECKING, Final
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
 
-from mbkit._escape import one_line
-from mbkit.report.drawing import PAGE, canvas, svg
-from mbkit.report.reading import by_term
-from mbkit.studies.all_robots import Sweep
-from mbkit.studies.drawing import engine_mark, log_ticks
-from mbkit.studies.result import Comparison
+from mbkit._escape import html, one_line
+from mbkit.report.compare_view import by_term
+from mbkit.studies._figure_style import Palette, engine_mark, log_ticks, style
+from mbkit.studies.compare.all_robots import Sweep
+from mbkit.studies.compare.result import Comparison, Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-__all__ = ["digits", "robots"]
+__all__ = ["PAGE", "canvas", "digits", "page_style", "robots", "svg", "term_costs"]
+
+
+# Figures as SVG that takes its colours from the page, so that light and dark both read.
+#
+# Matplotlib draws with stand-in colours; each is then replaced by a variable of the
+# page's style sheet.
+
+#: Stand-ins for what the page says.
+PAGE: Final = Palette(
+    "#010101", "#020202", "#030303", "#040404", ("#050501", "#050502", "#050503", "#050504", "#050505", "#050506")
+)
+_VARIABLES: Final = {
+    PAGE.ink: "var(--ink)",
+    PAGE.muted: "var(--muted)",
+    PAGE.grid: "var(--rule)",
+    PAGE.bad: "var(--bad)",
+    **{colour: f"var(--series{k})" for k, colour in enumerate(PAGE.series, 1)},
+}
+_NO_METADATA: Final[dict[str, None]] = {"Date": None, "Creator": None, "Format": None, "Type": None}
+
+
+@contextmanager
+def page_style(salt: str) -> Iterator[None]:
+    """Give the page's style, and the same names inside an SVG every time."""
+    from matplotlib import rc_context
+
+    settings: Any = {**style(PAGE), "svg.hashsalt": f"mbkit {salt}"}
+    with rc_context(settings):
+        yield
+
+
+@contextmanager
+def canvas(width: float, height: float, salt: str) -> Iterator[tuple[Figure, Axes]]:
+    """Give a figure, sized in inches, and its one pair of axes."""
+    # Figure without pyplot: no window system, nothing to close.
+    from matplotlib.figure import Figure
+
+    with page_style(salt):
+        fig = Figure(figsize=(width, height))
+        yield fig, fig.subplots()
+
+
+def svg(fig: Figure, title: str) -> str:
+    """Return a figure as an element of a page; `title` is what a screen reader says."""
+    stream = io.StringIO()
+    fig.savefig(stream, format="svg", transparent=True, bbox_inches="tight", pad_inches=0.05, metadata=_NO_METADATA)
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}"', 1)
+    # Names of parts would otherwise stand twice on a page with two figures.
+    text = re.sub(r'<g id="[^"]*"', "<g", text)
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    for stand_in, variable in _VARIABLES.items():
+        text = text.replace(stand_in, variable)
+    return text
+
 
 _GROUP_MARKS: Final = "osD^vP"
 #: Where an error of exactly zero stands on an axis of digits.
@@ -94,3 +156,94 @@ def robots(result: Sweep) -> str:
         log_ticks(ax)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
         return svg(fig, "Worst relative error of each robot against its size")
+
+
+# The terms' errors against their run times: what a digit of each term costs on each engine.
+
+_EPS: Final = 2.0**-52
+#: Where smaller errors stand, and none: below this, double precision tells nothing.
+_LEAST: Final = _EPS / 64
+_COLUMNS: Final = 5
+_ROW: Final = 1.55
+
+
+def term_costs(result: Comparison) -> str:
+    """Draw each term's worst relative error over the time of a call, one small panel a term.
+
+    Terms that were not timed are left out; empty where none was.
+    """
+    terms = {name: _timed(rows) for name, rows in by_term(result).items()}
+    terms = {name: rows for name, rows in terms.items() if rows}
+    if not terms:
+        return ""
+    count = math.ceil(len(terms) / _COLUMNS)
+    with page_style("term costs"):
+        from matplotlib.figure import Figure
+
+        height = 1.0 + _ROW * count
+        fig = Figure(figsize=(10.4, height))
+        margins = {"left": 0.07, "right": 0.995, "top": 1 - 0.6 / height, "bottom": 0.5 / height}
+        grid = fig.subplots(
+            count,
+            _COLUMNS,
+            sharex=True,
+            sharey=True,
+            squeeze=False,
+            gridspec_kw={**margins, "wspace": 0.15, "hspace": 0.3},
+        )
+        panels = list(grid.flat)
+        for ax, (name, rows) in zip(panels, terms.items(), strict=False):
+            _panel(ax, name, rows, result.tolerance)
+        _limits(panels[0], [r for rows in terms.values() for r in rows], result.tolerance)
+        for k, ax in enumerate(panels):
+            if k >= len(terms):
+                ax.remove()
+                continue
+            ax.grid(which="major")
+            log_ticks(ax, 5)
+            ax.tick_params(labelsize=8.5, labelbottom=k + _COLUMNS >= len(terms))
+        fig.text(0.53, 0.0, "time of one call, ns", ha="center", va="bottom")
+        fig.text(0.0, 0.5, "worst relative error", rotation=90, ha="left", va="center")
+        _legend(fig, result)
+        return svg(fig, "Error of each term against the time of a call")
+
+
+def _timed(rows: dict[str, Row]) -> list[Row]:
+    # An engine that stands in for the oracle has no error of its own.
+    return [r for r in rows.values() if math.isfinite(r.ns) and r.ns > 0 and r.engine != r.reference]
+
+
+def _shown(row: Row) -> float:
+    return 1.0 if math.isnan(row.relative) else min(max(row.relative, _LEAST), 1.0)
+
+
+def _panel(ax: Axes, name: str, rows: list[Row], tolerance: float) -> None:
+    for y, line in ((_EPS, "-"), (tolerance, (0, (4, 3)))):
+        ax.axhline(y, color=PAGE.muted, linestyle=line, linewidth=0.9)
+    for row in rows:
+        place = [row.ns], [_shown(row)]
+        ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
+        if not row.passed:
+            ax.plot(*place, "x", color=PAGE.bad, markersize=11, markeredgewidth=2.2)
+    ax.set_title(one_line(name, 28), loc="left", fontsize=9.5, pad=3)
+
+
+def _limits(ax: Axes, rows: list[Row], tolerance: float) -> None:
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    times, errors = [r.ns for r in rows], [_shown(r) for r in rows]
+    ax.set_xlim(min(times) / 1.6, max(times) * 1.6)
+    ax.set_ylim(min(*errors, _EPS) / 3, max(*errors, tolerance) * 3)
+
+
+def _legend(fig: Figure, result: Comparison) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=PAGE.engine(e), marker=engine_mark(e), linestyle="none", markersize=7, label=e)
+        for e in result.engines
+    ]
+    handles.append(Line2D([], [], color=PAGE.muted, linewidth=0.9, label="eps of double precision"))
+    told = f"tolerance {result.tolerance:g}"
+    handles.append(Line2D([], [], color=PAGE.muted, linestyle=(0, (4, 3)), linewidth=0.9, label=told))
+    fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.03, 1.0), ncols=len(handles), columnspacing=1.8)

@@ -9,9 +9,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from mbkit._escape import terminal
-from mbkit.report import figures, importers, precision, stress
-from mbkit.report.numbers import count_text, error_text, time_text
-from mbkit.report.reading import (
+from mbkit.report import figures, importers_view, stress_view, work_precision_view
+from mbkit.report.compare_view import (
     allowances,
     by_term,
     failures,
@@ -22,20 +21,18 @@ from mbkit.report.reading import (
     saving_text,
     told,
 )
-from mbkit.report.stress_figures import stable_steps
-from mbkit.report.stress_map import section
-from mbkit.report.stress_methods import methods
-from mbkit.report.stress_silent import avoid, silences
-from mbkit.report.stress_steps import kinds, rules, steps
-from mbkit.report.terms_figure import term_costs
-from mbkit.studies import drawing
-from mbkit.studies.all_robots import Sweep
-from mbkit.studies.parsers.result import ParserComparison
-from mbkit.studies.precision_result import WorkPrecision
-from mbkit.studies.result import Comparison
+from mbkit.report.figures import term_costs
+from mbkit.report.formatting import count_text, error_text, time_text
+from mbkit.report.stress_case import section
+from mbkit.report.stress_steps import kinds, rules, stable_steps, steps
+from mbkit.report.stress_view import avoid, methods, silences
+from mbkit.studies import _figure_style
+from mbkit.studies.compare.all_robots import Sweep
+from mbkit.studies.compare.result import Comparison
+from mbkit.studies.importers.result import ParserComparison
 from mbkit.studies.stress.figure import error_short, number_text
-from mbkit.studies.stress.reading import engines_of, name_of
-from mbkit.studies.stress.result import StressResult
+from mbkit.studies.stress.result import StressResult, engines_of, name_of
+from mbkit.studies.work_precision.result import WorkPrecision
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -98,7 +95,7 @@ def bench_page(
         data,
         result,
         asked=asked if asked != result.model else "",
-        headline=precision.headline(result),
+        headline=work_precision_view.headline(result),
         table=table,
         study=_study(result),
     )
@@ -110,11 +107,11 @@ def _study(result: WorkPrecision) -> dict[str, Any]:
 
     return {
         "result": result,
-        "figure": Markup(precision.error_against_time(result)) if result.front else None,
-        "front": precision.front_names(result),
-        "leads": precision.leads(result),
-        "lines": precision.curve_lines(result),
-        "order_tolerance": precision.ORDER_TOLERANCE,
+        "figure": Markup(work_precision_view.error_against_time(result)) if result.front else None,
+        "front": work_precision_view.front_names(result),
+        "leads": work_precision_view.leads(result),
+        "lines": work_precision_view.curve_lines(result),
+        "order_tolerance": work_precision_view.ORDER_TOLERANCE,
         "notices": notices(result.refusals),
     }
 
@@ -135,9 +132,9 @@ def importers_page(result: ParserComparison, *, data: str = "", when: datetime |
         when,
         data,
         result,
-        title=importers.title(result),
-        lines=importers.lines(result),
-        reasons={p.engine: importers.reasons(p) for p in result.importers},
+        title=importers_view.title(result),
+        lines=importers_view.lines(result),
+        reasons={p.engine: importers_view.reasons(p) for p in result.importers},
     )
 
 
@@ -162,7 +159,7 @@ def stress_page(result: StressResult, *, data: str = "", table: str = "", when: 
     """
     from markupsafe import Markup
 
-    told = stress.overview(result)
+    told = stress_view.overview(result)
     step_cases = steps(told)
     step_rules = rules(step_cases)
     engines = engines_of(result.cases)
@@ -172,22 +169,22 @@ def stress_page(result: StressResult, *, data: str = "", table: str = "", when: 
         data,
         result,
         table=table,
-        headline=stress.headline(result),
+        headline=stress_view.headline(result),
         avoid=avoid(result),
         silences=silences(result),
         asked=[o for o in told if o.choice is not None],
         behind=[o for o in told if o.behind],
         methods=methods(result),
-        run_families=stress.families([o for o in told if stress.ranks(o.case)]),
-        families=stress.families(told),
+        run_families=stress_view.families([o for o in told if stress_view.ranks(o.case)]),
+        families=stress_view.families(told),
         sections={o.anchor: section(o) for o in told},
         engines=engines,
-        series={e: drawing.engine_index(e) + 1 for e in engines},
+        series={e: _figure_style.engine_index(e) + 1 for e in engines},
         steps=step_cases,
         rules=step_rules,
         kinds=kinds(step_rules),
         step_figure=Markup(stable_steps(step_cases)) if step_cases else None,
-        bars=stress.bars(result),
+        bars=stress_view.bars(result),
     )
 
 
@@ -219,11 +216,11 @@ def _environment() -> Environment:
         limit=_limit,
         unchanged=omission_state,
         saving=saving_text,
-        setting=precision.setting_text,
-        value=stress.value_text,
-        held=stress.held_text,
-        how=lambda outcome: stress.HOW.get(outcome, ""),
-        told=stress.told,
+        setting=work_precision_view.setting_text,
+        value=stress_view.value_text,
+        held=stress_view.held_text,
+        how=lambda outcome: stress_view.HOW.get(outcome, ""),
+        told=stress_view.told,
         rowname=name_of,
         choice=_choice,
     )

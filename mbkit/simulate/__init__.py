@@ -1,12 +1,12 @@
 """Motion in time: one trajectory or a batch, by any engine's forward dynamics."""
 
 from mbkit._callable import make_callable
+from mbkit.methods.registry import METHODS, Method
+from mbkit.methods.tableaus import RK4, Tableau
+from mbkit.simulate.diagnostics.eigenvalues import Stiffness, stiffness
 from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
-from mbkit.simulate.methods import METHODS, Method
+from mbkit.simulate.result import Stats
 from mbkit.simulate.run import simulate
-from mbkit.simulate.stats import Stats
-from mbkit.simulate.stiffness import Stiffness, stiffness
-from mbkit.simulate.tableau import RK4, Tableau
 from mbkit.simulate.trajectory import Trajectory
 
 __all__ = [

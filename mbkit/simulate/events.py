@@ -14,7 +14,7 @@ import numpy as np
 
 from mbkit._check import Array, real
 from mbkit.engines import Dynamics
-from mbkit.engines.clock import at_time
+from mbkit.engines.base import at_time
 from mbkit.errors import EventError, InputError, UnknownNameError
 from mbkit.model import Model
 

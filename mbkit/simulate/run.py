@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
@@ -13,28 +13,88 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
-from mbkit.engines.expected import no_dynamics
+from mbkit.engines.base import no_dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, UnsupportedError
+from mbkit.methods.registry import METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
-from mbkit.simulate.applied import Applied, TorqueFunction
-from mbkit.simulate.asked import Asked
-from mbkit.simulate.consistent import along_constraints, from_consistent
-from mbkit.simulate.doubts import doubts, halved, idle
+from mbkit.simulate.constraint_projection import along_constraints, from_consistent
+from mbkit.simulate.diagnostics.checks import doubts, halved, idle
 from mbkit.simulate.events import Event, as_events
-from mbkit.simulate.grid import DEFAULT_STEP, Grid, save_times
-from mbkit.simulate.methods import METHODS, Method, Tolerances, method_of
-from mbkit.simulate.native import run_native
-from mbkit.simulate.outcome import Outcome
+from mbkit.simulate.problem import Asked
 from mbkit.simulate.progress import Progress, ProgressFunction
-from mbkit.simulate.runners import adaptive_runner, fixed_runner
-from mbkit.simulate.stats import Stats
-from mbkit.simulate.torque import Torque
+from mbkit.simulate.result import Outcome, Stats
+from mbkit.simulate.solvers.native import run_native
+from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
+from mbkit.simulate.torque import Applied, Torque, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.embedding import Embedded
+    from mbkit.lagrangian.constraints.independent_coordinates import Embedded
 
-__all__ = ["simulate"]
+__all__ = ["adaptive_runner", "fixed_runner", "simulate"]
+
+
+# Which integrator runs a method, each imported when it is first needed.
+
+
+def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[..., Outcome]:
+    """Return run(dyn, method, q0, v0, grid, kept, torque, bar)."""
+    if method.name == "implicit_midpoint":
+        from mbkit.simulate.solvers.implicit_midpoint import run_midpoint
+
+        return run_midpoint
+    if method.name in ("rk4", "semi_implicit_euler") and not torque.callable and _compiles(dyn):
+        from mbkit.simulate.solvers.compiled_fixed_step import run_rollout
+
+        return run_rollout
+    from mbkit.simulate.solvers.fixed_step import run_fixed
+
+    return run_fixed
+
+
+def adaptive_runner(method: Method) -> Callable[[Asked], Outcome]:
+    """Return what integrates with tolerances."""
+    if method.name == "auto":
+        from mbkit.simulate.solvers.auto import run_auto
+
+        return run_auto
+    if method.name in ("rk853", "rodas5"):
+        from mbkit.simulate.solvers.adaptive import run_embedded
+
+        return run_embedded
+    if method.name == "taylor":
+        from mbkit.simulate.solvers.taylor import run_taylor
+
+        return run_taylor
+    if method.name == "cvodes":
+        from mbkit.simulate.solvers.cvodes import run_cvodes
+
+        return run_cvodes
+    if method.name.startswith("drake_"):
+        from mbkit.simulate.solvers.native import run_drake
+
+        return run_drake
+    from mbkit.simulate.solvers.scipy import run_scipy
+
+    return run_scipy
+
+
+def _compiles(dyn: Dynamics) -> bool:
+    """Return whether whole steps can be compiled: own derivation, written out, and a compiler."""
+    if dyn.engine != "lagrangian":
+        return False
+    # Other engines need no CasADi.
+    from mbkit.codegen.interpreter import Machine
+    from mbkit.engines.lagrangian import LagrangianDynamics
+
+    # A compiled step has one value of each parameter, the time among them.
+    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out or dyn.model.clock:
+        return False
+    # Nor does it look for constraints after each step.
+    if dyn.model.constrained:
+        return False
+    return not isinstance(dyn.code("forward_dynamics"), Machine)
+
 
 # The oracle computes with 113 bits.
 _LEAST_EXTENDED: Final = 1e-32
@@ -166,7 +226,7 @@ def simulate(
     if not isinstance(dyn, Dynamics):
         if hasattr(dyn, "chart"):
             # Only where SymPy and CasADi are loaded already.
-            from mbkit.simulate.charts import run_on_charts
+            from mbkit.simulate.independent_coordinates import run_on_charts
 
             chosen = method_of(method)
             start, duration, dt = _times(dyn.dynamics, chosen, t0, duration, dt)

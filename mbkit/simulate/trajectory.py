@@ -15,14 +15,20 @@ from mbkit import _check
 from mbkit._check import Array
 from mbkit._escape import csv_text, html, one_line
 from mbkit.engines import ENGINES, Dynamics, dynamics
-from mbkit.engines.clock import at_times
+from mbkit.engines.base import at_times
 from mbkit.errors import InputError, OutputError, UnsupportedError
 from mbkit.model import Model
-from mbkit.simulate.applied import Applied, Asked, Held, Sampled
-from mbkit.simulate.balance import kinetic_energy, potential_energy, work
+from mbkit.simulate.along_trajectory import (
+    canonical_momentum,
+    kinetic_energy,
+    member_of,
+    momentum,
+    potential_energy,
+    work,
+)
 from mbkit.simulate.events import Hit
-from mbkit.simulate.momenta import canonical_momentum, member_of, momentum
-from mbkit.simulate.stats import Stats
+from mbkit.simulate.result import Stats
+from mbkit.simulate.torque import Applied, Asked, Held, Sampled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -210,7 +216,7 @@ class Trajectory:
         Lengths, angles and quaternions have a panel each. Of a batch, the first ten
         trajectories are drawn. Events and the end of a run that diverged are marked.
         """
-        from mbkit.simulate.plots import plot
+        from mbkit.simulate.plotting.time_series import plot
 
         return plot(self)
 
@@ -232,7 +238,7 @@ class Trajectory:
         member : int
             Which trajectory of a batch.
         """
-        from mbkit.simulate.picture import picture
+        from mbkit.simulate.plotting.motion_strip import picture
 
         member = _check.count("member", member)
         members = len(self.q) if self.q.ndim == 3 else 1

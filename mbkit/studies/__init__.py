@@ -1,12 +1,12 @@
 """Questions asked of several engines at once."""
 
 from mbkit.studies import stress
-from mbkit.studies.compare import compare
-from mbkit.studies.precision_result import Curve, InterruptedSweepError, PrecisionPoint, WorkPrecision
-from mbkit.studies.reference import Reference
-from mbkit.studies.result import Comparison, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.compare.result import Comparison, Omission, Refusal, RolloutRow, Row
+from mbkit.studies.compare.study import compare
 from mbkit.studies.stress.result import StressResult
-from mbkit.studies.work_precision import work_precision
+from mbkit.studies.work_precision.reference import Reference
+from mbkit.studies.work_precision.result import Curve, InterruptedSweepError, PrecisionPoint, WorkPrecision
+from mbkit.studies.work_precision.study import work_precision
 
 __all__ = [
     "Comparison",

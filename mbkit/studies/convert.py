@@ -18,12 +18,12 @@ from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.errors import MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import load
-from mbkit.load.urdf_text import urdf_text
+from mbkit.load.urdf_writer import urdf_text
 from mbkit.model import Model
-from mbkit.model.expected import expect_model
-from mbkit.studies.causes.explaining import explain
-from mbkit.studies.causes.result import Cause
-from mbkit.studies.causes.terms import Gap, evaluated, gaps, model_terms, states_of
+from mbkit.model.builder import expect_model
+from mbkit.studies.explain.result import Cause
+from mbkit.studies.explain.study import explain
+from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of
 
 __all__ = ["FORMATS", "Converted", "convert"]
 
@@ -145,7 +145,7 @@ def _head(model: Model, to: str) -> str:
 
 
 def _to_mjcf(model: Model) -> Converted:
-    from mbkit.engines.mujoco_text import mjcf_text, read_back
+    from mbkit.engines.mujoco.mjcf_writer import mjcf_text, read_back
 
     notes = []
     if model.layout.reduced:

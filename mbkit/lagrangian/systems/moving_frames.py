@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sympy as sp
 
-from mbkit.lagrangian.symbols import velocity_of
+from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.systems._values import Value, values
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import sympy as sp
 
-from mbkit.lagrangian.symbols import velocity_of
+from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.systems._values import Value, values
 

@@ -3,14 +3,12 @@
 `record` writes, `check` holds a model and the installed engines against it, `diff` reads two.
 """
 
-from mbkit.studies.baseline.changes import Change
-from mbkit.studies.baseline.checking import check
-from mbkit.studies.baseline.comparing import diff
+from mbkit.studies.baseline.check import check, diff
 from mbkit.studies.baseline.content import Baseline
+from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.file import read
-from mbkit.studies.baseline.recording import record
+from mbkit.studies.baseline.record import record
 from mbkit.studies.baseline.result import BaselineResult
-from mbkit.studies.baseline.versions import VersionChange
-from mbkit.studies.baseline.yardstick import Moved
+from mbkit.studies.baseline.tolerance import Moved, VersionChange
 
 __all__ = ["Baseline", "BaselineResult", "Change", "Moved", "VersionChange", "check", "diff", "read", "record"]

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 from mbkit._check import Array
 from mbkit.studies.baseline.description import Description
-from mbkit.studies.result import Refusal
-from mbkit.studies.states import States
+from mbkit.studies.compare.result import Refusal
+from mbkit.studies.compare.terms import States
 
 __all__ = ["ROLLOUT", "Baseline", "Rollout"]
 
@@ -49,7 +49,7 @@ class Baseline:
         Term -> values at the states by the oracle, rounded to double. ``"rollout"`` is the end
         of a rollout.
     errors : dict
-        Engine -> term -> worst error against these, as `mbkit.studies.measure` defines it; zero for
+        Engine -> term -> worst error against these, as `mbkit.studies.compare.errors` defines it; zero for
         one of less than 8 eps, which any engine may have.
     own : dict
         Engine -> term -> the engine's own values, where it differed by more than rounding.

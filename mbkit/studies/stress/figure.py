@@ -13,9 +13,20 @@ from typing import TYPE_CHECKING, Final
 
 from mbkit._escape import one_line
 from mbkit.errors import UnknownNameError
-from mbkit.studies.drawing import PLAIN, Palette, engine_mark, style
-from mbkit.studies.stress.reading import Line, best, engines_of, lines, name_of, place, recommended
-from mbkit.studies.stress.result import CaseResult, Cell, Outcome, StressResult
+from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, style
+from mbkit.studies.stress.result import (
+    CaseResult,
+    Cell,
+    Line,
+    Outcome,
+    StressResult,
+    best,
+    engines_of,
+    lines,
+    name_of,
+    place,
+    recommended,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,19 +12,18 @@ from typing import Any, Final
 
 from mbkit._check import count, real
 from mbkit.errors import InputError
-from mbkit.simulate.methods import METHODS
-from mbkit.studies import stamp
-from mbkit.studies.keeper import Checkpoint, Keeper, Progress
-from mbkit.studies.pairs import pairs
-from mbkit.studies.precision_result import InterruptedSweepError
+from mbkit.methods.registry import METHODS
+from mbkit.studies import _results
+from mbkit.studies._checkpoint import Checkpoint, Keeper, Progress
+from mbkit.studies._processes import processors
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.messages import Introduce
+from mbkit.studies.stress.reference import TERMS
 from mbkit.studies.stress.result import BAR, StressResult
-from mbkit.studies.stress.schedule import MisuseError, Slots
-from mbkit.studies.stress.server import busy
-from mbkit.studies.stress.sweep import Bounds, CaseSweep
-from mbkit.studies.stress.terms import TERMS
-from mbkit.studies.workers import processors
+from mbkit.studies.stress.sweep import Bounds, CaseSweep, MisuseError, Slots
+from mbkit.studies.stress.worker_main import busy
+from mbkit.studies.work_precision.result import InterruptedSweepError
+from mbkit.studies.work_precision.settings import pairs
 
 __all__ = ["QUICK_METHODS", "stress"]
 
@@ -193,8 +192,8 @@ def stress(
         return StressResult(
             cases=tuple(sweep.result() for sweep in sweeps),
             complete=complete,
-            versions=stamp.versions(),
-            processor=stamp.processor(),
+            versions=_results.versions(),
+            processor=_results.processor(),
             seconds=time.perf_counter() - begun,
             settings=settings,
         )

@@ -12,8 +12,8 @@ import numpy as np
 from mbkit import catalog
 from mbkit.load import load
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._pendulums import cart_pole, pendulum
-from mbkit.studies.stress.cases._sweeps import EPS, powers, terms_at
+from mbkit.studies.stress.cases._common import EPS, powers, terms_at
+from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum
 from mbkit.studies.stress.cases.spin import tumbling
 
 __all__ = ["CASES"]

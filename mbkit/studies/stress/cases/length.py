@@ -9,7 +9,7 @@ import numpy as np
 from mbkit import catalog
 from mbkit._check import Array
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._sweeps import terms_at
+from mbkit.studies.stress.cases._common import terms_at
 
 __all__ = ["CASES", "straight_inertia"]
 

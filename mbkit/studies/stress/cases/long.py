@@ -8,7 +8,7 @@ import numpy as np
 
 from mbkit import catalog
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._sweeps import powers
+from mbkit.studies.stress.cases._common import powers
 
 __all__ = ["CASES"]
 

@@ -11,8 +11,8 @@ import numpy as np
 from mbkit.load import load
 from mbkit.model import Body, Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Measure, Problem
-from mbkit.studies.stress.cases._chains import HangingChain
-from mbkit.studies.stress.cases._sweeps import powers, terms_at
+from mbkit.studies.stress.cases._common import powers, terms_at
+from mbkit.studies.stress.cases.exact_motions import HangingChain
 
 __all__ = ["CASES"]
 

@@ -13,8 +13,8 @@ from mbkit._check import Array
 from mbkit.load import load
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._rotations import past_gimbal_lock
-from mbkit.studies.stress.cases._sweeps import EPS, powers, terms_at
+from mbkit.studies.stress.cases._common import EPS, powers, terms_at
+from mbkit.studies.stress.cases.exact_motions import past_gimbal_lock
 
 __all__ = ["CASES"]
 

@@ -10,8 +10,8 @@ from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._rotations import free_rotor, precession, turning
-from mbkit.studies.stress.cases._sweeps import EPS, Exact, powers
+from mbkit.studies.stress.cases._common import EPS, Exact, powers
+from mbkit.studies.stress.cases.exact_motions import free_rotor, precession, turning
 
 __all__ = ["CASES", "box_spin", "tumbling"]
 

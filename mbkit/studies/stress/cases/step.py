@@ -11,9 +11,8 @@ from typing import Final
 import numpy as np
 
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._linear import released
-from mbkit.studies.stress.cases._stability import largest_step
-from mbkit.studies.stress.cases._sweeps import EPS
+from mbkit.studies.stress.cases._common import EPS, largest_step
+from mbkit.studies.stress.cases.exact_motions import released
 from mbkit.studies.stress.cases.stiffness import conical, hinge
 
 __all__ = ["CASES"]

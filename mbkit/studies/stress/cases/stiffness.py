@@ -13,11 +13,15 @@ from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._linear import modal, released, slowest_mode
-from mbkit.studies.stress.cases._pendulums import cart_pole
-from mbkit.studies.stress.cases._slow import slow_motion
-from mbkit.studies.stress.cases._springs import ringing_spring
-from mbkit.studies.stress.cases._sweeps import EPS, powers, stable_steps
+from mbkit.studies.stress.cases._common import EPS, powers, stable_steps
+from mbkit.studies.stress.cases.exact_motions import (
+    cart_pole,
+    modal,
+    released,
+    ringing_spring,
+    slow_motion,
+    slowest_mode,
+)
 
 __all__ = ["CASES", "conical", "hinge"]
 

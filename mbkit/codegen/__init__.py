@@ -1,0 +1,1 @@
+"""Machine code, C source, extended precision and Taylor series from CasADi graphs."""

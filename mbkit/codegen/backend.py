@@ -1,0 +1,89 @@
+"""How a derived function is run: as machine code, or in CasADi's own machine."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Final
+
+import casadi as ca
+
+from mbkit._fork import fork_safe
+from mbkit.codegen.interpreter import Machine
+from mbkit.errors import NoCompilerWarning
+
+if TYPE_CHECKING:
+    from mbkit.codegen.compiled import Compiled
+
+__all__ = ["DERIVING", "compile_by_default", "executable", "has_compiler"]
+
+#: One thread derives at a time; a fork waits for it. Python 3.11's cached properties hold locks meanwhile.
+DERIVING: Final = fork_safe(threading.RLock())
+
+#: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not
+#: spent unasked: a Coriolis matrix of a hundred joints has twice as many, and is
+#: interpreted in 0.5 ms.
+_MOST: Final = 200_000
+
+
+def compile_by_default() -> bool:
+    """Return whether functions are compiled when nobody says: yes, unless ``MBKIT_COMPILE=0``."""
+    return os.environ.get("MBKIT_COMPILE", "1") != "0"
+
+
+def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile: bool) -> Compiled | Machine:  # noqa: A002  # the word that users look for
+    """Return a function ready to run.
+
+    Parameters
+    ----------
+    name : sequence of str
+        All that it depends on but the code of mbkit, for the cache.
+    make : callable
+        Derives it; not called if its machine code is in the cache.
+    compile : bool
+        Whether to compile; where there is no compiler a `NoCompilerWarning` says so
+        once, and CasADi's machine runs it. It also runs what is very large.
+    """
+    if not compile or not _compiler():
+        return Machine(make())
+    # Loads LLVM, which interpreting never needs.
+    from mbkit.codegen.compiled import compiled
+
+    def checked() -> ca.Function:
+        function = make()
+        if function.n_instructions() > _MOST:
+            raise _TooLargeError(function)
+        return function
+
+    try:
+        return compiled(name, checked)
+    except _TooLargeError as error:
+        return Machine(error.function)
+
+
+class _TooLargeError(Exception):
+    def __init__(self, function: ca.Function) -> None:
+        super().__init__()
+        self.function = function
+
+
+def has_compiler() -> bool:
+    """Return whether functions can be compiled; where not, a `NoCompilerWarning` says so once."""
+    return _compiler()
+
+
+@cache
+def _compiler() -> bool:
+    if importlib.util.find_spec("llvmlite") is not None:
+        return True
+    warnings.warn(
+        "llvmlite is not installed: mbkit's own derivation runs in CasADi's machine, some ten times slower; "
+        "pip install llvmlite",
+        NoCompilerWarning,
+        stacklevel=2,
+    )
+    return False

@@ -1,0 +1,363 @@
+"""A function of vectors as machine code: one state or a batch, one thread or all."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, Final, NamedTuple
+from weakref import WeakValueDictionary
+
+import casadi as ca
+import numpy as np
+
+from mbkit._check import Array
+from mbkit._version import __version__
+from mbkit.codegen import disk_cache as disk
+from mbkit.codegen import jit
+from mbkit.codegen.batch_loop import RUN
+from mbkit.codegen.program import program
+from mbkit.derivation.fingerprint import SOURCES
+
+__all__ = ["Call", "CallSequence", "Compiled", "aligned", "compiled", "cores", "shared_object"]
+
+
+#: Operations on which a second thread is worth its start: about 100 µs.
+_SHARE: Final = 2_000_000
+#: Coordinate-major arrays with more rows than this are read in blocks: so many places
+#: of a large array at once are more than the processor's tables of pages hold.
+_ROWS: Final = 48
+#: Samples in such a block. No power of two: rows would meet in the same cache sets.
+_BLOCK: Final = 1032
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def aligned(size: int) -> Array:
+    """Return an array that starts at a cache line."""
+    room = np.empty(size + 8)
+    return room[-room.ctypes.data // 8 % 8 :][:size]
+
+
+def _readable(x: Array) -> Array:
+    """Return an array as machine code can read it: doubles at whole places."""
+    good = x.dtype == np.float64 and x.dtype.isnative and not any(s % 8 for s in x.strides) and not x.ctypes.data % 8
+    return x if good else np.array(x, dtype=np.float64)
+
+
+class Compiled:
+    """Machine code of a function whose arguments are vectors.
+
+    Attributes
+    ----------
+    inputs : tuple of int
+        Entries of each argument.
+    shapes : tuple of (int, int)
+        Rows and columns of each result.
+    operations : int
+        Scalar operations of one evaluation.
+    work_size : int
+        Doubles of work space that a call needs.
+    loaded : jit.Loaded
+        The code itself.
+    """
+
+    def __init__(self, about: dict[str, Any], code: bytes) -> None:
+        self.inputs = tuple(about["inputs"])
+        self.shapes = tuple((r, c) for r, c in about["shapes"])
+        self.operations = int(about["operations"])
+        self.loaded = jit.load(_batch_object(), code)
+        self._share = int(about["work"])
+        tiles = sum(self.inputs) + sum(rows * columns for rows, columns in self.shapes)
+        self.work_size = self._share + tiles * jit.host().width
+        self._local = threading.local()
+
+    def __call__(self, *arguments: Array, threads: int | None = None) -> list[Array]:
+        """Return each result with shape (rows, columns) or (N, rows, columns).
+
+        Arguments are all vectors or all (N, n), with any strides. Results are
+        coordinate-major if all arguments of more than one entry are.
+        """
+        return self.watched(*arguments, threads=threads)[0]
+
+    def watched(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
+        """Return the results, and whether all that was read and written is finite."""
+        single = arguments[0].ndim == 1
+        given = [x[None] for x in arguments] if single else list(arguments)
+        n = given[0].shape[0]
+        for i, (x, size) in enumerate(zip(given, self.inputs, strict=True)):
+            if x.shape != (n, size):
+                raise ValueError(f"argument {i}: expected ({n}, {size}), got {x.shape}")
+        given = [_readable(x) for x in given]
+        major = n > 1 and all(x.strides[0] == 8 for x in given if x.shape[1] > 1)
+        sizes = [rows * columns for rows, columns in self.shapes]
+        flat = [np.empty((size, n)).T if major else np.empty((n, size)) for size in sizes]
+        finite = self.run(given, flat, threads)
+        results = [
+            (x.T.reshape(r, c, n).transpose(2, 0, 1) if major else x.reshape(n, r, c))
+            for x, (r, c) in zip(flat, self.shapes, strict=True)
+        ]
+        return ([x[0] for x in results] if single else results), finite
+
+    def run(self, inputs: Sequence[Array], outputs: Sequence[Array], threads: int | None = None) -> bool:
+        """Fill outputs, without checks.
+
+        Parameters
+        ----------
+        inputs, outputs : sequences of (N, n) float64 arrays
+            With any strides; transposed coordinate-major ones are used in place.
+        threads : int, optional
+
+        Returns
+        -------
+        bool
+            Whether every number read and written is finite.
+        """
+        n = inputs[0].shape[0]
+        if n == 0:
+            return True
+        width = jit.host().width
+        parts = min(threads or cores(), max(1, n * self.operations // _SHARE))
+        if parts == 1:
+            return self._part(inputs, outputs, 0, n)
+        # A few more parts than threads: one that is held up is helped out by the others.
+        size = -(-n // (4 * parts * width)) * width
+        starts = range(0, n, size)
+        return all(list(_pool(parts).map(lambda s: self._part(inputs, outputs, s, min(s + size, n)), starts)))
+
+    def _part(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
+        many = [sum(x.shape[1] for x in xs if x.strides[0] == 8) > _ROWS for xs in (inputs, outputs)]
+        if not any(many) or last - first <= _BLOCK:
+            return self._straight(inputs, outputs, first, last)
+        near = [[np.empty((x.shape[1], _BLOCK)).T for x in xs] for xs in (inputs, outputs)]
+        finite = True
+        for start in range(first, last, _BLOCK):
+            n = min(_BLOCK, last - start)
+            for x, y in zip(inputs, near[0], strict=True):
+                y[:n] = x[start : start + n]
+            finite &= self._straight(near[0], near[1], 0, n)
+            for x, y in zip(outputs, near[1], strict=True):
+                x[start : start + n] = y[:n]
+        return finite
+
+    def _straight(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
+        table = self.table(inputs, outputs)
+        work = self._work()
+        watch = work[: jit.host().width]
+        watch[:] = 0.0
+        lead = self._lead((*inputs, *outputs), first, last)
+        for start, end in ((first, lead), (lead, last)):
+            self.loaded.run(table.ctypes.data, work.ctypes.data, start, end)
+        return bool(np.dot(watch, watch) == 0.0)
+
+    @staticmethod
+    def _lead(arrays: Sequence[Array], first: int, last: int) -> int:
+        """Return where vectors of coordinate-major arrays begin to lie on whole cache lines.
+
+        NumPy's large arrays start 16 bytes beyond one, and a vector on two lines
+        fetches each line twice where rows are a power of two apart.
+        """
+        for x in arrays:
+            if x.strides[0] == 8 and x.strides[1] % 64 == 0:
+                return min(first + -(x.ctypes.data // 8 + first) % 8, last)
+        return first
+
+    def table(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Array:
+        """Return what the code is told of these arrays, which must outlive its use."""
+        table = [len(inputs), len(outputs), self._share]
+        for x in (*inputs, *outputs):
+            table += [x.ctypes.data, x.shape[1], x.strides[1] >> 3, x.strides[0] >> 3]
+        return np.array(table, dtype=np.int64)
+
+    def bound(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> tuple[Callable[[], None], Array]:
+        """Return a call that reads and writes these very arrays, for many calls of few states.
+
+        Parameters
+        ----------
+        inputs, outputs : sequences of (N, n) float64 arrays
+            As in `run`.
+
+        Returns
+        -------
+        callable
+            Takes nothing and returns nothing; one thread may be in it at a time.
+        array
+            Zero until a number read or written is not finite; may be set to zero again.
+        """
+        table, work = self.table(inputs, outputs), aligned(self.work_size)
+        watch = work[: jit.host().width]
+        watch[:] = 0.0
+        run, last = self.loaded.run, inputs[0].shape[0]
+        at, scratch = table.ctypes.data, work.ctypes.data
+
+        def call(_kept: Any = (self, table, work, inputs, outputs)) -> None:
+            run(at, scratch, 0, last)
+
+        return call, watch
+
+    def _work(self) -> Array:
+        """Return this thread's own work space."""
+        if not hasattr(self._local, "work"):
+            self._local.work = aligned(self.work_size)
+        work: Array = self._local.work
+        return work
+
+
+@cache
+def _batch_object() -> bytes:
+    return shared_object("batch", jit.batch_object)
+
+
+def shared_object(name: str, make: Callable[[], bytes]) -> bytes:
+    """Return an object file that depends on no model, from disk or made now."""
+    key = disk.key_of(name, SOURCES, *map(str, jit.host()))
+    found = disk.read(key)
+    if found:
+        return found[1]
+    code = make()
+    disk.write(key, {}, code)
+    return code
+
+
+_POOLS: dict[int, ThreadPoolExecutor] = {}
+if hasattr(os, "register_at_fork"):
+    # A child has none of its parent's threads.
+    os.register_at_fork(after_in_child=_POOLS.clear)
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    if threads not in _POOLS:
+        _POOLS[threads] = ThreadPoolExecutor(threads, thread_name_prefix="mbkit")
+    return _POOLS[threads]
+
+
+def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
+    """Return machine code of a function: kept in this process, from disk, or made now.
+
+    Parameters
+    ----------
+    name : sequence of str
+        All that the function depends on but the code of mbkit: the model's digest,
+        the quantity.
+    make : callable
+        Derives the function; called only if it has not been compiled before.
+    """
+    key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, jit.host()))
+    with jit.COMPILING:
+        found = None if disk.forgotten(key) else _HELD.get(key)
+        if found is None:
+            found = _HELD[key] = _from_disk(key) or _made(key, make)
+    return found
+
+
+def _from_disk(key: str) -> Compiled | None:
+    found = disk.read(key)
+    if found is None:
+        return None
+    try:
+        return Compiled(*found)
+    except (KeyError, TypeError, ValueError):
+        # Whole, and ours by its key, but not of this form: made anew.
+        return None
+
+
+def _made(key: str, make: Callable[[], ca.Function]) -> Compiled:
+    derived = program(make())
+    code, work = jit.program_object(derived)
+    about = {
+        "inputs": derived.inputs,
+        "shapes": derived.shapes,
+        "operations": derived.arithmetic,
+        "work": work,
+    }
+    disk.write(key, about, code)
+    return Compiled(about, code)
+
+
+#: Functions in use by anyone in this process.
+_HELD: Final[WeakValueDictionary[str, Compiled]] = WeakValueDictionary()
+
+
+# Compiled functions called one after another without going back to Python in between.
+
+# With the signature of a compiled function's own loop, so that it is loaded like one:
+# the list holds, for each call, the addresses of loop, table and work space, and the
+# number of states.
+_CODE: Final = f"""
+define void @{RUN}(ptr %list, ptr %unused, i64 %first, i64 %last) nounwind {{
+entry:
+  %any = icmp slt i64 %first, %last
+  br i1 %any, label %one, label %done
+one:
+  %i = phi i64 [ %first, %entry ], [ %next, %one ]
+  %start = mul i64 %i, 4
+  %at = getelementptr ptr, ptr %list, i64 %start
+  %run = load ptr, ptr %at
+  %at1 = getelementptr ptr, ptr %at, i64 1
+  %table = load ptr, ptr %at1
+  %at2 = getelementptr ptr, ptr %at, i64 2
+  %work = load ptr, ptr %at2
+  %at3 = getelementptr ptr, ptr %at, i64 3
+  %states = load i64, ptr %at3
+  call void %run(ptr %table, ptr %work, i64 0, i64 %states)
+  %next = add i64 %i, 1
+  %more = icmp slt i64 %next, %last
+  br i1 %more, label %one, label %done
+done:
+  ret void
+}}
+"""
+
+
+class Call(NamedTuple):
+    """A function and the (N, n) arrays that it reads and writes, as in `Compiled.run`."""
+
+    code: Compiled
+    inputs: Sequence[Array]
+    outputs: Sequence[Array]
+
+
+class CallSequence:
+    """Calls on fixed arrays, made in order; one thread may run it at a time.
+
+    Parameters
+    ----------
+    calls : sequence of Call
+        Their arrays are kept alive, and may be changed between runs.
+    times : int
+        How often they stand in the sequence, one round after another.
+    """
+
+    def __init__(self, calls: Sequence[Call], times: int = 1) -> None:
+        self._calls = tuple(calls)
+        self._work = aligned(max((call.code.work_size for call in calls), default=0))
+        # The sum in which a compiled function tells that something is not finite.
+        self._work[:] = 0.0
+        self._tables = [call.code.table(call.inputs, call.outputs) for call in calls]
+        entries = [
+            (_address(call.code), table.ctypes.data, self._work.ctypes.data, len(call.inputs[0]))
+            for call, table in zip(calls, self._tables, strict=True)
+        ]
+        self._list = np.array(entries * times, dtype=np.int64)
+        self._runner = _runner()
+
+    def run(self, first: int, last: int) -> None:
+        """Make the calls from `first` to before `last`; other Python threads run meanwhile."""
+        self._runner.run(self._list.ctypes.data, None, first, last)
+
+
+def _address(code: Compiled) -> int:
+    return ctypes.cast(code.loaded.run, ctypes.c_void_p).value or 0
+
+
+@cache
+def _runner() -> jit.Loaded:
+    return jit.load(shared_object("sequence", lambda: jit.object_code(_CODE)))

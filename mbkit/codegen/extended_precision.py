@@ -1,0 +1,357 @@
+"""Arrays of numbers with 113 bits, about 34 digits: heyoka's or mpmath's.
+
+Both round to the format of IEEE 754's binary128. heyoka's `real128` is a NumPy type
+whose loops run in C; where heyoka is not installed, or its build has no `real128`,
+arrays hold mpmath's numbers, some twenty times slower.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.codegen.program import Program
+from mbkit.errors import InputError, UnsupportedError
+
+__all__ = ["BITS", "Arithmetic", "Backend", "Extended", "arithmetic", "digits", "mpmath_context", "product", "solve"]
+
+
+Backend = Literal["real128", "mpmath"]
+BITS: Final = 113
+
+#: Functions' names in C -> in NumPy.
+_FUNCTIONS: Final = {
+    "sqrt": "sqrt",
+    "sin": "sin",
+    "cos": "cos",
+    "tan": "tan",
+    "asin": "arcsin",
+    "acos": "arccos",
+    "atan": "arctan",
+    "atan2": "arctan2",
+    "exp": "exp",
+    "expm1": "expm1",
+    "log": "log",
+    "log1p": "log1p",
+    "sinh": "sinh",
+    "cosh": "cosh",
+    "tanh": "tanh",
+    "asinh": "arcsinh",
+    "acosh": "arccosh",
+    "atanh": "arctanh",
+    "pow": "power",
+}
+#: Beyond it binary128 has no numbers, nor anything between 0 and its inverse.
+_LARGEST: Final = 16384
+
+
+@dataclass(frozen=True)
+class Arithmetic:
+    """What computes with arrays of 113-bit numbers.
+
+    Attributes
+    ----------
+    name : {"real128", "mpmath"}
+    dtype : type
+        Of the arrays.
+    number : callable
+        From a float to one number, exactly.
+    divide : callable
+        Of arrays; sums, differences and products are NumPy's own operators.
+    functions : mapping of str to callable
+        Of arrays, by their names in C: sqrt, sin, ..., pow. Outside of its domain a
+        function is no number.
+    """
+
+    name: Backend
+    dtype: Any
+    number: Callable[[float], Any]
+    divide: Callable[[Any, Any], Any]
+    functions: Mapping[str, Callable[..., Any]] = field(compare=False, repr=False)
+
+    def sqrt(self, x: Any) -> Any:
+        """Return square roots."""
+        return self.functions["sqrt"](x)
+
+    def array(self, x: Any) -> Any:
+        """Return an array of floats, or one that is extended already, as 113-bit numbers."""
+        x = np.asarray(x)
+        if x.dtype == np.dtype(self.dtype):
+            return x
+        if self.dtype is object:
+            return np.frompyfunc(self.number, 1, 1)(x.astype(np.float64))
+        return x.astype(self.dtype)
+
+    def zeros(self, shape: tuple[int, ...]) -> Any:
+        """Return zeros."""
+        return np.full(shape, self.number(0.0), dtype=self.dtype)
+
+    def pair(self, x: Any) -> tuple[Array, Array]:
+        """Return (high, low): the numbers rounded to double, and the rounded rest."""
+        with np.errstate(all="ignore"):
+            high = np.asarray(x).astype(np.float64)
+            return high, np.asarray(x - self.array(high)).astype(np.float64)
+
+    def from_pair(self, high: Array, low: Array) -> Any:
+        """Return high + low."""
+        return self.array(high) + self.array(low)
+
+
+@cache
+def arithmetic(name: Backend | None = None) -> Arithmetic:
+    """Return a backend; by default the faster one that is at hand.
+
+    Raises
+    ------
+    InputError
+        No backend of this name.
+    UnsupportedError
+        heyoka, or its `real128`, is not installed.
+    """
+    if name not in (None, "real128", "mpmath"):
+        raise InputError(f"arithmetic: expected 'real128' or 'mpmath', got {name!r}")
+    if name == "mpmath":
+        return _mpmath()
+    try:
+        import heyoka
+    except ImportError:
+        heyoka = None
+    if hasattr(heyoka, "real128"):
+        functions = {name: getattr(np, its) for name, its in _FUNCTIONS.items()}
+        return Arithmetic("real128", heyoka.real128, heyoka.real128, np.divide, functions)
+    if name == "real128":
+        raise UnsupportedError("real128 takes heyoka, built with it; pip install heyoka (Linux), or use 'mpmath'")
+    return _mpmath()
+
+
+@cache
+def mpmath_context() -> Any:
+    """Return a context of mpmath's of our own, so that nobody's `mp.prec` is touched."""
+    import mpmath
+
+    context = mpmath.MPContext()
+    context.prec = BITS
+    return context
+
+
+def _mpmath() -> Arithmetic:
+    context = mpmath_context()
+
+    def divide(a: Any, b: Any) -> Any:
+        # As IEEE 754 has it, so that a singular matrix is found where results are checked.
+        return a / b if b != 0 else context.sign(a) * context.inf
+
+    def real(function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that is no number where mpmath's is complex or a pole, as with IEEE 754."""
+
+        def within(*x: Any) -> Any:
+            try:
+                y = function(*x)
+            except (ValueError, ZeroDivisionError):
+                return context.nan
+            return y if isinstance(y, context.mpf) else context.nan
+
+        return within
+
+    def bounded(growing: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Return a function that grows like exp, within the range of binary128: mpmath has no bounds but memory."""
+        most = context.mpf(_LARGEST) * context.ln2
+        return lambda x: growing(x if abs(x) < most else context.sign(x) * context.inf)
+
+    def power(a: Any, b: Any) -> Any:
+        if b == 0 or a == 1:
+            return context.one
+        if a == 0:
+            return context.inf if b < 0 else context.zero if b > 0 else context.nan
+        size = b * context.log(abs(a), 2)
+        if abs(size) < _LARGEST:
+            return context.power(a, b)
+        return context.nan if a < 0 or context.isnan(size) else context.inf if size > 0 else context.zero
+
+    own = {name: getattr(context, name) for name in _FUNCTIONS if name != "pow"}
+    own |= {name: bounded(own[name]) for name in ("exp", "expm1", "sinh", "cosh")}
+    # mpmath's own loses two digits near 1.
+    own["acosh"] = lambda x: context.log1p(x - 1 + context.sqrt((x - 1) * (x + 1)))
+    own["pow"] = power
+    functions = {name: np.frompyfunc(real(f), 2 if name in ("atan2", "pow") else 1, 1) for name, f in own.items()}
+    return Arithmetic("mpmath", object, lambda x: context.mpf(float(x)), np.frompyfunc(divide, 2, 1), functions)
+
+
+def digits(x: Any, own: Arithmetic) -> Any:
+    """Return an array of 113-bit numbers as mpmath's, exactly, for looking at."""
+    context = mpmath_context()
+    high, _ = own.pair(x)
+    rest = x - own.array(high)
+    middle, low = own.pair(rest)
+    # 113 bits are at most three doubles.
+    return np.frompyfunc(lambda *parts: context.fsum(context.mpf(float(p)) for p in parts), 3, 1)(high, middle, low)
+
+
+# Run a program on arrays of 113-bit numbers, a batch of states at once.
+#
+# Nothing is compiled: each operation is one loop over the states. Temporaries are
+# dropped with their last use. What does not depend on the state is computed once: an
+# argument that is the same for all states is given as one row, and NumPy's
+# broadcasting does the rest.
+
+# States per pass: enough to share the interpreter's work, few enough for memory.
+_LANES: Final = 128
+
+
+class Extended:
+    """A program in extended precision.
+
+    Parameters
+    ----------
+    program : Program
+    arithmetic : Arithmetic
+    """
+
+    def __init__(self, program: Program, arithmetic: Arithmetic) -> None:
+        self.program, self.arithmetic = program, arithmetic
+        functions = _functions(arithmetic)
+        last: dict[int, int] = {}
+        for k, operation in enumerate(program.operations):
+            if operation.name != "input":
+                last.update(dict.fromkeys(operation.arguments, k))
+        for out in program.outputs:
+            last.update((int(k), -1) for k in out.flat)
+        dying: list[list[int]] = [[] for _ in program.operations]
+        for i, k in last.items():
+            if k >= 0:
+                dying[k].append(i)
+        self._inputs: list[tuple[int, int, int]] = []
+        self._constants: list[tuple[int, Any]] = []
+        self._steps: list[tuple[int, Callable[..., Any], tuple[int, ...], list[int]]] = []
+        for k, operation in enumerate(program.operations):
+            if operation.name == "input":
+                which, entry = operation.arguments
+                self._inputs.append((k, which, entry))
+            elif operation.name == "const":
+                self._constants.append((k, arithmetic.array(np.full(1, operation.value))))
+            else:
+                self._steps.append((k, functions[operation.name], operation.arguments, dying[k]))
+
+    def __call__(self, *arguments: Any) -> list[Any]:
+        """Return each output, shape (N, rows, columns), as 113-bit numbers.
+
+        Parameters
+        ----------
+        *arguments : (N, n) or (1, n) array
+            float64 or 113-bit; a single row stands for all states.
+        """
+        n = max((len(x) for x in arguments), default=1) if all(len(x) for x in arguments) else 0
+        own = self.arithmetic
+        outputs = [np.empty((n, *shape), dtype=own.dtype) for shape in self.program.shapes]
+        with np.errstate(all="ignore"):
+            columns = [np.ascontiguousarray(own.array(x).T) for x in arguments]
+            for start in range(0, n, _LANES):
+                part = slice(start, start + _LANES)
+                self._run([c if c.shape[1] == 1 else c[:, part] for c in columns], [out[part] for out in outputs])
+        return outputs
+
+    def _run(self, columns: list[Any], outputs: list[Any]) -> None:
+        values: list[Any] = [None] * len(self.program.operations)
+        for k, which, entry in self._inputs:
+            values[k] = columns[which][entry]
+        for k, constant in self._constants:
+            values[k] = constant
+        for k, function, used, dying in self._steps:
+            values[k] = function(*[values[i] for i in used])
+            for i in dying:
+                values[i] = None
+        for out, where in zip(outputs, self.program.outputs, strict=True):
+            for index in np.ndindex(where.shape):
+                out[(slice(None), *index)] = values[int(where[index])]
+
+
+def _functions(own: Arithmetic) -> dict[str, Callable[..., Any]]:
+    zero, one = own.array(np.zeros(1)), own.array(np.ones(1))
+
+    def truth(holds: Any) -> Any:
+        return np.where(holds, one, zero)
+
+    return {
+        **own.functions,
+        "add": np.add,
+        "sub": np.subtract,
+        "mul": np.multiply,
+        "div": own.divide,
+        "neg": np.negative,
+        "sq": lambda x: x * x,
+        "twice": lambda x: x + x,
+        "inv": lambda x: own.divide(one, x),
+        "hypot": lambda a, b: own.sqrt(a * a + b * b),
+        "fabs": lambda x: np.where(x < zero, -x, x),
+        "sign": lambda x: np.where(x > zero, one, np.where(x < zero, -one, x)),
+        "fmin": lambda a, b: np.where((a < b) | (a != a), a, b),
+        "fmax": lambda a, b: np.where((a > b) | (a != a), a, b),
+        "lt": lambda a, b: truth(a < b),
+        "le": lambda a, b: truth(a <= b),
+        "eq": lambda a, b: truth(a == b),
+        "ne": lambda a, b: truth(a != b),
+        "not": lambda a: truth(a == zero),
+        "and": lambda a, b: truth((a != zero) & (b != zero)),
+        "or": lambda a, b: truth((a != zero) | (b != zero)),
+        "if_else_zero": lambda a, b: np.where(a != zero, b, zero),
+    }
+
+
+# Solve M a = f in extended precision, for all states at once.
+#
+# The same elimination as `mbkit.derivation.mass_matrix_solve` (Featherstone 2008, Rigid Body
+# Dynamics Algorithms, ch. 6.5), on arrays of numbers instead of expressions.
+
+
+def product(M: Any, x: Any) -> Any:
+    """Return M x for (N, n, n) and (N, n) arrays of 113-bit numbers."""
+    out = np.zeros_like(x)
+    for j in range(x.shape[1]):
+        out = out + M[:, :, j] * x[:, j : j + 1]
+    return out
+
+
+def solve(M: Any, f: Any, pattern: Array, order: Sequence[int], own: Arithmetic) -> Any:
+    """Return M⁻¹ f, shape (N, n); not finite where M is singular.
+
+    Parameters
+    ----------
+    M, f : (N, n, n) and (N, n) arrays of 113-bit numbers
+    pattern : (n, n) bool array
+        Where M can be other than zero.
+    order : sequence of int
+        The indices with every parent before its children.
+    own : Arithmetic
+    """
+    n = len(order)
+    zero = own.zeros((1,))
+    rows: list[dict[int, Any]] = []
+    for k, i in enumerate(order):
+        rows.append({m: M[:, i, j] for m, j in enumerate(order[: k + 1]) if pattern[i, j] or m == k})
+    x = [f[:, i] for i in order]
+    diagonal: list[Any] = [None] * n
+    factors: list[dict[int, Any]] = [{} for _ in range(n)]
+    with np.errstate(all="ignore"):
+        for k in reversed(range(n)):
+            row = rows[k]
+            diagonal[k] = row.pop(k)
+            for i in sorted(row, reverse=True):
+                factors[k][i] = own.divide(row[i], diagonal[k])
+                for j, entry in row.items():
+                    if j <= i:
+                        rows[i][j] = rows[i].get(j, zero) - factors[k][i] * entry
+            for i, factor in factors[k].items():
+                x[i] = x[i] - factor * x[k]
+        for k in range(n):
+            x[k] = own.divide(x[k], diagonal[k])
+            for i, factor in factors[k].items():
+                x[k] = x[k] - factor * x[i]
+    out = np.empty_like(f)
+    for k, i in enumerate(order):
+        out[:, i] = x[k]
+    return out

@@ -1,0 +1,112 @@
+"""Machine code for this processor, by LLVM (llvmlite).
+
+A compiled program is an object file in memory: bytes that can be kept and loaded
+again, by this process or another one on the same kind of processor.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+import llvmlite
+from llvmlite import binding as llvm
+from llvmlite.binding.newpassmanagers import NewPassManager
+
+from mbkit._fork import fork_safe
+from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, batch_code
+from mbkit.codegen.program import Program
+from mbkit.codegen.simd_kernel import vector_code
+
+__all__ = ["COMPILING", "Host", "Loaded", "batch_object", "host", "load", "object_code", "program_object"]
+
+_SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+
+
+class Host(NamedTuple):
+    """What machine code depends on; `width` is the number of doubles in a register."""
+
+    triple: str
+    cpu: str
+    features: str
+    width: int
+    llvm: str
+
+
+class Loaded:
+    """A function in memory; its code lives as long as this object."""
+
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
+        #: Called with the addresses of table and work space and a range of samples;
+        #: other Python threads run meanwhile.
+        self.run = _SIGNATURE(engine.get_function_address(RUN))
+
+
+#: One thread compiles at a time: LLVM's own tables are shared by the process.
+COMPILING: Final = fork_safe(threading.RLock())
+if hasattr(llvm.ffi.lib, "_lock"):
+    # Modules are also freed outside of COMPILING, under the lock of llvmlite itself.
+    fork_safe(llvm.ffi.lib._lock)
+
+
+@cache
+def host() -> Host:
+    """Return what this machine's code depends on."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    found = llvm.get_host_cpu_features()
+    width = 8 if found.get("avx512f") else 4 if found.get("avx") else 2
+    version = f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
+    return Host(llvm.get_process_triple(), llvm.get_host_cpu_name(), found.flatten(), width, version)
+
+
+def _target() -> Any:
+    h = host()
+    return llvm.Target.from_triple(h.triple).create_target_machine(cpu=h.cpu, features=h.features, opt=2, jit=True)
+
+
+def object_code(text: str) -> bytes:
+    """Return the object file of LLVM's textual code."""
+    # LLVM keeps the constants and types of what it compiles as long as the context, of which a global one
+    # would grow for ever.
+    with COMPILING, llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
+        target = _target()
+        builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
+        passes = builder.getModulePassManager()
+        try:
+            passes.run(module, builder)
+        finally:
+            # llvmlite 0.50 frees no pass manager: ObjectRef's empty _dispose hides NewPassManager's.
+            if type(passes)._dispose is llvm.ffi.ObjectRef._dispose:
+                NewPassManager._dispose(passes)
+            passes.close()
+        return bytes(target.emit_object(module))
+
+
+def program_object(program: Program) -> tuple[bytes, int]:
+    """Return a program's object file, and how many doubles of work space its body needs."""
+    if max(len(program.inputs), len(program.outputs)) > MOST_ARRAYS:
+        raise ValueError(f"expected at most {MOST_ARRAYS} arguments and as many results")
+    width = host().width
+    text, vectors = vector_code(program, width)
+    return object_code(text), vectors * width
+
+
+def batch_object() -> bytes:
+    """Return the object file of the loop over a batch, which every program shares."""
+    return object_code(batch_code(host().width))
+
+
+def load(*objects: bytes) -> Loaded:
+    """Return the function of object files that belong together."""
+    host()
+    with COMPILING:
+        # llvmlite's memory manager keeps all sections within reach of one another.
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target(), use_lmm=True)
+        for code in objects:
+            engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        return Loaded(engine)

@@ -1,0 +1,251 @@
+"""Parts of a step run round after round on a few states side by side, in one piece of machine code.
+
+A single state uses one lane of a vector, and a loop around each part would cost as
+much as the parts. So all that the parts read and write has a fixed place in one array,
+the arena, and the loop over rounds is compiled with them: a function that stands
+several times among the parts, the forward dynamics, is compiled once and called. Vectors are
+of four numbers, which for one state are faster than eight: shorter divisions and
+roots, and less to keep aside.
+
+The function has the signature ::
+
+    void run(double *arena, int64 *ways, int64 first, int64 last)
+
+Every round it fetches the rows of the state from ``ways[0] + round * ways[1]``, runs the
+parts, and copies the rows of the new state to ``ways[2] + round * bytes``. The number of
+rounds done is left in ``ways[3]``: all, or as many as were made before no lane of the
+new state's last row was other than zero, if ``ways[4]`` asks to look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import accumulate, pairwise
+from typing import Any, Final
+from weakref import WeakValueDictionary
+
+import casadi as ca
+
+from mbkit._version import __version__
+from mbkit.codegen import disk_cache as disk
+from mbkit.codegen import jit
+from mbkit.codegen.batch_loop import RUN
+from mbkit.codegen.llvm_ir import declarations, library
+from mbkit.codegen.program import Program, program
+from mbkit.codegen.simd_kernel import Piece, pieces_of, slots_of
+from mbkit.derivation.fingerprint import SOURCES
+from mbkit.derivation.steps.fixed import Part
+
+__all__ = ["Lanes", "lanes", "width"]
+
+_NAME: Final = "mbkit_part"
+
+
+def width() -> int:
+    """Return the number of states side by side."""
+    return min(4, jit.host().width)
+
+
+class Lanes:
+    """The machine code of parts, and where everything is in the arena.
+
+    Attributes
+    ----------
+    rows : dict of str to (int, int)
+        First row and number of rows of each name that the parts read or write.
+    size : int
+        Rows of the arena; a row has a number for each lane.
+    operations : int
+        Scalar operations of one round.
+    loaded : jit.Loaded
+        The code itself.
+    """
+
+    def __init__(self, about: dict[str, Any], code: bytes) -> None:
+        self.rows = {name: (int(a), int(n)) for name, (a, n) in about["rows"].items()}
+        self.size = int(about["size"])
+        self.operations = int(about["operations"])
+        self.loaded = jit.load(code)
+
+
+def lanes(name: Sequence[str], make: Callable[[], Sequence[Part]], state: Sequence[str]) -> Lanes:
+    """Return machine code of parts: kept in this process, from disk, or made now.
+
+    Parameters
+    ----------
+    name : sequence of str
+        All that the parts depend on but the code of mbkit.
+    make : callable
+        Derives the parts, in order; one name among them is one function, which reads
+        the same each time. Called only if they have not been compiled before.
+    state : sequence of str
+        What a round starts from. The last part writes these names with a 1 behind,
+        in this order.
+    """
+    key = disk.key_of("lanes", *name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, (*jit.host(), width())))
+    found = None if disk.forgotten(key) else _HELD.get(key)
+    if found is None:
+        found = _HELD[key] = _from_disk(key) or _made(key, make(), state)
+    return found
+
+
+_HELD: Final[WeakValueDictionary[str, Lanes]] = WeakValueDictionary()
+
+
+def _from_disk(key: str) -> Lanes | None:
+    found = disk.read(key)
+    if found is None:
+        return None
+    try:
+        return Lanes(*found)
+    except (KeyError, TypeError, ValueError):
+        # Whole, and ours by its key, but not of this form: made anew.
+        return None
+
+
+def _made(key: str, parts: Sequence[Part], state: Sequence[str]) -> Lanes:
+    made = {part.name: part.make for part in parts}
+    programs = {name: program(make()) for name, make in made.items()}
+    rows, size = _rows(parts, programs, state)
+    written = {part.name: _Function(part, programs[part.name], rows, size) for part in parts}
+    size += max(f.work for f in written.values())
+    calls = [f"  call void @{_NAME}_{p.name}(ptr %arena, ptr %out_{p.writes[0]})" for p in parts]
+    first, count = rows[state[0]][0], sum(rows[name][1] for name in state)
+    round_ = _round(calls, {p.writes[0]: rows[p.writes[0]][0] for p in parts}, (first, rows[f"{state[0]}1"][0], count))
+    text = "\n".join(
+        [declarations(width()), library(width(), *programs.values()), *(f.text for f in written.values()), round_]
+    )
+    code = jit.object_code(text)
+    operations = sum(programs[part.name].arithmetic for part in parts)
+    about = {"rows": rows, "size": size, "operations": operations}
+    disk.write(key, about, code)
+    return Lanes(about, code)
+
+
+def _rows(
+    parts: Sequence[Part], programs: dict[str, Program], state: Sequence[str]
+) -> tuple[dict[str, tuple[int, int]], int]:
+    """Return a place for every name: what a part writes, one after another; and the number of rows."""
+    sizes: dict[str, int] = {}
+    order: list[str] = [*state]
+    for part in parts:
+        sizes.update(zip(part.reads, programs[part.name].inputs, strict=True))
+        sizes.update(zip(part.writes, (r * c for r, c in programs[part.name].shapes), strict=True))
+        order += part.writes
+    for name in state:
+        # Nobody may read what is only handed on.
+        sizes.setdefault(name, sizes[f"{name}1"])
+    order += [name for part in parts for name in part.reads]
+    order = list(dict.fromkeys(order))
+    starts = [0, *accumulate(sizes[name] for name in order)]
+    rows = {name: (start, sizes[name]) for name, start in zip(order, starts, strict=False)}
+    for part in parts:
+        places = [rows[name] for name in part.writes]
+        if any(a + n != b for (a, n), (b, _) in pairwise(places)):
+            raise ValueError(f"part {part.name!r}: what it writes is written elsewhere in another order")
+    return rows, starts[-1]
+
+
+class _Function:
+    """The code of one part: a function of the arena and of where its results go."""
+
+    def __init__(self, part: Part, made: Program, rows: dict[str, tuple[int, int]], size: int) -> None:
+        pieces = pieces_of(made)
+        slots = slots_of(made, pieces)
+        self.work = max(slots.values(), default=0) + 1
+        names = [f"{_NAME}_{part.name}_{k}" for k in range(len(pieces))]
+        texts = []
+        for k, piece in enumerate(pieces):
+            one = _Placed(made, piece, [rows[name][0] for name in part.reads], size)
+            one.write(slots, first=k == 0)
+            texts.append(one.function(names[k]))
+        calls = "\n".join(f"  call void @{name}(ptr %arena, ptr %out)" for name in names)
+        head = f"define internal void @{_NAME}_{part.name}(ptr noalias %arena, ptr noalias %out) nounwind {{"
+        self.text = "\n".join([*texts, f"{head}\n{calls}\n  ret void\n}}\n"])
+
+
+class _Placed(Piece):
+    """A piece whose arguments, results and work space have fixed places."""
+
+    def __init__(self, made: Program, piece: list[int], reads: list[int], work: int) -> None:
+        super().__init__(made, piece, width())
+        self._reads, self._start = reads, work
+        self._writes = [0, *accumulate(out.size for out in made.outputs)]
+        for i, out in enumerate(made.outputs):
+            for j, k in enumerate(out.ravel().tolist()):
+                # Zeros are stored like everything else.
+                if (i, j) not in self._outputs.setdefault(k, []):
+                    self._outputs[k].append((i, j))
+
+    def _place(self, arrays: str, strides: str, i: int, j: int) -> str:  # noqa: ARG002  # rows are all alike
+        row = (self._reads if arrays == "in" else self._writes)[i] + j
+        return self._row("arena" if arrays == "in" else "out", row)
+
+    def _work(self, slot: int) -> str:
+        return self._row("arena", self._start + slot)
+
+    def _row(self, base: str, row: int) -> str:
+        return self._text.put(f"getelementptr inbounds {self._text.vector}, ptr %{base}, i64 {row}")
+
+    def _watch(self) -> None:
+        # The error of a step tells of what is no number.
+        pass
+
+    def function(self, name: str) -> str:
+        lines = "\n".join(self._text.lines)
+        head = f"define internal void @{name}(ptr noalias %arena, ptr noalias %out) noinline nounwind {{"
+        return f"{head}\n{lines}\n  ret void\n}}\n"
+
+
+def _round(calls: list[str], outs: dict[str, int], state: tuple[int, int, int]) -> str:
+    """Return the loop over rounds; `state` has the first rows of old and new state, and how many they are."""
+    w = width()
+    V, row = f"<{w} x double>", 8 * w
+    old, new, count = state
+    places = "\n".join(
+        f"  %out_{name} = getelementptr inbounds {V}, ptr %arena, i64 {place}" for name, place in outs.items()
+    )
+    ways = "\n".join(
+        f"  %at{i} = getelementptr i64, ptr %ways, i64 {i}\n  %{name} = load i64, ptr %at{i}"
+        for i, name in enumerate(("source", "stride", "log", "unused", "heed"))
+    )
+    body = "\n".join(calls)
+    return f"""
+declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
+
+define void @{RUN}(ptr %arena, ptr %ways, i64 %first, i64 %last) nounwind {{
+entry:
+  %old = getelementptr inbounds {V}, ptr %arena, i64 {old}
+  %new = getelementptr inbounds {V}, ptr %arena, i64 {new}
+  %flag = getelementptr inbounds {V}, ptr %arena, i64 {new + count - 1}
+{places}
+{ways}
+  %heeds = icmp ne i64 %heed, 0
+  store i64 %first, ptr %at3
+  %any = icmp slt i64 %first, %last
+  br i1 %any, label %one, label %done
+one:
+  %i = phi i64 [ %first, %entry ], [ %next, %one ]
+  %from = mul i64 %i, %stride
+  %fromwhere = add i64 %source, %from
+  %fromthere = inttoptr i64 %fromwhere to ptr
+  call void @llvm.memcpy.p0.p0.i64(ptr %old, ptr %fromthere, i64 {count * row}, i1 false)
+{body}
+  %to = mul i64 %i, {count * row}
+  %towhere = add i64 %log, %to
+  %tothere = inttoptr i64 %towhere to ptr
+  call void @llvm.memcpy.p0.p0.i64(ptr %tothere, ptr %new, i64 {count * row}, i1 false)
+  %flags = load {V}, ptr %flag, align 8
+  %goes = fcmp une {V} %flags, zeroinitializer
+  %go = call i1 @llvm.vector.reduce.or.v{w}i1(<{w} x i1> %goes)
+  %stays = xor i1 %go, true
+  %ends = and i1 %heeds, %stays
+  %next = add i64 %i, 1
+  store i64 %next, ptr %at3
+  %last_one = icmp sge i64 %next, %last
+  %over = or i1 %ends, %last_one
+  br i1 %over, label %done, label %one
+done:
+  ret void
+}}
+"""

@@ -1,0 +1,305 @@
+"""The equations of motion as Taylor integrators of heyoka's, in double and beyond.
+
+A Taylor step expands the solution to the order that its tolerance asks for, by
+automatic differentiation of every operation (Jorba and Zou 2005, A software package
+for the numerical integration of ODEs by means of high-order Taylor methods;
+Biscani and Izzo 2021, Revisiting high-order Taylor methods for astrodynamics and
+celestial mechanics). So the graph that CasADi made is handed over operation by
+operation, and q̇ = D(q) v and v̇ of it are compiled together.
+
+Rotations see unit quaternions: each is divided by its norm before it enters the
+dynamics, while its rate D(q) v stays linear in it. Its norm is then a constant of
+the exact flow, and whatever it drifts by never bends the motion.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import casadi as ca
+import numpy as np
+
+from mbkit._check import Array
+from mbkit._fork import fork_safe
+from mbkit.codegen.program import Operation, program
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.mass_matrix_solve import elimination_size
+from mbkit.errors import UnsupportedError
+
+__all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
+
+# A compiler's time for more is no longer spent unasked: 34,000 operations take 9 s.
+_MOST: Final = 100_000
+# Up to this many operations times order², the recurrences are written out: 2 to 3
+# times as fast to run as loops over them, compiled in about a second.
+_UNROLLED: Final = 25_000
+_KINKS: Final = frozenset(
+    {"fabs", "sign", "fmin", "fmax", "lt", "le", "eq", "ne", "not", "and", "or", "if_else_zero"}
+    # A series follows the branch that it began on.
+    | {"sqrt", "hypot", "pow", "asin", "acos", "acosh", "atan2"}
+)
+#: Functions that heyoka calls as we do.
+_SAME: Final = (
+    *("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
+    *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
+#: heyoka's default limit of the machine code that it keeps in memory, bytes, and the one that replaces it:
+#: enough for some hundred systems.
+_HEYOKAS_MEMORY: Final = 2**31
+_MEMORY: Final = 2**26
+#: heyoka's compiler has locks of its own, which a forked child must not find held.
+_COMPILING: Final = fork_safe(threading.RLock())
+_REMEDY: Final = "method='rk853' and method='dop853' go without it"
+
+
+@dataclass(frozen=True)
+class Precision:
+    """A format of numbers.
+
+    Attributes
+    ----------
+    bits : int
+        Of the significand: 53, 64 or 113.
+    dtype : type
+        Of the arrays.
+    eps : float
+        Spacing of the numbers at 1.
+    """
+
+    bits: int
+    dtype: Any
+
+    @property
+    def eps(self) -> float:
+        """Spacing of the numbers at 1."""
+        return 2.0 ** (1 - self.bits)
+
+    def array(self, high: Array, low: Array | float = 0.0) -> Any:
+        """Return high + low."""
+        return np.asarray(high, dtype=np.float64).astype(self.dtype) + np.asarray(low, dtype=np.float64).astype(
+            self.dtype
+        )
+
+    def pair(self, x: Any) -> tuple[Array, Array]:
+        """Return (high, low): numbers rounded to double, and the rounded rest."""
+        high = np.asarray(x).astype(np.float64)
+        return high, (x - high.astype(self.dtype)).astype(np.float64)
+
+
+#: Bits of a format -> the name that heyoka and NumPy know it by.
+PRECISIONS: Final = {53: "double", 64: "80-bit extended", 113: "quadruple"}
+
+
+def precision(bits: int) -> Precision:
+    """Return a format that heyoka computes in here.
+
+    Raises
+    ------
+    UnsupportedError
+        heyoka is not installed, or this machine or build does not have the format.
+    """
+    heyoka = _heyoka()
+    if bits == 53:
+        return Precision(53, np.float64)
+    if bits == 64 and np.finfo(np.longdouble).nmant == 63 and hasattr(heyoka, "taylor_adaptive_ldbl"):
+        return Precision(64, np.longdouble)
+    if bits == 113 and hasattr(heyoka, "real128"):
+        return Precision(113, heyoka.real128)
+    name = PRECISIONS.get(bits, f"{bits}-bit")
+    raise UnsupportedError(f"taylor: heyoka has no {name} numbers on this machine; in double: dynamics(model)")
+
+
+def _heyoka() -> Any:
+    try:
+        import heyoka
+    except ImportError:
+        raise UnsupportedError(
+            "taylor: heyoka is not installed; pip install heyoka (Linux), or conda install -c conda-forge heyoka.py; "
+            + _REMEDY
+        ) from None
+    if heyoka.llvm_state.get_memcache_limit() == _HEYOKAS_MEMORY:
+        heyoka.llvm_state.set_memcache_limit(_MEMORY)
+    return heyoka
+
+
+def order_of(tolerance: float) -> int:
+    """Return the order of the Taylor series that a tolerance asks for (Jorba and Zou 2005, eq. 3.4).
+
+    The length of a step follows from the series, so that tolerances of one order make
+    the same run.
+    """
+    return max(2, math.ceil(1 - math.log(tolerance) / 2))
+
+
+def rates(equations: Equations) -> ca.Function:
+    """Return (q, v, tau) -> (q̇, v̇), with the equations' trailing arguments behind; quaternions of any norm."""
+    eq, q = equations, ca.SX(equations.q)
+    for start, _ in eq.model.quaternions:
+        part = eq.q[start : start + 4]
+        q[start : start + 4] = part / ca.sqrt(ca.sumsqr(part))
+    forward = eq.function("forward_dynamics")
+    a = forward(q, eq.v, eq.tau, *eq.trailing.values())
+    given = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.trailing}
+    outs = [ca.densify(eq.kin.qdot), ca.densify(a)]
+    return ca.Function("rates", list(given.values()), outs, list(given), ["qdot", "a"])
+
+
+class TaylorSystem:
+    """A model's equations of motion, ready to be compiled for any tolerance and format.
+
+    Parameters
+    ----------
+    equations : Equations
+        With literal constants for double; with symbols, which keep all their digits,
+        for more than double.
+
+    Attributes
+    ----------
+    operations : int
+        Scalar operations of one evaluation.
+    rates : casadi.Function
+        As `rates` gives it.
+    kinked : bool
+        Whether a length, an absolute value, a decision or a function with branches enters,
+        where forces can jump. A series goes on analytically there, as if nothing had
+        happened.
+    clock : int or None
+        Place of the time among what is behind tau, where it enters.
+
+    Raises
+    ------
+    UnsupportedError
+        heyoka is not installed, or the forward dynamics is too large to be written out.
+    """
+
+    def __init__(self, equations: Equations) -> None:
+        heyoka = _heyoka()
+        size = elimination_size(equations.model)
+        if size <= _MOST:
+            self.rates = rates(equations)
+            made = program(self.rates)
+            size = made.arithmetic
+        if size > _MOST:
+            name = equations.model.name
+            raise UnsupportedError(
+                f"taylor: {name} takes {size} operations, too many for a Taylor series; method='rk853' or 'dop853'"
+            )
+        self.operations = made.arithmetic
+        # Each quaternion's norm is a square root too, and each constraint's weight, of what never vanishes.
+        kinks, model = sum(o.name in _KINKS for o in made.operations), equations.model
+        rows = equations.constraints.value.numel() if model.constrained else 0  # type: ignore[attr-defined]  # written
+        self.kinked = kinks > len(model.quaternions) + rows
+        # Parameters stand first among what is behind tau.
+        self.clock = list(model.parameters).index(model.clock) if model.clock else None
+        self._nq, self._nv = made.inputs[:2]
+        #: Place of each parameter among heyoka's -> (argument, entry); unused ones have none.
+        self._places: dict[tuple[int, int], int] = {}
+        variables = heyoka.make_vars(*(f"y{i}" for i in range(self._nq + self._nv)))
+        variables = [variables] if self._nq + self._nv == 1 else list(variables)
+        self._system = list(zip(variables, self._expressions(heyoka, made, variables), strict=True))
+        self._idle: dict[tuple[int, int], list[Any]] = {}
+
+    def _expressions(self, heyoka: Any, made: Any, variables: list[Any]) -> list[Any]:
+        functions, clock = _functions(heyoka), self.clock
+        values: list[Any] = []
+
+        def entry(operation: Operation) -> Any:
+            which, at = operation.arguments
+            if which < 2:
+                return variables[at + which * self._nq]
+            if which == 3 and at == clock:
+                return heyoka.time
+            return heyoka.par[self._places.setdefault((which, at), len(self._places))]
+
+        for operation in made.operations:
+            if operation.name == "input":
+                values.append(entry(operation))
+            elif operation.name == "const":
+                values.append(heyoka.expression(operation.value))
+            else:
+                values.append(functions[operation.name](*(values[i] for i in operation.arguments)))
+        return [values[k] for out in made.outputs for k in out.ravel()]
+
+    @contextmanager
+    def integrator(self, kind: Precision, tolerance: float) -> Iterator[Any]:
+        """Lend a `heyoka.taylor_adaptive` that nobody else uses meanwhile.
+
+        Its state, time and parameters are whatever the last user left. It is compiled
+        when there is none to lend; heyoka keeps what it compiled in memory and on disk.
+        """
+        key = (kind.bits, order_of(tolerance))
+        idle = self._idle.setdefault(key, [])
+        try:
+            made = idle.pop()
+        except IndexError:
+            made = self._compiled(kind, tolerance)
+        yield made
+        # One whose run ended in an error is not lent again.
+        idle.append(made)
+
+    def _compiled(self, kind: Precision, tolerance: float) -> Any:
+        n = self._nq + self._nv
+        # Beyond double the arithmetic itself takes so long that loops cost nothing.
+        compact = kind.bits > 53 or self.operations * order_of(tolerance) ** 2 > _UNROLLED
+        with _COMPILING:
+            return _heyoka().taylor_adaptive(
+                self._system,
+                np.zeros(n).astype(kind.dtype),
+                pars=np.zeros(len(self._places)).astype(kind.dtype),
+                tol=kind.dtype(max(tolerance, kind.eps)),
+                fp_type=float if kind.bits == 53 else kind.dtype,
+                compact_mode=compact,
+                # In loops more optimization takes half as long again, and gains nothing; where every
+                # operation is a call, any takes three times as long.
+                opt_level=0 if kind.bits == 113 else 1 if compact else 3,
+            )
+
+    def fill(self, integrator: Any, *arguments: Any) -> None:
+        """Write tau, and what else stands behind (q, v), into an integrator's parameters."""
+        for (which, at), place in self._places.items():
+            if which - 2 < len(arguments):
+                integrator.pars[place] = arguments[which - 2][at]
+
+
+def taylor_system(equations: Equations) -> TaylorSystem:
+    """Return the Taylor system of equations, made once for all dynamics that share them."""
+    if "taylor" not in equations.kept:
+        equations.kept["taylor"] = TaylorSystem(equations)
+    made: TaylorSystem = equations.kept["taylor"]
+    return made
+
+
+def _functions(heyoka: Any) -> dict[str, Any]:
+    zero, one = heyoka.expression(0.0), heyoka.expression(1.0)
+    select, below, other = heyoka.select, heyoka.lt, heyoka.neq
+    either, both = heyoka.logical_or, heyoka.logical_and
+    return {
+        **{name: getattr(heyoka, name) for name in _SAME},
+        "add": lambda a, b: a + b,
+        "sub": lambda a, b: a - b,
+        "mul": lambda a, b: a * b,
+        "div": lambda a, b: a / b,
+        "neg": lambda a: -a,
+        "sq": lambda a: a * a,
+        "twice": lambda a: 2.0 * a,
+        "inv": lambda a: one / a,
+        "pow": lambda a, b: a**b,
+        "hypot": lambda a, b: heyoka.sqrt(a * a + b * b),
+        "fabs": lambda a: select(below(a, zero), -a, a),
+        "sign": lambda a: select(below(a, zero), -one, select(below(zero, a), one, zero)),
+        "fmin": lambda a, b: select(either([below(a, b), other(a, a)]), a, b),
+        "fmax": lambda a, b: select(either([below(b, a), other(a, a)]), a, b),
+        "lt": below,
+        "le": heyoka.lte,
+        "eq": heyoka.eq,
+        "ne": other,
+        "not": lambda a: heyoka.eq(a, zero),
+        "and": lambda a, b: both([other(a, zero), other(b, zero)]),
+        "or": lambda a, b: either([other(a, zero), other(b, zero)]),
+        "if_else_zero": lambda a, b: select(other(a, zero), b, zero),
+    }

@@ -1,0 +1,103 @@
+"""Sparse LᵀDL solution of M a = f, written out as expressions.
+
+Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 6.5: eliminating from the
+leaves to the root fills in nothing on a tree. Mimic joints and the rotors of joint
+couplings couple branches; the entries that they fill in are added to the pattern.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from mbkit.derivation.model_values import scalar
+from mbkit.model import Model
+
+__all__ = ["Factors", "elimination_order", "elimination_size", "solve"]
+
+
+def elimination_order(model: Model) -> tuple[int, ...]:
+    """Return the velocity indices with every parent before its children."""
+    parts = [model.layout.v[j.name] for j in model.tree]
+    return tuple(i for part in parts for i in range(part.start, part.stop))
+
+
+def elimination_size(model: Model) -> int:
+    """Return about how many multiplications `solve` takes, from the tree alone."""
+    rank = {index: k for k, index in enumerate(elimination_order(model))}
+    moving: dict[str, frozenset[int]] = {"world": frozenset()}
+    before: dict[int, set[int]] = {i: set() for i in rank}
+    for joint in model.tree:
+        part = model.layout.v[joint.mimic.joint if joint.mimic else joint.name]
+        moving[joint.child] = moving[joint.parent] | frozenset(range(part.start, part.stop))
+        # Of two velocities that move one body, the later one's row has an entry.
+        for i in moving[joint.child]:
+            before[i] |= {j for j in moving[joint.child] if rank[j] <= rank[i]}
+    rotors = [c for c in model.couplings if c.armature or any(b.part == c.name for b in model.bindings)]
+    for coupling in rotors:
+        row = np.flatnonzero(model.layout.coupling_row(coupling) @ model.layout.G).tolist()
+        for i in row:
+            before[i] |= {j for j in row if rank[j] <= rank[i]}
+    if rotors:
+        # They couple branches: eliminating one velocity after the other fills in more entries.
+        for k in sorted(rank, key=rank.__getitem__, reverse=True):
+            for i in before[k] - {k}:
+                before[i] |= {j for j in before[k] if rank[j] <= rank[i]}
+    return sum(len(earlier) ** 2 for earlier in before.values())
+
+
+def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
+    """Return M⁻¹ f.
+
+    Parameters
+    ----------
+    M : (n, n) casadi.SX
+        Symmetric positive definite, sparse.
+    f : (n,) or (n, k) casadi.SX
+        Right-hand sides; what is structurally zero stays so where it can.
+    order : sequence of int
+        The indices with every parent before its children.
+    """
+    return Factors(M, order).solve(f)
+
+
+class Factors:
+    """The LᵀDL factors of a matrix, for several right-hand sides one after the other; parameters as of `solve`."""
+
+    def __init__(self, M: ca.SX, order: Sequence[int]) -> None:
+        n = M.shape[0]
+        self._order = tuple(order)
+        rank = {index: k for k, index in enumerate(order)}
+        rows: list[dict[int, Any]] = [{} for _ in range(n)]
+        for i, j in zip(*M.sparsity().get_triplet(), strict=True):
+            if rank[j] <= rank[i]:
+                rows[rank[i]][rank[j]] = scalar(M[i, j])
+        self._diagonal: list[Any] = [None] * n
+        self._factors: list[dict[int, Any]] = [{} for _ in range(n)]
+        for k in reversed(range(n)):
+            row, factors = rows[k], self._factors[k]
+            # A joint that moves nothing has no entry at all: the quotient is then
+            # infinite, and whoever evaluates finds it.
+            self._diagonal[k] = row.pop(k, 0.0)
+            for i in sorted(row, reverse=True):
+                factors[i] = row[i] / self._diagonal[k]
+                for j, entry in row.items():
+                    if j <= i:
+                        rows[i][j] = rows[i].get(j, 0.0) - factors[i] * entry
+
+    def solve(self, f: ca.SX) -> ca.SX:
+        """Return M⁻¹ f, (n,) or (n, k)."""
+        n = len(self._order)
+        x = [scalar(f[index, :]) for index in self._order]
+        for k in reversed(range(n)):
+            for i, factor in self._factors[k].items():
+                x[i] = x[i] - factor * x[k]
+        for k in range(n):
+            x[k] = x[k] / self._diagonal[k] - sum((factor * x[i] for i, factor in self._factors[k].items()), 0.0)
+        rows_out: list[Any] = [None] * n
+        for k, index in enumerate(self._order):
+            rows_out[index] = x[k]
+        return ca.vertcat(ca.SX(0, f.shape[1]), *rows_out)

@@ -1,0 +1,208 @@
+"""The numbers of a description as the equations read them: floats, or symbols.
+
+This is the one place through which a number of the model enters an expression.
+With literal constants a number is a float, and CasADi folds it in double while the
+graph is built. With symbols it is an argument, so that the graph can be evaluated
+in any precision: no two of them meet in double on the way.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, Final, Literal
+
+import casadi as ca
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.errors import InputError
+from mbkit.model import Frame, Joint, Model
+
+__all__ = ["Constants", "Scalar", "Values", "cos", "is_zero", "scalar", "sin"]
+
+
+# Expressions whose arithmetic is quick to write down, entry by entry.
+#
+# CasADi's operators first look for what their operands could be converted to, some
+# 15 µs each; `SX.binary` is told, and takes 2. A tree's kinematics are tens of thousands
+# of them. The functions are those that a joint's kind asks for: this module stands for
+# CasADi there.
+
+
+class Scalar(ca.SX):
+    """A `casadi.SX` whose operators take expressions and floats, and no other operand.
+
+    Zeros and ones among the floats vanish, as they do in CasADi.
+    """
+
+    def __add__(self, other: Any) -> Any:
+        return self if _is(other, 0.0) else _of(ca.OP_ADD, self, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return self if _is(other, 0.0) else _of(ca.OP_ADD, other, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return self if _is(other, 0.0) else _of(ca.OP_SUB, self, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return _of(ca.OP_SUB, other, self)
+
+    def __mul__(self, other: Any) -> Any:
+        if _is(other, 0.0):
+            return 0.0
+        return self if _is(other, 1.0) else _of(ca.OP_MUL, self, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        if _is(other, 0.0):
+            return 0.0
+        return self if _is(other, 1.0) else _of(ca.OP_MUL, other, self)
+
+    def __truediv__(self, other: Any) -> Any:
+        return _of(ca.OP_DIV, self, other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return _of(ca.OP_DIV, other, self)
+
+    def __neg__(self) -> Any:
+        return scalar(ca.SX.unary(ca.OP_NEG, self))
+
+
+def _is(x: Any, number: float) -> bool:
+    return not isinstance(x, ca.SX) and x == number
+
+
+def _of(operation: int, a: Any, b: Any) -> Any:
+    return scalar(ca.SX.binary(operation, a, b))
+
+
+def scalar(x: Any) -> Any:
+    """Return an expression as a `Scalar`: the object itself, which is still CasADi's."""
+    x.__class__ = Scalar
+    return x
+
+
+def sin(x: Any) -> Any:
+    """Return sin x."""
+    return scalar(ca.SX.unary(ca.OP_SIN, x))
+
+
+def cos(x: Any) -> Any:
+    """Return cos x."""
+    return scalar(ca.SX.unary(ca.OP_COS, x))
+
+
+Constants = Literal["literal", "symbols"]
+
+_BODY: Final = ("mass", "com", "inertia")
+_PLACE: Final = ("rotation", "translation")
+_JOINT: Final = (*_PLACE, "axes", "pitch", "armature", "damping", "stiffness", "rest")
+_MIMIC: Final = ("ratio", "offset")
+_COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
+_SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
+# A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum
+# of literal masses could be divided by, and its quotient be rounded to double.
+_DIRECTIONS: Final = frozenset({"rotation", "axes"})
+
+
+def is_zero(value: Any) -> bool:
+    """Return whether a number of the model is zero for good, and not a symbol."""
+    return isinstance(value, float) and value == 0.0
+
+
+class Values:
+    """Every number of a model that enters its equations.
+
+    The parts' own attribute names, with scalars that are floats or `casadi.SX`;
+    vectors are lists of them, matrices lists of rows.
+
+    Parameters
+    ----------
+    model : Model
+    constants : {"literal", "symbols"}
+        Whether the model's numbers are floats or symbols. Zeros are floats either
+        way, and so are the ones of rotations and axes, so that they vanish.
+
+    A number that stands for an expression of parameters is that expression. The
+    parameters are symbols either way: arguments of their own beside literal constants,
+    and among the constants, at their nominal values, where those are symbols.
+
+    Attributes
+    ----------
+    gravity : list of 3 scalars
+    bodies, joints, springs, couplings : dict of str to SimpleNamespace
+        By name. A joint that mimics has `ratio` and `offset` too.
+    named : dict of str to casadi.SX
+        The parameters' symbols.
+    parameters : (p, 1) casadi.SX
+        In the order of `model.parameters`; empty where they are among the constants.
+    constants : (k, 1) casadi.SX
+        The symbols that stand for numbers: the parameters, then the others, of which
+        equal ones share a symbol.
+    constant_values : (k,) array
+        What they stand for.
+    """
+
+    def __init__(self, model: Model, constants: Constants = "literal") -> None:
+        if constants not in ("literal", "symbols"):
+            raise InputError(f"constants: expected 'literal' or 'symbols', got {constants!r}")
+        self.model = model
+        self._symbolic = constants == "symbols"
+        self._pool: dict[float, Any] = {}
+        named = self.named = {name: scalar(ca.SX.sym(name)) for name in model.parameters}
+        if self._symbolic:
+            model.require_values("constants='symbols'")
+        self.parameters = ca.SX(0, 1) if self._symbolic else ca.vertcat(ca.SX(0, 1), *named.values())
+        self._bound = {
+            (b.where, b.part, b.field, b.index): b.expression.evaluate(lambda p: named[p.name], self._scalar)
+            for b in model.bindings
+        }
+        self.gravity = self._read("gravity", "", model, ("gravity",)).gravity
+        self.bodies = {b.name: self._read("bodies", b.name, b, _BODY) for b in model.bodies}
+        self.joints = {j.name: self._joint(j) for j in model.joints}
+        self.springs = {s.name: self._read("springs", s.name, s, _SPRING) for s in model.springs}
+        self.couplings = {c.name: self._read("couplings", c.name, c, _COUPLING) for c in model.couplings}
+        self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
+
+    @property
+    def constants(self) -> Any:
+        """The symbols that stand for numbers so far."""
+        first = self.named.values() if self._symbolic else ()
+        return ca.vertcat(ca.SX(0, 1), *first, *self._pool.values())
+
+    @property
+    def constant_values(self) -> Array:
+        """What they stand for."""
+        first = self.named if self._symbolic else ()
+        return np.array([*(self.model.parameters[n] for n in first), *self._pool], dtype=np.float64)
+
+    def number(self, value: float) -> Any:
+        """Return what stands for a number that is no part's."""
+        return self._scalar(value)
+
+    def frame(self, frame: Frame) -> Any:
+        """Return a frame's rotation and translation; a body's own has zeros and ones only."""
+        return self._frames.get(frame.name) or self._read("frames", frame.name, frame, _PLACE)
+
+    def _joint(self, joint: Joint) -> Any:
+        values = self._read("joints", joint.name, joint, _JOINT)
+        if joint.mimic:
+            values.__dict__.update(self._read("joints", joint.name, joint.mimic, _MIMIC).__dict__)
+        return values
+
+    def _read(self, where: str, part: str, source: Any, fields: tuple[str, ...]) -> Any:
+        return SimpleNamespace(**{f: self._entries((where, part, f), (), getattr(source, f)) for f in fields})
+
+    def _entries(self, place: tuple[str, str, str], index: tuple[int, ...], value: Any) -> Any:
+        if np.ndim(value):
+            return [self._entries(place, (*index, i), x) for i, x in enumerate(value)]
+        if (*place, index) in self._bound:
+            return self._bound[*place, index]
+        return self._scalar(float(value), direction=place[-1] in _DIRECTIONS)
+
+    def _scalar(self, value: float, direction: bool = False) -> Any:
+        if not self._symbolic or value == 0.0 or (direction and abs(value) == 1.0):
+            return value
+        size = abs(value)
+        if size not in self._pool:
+            self._pool[size] = scalar(ca.SX.sym(f"c{len(self._pool)}"))
+        return self._pool[size] if value > 0 else -self._pool[size]

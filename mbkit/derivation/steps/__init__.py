@@ -1,0 +1,1 @@
+"""Step formulas of the integration methods as stages of compiled code."""

@@ -1,0 +1,264 @@
+"""The implicit midpoint rule in canonical coordinates and momenta, on the manifold, as parts of a step.
+
+It is the variational integrator of the discrete Lagrangian (Marsden and West 2001,
+Discrete mechanics and variational integrators, ch. 1.3)::
+
+    L_d(q0, q1) = h L(q_m, w)      q_m = q0 moved by h w/2      q1 = q0 moved by h w
+
+with w the velocity of `mbkit.model.integration_space`, constant over the step, and forces by the
+discrete Lagrange-d'Alembert principle (ch. 3.2). So it is symplectic on T*Q, keeps what
+Noether's theorem keeps, and is its own inverse under h -> -h. With μ = ∂L/∂w and f = ∂L/∂q
+plus all applied forces, both at (q_m, w), plain coordinates have ::
+
+    p0 = μ - h/2 f      p1 = p0 + h f
+
+the midpoint rule in (q, p). For a rotation with body-axes velocity, x = h w and its
+angle θ = |x|, the functions of x̂ that the derivation leaves behind collapse to ::
+
+    R0ᵀ π0 = dexp⁻¹(x) μ - h/2 (f + tan(θ/4)/θ x × f)      π1 = π0 + h R_m f
+
+The momentum is carried as π = R p, in the axes of the joint's fixed frame: where no torque
+acts it then stays what it is to the bit. The unknown of a step is w alone.
+
+Where L depends on the time, L_d has it at the middle of the step: every step is still the one of
+an autonomous system, and symplectic.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, Final
+
+import casadi as ca
+
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.mass_matrix_solve import solve
+from mbkit.derivation.steps.fixed import Part, SymbolicSpace, function_of
+from mbkit.model import quaternions
+
+__all__ = ["GUESS", "LEAST", "MOST", "SMALL", "Midpoint", "eliminated"]
+
+#: Weights of the velocities of the last steps in the first guess of the next one: the
+#: parabola through them, continued.
+GUESS: Final = (3.0, -3.0, 1.0)
+#: A correction below SMALL of the velocity, or one that moves the configuration by less
+#: than LEAST (rad, m, or this part of the coordinates), was the last one needed: what
+#: Newton's iteration leaves behind is its square.
+SMALL: Final = 1e-8
+LEAST: Final = 1e-12
+#: Newton's iterations of a step, at most: what has not converged by then wanders about.
+MOST: Final = 12
+# Beyond 1e100 a state is none any more.
+_RUNAWAY: Final = 1e200
+
+
+class _MomentumSpace(SymbolicSpace):
+    """The integrators' space with its momenta: π of plain coordinates, and of rotations in fixed axes."""
+
+    def toward(self, q: Any, u: Any) -> Any:
+        """Return q moved by u, with quaternions of unit length only to rounding."""
+        out = self.copied(q)
+        for a, b in self._sums:
+            out[a] = q[a] + u[b]
+        for a, b in self._turns:
+            turn = quaternions.exponential(self.arithmetic(q), self.components(u, b))
+            self.put(out, a, quaternions.product(self.components(q, a), turn))
+        return out
+
+    def pullback(self, q: Any, gradient: Any) -> Any:
+        """Return the derivative along `move` of what has this gradient in the coordinates."""
+        out = ca.SX(self.nv, 1)
+        for a, b in self._sums:
+            out[b] = gradient[a]
+        for a, b in self._turns:
+            (*u, w), (*g, last) = self.components(q, a), self.components(gradient, a)
+            turned = quaternions.cross(g, u)
+            self.put(out, b, [0.5 * (w * g[i] + turned[i] - last * u[i]) for i in range(3)])
+        return out
+
+    def to_body(self, q: Any, pi: Any) -> Any:
+        """Return momenta with those of rotations in body axes."""
+        return self._turned(q, pi, quaternions.rotate_back)
+
+    def to_fixed(self, q: Any, p: Any) -> Any:
+        """Return momenta or forces with those of rotations in the axes of the joint's fixed frame."""
+        return self._turned(q, p, quaternions.rotate)
+
+    def _turned(self, q: Any, p: Any, turn: Any) -> Any:
+        out = self.copied(p)
+        for a, b in self._turns:
+            self.put(out, b, turn(self.components(q, a), self.components(p, b)))
+        return out
+
+    def discrete(self, x: Any, mu: Any, f: Any, h: Any) -> Any:
+        """Return the momentum at the start of a step, rotations' in body axes."""
+        out = mu - (h / 2) * f
+        for _, b in self._turns:
+            angle = self.components(x, b)
+            m, force = self.arithmetic(x), self.components(f, b)
+            (*u, w) = quaternions.exponential(m, [c / 2 for c in angle])
+            along = quaternions.dexp_inverse(m, angle, self.components(mu, b))
+            # The vector part over the scalar part is tan(θ/4)/θ x.
+            across = quaternions.cross([c / w for c in u], force)
+            self.put(out, b, [along[i] - (h / 2) * (force[i] + across[i]) for i in range(3)])
+        return out
+
+
+class Midpoint:
+    """The parts of a step of the implicit midpoint rule, and the way between v and momenta.
+
+    Every function takes the equations' trailing arguments behind its own.
+
+    Parameters
+    ----------
+    equations : Equations
+    """
+
+    def __init__(self, equations: Equations) -> None:
+        self._equations, self._space = equations, _MomentumSpace(equations.model)
+        nq, nv = equations.model.nq, equations.model.nv
+        sizes = {"q": nq, **dict.fromkeys(("v", "pi", "w", "w_1", "w_2", "tau"), nv)}
+        sizes |= dict.fromkeys(("dt", "miss", "misses"), 1)
+        self._s = {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.trailing}
+
+    @property
+    def newton(self) -> Part:
+        """(q, pi, w, tau, dt) -> w1, miss: one step of Newton's iteration, and 0 where it was the last one needed."""
+        return self._part("midpoint_newton", ("q", "pi", "w", "tau", "dt"), ("w1", "miss"), self._newton)
+
+    @property
+    def system(self) -> Part:
+        """(q, pi, w, tau, dt) -> residual, jacobian: the same equation, to be solved elsewhere."""
+        return self._part("midpoint_system", ("q", "pi", "w", "tau", "dt"), ("residual", "jacobian"), self._system)
+
+    @property
+    def end(self) -> Part:
+        """The state after the step from its velocity w and those of the two before, w_1 and w_2.
+
+        It writes q1, pi1, the first guess of the next velocity, and `misses`, the number of
+        steps that were not solved or ended nowhere.
+        """
+        reads = ("q", "pi", "w", "w_1", "w_2", "tau", "dt", "miss", "misses")
+        return self._part("midpoint_end", reads, ("q1", "pi1", "guess", "misses1"), self._end)
+
+    @property
+    def momentum(self) -> Part:
+        """(q, v) -> pi."""
+        return self._part("midpoint_momentum", ("q", "v"), ("pi",), self._momentum)
+
+    @property
+    def velocity(self) -> Part:
+        """(q, pi) -> v, by the tree's sparse factorization of the mass matrix."""
+        return self._part("midpoint_velocity", ("q", "pi"), ("v",), self._velocity)
+
+    @property
+    def velocity_system(self) -> Part:
+        """(q, pi) -> M and M v, the momentum less what it is at rest, in mbkit's velocity, to be solved elsewhere."""
+        return self._part("midpoint_velocity_system", ("q", "pi"), ("M", "p"), self._velocity_system)
+
+    def _part(self, name: str, reads: tuple[str, ...], writes: tuple[str, ...], make: Any) -> Part:
+        given = (*reads, *self._equations.trailing)
+
+        def function() -> ca.Function:
+            return function_of(name, {n: self._s[n] for n in given}, dict(zip(writes, make(), strict=True)))
+
+        return Part(name, given, writes, function)
+
+    def _at_midpoint(self, w: Any) -> tuple[Any, Any, Any]:
+        """Return q_m, μ and f of a step with this velocity."""
+        s = self._s
+        q_m = self._space.toward(s["q"], (s["dt"] / 2) * w)
+        mu, f = self._forces(q_m, w, s["tau"], *self._equations.trailing.values())
+        return q_m, mu, f
+
+    @cached_property
+    def _forces(self) -> ca.Function:
+        """(q, w, tau) -> μ = ∂L/∂w and f = ∂L/∂q + τ + damping, along `move`."""
+        eq, space = self._equations, self._space
+        w = self._s["w"]
+        v = space.leave(eq.q, w)
+        kinetic = ca.substitute(eq.kinetic_energy, eq.v, v)
+        applied = eq.tau + ca.substitute(eq.damping, eq.v, v)
+        f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.enter_force(eq.q, applied)
+        given = [eq.q, w, eq.tau, *eq.trailing.values()]
+        return ca.Function("forces", given, [ca.gradient(kinetic, w), f], {"cse": True})
+
+    def _residual(self) -> Any:
+        s = self._s
+        _, mu, f = self._at_midpoint(s["w"])
+        return self._space.discrete(s["dt"] * s["w"], mu, f, s["dt"]) - self._space.to_body(s["q"], s["pi"])
+
+    def _system(self) -> tuple[Any, Any]:
+        residual = self._residual()
+        return residual, ca.jacobian(residual, self._s["w"])
+
+    def _newton(self) -> tuple[Any, Any]:
+        s = self._s
+        # ∂ residual/∂w is M + O(h), with M's own zeros.
+        residual, jacobian = self._system()
+        change = eliminated(jacobian, residual, self._equations.elimination_order)
+        w1 = s["w"] - change
+        reach = (LEAST / s["dt"]) ** 2
+        limit = SMALL**2 * ca.sumsqr(w1) + reach * (1 + ca.sumsqr(s["q"]))
+        # A NaN is not below anything.
+        return w1, 1 - (ca.sumsqr(change) < limit)
+
+    def _end(self) -> tuple[Any, ...]:
+        s, h = self._s, self._s["dt"]
+        q_m, _, f = self._at_midpoint(s["w"])
+        q1 = self._space.move(s["q"], h * s["w"])
+        pi1 = s["pi"] + h * self._space.to_fixed(q_m, f)
+        guess = sum(weight * s[n] for weight, n in zip(GUESS, ("w", "w_1", "w_2"), strict=True))
+        lost = 1 - (ca.sumsqr(q1) + ca.sumsqr(pi1) < _RUNAWAY)
+        return q1, pi1, guess, s["misses"] + s["miss"] + lost
+
+    def _momentum(self) -> tuple[Any]:
+        eq, s = self._equations, self._s
+        p = ca.substitute(eq.momentum, ca.vertcat(eq.q, eq.v), ca.vertcat(s["q"], s["v"]))
+        return (self._space.to_fixed(s["q"], self._space.enter_force(s["q"], p)),)
+
+    def _velocity_system(self) -> tuple[Any, Any]:
+        eq, s = self._equations, self._s
+        at_rest = ca.substitute(eq.momentum, eq.v, ca.SX.zeros(eq.model.nv))
+        M, b = (ca.substitute(x, eq.q, s["q"]) for x in (eq.mass_matrix, at_rest))
+        return M, self._space.leave_force(s["q"], self._space.to_body(s["q"], s["pi"])) - b
+
+    def _velocity(self) -> tuple[Any]:
+        return (solve(*self._velocity_system(), self._equations.elimination_order),)
+
+
+def eliminated(A: ca.SX, b: ca.SX, order: Any) -> ca.SX:
+    """Return A⁻¹ b, written out, without pivoting.
+
+    Parameters
+    ----------
+    A : (n, n) casadi.SX
+        Near a symmetric positive definite matrix, with the zeros of a tree's mass
+        matrix: eliminating from the leaves to the root then fills in nothing.
+    b : (n,) casadi.SX
+    order : sequence of int
+        The indices with every parent before its children.
+    """
+    rank = {index: k for k, index in enumerate(order)}
+    rows: list[dict[int, Any]] = [{} for _ in rank]
+    for i, j in zip(*A.sparsity().get_triplet(), strict=True):
+        rows[rank[i]][rank[j]] = A[i, j]
+    x = [b[index] for index in order]
+    for k in reversed(range(len(x))):
+        # Where nothing moves there is no entry at all: the quotient is then no number.
+        inverse = 1 / ca.SX(rows[k].get(k, 0.0))
+        for i in range(k):
+            if k not in rows[i]:
+                continue
+            factor = rows[i].pop(k) * inverse
+            x[i] = x[i] - factor * x[k]
+            for j, entry in rows[k].items():
+                if j < k:
+                    rows[i][j] = rows[i].get(j, 0.0) - factor * entry
+        rows[k][k] = inverse
+    for k in range(len(x)):
+        x[k] = (x[k] - sum((rows[k][j] * x[j] for j in rows[k] if j < k), 0.0)) * rows[k][k]
+    out: list[Any] = [None] * len(x)
+    for k, index in enumerate(order):
+        out[index] = x[k]
+    return ca.vertcat(ca.SX(0, 1), *out)

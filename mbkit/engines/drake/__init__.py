@@ -1,0 +1,1 @@
+"""Drake: model, engine, reader."""

@@ -1,0 +1,227 @@
+"""Drake's plant, built from a description.
+
+Joints of several coordinates with v = q̇ are stacks of one-coordinate joints on bodies
+without mass: a universal joint two, a spherical-ZYX joint three, a planar joint three. A ball
+joint is Drake's roll-pitch-yaw joint, whose velocities are angular velocities all the same, so that
+only its q̇ is singular, which nothing here uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody import tree
+from pydrake.multibody.plant import MultibodyPlant
+
+from mbkit._check import Array
+from mbkit.engines.base import unknown_joint
+from mbkit.errors import UnsupportedError
+from mbkit.model import Body, Joint, Model
+from mbkit.model.parts import PointSpring
+from mbkit.model.validation import static_bodies
+
+__all__ = ["DrakeModel", "build"]
+
+_X, _Y, _Z = np.eye(3)
+_TURN: Final = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class DrakeModel:
+    """The plant and the maps between its coordinates and the description's.
+
+    Attributes
+    ----------
+    plant : pydrake.multibody.plant.MultibodyPlant
+        Continuous, finalized.
+    q_index, v_index : integer arrays
+        Drake's entry i of a joint of real coordinates is full coordinate ``q_index[i]``; -1 where a joint
+        turns by a quaternion.
+    turning : tuple of (Joint, int, int)
+        Ball and free joints, with where they start in Drake's positions and velocities.
+    bodies : dict
+        Body name -> Drake's body.
+    bushings : tuple of (float, body, point, body, point)
+        Stiffness and ends of the springs that are bushings, of which Drake has no energy.
+    """
+
+    plant: Any
+    q_index: np.ndarray
+    v_index: np.ndarray
+    turning: tuple[tuple[Joint, int, int], ...]
+    bodies: dict[str, Any]
+    bushings: tuple[tuple[float, Any, Array, Any, Array], ...]
+
+
+def build(description: Model, *, gravity: bool = True, bushings: bool = True) -> DrakeModel:
+    """Make the plant.
+
+    Parameters
+    ----------
+    description : Model
+    gravity, bushings : bool
+        Whether it acts, and whether springs without a length at rest do.
+
+    Raises
+    ------
+    UnsupportedError
+        A body or a spring that Drake refuses, a joint of a type or with damping that it cannot hold, or a joint
+        coupling; named.
+    """
+    if description.couplings:
+        names = ", ".join(repr(c.name) for c in description.couplings)
+        raise UnsupportedError(
+            f"drake: {description.name} has joint couplings ({names}); Drake has no spring, damper or rotor on a sum "
+            "of joint coordinates"
+        )
+    # A step of zero makes it continuous: ẋ = f(x) and nothing else.
+    plant = MultibodyPlant(0.0)
+    plant.mutable_gravity_field().set_gravity_vector(np.array(description.gravity) * gravity)
+    bodies: dict[str, Any] = {"world": plant.world_body()}
+    static = static_bodies(description.joints)
+    for k, body in enumerate(description.bodies):
+        # Names of files may hold what Drake's do not; ours are kept in the map.
+        bodies[body.name] = plant.AddRigidBody(f"{k}:{body.name}", _inertia(body, body.name in static))
+    made = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
+    springs = [s for s in description.springs if bushings or s.rest_length > 0]
+    added = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
+    try:
+        plant.Finalize()
+    except (RuntimeError, SystemExit) as error:
+        raise UnsupportedError(f"drake: refuses {description.name}: {str(error).splitlines()[0]}") from None
+    return _mapped(plant, description, made, bodies, added)
+
+
+def _add_spring(
+    plant: Any, spring: PointSpring, bodies: dict[str, Any]
+) -> Iterator[tuple[float, Any, Array, Any, Array]]:
+    """Add a spring; yield it where it is a bushing."""
+    ends = bodies[spring.body_a], np.array(spring.point_a), bodies[spring.body_b], np.array(spring.point_b)
+    length, stiffness = spring.rest_length, spring.stiffness
+    if length == 0:
+        # Drake's spring has a length at rest. Without one the pull is k times the gap, along each axis alike,
+        # which is a bushing's; the damper along the line is a spring's of no stiffness and any length.
+        frames = [
+            plant.AddFrame(tree.FixedOffsetFrame(f"{spring.name}.{k}", body, RigidTransform(point)))
+            for k, body, point in (("a", *ends[:2]), ("b", *ends[2:]))
+        ]
+        zero = np.zeros(3)
+        plant.AddForceElement(tree.LinearBushingRollPitchYaw(*frames, zero, zero, np.full(3, stiffness), zero))
+        yield (stiffness, *ends)
+        length, stiffness = 1.0, 0.0
+    if stiffness or spring.damping:
+        plant.AddForceElement(tree.LinearSpringDamper(*ends, length, stiffness, spring.damping))
+
+
+def _inertia(body: Body, static: bool) -> Any:
+    if body.mass == 0 and (static or not body.inertia.any()):
+        return tree.SpatialInertia.Zero()
+    # Drake refuses some inertias that cannot act, because the body never moves.
+    I = np.zeros((3, 3)) if static else body.inertia
+    try:
+        central = tree.RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
+        return tree.SpatialInertia.MakeFromCentralInertia(float(body.mass), np.array(body.com), central)
+    except (RuntimeError, SystemExit) as error:
+        told = str(error).strip().splitlines()
+        raise UnsupportedError(
+            f"drake: refuses body {body.name!r} (mass {body.mass:.4g} kg): {told[0] if told else 'not physical'}"
+        ) from None
+
+
+def _add(plant: Any, joint: Joint, bodies: dict[str, Any]) -> list[Any]:
+    """Add a joint, as a stack where it has several real coordinates; return Drake's joints."""
+    parent, child = bodies[joint.parent], bodies[joint.child]
+    X_PJ = RigidTransform(RotationMatrix(np.array(joint.rotation)), joint.translation)
+    if joint.kind not in _STEPS:
+        raise unknown_joint("drake", joint)
+    if joint.kind == "fixed":
+        return [plant.AddJoint(tree.WeldJoint(joint.name, parent.body_frame(), child.body_frame(), X_PJ))]
+    frame = plant.AddFrame(tree.FixedOffsetFrame(f"{joint.name}.fixed", parent, X_PJ))
+    steps = _STEPS[joint.kind](joint)
+    if not steps:
+        return [plant.AddJoint(_turning(joint, frame, child.body_frame()))]
+    out = []
+    for k, (kind, axis) in enumerate(steps):
+        name = joint.name if len(steps) == 1 else f"{joint.name}.{k}"
+        last = k == len(steps) - 1
+        body = child if last else plant.AddRigidBody(f"{name}.between", tree.SpatialInertia.Zero())
+        out.append(_one(plant, joint, k, name, kind, axis, frame, body.body_frame()))
+        frame = body.body_frame()
+    return out
+
+
+#: Joint type -> type and axis of each one-coordinate joint of its stack; none where it is one joint of Drake's.
+_STEPS: Final[dict[str, Callable[[Joint], Sequence[tuple[str, Array]]]]] = {
+    "fixed": lambda _: (),
+    "revolute": lambda joint: [("revolute", joint.axes[0])],
+    "continuous": lambda joint: [("revolute", joint.axes[0])],
+    "prismatic": lambda joint: [("prismatic", joint.axes[0])],
+    "helical": lambda joint: [("helical", joint.axes[0])],
+    "universal": lambda joint: [("revolute", axis) for axis in joint.axes],
+    "spherical_zyx": lambda _: [("revolute", axis) for axis in (_Z, _Y, _X)],
+    "ball": lambda _: (),
+    "planar": lambda _: [("prismatic", _X), ("prismatic", _Y), ("revolute", _Z)],
+    "free": lambda _: (),
+}
+
+
+def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at: Any, body: Any) -> Any:
+    damping, axis = float(joint.damping[k]), np.array(axis)
+    if damping < 0:
+        raise UnsupportedError(f"drake: joint {joint.name!r} has a negative damping, which Drake refuses")
+    if kind == "revolute":
+        made = plant.AddJoint(tree.RevoluteJoint(name, at, body, axis, damping))
+    elif kind == "prismatic":
+        made = plant.AddJoint(tree.PrismaticJoint(name, at, body, axis, damping=damping))
+    else:
+        # Metres per radian here, per turn there.
+        made = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _TURN * joint.pitch, damping))
+    if joint.type.nv == 1 and joint.armature[0]:
+        # Drake knows armature as the inertia of an actuator's rotor.
+        actuator = plant.AddJointActuator(f"{name}.rotor", made)
+        actuator.set_default_rotor_inertia(float(joint.armature[0]))
+        actuator.set_default_gear_ratio(1.0)
+    stiffness, rest = float(joint.stiffness[k]), float(joint.rest[k])
+    if stiffness:
+        if kind not in ("revolute", "prismatic"):
+            raise UnsupportedError(f"drake: joint {joint.name!r} has a spring, which Drake's {kind} joint cannot have")
+        spring = tree.RevoluteSpring if kind == "revolute" else tree.PrismaticSpring
+        try:
+            plant.AddForceElement(spring(made, rest, stiffness))
+        except (RuntimeError, SystemExit) as error:
+            raise UnsupportedError(f"drake: refuses the spring of joint {joint.name!r}: {error}") from None
+    return made
+
+
+def _turning(joint: Joint, at: Any, body: Any) -> Any:
+    linear, angular = (joint.damping[:0], joint.damping) if joint.kind == "ball" else np.split(joint.damping, 2)
+    for values in (linear, angular):
+        if len(values) and np.ptp(values) > 0:
+            raise UnsupportedError(
+                f"drake: joint {joint.name!r} is damped differently along its body axes; Drake damps it evenly"
+            )
+    if joint.kind == "ball":
+        return tree.BallRpyJoint(joint.name, at, body, float(angular[0]))
+    return tree.QuaternionFloatingJoint(joint.name, at, body, float(angular[0]), float(linear[0]))
+
+
+def _mapped(
+    plant: Any, description: Model, made: dict[str, list[Any]], bodies: dict[str, Any], bushings: tuple[Any, ...]
+) -> DrakeModel:
+    layout = description.layout
+    q_index, v_index = np.full(plant.num_positions(), -1), np.full(plant.num_velocities(), -1)
+    turning = []
+    for joint in description.joints:
+        if not joint.type.nv:
+            continue
+        q, v, own = layout.full_q[joint.name], layout.full_v[joint.name], made[joint.name]
+        if joint.type.quaternion is not None:
+            turning.append((joint, own[0].position_start(), own[0].velocity_start()))
+            continue
+        for k, one in enumerate(own):
+            q_index[one.position_start()], v_index[one.velocity_start()] = q.start + k, v.start + k
+    return DrakeModel(plant, q_index, v_index, tuple(turning), bodies, bushings)

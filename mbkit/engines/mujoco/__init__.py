@@ -1,0 +1,1 @@
+"""MuJoCo: model, engine, native rollouts, reader and writer of MJCF."""

@@ -1,0 +1,383 @@
+"""MuJoCo behind the protocol: terms from its smooth dynamics, rollouts from its integrators.
+
+Todorov, Erez, Tassa 2012, "MuJoCo: a physics engine for model-based control". The
+only place that knows MuJoCo's quaternion order and its velocity of a free joint
+(linear in the world's axes): v_mj = T v with T = diag(R, 1), so M = Tᵀ M_mj T, and
+a_mj = T a + b with b = R (ω × v).
+"""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, ClassVar, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of, count, real
+from mbkit._fork import fork_safe
+from mbkit.engines import known_defects
+from mbkit.engines.base import Dynamics, per_sample
+from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
+from mbkit.engines.mujoco.rollout import Rollout
+from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.model import Model
+
+__all__ = ["MujocoDynamics"]
+
+
+#: Quantities that M is part of.
+_OF_MASS: Final = ("mass_matrix", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
+
+
+class MujocoDynamics(Dynamics):
+    """MuJoCo on a description.
+
+    Attributes
+    ----------
+    mj_model : mujoco.MjModel
+        What was compiled; free to read.
+    disabled : tuple of str
+        What was switched off because the comparison of smooth terms does not
+        want it.
+    """
+
+    engine = "mujoco"
+    refuses: ClassVar[dict[str, str]] = {
+        "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
+        "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
+    }
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self._made: MujocoModel = build(model)
+        self.mj_model = self._m = self._made.model
+        self.disabled = self._made.disabled
+        self._d = mujoco.MjData(self._m)
+        self._reduced = model.layout.reduced
+        self._lock = fork_safe(threading.RLock())
+
+    def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+        if quantity in _OF_MASS and self.model.couplings and self._torn_couplings:
+            names = ", ".join(repr(name) for name in self._torn_couplings)
+            known_defects.announce(known_defects.TENDON_ARMATURE, f"coupling {names}")
+        # One MjData and one handler of warnings: two threads in here end the process.
+        with self._lock, heard_warnings() as heard:
+            # MuJoCo tells each kind of warning once, unless its count is put back.
+            self._d.warning.number.fill(0)
+            out = super()._evaluate(quantity, method, **arguments)
+        if heard:
+            raise NumericalError(f"mujoco: {quantity} of {self.model.name}: {heard[0].strip()}{self._blame()}")
+        return out
+
+    @cached_property
+    def _torn_couplings(self) -> tuple[str, ...]:
+        """Names of the couplings whose armature MuJoCo leaves out of M between branches, found by evaluating M."""
+        layout, q = self.model.layout, self.model.neutral()
+        rows = {c.name: c.armature**0.5 * layout.coupling_row(c) @ layout.G for c in self.model.couplings if c.armature}
+        if not rows:
+            return ()
+        with self._lock:
+            M = self._one_mass_matrix(q)
+        bare = MujocoDynamics(replace(self.model, couplings=()))._one_mass_matrix(q)
+        missing = np.abs(bare + sum(np.outer(x, x) for x in rows.values()) - M)
+        root = np.sqrt(np.abs(np.diag(M)))
+        lost = missing > 1e-9 * np.outer(root, root)
+        return tuple(name for name, x in rows.items() if lost[np.ix_(x != 0, x != 0)].any())
+
+    # Between the description's numbers and MuJoCo's.
+
+    def _set(self, q: Array, v: Array | None = None) -> tuple[Array, Array]:
+        """Put a state into MuJoCo; return full velocities and b of a_mj = T a + b."""
+        layout, d = self.model.layout, self._d
+        d.qpos[:] = layout.expand_q(q)[self._made.q_index]
+        full = np.zeros(layout.sizes[3]) if v is None else layout.expand_v(v)
+        qvel = full[self._made.v_index]
+        b = np.zeros(self._m.nv)
+        for iq, iv in self._made.free:
+            R = self._rotation(iq)
+            linear = qvel[iv : iv + 3].copy()
+            slip = np.empty(3)
+            mujoco.mju_cross(slip, qvel[iv + 3 : iv + 6], linear)
+            b[iv : iv + 3] = R @ slip
+            qvel[iv : iv + 3] = R @ linear
+        d.qvel[:] = qvel
+        return qvel, b
+
+    def _rotation(self, start_q: int) -> Array:
+        R = np.empty(9)
+        mujoco.mju_quat2Mat(R, self._d.qpos[start_q + 3 : start_q + 7])
+        return R.reshape(3, 3)
+
+    def _to_mujoco(self, x: Array) -> Array:
+        """Return T x for a vector of full velocities or accelerations, after `_set`."""
+        out = self.model.layout.expand_v(x)[self._made.v_index].copy()
+        for iq, iv in self._made.free:
+            out[iv : iv + 3] = self._rotation(iq) @ out[iv : iv + 3]
+        return np.asarray(out)
+
+    def _columns(self, J: Array) -> Array:
+        """Return J T, in the description's order and reduced."""
+        J = J.copy()
+        for iq, iv in self._made.free:
+            J[:, iv : iv + 3] = J[:, iv : iv + 3] @ self._rotation(iq)
+        full = np.empty_like(J)
+        full[:, self._made.v_index] = J
+        return np.asarray(full @ self.model.layout.G) if self._reduced else full
+
+    def _force(self, f: Array) -> Array:
+        return np.asarray(self._columns(f[None, :])[0])
+
+    @cached_property
+    def _lines(self) -> list[int]:
+        """Tendons of the point springs that need a direction; springs are the first tendons."""
+        return [k for k, spring in enumerate(self.model.springs) if spring.needs_direction]
+
+    def _directed(self, x: np.ndarray) -> Array:
+        """Return what contains spring forces; NaN where a spring that needs a direction has no length.
+
+        MuJoCo takes the x axis for the direction of a shorter line than mjMINVAL.
+        """
+        lengths = self._d.ten_length[self._lines]
+        return np.full_like(x, np.nan) if (lengths < mujoco.mjMINVAL).any() else np.asarray(x)
+
+    def _positions(self) -> None:
+        mujoco.mj_fwdPosition(self._m, self._d)
+
+    def _velocities(self) -> None:
+        mujoco.mj_fwdPosition(self._m, self._d)
+        mujoco.mj_fwdVelocity(self._m, self._d)
+
+    # The protocol.
+
+    def _mass_matrix(self, q: Array) -> Array:
+        return per_sample(self._one_mass_matrix, q)
+
+    def _one_mass_matrix(self, q: Array) -> Array:
+        self._set(q)
+        mujoco.mj_kinematics(self._m, self._d)
+        mujoco.mj_comPos(self._m, self._d)
+        if self._m.ntendon:
+            # Their armature is part of M.
+            mujoco.mj_tendon(self._m, self._d)
+        mujoco.mj_makeM(self._m, self._d)
+        return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
+
+    def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
+        """Return Σ |terms| / M_jj, worst over j.
+
+        MuJoCo writes composite inertias and joint axes about the centre of mass of
+        the whole tree (`mj_comPos`, `mj_crb`); a light link far from there is the
+        small difference of large numbers.
+        """
+        return self._evaluate("mass_matrix_rounding", lambda q: per_sample(self._one_rounding, q), q=q)
+
+    def _one_rounding(self, q: Array) -> Array:
+        M = self._one_mass_matrix(q)
+        cdof, composite = np.abs(self._d.cdof), np.abs(self._d.crb[self._m.dof_bodyid])
+        # crb holds Ixx, Iyy, Izz, Ixy, Ixz, Iyz, m cx, m cy, m cz, m about that point.
+        w, v, h, mass = cdof[:, :3], cdof[:, 3:], composite[:, 6:9], composite[:, 9]
+        x, y, z = w.T
+        turning = composite[:, :3] * w * w
+        mixed = 2 * (composite[:, 3] * x * y + composite[:, 4] * x * z + composite[:, 5] * y * z)
+        coupling = 2 * np.sum(h * (np.roll(w, 1, 1) * np.roll(v, 2, 1) + np.roll(w, 2, 1) * np.roll(v, 1, 1)), axis=1)
+        terms = turning.sum(axis=1) + mixed + coupling + mass * np.sum(v * v, axis=1)
+        layout = self.model.layout
+        full = np.empty(self._m.nv)
+        full[self._made.v_index] = terms
+        own = layout.G.T**2 @ full if self._reduced else full
+        diagonal = np.diag(M)
+        return np.array(np.max(own / np.where(diagonal > 0, diagonal, np.inf), initial=1.0))
+
+    def _gravity(self, q: Array) -> Array:
+        def one(q: Array) -> Array:
+            self._set(q)
+            self._velocities()
+            return self._force(self._d.qfrc_bias)
+
+        return per_sample(one, q)
+
+    def _nle(self, q: Array, v: Array) -> Array:
+        def one(q: Array, v: Array) -> Array:
+            _, b = self._set(q, v)
+            self._velocities()
+            return self._force(self._d.qfrc_bias + self._times_mass(b))
+
+        return per_sample(one, q, v)
+
+    def _coriolis_force(self, q: Array, v: Array) -> Array:
+        # With gravity off, so that nothing cancels.
+        flags = self._m.opt.disableflags
+        self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+        try:
+            return self._nle(q, v)
+        finally:
+            self._m.opt.disableflags = flags
+
+    def _times_mass(self, x: Array) -> Array:
+        out = np.zeros(self._m.nv)
+        if self._made.free:
+            mujoco.mj_mulM(self._m, self._d, out, x)
+        return out
+
+    def _passive(self, q: Array, v: Array) -> Array:
+        def one(q: Array, v: Array) -> Array:
+            self._set(q, v)
+            self._velocities()
+            return self._directed(self._force(self._d.qfrc_passive))
+
+        return per_sample(one, q, v)
+
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        def one(q: Array, v: Array, a: Array) -> Array:
+            _, b = self._set(q, v)
+            self._d.qacc[:] = self._to_mujoco(a) + b
+            mujoco.mj_inverse(self._m, self._d)
+            return self._directed(self._force(self._d.qfrc_inverse))
+
+        return per_sample(one, q, v, a)
+
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        return per_sample(self._forward_reduced if self._reduced else self._forward_tree, q, v, tau)
+
+    def _forward_tree(self, q: Array, v: Array, tau: Array) -> Array:
+        _, b = self._set(q, v)
+        # T is orthogonal, so a force maps as a velocity does.
+        self._d.qfrc_applied[:] = self._to_mujoco(tau)
+        mujoco.mj_forward(self._m, self._d)
+        self._d.qfrc_applied[:] = 0.0
+        return self._directed(self._force(self._d.qacc - b))
+
+    def _forward_reduced(self, q: Array, v: Array, tau: Array) -> Array:
+        # A mimic joint inside MuJoCo would be a soft equality: reduce instead.
+        M = self._one_mass_matrix(q)
+        _, b = self._set(q, v)
+        self._velocities()
+        rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
+        return self._directed(np.linalg.solve(M, tau + rest))
+
+    def _kinetic_energy(self, q: Array, v: Array) -> Array:
+        def one(q: Array, v: Array) -> Any:
+            self._set(q, v)
+            self._velocities()
+            mujoco.mj_energyVel(self._m, self._d)
+            return float(self._d.energy[1])
+
+        return per_sample(one, q, v)
+
+    def _potential_energy(self, q: Array) -> Array:
+        def one(q: Array) -> Any:
+            self._set(q)
+            self._positions()
+            mujoco.mj_energyPos(self._m, self._d)
+            return float(self._d.energy[0])
+
+        return per_sample(one, q)
+
+    def _body(self, frame: str) -> tuple[int, Array, Array]:
+        f = self.model.frame(frame)
+        if f.body in self._made.absorbed:
+            raise UnsupportedError(
+                f"mujoco: frame {frame!r} rides on {f.body!r}, a body without mass between two joints, "
+                "which MuJoCo holds as two joints of one body"
+            )
+        return self._made.bodies[f.body], f.rotation, f.translation
+
+    def _frame_pose(self, body: int, R_BF: Array, p_BF: Array) -> tuple[Array, Array]:
+        mujoco.mj_kinematics(self._m, self._d)
+        mujoco.mj_comPos(self._m, self._d)
+        R = self._d.xmat[body].reshape(3, 3)
+        return R @ R_BF, self._d.xpos[body] + R @ p_BF
+
+    def _pose(self, q: Array, frame: str) -> Array:
+        body, R_BF, p_BF = self._body(frame)
+
+        def one(q: Array) -> Array:
+            self._set(q)
+            X = np.eye(4)
+            X[:3, :3], X[:3, 3] = self._frame_pose(body, R_BF, p_BF)
+            return X
+
+        return per_sample(one, q)
+
+    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
+        body, R_BF, p_BF = self._body(frame)
+
+        def one(q: Array) -> Array:
+            self._set(q)
+            R, p = self._frame_pose(body, R_BF, p_BF)
+            linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
+            mujoco.mj_jac(self._m, self._d, linear, angular, p, body)
+            if axes == "body":
+                linear, angular = R.T @ linear, R.T @ angular
+            return self._columns(np.vstack([linear, angular]))
+
+        return per_sample(one, q)
+
+    # Native integration.
+
+    def rollout(
+        self,
+        integrator: str,
+        q0: Array,
+        v0: Array,
+        dt: float,
+        tau: Array | None,
+        steps: int,
+        *,
+        euler_damping: bool = False,
+        progress: Callable[[float], object] | None = None,
+    ) -> tuple[Array, Array]:
+        """Integrate with MuJoCo's own steps.
+
+        Parameters
+        ----------
+        integrator : {"euler", "rk4", "implicit", "implicitfast"}
+        q0, v0 : (n,) or (N, n) arrays
+        dt : float
+            Step, s.
+        tau : (steps, nv) or (N, steps, nv) array, optional
+            Held over each step.
+        steps : int
+        euler_damping : bool
+            Whether Euler treats joint damping implicitly, MuJoCo's default; it
+            then solves (M + h D) a = f and is no longer the explicit formula.
+        progress : callable, optional
+            Gets the fraction done, about ten times a second; what it raises ends the run.
+
+        Returns
+        -------
+        q, v : (steps + 1, n) or (N, steps + 1, n) arrays
+            NaN from the step on that MuJoCo found to diverge.
+
+        Raises
+        ------
+        UnsupportedError
+            For reduced mimic joints (MuJoCo would make them soft), and forces on
+            a free joint's translation (MuJoCo holds them in world axes).
+        """
+        if self._reduced:
+            names = ", ".join(j.name for j in self.model.joints if j.mimic)
+            raise UnsupportedError(
+                f"mujoco: native rollouts of mimic joints ({names}) would follow a soft equality, not the reduced "
+                "equations; load with mimic='free', or use method='rk4' on this engine"
+            )
+        q0, v0 = self.model.check_q(q0, "q0"), self.model.check_v(v0, "v0")
+        size = batch_of(q0=q0, v0=v0)
+        if size is not None:
+            q0, v0 = (np.broadcast_to(x, (size, x.shape[-1])) for x in (q0, v0))
+        real("dt", dt, positive=True)
+        count("steps", steps)
+        if tau is not None and np.shape(tau) not in ((steps, self.model.nv), (size, steps, self.model.nv)):
+            raise InputError(f"tau: expected shape ({steps}, {self.model.nv}), one row a step, got {np.shape(tau)}")
+        if self._lines:
+            self.passive(q0, v0)  # raises where a spring has no direction to start in
+        model = copy.copy(self._m)
+        if euler_damping:
+            model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        return Rollout(self.model, self._made, model)(integrator, q0, v0, dt, tau, steps, progress)

@@ -1,0 +1,209 @@
+"""The MuJoCo model that mbkit builds, as MJCF with every digit, and read back by MuJoCo's own parser.
+
+MuJoCo's writer keeps six digits. Here numbers are the shortest decimals that give the same doubles.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from mbkit._check import Array
+from mbkit._escape import xml_attribute, xml_comment
+from mbkit._fork import fork_safe
+from mbkit.engines.base import Dynamics
+from mbkit.engines.mujoco.engine import MujocoDynamics
+from mbkit.engines.mujoco.model import JOINT_TYPES, MujocoModel, Placed, heard_warnings, mapped, specified
+from mbkit.errors import UnsupportedError
+from mbkit.model import Joint, Model
+
+__all__ = ["ReadBack", "mjcf_text", "read_back"]
+
+_TYPES: Final = {
+    int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
+    int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
+    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
+    int(mujoco.mjtJoint.mjJNT_FREE): "free",
+}
+# MuJoCo refuses principal moments below 1e-15 kg m².
+_LEAST: Final = 2e-15
+
+
+class ReadBack(MujocoDynamics):
+    """MuJoCo on the model that its own parser made of a text."""
+
+    def __init__(self, model: Model, made: MujocoModel) -> None:
+        Dynamics.__init__(self, model)
+        self._made = made
+        self.mj_model = self._m = made.model
+        self.disabled = ()
+        self._d = mujoco.MjData(self._m)
+        self._reduced = model.layout.reduced
+        self._lock = fork_safe(threading.RLock())
+
+
+def mjcf_text(model: Model, comment: str) -> str:
+    """Return a description as MJCF.
+
+    Parameters
+    ----------
+    model : Model
+    comment : str
+        What stands at its head.
+
+    Raises
+    ------
+    UnsupportedError
+        With everything that MJCF cannot say of it.
+    """
+    faults = list(_unsayable(model))
+    if faults:
+        raise UnsupportedError(f"MJCF cannot say of {model.name}: {'; '.join(faults)}")
+    spec, placed, _ = specified(model)
+    lines = [
+        f"<mujoco model={xml_attribute(model.name)}>",
+        f"  <!-- {xml_comment(comment)} -->",
+        '  <compiler angle="radian" autolimits="false" inertiafromgeom="false" balanceinertia="false"/>',
+        f"  <option{_told(gravity=model.gravity)}/>",
+        "  <worldbody>",
+    ]
+    owners = {name: joint for joint in model.joints for name in placed.joints[joint.name]}
+    lines += _body(spec.worldbody, owners, placed, model, "    ")
+    lines.append("  </worldbody>")
+    lines += _tendons(spec, model)
+    lines += _equalities(model)
+    return "\n".join([*lines, "</mujoco>"]) + "\n"
+
+
+def read_back(model: Model, text: str) -> ReadBack:
+    """Return what MuJoCo's parser makes of a text of `mjcf_text`, in the description's coordinates.
+
+    Raises
+    ------
+    UnsupportedError
+        MuJoCo refuses the text.
+    """
+    _, placed, _ = specified(model)
+    with heard_warnings():
+        try:
+            made = mujoco.MjModel.from_xml_string(text)
+        except ValueError as error:
+            told = " ".join(str(error).split())
+            raise UnsupportedError(f"mujoco: refuses what was written of {model.name}: {told}") from None
+    return ReadBack(model, mapped(made, model, placed, ()))
+
+
+def _unsayable(model: Model) -> Iterator[str]:
+    for joint in model.joints:
+        who = f"joint {joint.name!r}"
+        if joint.kind not in JOINT_TYPES:
+            yield f"{who} is {joint.kind}"
+        parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
+        if any(np.ptp(x) > 0 for x in parts):
+            yield f"{who} is damped differently along its body axes"
+        elif joint.kind == "free" and joint.parent == "world" and np.ptp(joint.damping) > 0:
+            yield f"{who} is damped differently in turning and in moving"
+    for coupling in model.couplings:
+        if coupling.armature and model.branched(coupling):
+            yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
+    yield from (f"loop {x.name!r} (MuJoCo's would be soft)" for x in model.loops)
+    yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
+    yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
+
+
+def _told(**attributes: Any) -> str:
+    out = []
+    for name, value in attributes.items():
+        if isinstance(value, str):
+            out.append(f" {name}={xml_attribute(value)}")
+        elif value is not None:
+            out.append(f' {name}="{" ".join(repr(float(x)) for x in np.ravel(value))}"')
+    return "".join(out)
+
+
+def _body(body: Any, owners: dict[str, Joint], placed: Placed, model: Model, indent: str) -> Iterator[str]:
+    name = body.name
+    if name != "world":
+        moments = placed.degenerate.get(name, np.array(body.inertia))
+        if body.mass > 0 or moments.any():
+            at = _told(pos=body.ipos, quat=body.iquat, mass=body.mass, diaginertia=_allowed(moments))
+            yield f"{indent}<inertial{at}/>"
+    for joint in body.joints:
+        yield f"{indent}<joint{_joint(joint, owners[joint.name])}/>"
+    frames = [(f.name, f.translation, f.rotation) for f in model.frames if f.body == name]
+    for site in body.sites:
+        yield f"{indent}<site{_told(name=site.name, pos=site.pos)}/>"
+    for own, p, R in frames:
+        yield f"{indent}<site{_told(name=own, pos=p, xyaxes=R.T[:2])}/>"
+    for child in body.bodies:
+        simple = None if child.simple else "false"
+        yield f"{indent}<body{_told(name=child.name, pos=child.pos, quat=child.quat, simple=simple)}>"
+        yield from _body(child, owners, placed, model, indent + "  ")
+        yield f"{indent}</body>"
+
+
+def _allowed(moments: Array) -> Array:
+    """Return principal moments that MuJoCo takes: a point's are lifted off zero, a plate's last digit lowered."""
+    out = np.maximum(moments, _LEAST)
+    low, middle, high = np.argsort(out)
+    if out[low] + out[middle] < out[high]:
+        # Half of what is missing on each side; a thin plate misses a rounding.
+        out[low] += out[high] - out[low] - out[middle]
+    while out[low] + out[middle] < out[high]:
+        out[low] = np.nextafter(out[low], np.inf)
+    return out
+
+
+def _joint(joint: Any, owner: Joint) -> str:
+    kind = _TYPES[int(joint.type)]
+    given: dict[str, Any] = {"name": joint.name, "type": kind}
+    if kind in ("hinge", "slide"):
+        given |= {"pos": joint.pos, "axis": joint.axis}
+        for name in ("stiffness", "damping"):
+            given[name] = np.ravel(getattr(joint, name))[0] or None
+        given["springref"] = joint.springref if given["stiffness"] else None
+        given["armature"], given["frictionloss"] = joint.armature or None, joint.frictionloss or None
+        # 2 is MuJoCo's "as the range says".
+        if int(joint.limited) == 1:
+            given |= {"limited": "true", "range": joint.range}
+        if owner.type.nv == 1 and np.isfinite(owner.effort_limit[0]) and owner.effort_limit[0] > 0:
+            effort = owner.effort_limit[0]
+            given |= {"actuatorfrclimited": "true", "actuatorfrcrange": np.array([-effort, effort])}
+    else:
+        given |= {"pos": joint.pos} if kind == "ball" else {}
+        given["damping"] = owner.damping[-1] or None
+    return _told(**given)
+
+
+def _tendons(spec: Any, model: Model) -> Iterable[str]:
+    if not spec.tendons:
+        return []
+    out = ["  <tendon>"]
+    points, between = spec.tendons[: len(model.springs)], spec.tendons[len(model.springs) :]
+    for tendon in points:
+        given = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping")}
+        out.append(f"    <spatial{_told(name=tendon.name, springlength=tendon.springlength[0], **given)}>")
+        out += [f"      <site{_told(site=wrap.target.name)}/>" for wrap in tendon.path]
+        out.append("    </spatial>")
+    for tendon in between:
+        given = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping", "armature")}
+        rest = tendon.springlength[0] if given["stiffness"] else None
+        out.append(f"    <fixed{_told(name=tendon.name, springlength=rest, **given)}>")
+        out += [f"      <joint{_told(joint=wrap.target.name, coef=wrap.coef)}/>" for wrap in tendon.path]
+        out.append("    </fixed>")
+    return [*out, "  </tendon>"]
+
+
+def _equalities(model: Model) -> Iterable[str]:
+    mimics = [(j.name, j.mimic) for j in model.joints if j.mimic is not None]
+    if not mimics:
+        return []
+    out = ["  <equality>"]
+    for name, m in mimics:
+        shape = np.array([m.offset, m.ratio, 0.0, 0.0, 0.0])
+        out.append(f"    <joint{_told(joint1=name, joint2=m.joint, polycoef=shape)}/>")
+    return [*out, "  </equality>"]

@@ -1,0 +1,441 @@
+"""A MuJoCo model made from a description with `MjSpec`, everything off that it does not need.
+
+MuJoCo puts several joints into one body, first to last. So a universal joint is two
+hinges, a spherical-ZYX joint three, a planar joint two slides and a hinge, and a free
+joint that does not hang directly in the world three slides and a ball (the same
+velocities: linear in the parent's axes, angular in the body's). A body without mass
+between two joints becomes such a stack too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.engines.base import unknown_joint
+from mbkit.engines.imported import unused
+from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.model import Body, Joint, Model
+from mbkit.model.validation import static_bodies
+
+__all__ = ["JOINT_TYPES", "MujocoModel", "Placed", "build", "full_mass_matrix", "heard_warnings", "mapped", "specified"]
+
+
+# What differs between versions of MuJoCo and what is global in it, in one place.
+#
+# 4.0 is the first whose Runge–Kutta on rotations is of fourth order, and the lower
+# bound. `mj_fullM` took the matrix itself before 3.10, and takes the data since.
+
+
+def _leave_no_log() -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the working folder, unless somebody has named another file."""
+    config = mujoco.MjLogConfig.get()
+    if config.logto_file and config.logfile == "MUJOCO_LOG.TXT":
+        config.logto_file = False
+        config.set()
+
+
+_leave_no_log()
+
+
+def full_mass_matrix(model: Any, data: Any) -> Array:
+    """Return the dense mass matrix of the last `mj_makeM`."""
+    out = np.zeros((model.nv, model.nv))
+    if model.nv:
+        mujoco.mj_fullM(model, data, out)
+    return out
+
+
+@contextlib.contextmanager
+def heard_warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, instead of prints."""
+    heard: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(heard.append)
+    try:
+        yield heard
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
+_X, _Y, _Z = np.eye(3)
+# A ball joint can only be the last of a stack: its quaternion is in the body's own axes.
+_STACKABLE: Final = ("revolute", "continuous", "prismatic", "universal", "spherical_zyx", "planar")
+# MuJoCo's compiler refuses principal moments below this (mjMINVAL).
+_SMALLEST: Final = 1e-15
+_OPEN: Final = 1e10
+
+
+@dataclass
+class MujocoModel:
+    """The compiled model and the maps between its coordinates and the description's.
+
+    Attributes
+    ----------
+    model : mujoco.MjModel
+    q_index, v_index : integer arrays
+        MuJoCo's entry i is full coordinate ``q_index[i]``, quaternions included.
+    free : tuple of (int, int)
+        (start in qpos, start in qvel) of every free joint, however it is made.
+    bodies : dict
+        Body name -> MuJoCo's body index.
+    absorbed : frozenset of str
+        Massless bodies that became part of a stack of joints.
+    disabled : tuple of str
+        What was switched off.
+    """
+
+    model: Any
+    q_index: np.ndarray
+    v_index: np.ndarray
+    free: tuple[tuple[int, int], ...]
+    bodies: dict[str, int]
+    absorbed: frozenset[str]
+    disabled: tuple[str, ...]
+
+
+def build(description: Model, *, spheres: bool = False) -> MujocoModel:
+    """Compile the description.
+
+    Parameters
+    ----------
+    description : Model
+    spheres : bool
+        Whether every body gets a sphere of 1 µm, to measure what geometry costs.
+
+    Raises
+    ------
+    UnsupportedError
+        For a joint of a type that MuJoCo does not have (helical), an unevenly damped
+        free joint, or a body that MuJoCo's compiler refuses; the message names it.
+    """
+    spec, placed, disabled = specified(description)
+    if spheres:
+        for name, body in placed.bodies.items():
+            if name != "world":
+                body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], pos=body.ipos, mass=0.0)
+    # A singular M at the zero configuration is told when somebody solves with it.
+    with heard_warnings(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise UnsupportedError(f"mujoco: {_refusal(description, str(error))}") from None
+        _set_constants(model, description, placed)
+    _verify(model, description, placed)
+    return mapped(model, description, placed, disabled)
+
+
+@dataclass
+class Placed:
+    """What of a description went where in a specification.
+
+    Attributes
+    ----------
+    bodies : dict
+        Body name -> MuJoCo's body.
+    degenerate : dict
+        Bodies that stand in with a placeholder -> their own principal moments.
+    joints : dict
+        Joint name -> names of MuJoCo's joints.
+    absorbed : set of str
+    static : set of str
+        Bodies that are fixed to the world.
+    """
+
+    bodies: dict[str, Any]
+    degenerate: dict[str, Array]
+    joints: dict[str, list[str]]
+    absorbed: set[str]
+    static: set[str]
+
+
+def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
+    """Return the specification, not compiled yet, what went where in it, and what was switched off.
+
+    Raises
+    ------
+    UnsupportedError
+        For a joint of a type that MuJoCo does not have or an unevenly damped free joint.
+    """
+    for joint in description.joints:
+        if joint.kind not in JOINT_TYPES:
+            raise unknown_joint("mujoco", joint)
+        if joint.kind == "free" and np.ptp(joint.damping[:3]) > 0:
+            raise UnsupportedError(
+                f"mujoco: free joint {joint.name!r} is damped differently along its body axes; "
+                "MuJoCo damps a free joint along world axes"
+            )
+    spec = mujoco.MjSpec()
+    spec.modelname = description.name
+    compiler = spec.compiler
+    compiler.degree, compiler.autolimits = False, False
+    compiler.balanceinertia, compiler.fusestatic, compiler.inertiafromgeom = False, False, 0
+    compiler.boundmass = compiler.boundinertia = 0.0
+    compiler.alignfree = False
+    disabled = _switch_off(spec, description)
+    placed = _add_tree(spec, description)
+    _add_springs(spec, description, placed)
+    _add_couplings(spec, description, placed)
+    return spec, placed, disabled
+
+
+def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
+    needs = description.needs
+    bits = {
+        "contacts": "CONTACT",
+        "joint limits": "LIMIT",
+        "dry friction": "FRICTIONLOSS",
+        "equality constraints": "EQUALITY",
+        "constraint solver": "CONSTRAINT",
+        "actuators": "ACTUATION",
+        "sensors": "SENSOR",
+        "implicit damping in Euler": "EULERDAMP",
+        "restart after divergence": "AUTORESET",
+        "warm start": "WARMSTART",
+        "islands": "ISLAND",
+    }
+    if not needs.gravity:
+        bits["gravity"] = "GRAVITY"
+    if not needs.springs:
+        bits["springs"] = "SPRING"
+    if not needs.damping:
+        bits["dampers"] = "DAMPER"
+    flags = 0
+    for bit in bits.values():
+        flags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}", 0))
+    spec.option.disableflags = flags
+    spec.option.gravity = np.array(description.gravity)
+    # 4.0.0 can give wrong accelerations with sparse Jacobians.
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    return tuple(bits)
+
+
+def _add_tree(spec: Any, description: Model) -> Placed:
+    placed = Placed({"world": spec.worldbody}, {}, {}, set(), static_bodies(description.joints))
+    children: dict[str, list[Joint]] = {}
+    for joint in description.joints:
+        children.setdefault(joint.parent, []).append(joint)
+    sprung = {b for s in description.springs for b in (s.body_a, s.body_b)}
+    # (MuJoCo parent, R, p) of the frame in which a joint stands, and the joints
+    # stacked on the way there, each with its frame in the same parent.
+    at: dict[str, tuple[str, Array, Array, list[tuple[Joint, Array, Array]]]] = {
+        "world": ("world", np.eye(3), np.zeros(3), [])
+    }
+    for joint in description.tree:
+        owner, R, p, stack = at[joint.parent]
+        R, p = R @ joint.rotation, p + R @ joint.translation
+        stack = [*stack, (joint, R, p)]
+        body = description.body(joint.child)
+        below = children.get(body.name, [])
+        massless = body.mass == 0 and not body.inertia.any()
+        if (
+            massless
+            and joint.kind in _STACKABLE
+            and len(below) == 1
+            and below[0].kind in (*_STACKABLE, "ball")
+            and body.name not in sprung
+        ):
+            at[body.name] = (owner, R, p, stack)
+            placed.absorbed.add(body.name)
+            continue
+        made = placed.bodies[owner].add_body(name=body.name, pos=p, quat=_wxyz(R))
+        placed.bodies[body.name] = made
+        _give_inertia(made, body, description, placed)
+        if len(stack) > 1 and any(stacked.kind == "prismatic" for stacked, _, _ in stack):
+            # MuJoCo 4.0.0 takes the mass matrix of several slides of a "simple" body for diagonal, even
+            # where they are parallel.
+            made.simple = 0
+        at_origin = owner == "world" and np.array_equal(R, np.eye(3)) and not p.any()
+        for stacked, R_PJ, p_PJ in stack:
+            _add_joint(made, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin=at_origin)
+        if owner == "world" and joint.kind == "fixed":
+            # MuJoCo forms inertias about the centre of mass of a body's whole tree, and
+            # rounds accordingly. What hangs on a body fixed to the world starts a tree
+            # of its own in the world, so that one leg is not measured from the other's.
+            at[body.name] = ("world", R, p, [])
+        else:
+            at[body.name] = (body.name, np.eye(3), np.zeros(3), [])
+    return placed
+
+
+def _give_inertia(made: Any, body: Body, description: Model, placed: Placed) -> None:
+    inertia = np.array(body.inertia)
+    if np.array_equal(inertia, np.diag(np.diag(inertia))):
+        moments, axes = np.diag(inertia).copy(), np.eye(3)
+    else:
+        moments, axes = np.linalg.eigh(inertia)
+        axes = axes * np.sign(np.linalg.det(axes))
+    made.explicitinertial = True
+    made.mass, made.ipos, made.iquat = body.mass, np.array(body.com), _wxyz(axes)
+    made.inertia = moments
+    listed = {name for name, _ in description.nonphysical}
+    low, middle, high = np.sort(moments)
+    harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
+    if harmless and (low < _SMALLEST or low + middle < high):
+        # A point mass, a thin rod or a plate is a fair idealization, and what is fixed
+        # to the world may have any inertia. The compiler refuses them though the dynamics
+        # needs no such rule: they are compiled with a placeholder and get their own
+        # moments afterwards.
+        placed.degenerate[body.name] = moments
+        made.inertia = np.ones(3)
+
+
+#: Joint type -> MuJoCo's type, axis and name suffix of each joint of its stack.
+JOINT_TYPES: Final[dict[str, Callable[[Joint], list[tuple[Any, Array, str]]]]] = {
+    "fixed": lambda _: [],
+    "revolute": lambda joint: [(_HINGE, joint.axes[0], "")],
+    "continuous": lambda joint: [(_HINGE, joint.axes[0], "")],
+    "prismatic": lambda joint: [(_SLIDE, joint.axes[0], "")],
+    "universal": lambda joint: [(_HINGE, joint.axes[0], ".1"), (_HINGE, joint.axes[1], ".2")],
+    "spherical_zyx": lambda _: [(_HINGE, _Z, ".z"), (_HINGE, _Y, ".y"), (_HINGE, _X, ".x")],
+    "ball": lambda _: [(_BALL, _Z, "")],
+    "planar": lambda _: [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_HINGE, _Z, ".theta")],
+    "free": lambda _: [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_SLIDE, _Z, ".z"), (_BALL, _Z, ".ball")],
+}
+
+
+def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, at_origin: bool) -> None:
+    """Add the joint, whose fixed frame at q = 0 is (R, p) in the body."""
+    names: list[str] = []
+
+    def add(kind: Any, axis: Array, k: int, suffix: str) -> None:
+        name = joint.name + suffix
+        j = made.add_joint(name=name, type=kind, axis=R @ axis, pos=p)
+        if kind in (_HINGE, _SLIDE):
+            j.stiffness[0], j.springref = joint.stiffness[k], joint.rest[k]
+            j.damping[0], j.frictionloss = joint.damping[k], joint.friction[k]
+            if joint.type.nv == 1:
+                j.armature = joint.armature[0]
+            low, high = float(joint.lower[k]), float(joint.upper[k])
+            if np.isfinite([low, high]).any() and low < high:
+                # MuJoCo has no open end; this one is never reached.
+                j.limited, j.range = 1, [max(low, -_OPEN), min(high, _OPEN)]
+        names.append(name)
+
+    steps = JOINT_TYPES[joint.kind](joint)
+    if joint.kind == "free" and at_origin:
+        # A true free joint's qpos is the pose in the world, ours too then.
+        steps = [(_FREE, _Z, "")]
+    for k, (type_, axis, suffix) in enumerate(steps):
+        add(type_, axis, k, suffix)
+    placed.joints[joint.name] = names
+
+
+def _add_springs(spec: Any, description: Model, placed: Placed) -> None:
+    for k, spring in enumerate(description.springs):
+        tendon = spec.add_tendon(name=spring.name)
+        for end, body, point in (("a", spring.body_a, spring.point_a), ("b", spring.body_b, spring.point_b)):
+            site = f"spring{k}.{end}"
+            placed.bodies[body].add_site(name=site, pos=np.array(point))
+            tendon.wrap_site(site)
+        tendon.stiffness[0], tendon.damping[0] = spring.stiffness, spring.damping
+        tendon.springlength = [spring.rest_length, spring.rest_length]
+
+
+def _add_couplings(spec: Any, description: Model, placed: Placed) -> None:
+    taken = {spring.name for spring in description.springs}
+    for coupling in description.couplings:
+        # Springs between points are tendons too.
+        tendon = spec.add_tendon(name=unused(coupling.name, taken))
+        # A rest length of -1 would mean the length where the joints' springs rest; with all signs turned it is 1.
+        sign = -1.0 if coupling.rest_length == -1.0 else 1.0
+        for joint, factor in zip(coupling.joints, coupling.factors, strict=True):
+            tendon.wrap_joint(placed.joints[joint][0], sign * float(factor))
+        tendon.stiffness[0], tendon.damping[0] = coupling.stiffness, coupling.damping
+        tendon.springlength = [sign * coupling.rest_length] * 2
+        tendon.armature = coupling.armature
+
+
+def _refusal(description: Model, error: str) -> str:
+    """Return MuJoCo's complaint in one line, with the body it names."""
+    lines = [line.strip() for line in error.splitlines() if line.strip()]
+    told = lines[0].removeprefix("Error: ") if lines else "compile failed"
+    named = next((x for x in lines if x.startswith("Element name")), "")
+    name = named.split("'")[1] if "'" in named else ""
+    reasons = dict(description.nonphysical)
+    if name:
+        body = next((b for b in description.bodies if b.name == name), None)
+        detail = f" (mass {body.mass:.4g} kg)" if body is not None else ""
+        why = f"; {reasons[name]}" if name in reasons else ""
+        return f"the compiler refuses body {name!r}{detail}: {told}{why}"
+    return f"the compiler refuses {description.name}: {told}"
+
+
+def _set_constants(model: Any, description: Model, placed: Placed) -> None:
+    for name, moments in placed.degenerate.items():
+        model.body_inertia[model.body(name).id] = moments
+    for joint in description.joints:
+        if joint.kind in ("ball", "free") and joint.damping.any():
+            adr = _addresses(model, placed.joints[joint.name])[1]
+            model.dof_damping[adr] = joint.damping
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _verify(model: Any, description: Model, placed: Placed) -> None:
+    """Raise unless every body arrived with its mass, centre of mass and inertia."""
+    for body in description.bodies:
+        if body.name in placed.absorbed:
+            continue
+        made = model.body(body.name)
+        x, y, z = made.iquat[1:]
+        R = spatial.matrix_from_quaternion(np.array([x, y, z, made.iquat[0]]))
+        inertia = R @ np.diag(made.inertia) @ R.T
+        for what, got, wanted in (
+            ("mass", made.mass, body.mass),
+            ("centre of mass", made.ipos, body.com),
+            ("inertia", inertia, body.inertia),
+        ):
+            off = np.abs(np.asarray(got) - wanted).max()
+            if off > 1e-13 * np.abs(wanted).max():
+                raise MbkitError(
+                    f"mujoco: {what} of body {body.name!r} changed by {off:.2e} on the way into MuJoCo "
+                    f"{mujoco.__version__}: expected {wanted}, got {got}; please report this model"
+                )
+
+
+def _addresses(model: Any, names: list[str]) -> tuple[list[int], list[int]]:
+    q: list[int] = []
+    v: list[int] = []
+    for name in names:
+        j = model.joint(name)
+        q += range(int(j.qposadr[0]), int(j.qposadr[0]) + len(j.qpos0))
+        v += range(int(j.dofadr[0]), int(j.dofadr[0]) + len(j.damping))
+    return q, v
+
+
+def mapped(model: Any, description: Model, placed: Placed, disabled: tuple[str, ...]) -> MujocoModel:
+    """Return a compiled model with the maps between its coordinates and the description's, by name."""
+    layout = description.layout
+    q_index, v_index = np.zeros(model.nq, int), np.zeros(model.nv, int)
+    free = []
+    for joint in description.joints:
+        if not joint.type.nv:
+            continue
+        q, v = _addresses(model, placed.joints[joint.name])
+        ours_q, ours_v = layout.full_q[joint.name], layout.full_v[joint.name]
+        order = list(range(ours_q.start, ours_q.stop))
+        if joint.type.quaternion is not None:
+            # x, y, z, w here; w, x, y, z there.
+            k = joint.type.quaternion
+            order[k:] = [order[-1], *order[k:-1]]
+        q_index[q], v_index[v] = order, range(ours_v.start, ours_v.stop)
+        if joint.kind == "free":
+            free.append((q[0], v[0]))
+    bodies = {name: model.body(name).id for name in placed.bodies if name != "world"} | {"world": 0}
+    return MujocoModel(model, q_index, v_index, tuple(free), bodies, frozenset(placed.absorbed), disabled)
+
+
+def _wxyz(R: Array) -> Array:
+    x, y, z, w = spatial.quaternion_from_matrix(R)
+    return np.array([w, x, y, z])

@@ -1,0 +1,1 @@
+"""Pinocchio: model, engine, reader."""

@@ -1,0 +1,478 @@
+"""Pinocchio behind the protocol: CRBA for M, RNEA for nle, ABA for forward dynamics.
+
+Carpentier et al. 2019, "The Pinocchio C++ library"; the algorithms are those of
+Featherstone 2008, ch. 5 to 7. Single states take the short way of `pinocchio_direct`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from math import isfinite
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import pinocchio as pin
+
+from mbkit._check import Array
+from mbkit.engines import known_defects
+from mbkit.engines.base import Dynamics, per_sample
+from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
+from mbkit.model import Model
+
+__all__ = ["PinocchioDynamics", "direct_calls", "unread_coordinates"]
+
+
+# Single states passed straight to Pinocchio, with the fewest checks that are safe.
+#
+# Arguments have to be plain vectors of native doubles: Pinocchio reads the memory of a
+# byte-swapped array, and the data of a masked one, as if they were such vectors. One sum
+# finds NaN and infinity in the answer, and so in the arguments; Pinocchio itself objects
+# to wrong sizes. On any doubt the checked method of `Dynamics` takes over: it
+# converts the arguments, or says what is wrong with them.
+
+_INFINITY: Final = float("inf")
+_DOUBLE: Final = np.dtype(np.float64)
+_Plain: Final = np.ndarray
+_NEAR_UNIT: Final = 1e-9
+Call = Callable[..., Any]
+Sound = Callable[[Array], bool]
+
+
+def direct_calls(
+    model: Model, unread: Mapping[str, tuple[int, ...]], bare: Mapping[str, Call], checked: Mapping[str, Call]
+) -> dict[str, Call]:
+    """Return calls for one state, under the quantities' names and with the arguments of `Dynamics`.
+
+    Parameters
+    ----------
+    model : Model
+    unread : mapping
+        Quantity -> coordinates in which a NaN would not show in its value; none where it is missing.
+    bare : mapping
+        The engine's calls for one state, without checks.
+    checked : mapping
+        The calls that take over on any doubt.
+    """
+    kinds: tuple[Callable[[Call, Call, Sound], Call], ...]
+    kinds = _mass_matrix, _gravity, _nle, _inverse_dynamics, _forward_dynamics
+    names = (kind.__name__[1:] for kind in kinds)
+    return {
+        name: kind(bare[name], checked[name], _sound(model, unread.get(name, ())))
+        for name, kind in zip(names, kinds, strict=True)
+    }
+
+
+def unread_coordinates(m: Any, d: Any, neutral: Array) -> tuple[dict[str, tuple[int, ...]], bool]:
+    """Return where a NaN leaves an answer of Pinocchio finite.
+
+    Returns
+    -------
+    dict
+        Quantity -> such coordinates.
+    bool
+        Whether any quantity has such a velocity.
+    """
+    q, v, zero = neutral.copy(), np.zeros(m.nv), np.zeros(m.nv)
+    terms: dict[str, Callable[[], Any]] = {
+        "mass_matrix": lambda: pin.crba(m, d, q),
+        "gravity": lambda: pin.computeGeneralizedGravity(m, d, q),
+        "nle": lambda: pin.nonLinearEffects(m, d, q, v),
+        "inverse_dynamics": lambda: pin.rnea(m, d, q, v, zero),
+        "forward_dynamics": lambda: pin.aba(m, d, q, v, zero),
+    }
+
+    def hidden(state: Array, term: Callable[[], Any]) -> tuple[int, ...]:
+        found = []
+        for i in range(state.size):
+            state[i], kept = np.nan, state[i]
+            if not np.isnan(term()).any():
+                found.append(i)
+            state[i] = kept
+        return tuple(found)
+
+    unread = {name: hidden(q, term) for name, term in terms.items()}
+    return unread, any(hidden(v, terms[name]) for name in terms if name not in ("mass_matrix", "gravity"))
+
+
+def _always(_q: Array) -> bool:
+    return True
+
+
+def _sound(model: Model, unread: tuple[int, ...]) -> Sound:
+    """Return a check of what the answer does not show: unread coordinates and quaternions."""
+    starts = tuple(start for start, _ in model.quaternions)
+    # A quaternion with a NaN is not of unit length.
+    rest = set(unread) - {start + k for start in starts for k in range(4)}
+    if not rest and not starts:
+        return _always
+    if starts == (3,) and rest <= {0, 1, 2}:
+        # A floating base: position, then quaternion.
+        def floating(q: Array) -> bool:
+            a, b, c, x, y, z, w = q[:7].tolist()
+            return bool(-_NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < _NEAR_UNIT and isfinite(a + b + c))
+
+        return floating
+
+    def general(q: Array) -> bool:
+        for start in starts:
+            x = q[start : start + 4]
+            if not -_NEAR_UNIT < x.dot(x) - 1.0 < _NEAR_UNIT:
+                return False
+        return isfinite(sum(q.tolist()))
+
+    return general
+
+
+# One closure for each quantity: a common one with *arguments would cost a third of a microsecond.
+
+
+def _mass_matrix(bare: Call, checked: Call, sound: Sound) -> Call:
+    def mass_matrix(q: Any) -> Any:
+        try:
+            if type(q) is _Plain and q.dtype == _DOUBLE and q.ndim == 1:
+                out = bare(q)
+                entries = out.ravel("K")
+                if entries.dot(entries) < _INFINITY and sound(q):
+                    return out
+        except Exception:  # Pinocchio's own errors vary; the checked way words them
+            pass
+        return checked(q)
+
+    return mass_matrix
+
+
+def _gravity(bare: Call, checked: Call, sound: Sound) -> Call:
+    def gravity(q: Any) -> Any:
+        try:
+            if type(q) is _Plain and q.dtype == _DOUBLE and q.ndim == 1:
+                out = bare(q)
+                if isfinite(sum(out.tolist())) and sound(q):
+                    return out
+        except Exception:  # as above
+            pass
+        return checked(q)
+
+    return gravity
+
+
+def _nle(bare: Call, checked: Call, sound: Sound) -> Call:
+    def nle(q: Any, v: Any) -> Any:
+        try:
+            if type(q) is type(v) is _Plain and q.dtype == v.dtype == _DOUBLE and q.ndim == v.ndim == 1:
+                out = bare(q, v)
+                if isfinite(sum(out.tolist())) and sound(q):
+                    return out
+        except Exception:  # as above
+            pass
+        return checked(q, v)
+
+    return nle
+
+
+def _inverse_dynamics(bare: Call, checked: Call, sound: Sound) -> Call:
+    def inverse_dynamics(q: Any, v: Any, a: Any) -> Any:
+        try:
+            if (
+                type(q) is type(v) is type(a) is _Plain
+                and q.dtype == v.dtype == a.dtype == _DOUBLE
+                and q.ndim == v.ndim == a.ndim == 1
+            ):
+                out = bare(q, v, a)
+                if isfinite(sum(out.tolist())) and sound(q):
+                    return out
+        except Exception:  # as above
+            pass
+        return checked(q, v, a)
+
+    return inverse_dynamics
+
+
+def _forward_dynamics(bare: Call, checked: Call, sound: Sound) -> Call:
+    def forward_dynamics(q: Any, v: Any, tau: Any) -> Any:
+        try:
+            if (
+                type(q) is type(v) is type(tau) is _Plain
+                and q.dtype == v.dtype == tau.dtype == _DOUBLE
+                and q.ndim == v.ndim == tau.ndim == 1
+            ):
+                out = bare(q, v, tau)
+                if isfinite(sum(out.tolist())) and sound(q):
+                    return out
+        except Exception:  # as above
+            pass
+        return checked(q, v, tau)
+
+    return forward_dynamics
+
+
+_SHORT: Final = ("mass_matrix", "gravity", "nle", "inverse_dynamics", "forward_dynamics")
+
+
+class PinocchioDynamics(Dynamics):
+    """Pinocchio's algorithms on a description.
+
+    Attributes
+    ----------
+    pin_model : pinocchio.Model
+        What was built; free to read.
+    """
+
+    engine = "pinocchio"
+    refuses: ClassVar[dict[str, str]] = {"function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has"}
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self._pin: PinModel = build(model)
+        self.pin_model = self._m = self._pin.model
+        self._d = self._m.createData()
+        self._joint_passive = JointPassive(model, self._pin.q_order, self._pin.v_order)
+        self._springs = PointSprings(model, self._pin) if model.springs else None
+        self._reduced = model.layout.reduced
+        #: Whether q and v go to Pinocchio as they are; else as G_q q + c and G v.
+        self._direct = self._pin.ordered and not self._reduced
+        layout = model.layout
+        self._G_q, self._c = layout.G_q[self._pin.q_order], layout.offsets[self._pin.q_order]
+        self._G = layout.G[self._pin.v_order]
+        self._Gt = np.ascontiguousarray(self._G.T)
+        self._take_short_way()
+        if tiny := self._tiny_bodies():
+            known_defects.announce(known_defects.TINY_MASS, f"the mass of body {tiny}")
+
+    def _take_short_way(self) -> None:
+        m, d = self._m, self._d
+        bare: dict[str, Callable[..., Any]] = {name: getattr(self, f"_one_{name}") for name in _SHORT}
+        # What is mixed by G_q q spreads a NaN to every coordinate.
+        unread: dict[str, tuple[int, ...]] = {}
+        if self._direct:
+            unread, velocities_unread = unread_coordinates(m, d, self.model.neutral())
+            if velocities_unread:
+                # A lone slide: nothing depends on v, so it must be looked at.
+                return
+            terms = {"mass_matrix": pin.crba, "gravity": pin.computeGeneralizedGravity, "nle": pin.nonLinearEffects}
+            needs = self.model.needs
+            if not (needs.springs or needs.damping):
+                terms |= {"inverse_dynamics": pin.rnea, "forward_dynamics": pin.aba}
+            elif not needs.springs and self._springs is None and not self.model.couplings:
+                bare |= self._damped_only()
+            if self._joint_passive.armature is not None:
+                terms = {name: terms[name] for name in ("gravity", "nle")}
+            bare |= {name: functools.partial(function, m, d) for name, function in terms.items()}
+        checked = {name: getattr(self, name) for name in _SHORT}
+        for name, call in direct_calls(self.model, unread, bare, checked).items():
+            setattr(self, name, functools.update_wrapper(call, checked[name]))
+
+    def _damped_only(self) -> dict[str, Callable[..., Any]]:
+        m, d, damping, rnea, aba = self._m, self._d, self._joint_passive.damping, pin.rnea, pin.aba
+
+        def inverse_dynamics(q: Array, v: Array, a: Array) -> Any:
+            out = rnea(m, d, q, v, a)
+            out += damping * v
+            return out
+
+        def forward_dynamics(q: Array, v: Array, tau: Array) -> Any:
+            return aba(m, d, q, v, tau - damping * v)
+
+        return {"inverse_dynamics": inverse_dynamics, "forward_dynamics": forward_dynamics}
+
+    # Between the description's coordinates and Pinocchio's.
+
+    def _full_q(self, q: Array) -> Array:
+        return q if self._direct else self._G_q.dot(q) + self._c
+
+    def _full_v(self, v: Array) -> Array:
+        return v if self._direct else self._G.dot(v)
+
+    def _force(self, f: Array) -> Array:
+        return f if self._direct else self._Gt.dot(f)
+
+    def _matrix(self, A: Array) -> Array:
+        return A if self._direct else self._Gt.dot(A).dot(self._G)
+
+    def _columns(self, J: Array) -> Array:
+        return J if self._direct else J @ self._G
+
+    # Terms at one state.
+
+    def _one_mass_matrix(self, q: Array) -> Array:
+        return self._matrix(self._full_mass_matrix(self._full_q(q)))
+
+    def _full_mass_matrix(self, q: Array) -> Array:
+        M: Array = pin.crba(self._m, self._d, q)
+        rotors = self._joint_passive.armature
+        return M if rotors is None else M + rotors
+
+    def _one_gravity(self, q: Array) -> Array:
+        return self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q)))
+
+    def _one_nle(self, q: Array, v: Array) -> Array:
+        return self._force(pin.nonLinearEffects(self._m, self._d, self._full_q(q), self._full_v(v)))
+
+    def _one_inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        q, v = self._full_q(q), self._full_v(v)
+        a, rotors = self._full_v(a), self._joint_passive.armature
+        out: Array = pin.rnea(self._m, self._d, q, v, a)
+        out -= self._full_passive(q, v)
+        if rotors is not None:
+            out += rotors @ a
+        return self._force(out)
+
+    def _one_forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        q, v = self._full_q(q), self._full_v(v)
+        m, d, passive = self._m, self._d, self._full_passive(q, v)
+        if not self._reduced and self._joint_passive.armature is None:
+            # G only puts the joints in order, so its transpose puts them back.
+            return self._force(pin.aba(m, d, q, v, self._full_v(tau) + passive))
+        # ABA knows neither mimic joints nor rotors between joints: solve GᵀMG a = τ + Gᵀ(passive - nle).
+        M, h = self._matrix(self._full_mass_matrix(q)), pin.nonLinearEffects(m, d, q, v)
+        return np.asarray(np.linalg.solve(M, tau + self._force(passive - h)))
+
+    def _full_passive(self, q: Array, v: Array) -> Array:
+        out = self._joint_passive.force(q, v)
+        if self._springs is not None:
+            out += self._springs.force(self._m, self._d, q, v)
+        return out
+
+    # The protocol.
+
+    def _mass_matrix(self, q: Array) -> Array:
+        return per_sample(self._one_mass_matrix, q)
+
+    def _gravity(self, q: Array) -> Array:
+        return per_sample(self._one_gravity, q)
+
+    def _nle(self, q: Array, v: Array) -> Array:
+        return per_sample(self._one_nle, q, v)
+
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        return per_sample(self._one_inverse_dynamics, q, v, a)
+
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        return per_sample(self._one_forward_dynamics, q, v, tau)
+
+    def _passive(self, q: Array, v: Array) -> Array:
+        return per_sample(lambda q, v: self._force(self._full_passive(self._full_q(q), self._full_v(v))), q, v)
+
+    def _coriolis_matrix(self, q: Array, v: Array) -> Array:
+        if self._coriolis_fault:
+            known_defects.announce(known_defects.CORIOLIS, self._coriolis_fault)
+        return per_sample(
+            lambda q, v: self._matrix(pin.computeCoriolisMatrix(self._m, self._d, self._full_q(q), self._full_v(v))),
+            q,
+            v,
+        )
+
+    def _kinetic_energy(self, q: Array, v: Array) -> Array:
+        if self._kinetic_fault:
+            known_defects.announce(known_defects.KINETIC_ENERGY, self._kinetic_fault)
+        rotors = self._joint_passive.armature
+
+        def one(q: Array, v: Array) -> Any:
+            q, v = self._full_q(q), self._full_v(v)
+            own = pin.computeKineticEnergy(self._m, self._d, q, v)
+            return own if rotors is None else own + 0.5 * float(v @ rotors @ v)
+
+        return per_sample(one, q, v)
+
+    def _potential_energy(self, q: Array) -> Array:
+        ground = -float(self.model.gravity @ self._pin.ground_moment)
+
+        def one(q: Array) -> Any:
+            q = self._full_q(q)
+            stored = self._joint_passive.energy(q)
+            if self._springs is not None:
+                stored += self._springs.energy(self._m, self._d, q)
+            return pin.computePotentialEnergy(self._m, self._d, q) + stored + ground
+
+        return per_sample(one, q)
+
+    def _frame_in_joint(self, frame: str) -> tuple[int, pin.SE3]:
+        f = self.model.frame(frame)
+        carrier, R, p = self._pin.bodies[f.body]
+        return carrier, pin.SE3(R @ f.rotation, p + R @ f.translation)
+
+    def _pose(self, q: Array, frame: str) -> Array:
+        carrier, X_JF = self._frame_in_joint(frame)
+
+        def one(q: Array) -> Array:
+            pin.forwardKinematics(self._m, self._d, self._full_q(q))
+            return np.array((self._d.oMi[carrier] * X_JF).homogeneous)
+
+        return per_sample(one, q)
+
+    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
+        carrier, X_JF = self._frame_in_joint(frame)
+
+        def one(q: Array) -> Array:
+            q = self._full_q(q)
+            if carrier:
+                # One column comes back as a vector.
+                own = pin.computeJointJacobian(self._m, self._d, q, carrier).reshape(6, self._m.nv)
+                J = X_JF.toActionMatrixInverse() @ own
+            else:
+                J = np.zeros((6, self._m.nv))
+            if axes == "world":
+                pin.forwardKinematics(self._m, self._d, q)
+                R = (self._d.oMi[carrier] * X_JF).rotation
+                J = np.vstack([R @ J[:3], R @ J[3:]])
+            return self._columns(J)
+
+        return per_sample(one, q)
+
+    # Known defects, measured on this very model.
+
+    def _tiny_bodies(self) -> str:
+        """Return the names of bodies so light that Pinocchio's sum of inertias, which M is made of, is wrong."""
+        out = []
+        for body in self.model.bodies:
+            if 0 < body.mass < np.finfo(float).eps:
+                one = pin.Inertia(body.mass, np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)))
+                out += [repr(body.name)] if abs((one + one).lever[0] - 1) > 1e-9 else []
+        return ", ".join(out[:3]) + (f" and {len(out) - 3} more" if len(out) > 3 else "")
+
+    @cached_property
+    def _coriolis_fault(self) -> str:
+        """Where C v + g is not nle; empty where it is."""
+
+        def wrong(q: Array, v: Array) -> bool:
+            C = pin.computeCoriolisMatrix(self._m, self._d, q, v)
+            h = pin.nonLinearEffects(self._m, self._d, q, v)
+            g = pin.computeGeneralizedGravity(self._m, self._d, q)
+            # Without ‖M‖‖v‖² the rounding of a symmetric rotor, which has no such forces, would count.
+            scale = np.abs(h).max() + np.abs(g).max() + np.abs(pin.crba(self._m, self._d, q)).max() * float(v @ v)
+            return bool(np.abs(C @ v + g - h).max() > 1e-9 * scale)
+
+        return self._joints_of(wrong)
+
+    @cached_property
+    def _kinetic_fault(self) -> str:
+        """Where the kinetic energy is not ½ vᵀ M v; empty where it is."""
+        if self._tiny_bodies():
+            return ""  # M is wrong then, which is another defect
+
+        def wrong(q: Array, v: Array) -> bool:
+            M = pin.crba(self._m, self._d, q)
+            off = abs(pin.computeKineticEnergy(self._m, self._d, q, v) - 0.5 * float(v @ M @ v))
+            return bool(off > 1e-11 * float(np.abs(v) @ np.abs(M) @ np.abs(v)))
+
+        return self._joints_of(wrong)
+
+    def _joints_of(self, wrong: Callable[[Array, Array], bool]) -> str:
+        """Return for which joints' motion a value is wrong, at a random state; empty where it is right.
+
+        Each joint is moved alone too: what it adds may be small beside the rest.
+        """
+        if not self.model.nv:
+            return ""
+        q, v = self.model.random_state(np.random.default_rng(1))
+        q, v = self._full_q(q), self._full_v(v)
+        places, order = self.model.layout.full_v, self._pin.v_order
+        alone = [
+            repr(joint.name)
+            for joint in self.model.tree
+            if wrong(q, np.where(np.isin(order, np.arange(order.size)[places[joint.name]]), v, 0.0))
+        ]
+        if alone:
+            return f"joint {', '.join(alone)}"
+        return "several joints that move together" if wrong(q, v) else ""

@@ -1,0 +1,200 @@
+"""Pinocchio's own importers of URDF and MJCF, and what they made of a file.
+
+The only place that knows what a parsed `pinocchio.Model` holds: links that are fixed to each other
+are merged and survive as frames, what is fixed to the world is in joint 0, a continuous joint
+is (cos, sin), a planar joint's velocity is in the body's axes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import pinocchio as pin
+
+from mbkit._check import Array
+from mbkit.engines.imported import Imported, checked, unused, written
+from mbkit.errors import UnsupportedError
+from mbkit.load.urdf_links import BASE_JOINT
+from mbkit.model import Body, Joint, Model
+from mbkit.model.joint_types import kind_of
+
+__all__ = ["read"]
+
+_ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous", "H": "helical"}
+_UNALIGNED: Final = {
+    "RevoluteUnaligned": "revolute",
+    "RevoluteUnboundedUnaligned": "continuous",
+    "PrismaticUnaligned": "prismatic",
+    "HelicalUnaligned": "helical",
+    "FreeFlyer": "free",
+    "Spherical": "ball",
+    "SphericalZYX": "spherical_zyx",
+    "Planar": "planar",
+}
+_AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
+
+
+def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
+    """Return what Pinocchio's parser makes of a text; an MJCF says by itself that its base floats."""
+    try:
+        raw = _urdf(text, floating_base) if format_ == "urdf" else _mjcf(text, files or {})
+    except Exception as error:
+        raise UnsupportedError(f"pinocchio: {' '.join(str(error).split())}") from None
+    described = _Description(raw)
+    return Imported(checked("pinocchio", described.model), described.terms, tuple(_beside(raw)))
+
+
+def _urdf(text: str, floating_base: bool) -> Any:
+    if floating_base:
+        return pin.buildModelFromXML(text, pin.JointModelFreeFlyer(), BASE_JOINT)
+    return pin.buildModelFromXML(text)
+
+
+def _mjcf(text: str, files: dict[str, bytes]) -> Any:
+    # Only files are read as MJCF.
+    with written(text, files) as path:
+        return pin.buildModelFromMJCF(str(path))
+
+
+def _beside(raw: Any) -> list[str]:
+    out = []
+    if np.any(raw.rotorInertia):
+        out.append("rotor inertias are read and, by themselves, in no term")
+    if np.any(np.abs(np.array(raw.gravity.angular)) > 0):
+        out.append(f"gravity has an angular part, {raw.gravity.angular}")
+    return out
+
+
+class _Description:
+    """Reads a parsed model joint by joint."""
+
+    def __init__(self, raw: Any) -> None:
+        self.raw, self.data = raw, raw.createData()
+        frames: dict[int, str] = {}
+        for frame in list(raw.frames)[1:]:
+            # A moving body is named after the first link on its joint: the one that the joint carries.
+            if frame.type == pin.BODY and frame.parentJoint:
+                frames.setdefault(int(frame.parentJoint), str(frame.name))
+        self.bodies: list[str] = ["world"]
+        joints, bodies = [], []
+        ground = raw.inertias[0]
+        if ground.mass:
+            bodies.append(_body("universe", ground))
+            joints.append(_joint("universe_fixed", "fixed", "world", "universe", pin.SE3.Identity(), None))
+        #: (joint of ours, Pinocchio's joint, kind) of each that moves.
+        self.moving: list[tuple[str, Any, str]] = []
+        for i in range(1, raw.njoints):
+            name, body = str(raw.names[i]), unused(frames.get(i, f"{raw.names[i]}_body"), self.bodies)
+            parent, X = self.bodies[raw.parents[i]], raw.jointPlacements[i]
+            steps = self._steps(raw.joints[i])
+            for k, (joint, kind, axis, inner) in enumerate(steps):
+                last = k == len(steps) - 1
+                child, own = (body, name) if last else (f"{body}.{k}", f"{name}.{k}")
+                joints.append(_joint(own, kind, parent, child, X * inner, axis, raw, joint))
+                bodies.append(_body(child, raw.inertias[i] if last else pin.Inertia.Zero()))
+                self.moving.append((own, joint, kind))
+                parent, X = child, pin.SE3.Identity()
+            self.bodies.append(body)
+        gravity = np.array(raw.gravity.linear)
+        self.model = Model(name="pinocchio", gravity=gravity, bodies=tuple(bodies), joints=tuple(joints))
+
+    def _steps(self, joint: Any) -> list[tuple[Any, str, Array | None, Any]]:
+        """Return a joint as steps: Pinocchio's joint, kind, axis, and where it stands in the one before."""
+        if joint.shortname() == "JointModelComposite":
+            inner = joint.extract()
+            return [(j, *_kind(j), X) for j, X in zip(inner.joints, inner.jointPlacements, strict=True)]
+        return [(joint, *_kind(joint), pin.SE3.Identity())]
+
+    # The engine's own values, in the description's coordinates.
+
+    def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:  # noqa: ARG002
+        """Return M, g, nle and passive at a batch of states.
+
+        passive is of the damping that Pinocchio read: its algorithms leave that to the caller.
+        """
+        made = [self._one(*x) for x in zip(q, v, strict=True)]
+        return {name: np.array([x[name] for x in made]) for name in ("M", "g", "nle", "passive")}
+
+    def _one(self, q: Array, v: Array) -> dict[str, Array]:
+        raw, layout = self.raw, self.model.layout
+        theirs, T, slip = np.empty(raw.nq), np.zeros((raw.nv, raw.nv)), np.zeros(raw.nv)
+        for name, joint, kind in self.moving:
+            x, w = q[layout.q[name]], layout.v[name]
+            iq, iv = joint.idx_q, joint.idx_v
+            T[iv : iv + joint.nv, w] = np.eye(joint.nv)
+            if joint.nq == joint.nv + 1 and kind == "continuous":
+                x = np.array([np.cos(x[0]), np.sin(x[0])])
+            elif kind == "planar":
+                c, s = np.cos(x[2]), np.sin(x[2])
+                x = np.array([x[0], x[1], c, s])
+                # v_pin = Rᵀ v, and v̇_pin = Rᵀ v̇ + Ṙᵀ v.
+                T[iv : iv + 2, w.start : w.start + 2] = [[c, s], [-s, c]]
+                a, b, turn = v[w]
+                slip[iv : iv + 2] = turn * np.array([-s * a + c * b, -c * a - s * b])
+            theirs[iq : iq + joint.nq] = x
+        u = T @ v
+        M = np.array(pin.crba(raw, self.data, theirs))
+        M = np.triu(M) + np.triu(M, 1).T
+        nle = np.array(pin.nonLinearEffects(raw, self.data, theirs, u))
+        g = np.array(pin.computeGeneralizedGravity(raw, self.data, theirs))
+        passive = -np.array(raw.damping) * u
+        return {"M": T.T @ M @ T, "g": T.T @ g, "nle": T.T @ (nle + M @ slip), "passive": T.T @ passive}
+
+
+def _kind(joint: Any) -> tuple[str, Array | None]:
+    name = joint.shortname().removeprefix("JointModel")
+    if name[:-1] in _ALIGNED:
+        return _ALIGNED[name[:-1]], _AXES[name[-1]]
+    if name not in _UNALIGNED:
+        raise UnsupportedError(f"pinocchio: made a {name} joint, which has no counterpart here")
+    kind = _UNALIGNED[name]
+    if kind_of(kind).n_axes:
+        motion = np.ravel(joint.createData().S)
+        return kind, motion[:3] if kind == "prismatic" else motion[3:]
+    return kind, None
+
+
+def _body(name: str, inertia: Any) -> Body:
+    return Body(name, float(inertia.mass), np.array(inertia.lever), np.array(inertia.inertia))
+
+
+def _joint(
+    name: str, kind: str, parent: str, child: str, X: Any, axis: Array | None, raw: Any = None, joint: Any = None
+) -> Joint:
+    type_ = kind_of(kind)
+    numbers: dict[str, Any] = {n: np.zeros(type_.nv) for n in ("armature", "damping", "friction")}
+    limits: dict[str, Any] = {"lower": np.full(type_.nq, -np.inf), "upper": np.full(type_.nq, np.inf)}
+    limits |= {n: np.full(type_.nv, np.inf) for n in ("velocity_limit", "effort_limit")}
+    if raw is not None:
+        v = slice(joint.idx_v, joint.idx_v + joint.nv)
+        numbers = {
+            "armature": np.array(raw.armature[v]),
+            "damping": np.array(raw.damping[v]),
+            "friction": np.array(raw.upperDryFrictionLimit[v]),
+        }
+        if type_.nv == 1:
+            limits["velocity_limit"] = _open(raw.upperVelocityLimit[v])
+            limits["effort_limit"] = _open(raw.upperEffortLimit[v])
+            if joint.nq == 1:
+                q = slice(joint.idx_q, joint.idx_q + 1)
+                limits["lower"], limits["upper"] = _open(raw.lowerPositionLimit[q]), _open(raw.upperPositionLimit[q])
+    return Joint(
+        name=name,
+        kind=kind,
+        parent=parent,
+        child=child,
+        rotation=np.array(X.rotation),
+        translation=np.array(X.translation),
+        axes=np.empty((0, 3)) if axis is None else np.array([axis]),
+        pitch=float(getattr(joint, "pitch", 0.0)) if kind == "helical" else 0.0,
+        stiffness=np.zeros(type_.nv),
+        rest=np.zeros(type_.nv),
+        **numbers,
+        **limits,
+    )
+
+
+def _open(x: Array) -> Array:
+    """Return limits, infinite where the largest double stands for none."""
+    return np.where(np.abs(x) < 1e300, x, np.copysign(np.inf, x))

@@ -1,0 +1,243 @@
+"""A `pinocchio.Model` made from a description, and how its numbers map to ours.
+
+Joints are added depth first, because Pinocchio's algorithms take a subtree to be
+contiguous. Continuous joints are plain revolute ones, with one angle. A planar
+joint is two slides and a hinge, whose velocities are the derivatives of its
+coordinates (Pinocchio's own planar joint has four numbers and body velocities).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pinocchio as pin
+
+from mbkit._check import Array
+from mbkit.engines.base import unknown_joint
+from mbkit.model import Body, Joint, Model, PointSpring
+
+__all__ = ["JointPassive", "PinModel", "PointSprings", "build"]
+
+
+_X, _Y, _Z = np.eye(3)
+
+
+@dataclass(frozen=True)
+class PinModel:
+    """The built model and the maps between its coordinates and the description's.
+
+    Attributes
+    ----------
+    model : pinocchio.Model
+    bodies : dict
+        Body name -> (joint index, R_JB, p_JB_J).
+    q_order, v_order : (n,) integer arrays
+        Pinocchio's coordinate i is full coordinate ``q_order[i]``.
+    ordered : bool
+        Whether both orders are the identity.
+    ground_moment : (3,) array
+        Σ m p over bodies fixed to the world: Pinocchio's energy leaves them out.
+    """
+
+    model: pin.Model
+    bodies: dict[str, tuple[int, Array, Array]]
+    q_order: np.ndarray
+    v_order: np.ndarray
+    ordered: bool
+    ground_moment: Array
+
+
+def build(description: Model) -> PinModel:
+    """Return the description as Pinocchio holds it.
+
+    Raises
+    ------
+    UnsupportedError
+        For a joint of a type that Pinocchio does not have; named.
+    """
+    made = pin.Model()
+    made.name = description.name
+    made.gravity = pin.Motion(np.array(description.gravity), np.zeros(3))
+    layout = description.layout
+    bodies: dict[str, tuple[int, Array, Array]] = {"world": (0, np.eye(3), np.zeros(3))}
+    q_order: list[int] = []
+    v_order: list[int] = []
+    ground = np.zeros(3)
+    for joint in description.tree:
+        carrier, R, p = bodies[joint.parent]
+        R, p = R @ joint.rotation, p + R @ joint.translation
+        if joint.kind not in _STEPS:
+            raise unknown_joint("pinocchio", joint)
+        if joint.type.nv:
+            for suffix, motion in _STEPS[joint.kind](joint):
+                carrier = made.addJoint(carrier, motion, pin.SE3(R, p), joint.name + suffix)
+                R, p = np.eye(3), np.zeros(3)
+            first = made.joints[carrier].idx_v + made.joints[carrier].nv - joint.type.nv
+            armature = np.array(made.armature)
+            armature[first : first + joint.type.nv] = joint.armature
+            made.armature = armature
+        bodies[joint.child] = (carrier, R, p)
+        body = description.body(joint.child)
+        if carrier:
+            made.appendBodyToJoint(carrier, _inertia(body), pin.SE3(R, p))
+        else:
+            ground += body.mass * (p + R @ body.com)
+        q_order.extend(range(layout.full_q[joint.name].start, layout.full_q[joint.name].stop))
+        v_order.extend(range(layout.full_v[joint.name].start, layout.full_v[joint.name].stop))
+    ordered = q_order == list(range(len(q_order)))
+    return PinModel(made, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground)
+
+
+def _inertia(body: Body) -> pin.Inertia:
+    # Set part by part: the constructor refuses an inertia that is not positive, which
+    # a description may hold after a warning.
+    made = pin.Inertia.Zero()
+    made.mass, made.lever, made.inertia = body.mass, np.array(body.com), np.array(body.inertia)
+    return made
+
+
+def _aligned(joint: Joint, letter: str, general: type) -> object:
+    """Return Pinocchio's cheaper joint where the axis is exactly x, y or z."""
+    for name, unit in (("X", _X), ("Y", _Y), ("Z", _Z)):
+        if np.array_equal(joint.axes[0], unit):
+            return getattr(pin, f"JointModel{letter}{name}")()
+    return general(np.array(joint.axes[0]))
+
+
+#: Joint type -> name suffix and Pinocchio joint of each step of a joint of this type.
+_STEPS: Final[dict[str, Callable[[Joint], list[tuple[str, object]]]]] = {
+    "fixed": lambda _: [],
+    "revolute": lambda joint: [("", _aligned(joint, "R", pin.JointModelRevoluteUnaligned))],
+    "continuous": lambda joint: [("", _aligned(joint, "R", pin.JointModelRevoluteUnaligned))],
+    "prismatic": lambda joint: [("", _aligned(joint, "P", pin.JointModelPrismaticUnaligned))],
+    "helical": lambda joint: [("", pin.JointModelHelicalUnaligned(np.array(joint.axes[0]), joint.pitch))],
+    "universal": lambda joint: [("", pin.JointModelUniversal(np.array(joint.axes[0]), np.array(joint.axes[1])))],
+    "spherical_zyx": lambda _: [("", pin.JointModelSphericalZYX())],
+    "ball": lambda _: [("", pin.JointModelSpherical())],
+    "planar": lambda _: [(".x", pin.JointModelPX()), (".y", pin.JointModelPY()), (".theta", pin.JointModelRZ())],
+    "free": lambda _: [("", pin.JointModelFreeFlyer())],
+}
+
+
+# Point-to-point springs and dampers on Pinocchio's kinematics.
+
+
+class PointSprings:
+    """Forces and energy of all point springs of a model, in Pinocchio's coordinates."""
+
+    def __init__(self, model: Model, made: PinModel) -> None:
+        self._ends: list[tuple[PointSpring, tuple[int, Array], tuple[int, Array]]] = []
+        for spring in model.springs:
+            a, b = (
+                (made.bodies[body][0], made.bodies[body][2] + made.bodies[body][1] @ point)
+                for body, point in ((spring.body_a, spring.point_a), (spring.body_b, spring.point_b))
+            )
+            self._ends.append((spring, a, b))
+
+    def energy(self, m: Any, d: Any, q: Array) -> float:
+        """Return Σ ½ k (l - l0)²."""
+        pin.forwardKinematics(m, d, q)
+        total = 0.0
+        for spring, (i, a), (j, b) in self._ends:
+            length = np.linalg.norm(d.oMi[j].act(b) - d.oMi[i].act(a))
+            total += 0.5 * spring.stiffness * float(length - spring.rest_length) ** 2
+        return total
+
+    def force(self, m: Any, d: Any, q: Array, v: Array) -> Array:
+        """Return the generalized force, by the points' Jacobians."""
+        pin.computeJointJacobians(m, d, q)
+        out = np.zeros(m.nv)
+        for spring, (i, a), (j, b) in self._ends:
+            gap = d.oMi[j].act(b) - d.oMi[i].act(a)
+            J = self._point_jacobian(m, d, j, b) - self._point_jacobian(m, d, i, a)
+            # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0. Where one
+            # is needed and there is none, the answer is NaN, which the caller finds.
+            length = float(np.linalg.norm(gap))
+            pull = spring.stiffness * gap
+            with np.errstate(invalid="ignore", divide="ignore"):
+                if spring.stiffness and spring.rest_length:
+                    pull = pull - spring.stiffness * spring.rest_length * (gap / length)
+                if spring.damping:
+                    pull = pull + spring.damping * (gap / length) * float(gap @ (J @ v)) / np.float64(length)
+            out -= J.T @ pull
+        return out
+
+    @staticmethod
+    def _point_jacobian(m: Any, d: Any, joint: int, point: Array) -> Array:
+        if not joint:
+            return np.zeros((3, m.nv))
+        # One column comes back as a vector.
+        J = pin.getJointJacobian(m, d, joint, pin.LOCAL).reshape(6, m.nv)
+        R = d.oMi[joint].rotation
+        return np.asarray(R @ (J[:3] - pin.skew(point) @ J[3:]))
+
+
+# Forces and energy of springs and dampers at joints and between them, for engines that leave them out.
+
+
+class JointPassive:
+    """Springs and dampers at the joints, and joint couplings, in full coordinates of a given order.
+
+    Parameters
+    ----------
+    model : Model
+    q_order, v_order : integer arrays
+        Entry i here is full coordinate ``q_order[i]`` of the description.
+
+    Attributes
+    ----------
+    armature : (n, n) array or None
+        What the couplings' rotors add to M; None where there are none.
+    """
+
+    def __init__(self, model: Model, q_order: np.ndarray, v_order: np.ndarray) -> None:
+        layout = model.layout
+        q_place, v_place = np.argsort(q_order), np.argsort(v_order)
+        self.damping = np.zeros(layout.sizes[3])
+        springs: list[tuple[int, int, float, float]] = []
+        for joint in model.joints:
+            iq, iv = layout.full_q[joint.name], layout.full_v[joint.name]
+            self.damping[v_place[iv]] = joint.damping
+            # A joint spring acts on one coordinate per velocity.
+            springs += [
+                (q_place[iq.start + k], v_place[iv.start + k], float(joint.stiffness[k]), float(joint.rest[k]))
+                for k in range(joint.type.nv)
+                if joint.stiffness[k]
+            ]
+        self._against = -self.damping
+        self._spring_q = np.array([s[0] for s in springs], dtype=int)
+        self._spring_v = np.array([s[1] for s in springs], dtype=int)
+        self._stiffness = np.array([s[2] for s in springs])
+        self._rest = np.array([s[3] for s in springs])
+        couplings = model.couplings
+        rows = np.array([layout.coupling_row(c) for c in couplings]).reshape(len(couplings), layout.sizes[3])
+        # The couplings' lengths are self._lengths q, the rates self._rates v.
+        self._rates, self._lengths = rows[:, v_order], np.zeros((len(couplings), layout.sizes[2]))
+        for name in {name for c in couplings for name in c.joints}:
+            iq, iv = layout.full_q[name].start, layout.full_v[name].start
+            self._lengths[:, q_place[iq]] = rows[:, iv]
+        stiffness, rest, damping, armature = (
+            np.array([getattr(c, field) for c in couplings])
+            for field in ("stiffness", "rest_length", "damping", "armature")
+        )
+        self._coupled = (stiffness, rest, damping)
+        self.armature = (self._rates.T * armature) @ self._rates if armature.any() else None
+
+    def force(self, q: Array, v: Array) -> Array:
+        """Return the generalized force."""
+        out: Array = self._against * v
+        if self._stiffness.size:
+            out[self._spring_v] -= self._stiffness * (q[self._spring_q] - self._rest)
+        if len(self._rates):
+            stiffness, rest, damping = self._coupled
+            out -= self._rates.T @ (stiffness * (self._lengths @ q - rest) + damping * (self._rates @ v))
+        return out
+
+    def energy(self, q: Array) -> float:
+        """Return the energy stored in the springs."""
+        stored = 0.5 * np.sum(self._stiffness * (q[self._spring_q] - self._rest) ** 2)
+        stiffness, rest, _ = self._coupled
+        return float(stored + 0.5 * np.sum(stiffness * (self._lengths @ q - rest) ** 2))

@@ -1,0 +1,1 @@
+"""Constraints: manifold, multipliers, redundancy, independent coordinates."""

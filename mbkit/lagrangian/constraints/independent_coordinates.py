@@ -1,0 +1,347 @@
+"""Constraints embedded: the motion on independent coordinates alone.
+
+A chart divides q into independent and dependent coordinates. The dependent ones follow
+from f(q, t) = 0 by Newton's iteration, velocities from J v + ∂f/∂t = 0 as
+v = N(q) u + v_t, and the equation is pulled back by N (Wehage and Haug 1982,
+Generalized coordinate partitioning; Shabana 2013, Dynamics of Multibody Systems, ch. 5)::
+
+    Nᵀ M N u̇ = Nᵀ (τ + applied - M a_t)
+
+A chart serves while its dependent block of J is not much nearer to singular than J is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit._escape import one_line
+from mbkit.engines.base import QUANTITIES, Dynamics, per_sample
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import InputError, NumericalError, UnknownNameError
+from mbkit.lagrangian.constraints.manifold import Manifold
+from mbkit.lagrangian.constraints.redundancy import require_few
+from mbkit.lagrangian.energies.model import abstract_parts
+from mbkit.model import Model
+
+__all__ = ["SINGULAR", "Chart", "Embedded", "EmbeddedDynamics", "ReducedModel"]
+
+
+# The equation on the independent coordinates of one chart; see `mbkit.lagrangian.constraints.independent_coordinates`.
+
+_MOST: Final = 25
+#: Places from which the next one is sought: more than a step has stages.
+_PLACES: Final = 32
+# Beyond such a change of J, relative to its size, Newton's iteration may end on another
+# branch; a link that turns by half a radian changes it by half.
+_BENT: Final = 0.5
+# Of a last step of Newton's, relative to the coordinates.
+_SOLVED: Final = 1e-9
+
+Indices = NDArray[np.intp]
+
+
+class ReducedModel(Model):
+    """The independent coordinates of a system, as integrators see a model.
+
+    Parameters
+    ----------
+    whole : Model
+    names : sequence of str
+    """
+
+    def __init__(self, whole: Model, names: tuple[str, ...]) -> None:
+        # The parts of a frozen class are set once, here.
+        object.__setattr__(self, "_clock", whole.clock)
+        super().__init__(whole.name, np.zeros(3), *abstract_parts(names))
+
+    _clock: str | None
+
+    @property
+    def clock(self) -> str | None:
+        """Name of the time, where it enters."""
+        return self._clock
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Which coordinates are independent, by index."""
+
+    independent: Indices
+    dependent: Indices
+
+
+@dataclass
+class _Memory:
+    """Where Newton's iteration last ended: pairs of q and J, and the sign of the dependent block's determinant."""
+
+    places: deque[tuple[Array, Array]]
+    sign: float
+
+    def nearest(self, independent: Indices, u: Array) -> tuple[Array, Array]:
+        """Return the place whose independent coordinates are the nearest; of equal ones the last."""
+        return min(reversed(self.places), key=lambda place: float(np.abs(place[0][independent] - u).max()))
+
+
+class EmbeddedDynamics(Dynamics):
+    """The equation on one chart; time runs from `begin`.
+
+    Parameters
+    ----------
+    model : ReducedModel
+    whole : LagrangianDynamics
+    chart : Chart
+    begin : float
+        s.
+    """
+
+    engine = "embedded"
+    refuses: ClassVar = dict.fromkeys(
+        sorted(
+            set(QUANTITIES)
+            - {"mass_matrix", "forward_dynamics", "inverse_dynamics", "kinetic_energy", "potential_energy"}
+        ),
+        "on independent coordinates there is the equation as a whole; the dynamics on all coordinates has the terms",
+    )
+
+    def __init__(self, model: Model, whole: LagrangianDynamics, chart: Chart, begin: float) -> None:
+        super().__init__(model)
+        self._whole, self._chart, self._begin = whole, chart, begin
+        self._manifold = Manifold(whole).at(begin)
+        self._memory = _Memory(deque(maxlen=_PLACES), 0.0)
+
+    def at(self, /, **values: float) -> EmbeddedDynamics:
+        """Return the same dynamics at a time of the run."""
+        out = object.__new__(type(self))
+        # Newton's iteration starts from where it last ended, at whatever time.
+        out.__dict__.update(self.__dict__)
+        (t,) = values.values()
+        out._manifold = Manifold(self._whole).at(self._begin + t)
+        return out
+
+    def remember(self, q: Array) -> None:
+        """Take a consistent configuration as the place from which the next one is sought.
+
+        Raises
+        ------
+        InputError
+            The dependent coordinates are not determined there.
+        """
+        J = self._manifold.jacobian(q)
+        sign = self._sign(J)
+        if not sign:
+            raise InputError(
+                f"{self.model.name}: {', '.join(self.model.coordinate_names)} do not determine the other coordinates "
+                f"at {self._told(q[self._chart.independent])}, a singular pose; choose others, or leave the choice open"
+            )
+        self._memory.places.clear()
+        self._memory.places.append((q.copy(), J))
+        self._memory.sign = sign
+
+    def _sign(self, J: Array) -> float:
+        return float(np.linalg.slogdet(J[:, self._chart.dependent])[0])
+
+    # From independent coordinates to all
+
+    def configuration(self, u: Array) -> Array:
+        """Return q, (n,)."""
+        chart, memory = self._chart, self._memory
+        q, J = memory.nearest(chart.independent, u)
+        q, before = q.copy(), J
+        q[chart.dependent] -= self._solved(J, J[:, chart.independent] @ (u - q[chart.independent]), q)
+        q[chart.independent] = u
+        for _ in range(_MOST):
+            f, J = self._manifold.call("constraint_rows", q)
+            step = self._solved(J, f[:, 0], q)
+            q[chart.dependent] -= step
+            size = float(np.abs(step).max())
+            if not np.isfinite(size):
+                break
+            # The iteration squares what is left.
+            if size <= _SOLVED * (1 + float(np.abs(q).max())):
+                if self._sign(J) != memory.sign:
+                    # On the other side of a singular pose another branch begins.
+                    raise NumericalError(f"{self.model.name}: beyond a singular pose at {self._told(u)}")
+                if np.linalg.norm(J - before) > _BENT * np.linalg.norm(before):
+                    raise NumericalError(
+                        f"{self.model.name}: too long a step to {self._told(u)} to tell the dependent coordinates"
+                    )
+                memory.places.append((q.copy(), J))
+                return q
+        raise NumericalError(
+            f"{self.model.name}: Newton's iteration finds no dependent coordinates at {self._told(u)}; "
+            "perhaps beyond a singular pose"
+        )
+
+    def _told(self, u: Array) -> str:
+        return ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, u, strict=True))
+
+    def _solved(self, J: Array, right: Array, q: Array) -> Array:
+        try:
+            return np.asarray(np.linalg.solve(J[:, self._chart.dependent], right))
+        except np.linalg.LinAlgError:
+            told = self._told(q[self._chart.independent])
+            raise NumericalError(f"{self.model.name}: singular pose at {told}") from None
+
+    def state(self, u: Array, w: Array) -> tuple[Array, Array]:
+        """Return q and v, (n,) each."""
+        q = self.configuration(u)
+        N, drift = self._null(q)
+        return q, N @ w + drift
+
+    def pullback(self, u: Array, tau: Array) -> Array:
+        """Return Nᵀ τ of a generalized force on all coordinates."""
+        return np.asarray(self._null(self.configuration(u))[0].T @ tau)
+
+    def _null(self, q: Array) -> tuple[Array, Array]:
+        """Return N and the part of v that the time makes."""
+        chart = self._chart
+        _, J, by_time, *_ = self._manifold.call("constraint", q, np.zeros_like(q))
+        both = self._solved(J, np.column_stack([J[:, chart.independent], by_time]), q)
+        N, drift = np.zeros((len(q), len(chart.independent))), np.zeros(len(q))
+        N[chart.independent, np.arange(N.shape[1])] = 1.0
+        N[chart.dependent], drift[chart.dependent] = -both[:, :-1], -both[:, -1]
+        return N, drift
+
+    def _reduced(self, u: Array, w: Array) -> tuple[Array, Array, Array]:
+        """Return N, Nᵀ M N and what stands on the right without τ."""
+        q = self.configuration(u)
+        N, drift = self._null(q)
+        J, _, gamma, M, force = self._manifold.call("embedded", q, N @ w + drift)
+        a = np.zeros(len(q))
+        a[self._chart.dependent] = -self._solved(J, gamma[:, 0], q)
+        return N, N.T @ M @ N, N.T @ (force[:, 0] - M @ a)
+
+    # The protocol
+
+    def _mass_matrix(self, q: Array) -> Array:
+        return per_sample(lambda u: self._reduced(u, np.zeros(len(u)))[1], q)
+
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        def one(u: Array, w: Array, force: Array) -> Array:
+            _, M, applied = self._reduced(u, w)
+            return np.asarray(np.linalg.solve(M, force + applied))
+
+        return per_sample(one, q, v, tau)
+
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        def one(u: Array, w: Array, rate: Array) -> Array:
+            _, M, applied = self._reduced(u, w)
+            return np.asarray(M @ rate - applied)
+
+        return per_sample(one, q, v, a)
+
+    def _kinetic_energy(self, q: Array, v: Array) -> Array:
+        return per_sample(lambda u, w: np.asarray(self._manifold.dyn.kinetic_energy(*self.state(u, w))), q, v)
+
+    def _potential_energy(self, q: Array) -> Array:
+        return per_sample(lambda u: np.asarray(self._manifold.dyn.potential_energy(self.configuration(u))), q)
+
+    def _gravity(self, q: Array) -> Array:
+        raise NotImplementedError
+
+    def _nle(self, q: Array, v: Array) -> Array:
+        raise NotImplementedError
+
+    def _passive(self, q: Array, v: Array) -> Array:
+        raise NotImplementedError
+
+    def _pose(self, q: Array, frame: str) -> Array:
+        raise NotImplementedError
+
+    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
+        raise NotImplementedError
+
+
+#: A pose is near a singular one where the smallest singular value of J, or of the
+#: dependent block, is below this part of the largest of J.
+SINGULAR: Final = 1e-3
+# Of the best that any choice can give: below, another one is due.
+_WORN: Final = 0.25
+
+
+class Embedded:
+    """A system under constraints, to be simulated on independent coordinates: ``mbkit.simulate(embedded, ...)``.
+
+    Parameters
+    ----------
+    manifold : Manifold
+    independent : tuple of str, optional
+        A choice that stays; else the best one, chosen anew when it no longer is.
+
+    Attributes
+    ----------
+    dynamics : LagrangianDynamics
+        On all coordinates, with multipliers.
+    independent : tuple of str or None
+    degrees : int
+        Of freedom.
+    """
+
+    def __init__(self, manifold: Manifold, independent: tuple[str, ...] | None = None) -> None:
+        self.manifold, self.dynamics, self.independent = manifold, manifold.dyn, independent
+        self.model = manifold.dyn.model
+        rows = len(self.model.system.constraints)  # type: ignore[attr-defined]  # of a written model
+        require_few(self.model)
+        self.degrees = self.model.nv - rows
+        if self.degrees < 1:
+            raise InputError(f"{self.model.name}: {rows} constraints leave none of {self.model.nv} coordinates free")
+        # However chosen, the best block of a matrix is no worse than this (Gu and Eisenstat 1996).
+        self.least = _WORN / float(np.sqrt(1 + rows * self.degrees))
+        if independent is not None:
+            self._check(independent)
+
+    def _check(self, names: tuple[str, ...]) -> None:
+        known = self.model.coordinate_names
+        for name in names:
+            if name not in known:
+                raise UnknownNameError("coordinate", name, known)
+        if len(set(names)) != self.degrees:
+            raise InputError(
+                f"independent: expected {self.degrees} of {', '.join(known)}, got {', '.join(names) or 'none'}"
+            )
+
+    def __repr__(self) -> str:
+        chosen = "chosen as it runs" if self.independent is None else ", ".join(self.independent)
+        return one_line(f"<Embedded {self.model.name!r}: {self.degrees} of {self.model.nv} coordinates, {chosen}>")
+
+    def chart(self, q: Array, t: float) -> Chart:
+        """Return the chart to start with at a configuration: the pivots of J, or what the user chose."""
+        from scipy.linalg import qr
+
+        names = self.model.coordinate_names
+        if self.independent is not None:
+            independent = np.array([names.index(n) for n in self.independent], dtype=np.intp)
+            return Chart(independent, np.setdiff1d(np.arange(len(names)), independent))
+        J = self.manifold.at(t).jacobian(q)
+        _, _, order = qr(J, mode="economic", pivoting=True)
+        return Chart(np.sort(order[len(J) :]), np.sort(order[: len(J)]))
+
+    def names(self, chart: Chart) -> str:
+        """Return the independent coordinates of a chart to read."""
+        return ", ".join(self.model.coordinate_names[i] for i in chart.independent)
+
+    def quality(self, chart: Chart, q: Array, t: float) -> float:
+        """Return the smallest singular value of the dependent block over that of J: small where it is a bad choice."""
+        J = self.manifold.at(t).jacobian(q)
+        least = np.linalg.svd(J, compute_uv=False)[-1]
+        return float(np.linalg.svd(J[:, chart.dependent], compute_uv=False)[-1] / max(least, np.finfo(float).tiny))
+
+    def nearness(self, chart: Chart, q: Array, t: float) -> float:
+        """Return the smallest singular value over the largest: of J, or of a dependent block that is to stay."""
+        J = self.manifold.at(t).jacobian(q)
+        block = J if self.independent is None else J[:, chart.dependent]
+        largest = np.linalg.norm(J, 2)
+        return float(np.linalg.svd(block, compute_uv=False)[-1] / max(largest, np.finfo(float).tiny))
+
+    def on(self, chart: Chart, q: Array, t: float) -> EmbeddedDynamics:
+        """Return the dynamics on a chart's independent coordinates, from a consistent configuration on."""
+        names = tuple(self.model.coordinate_names[i] for i in chart.independent)
+        out = EmbeddedDynamics(ReducedModel(self.model, names), self.dynamics, chart, t)
+        out.remember(q)
+        return out

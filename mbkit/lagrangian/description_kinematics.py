@@ -1,0 +1,548 @@
+"""Energies of a model as SymPy expressions, from the joints' own formulas and nothing else.
+
+The same kinematics as the derivation's (`mbkit.derivation`), on exact sums of cosines and sines: every
+number is the decimal that was written, so what cancels is gone and the result is short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from functools import cached_property
+from math import atan2, pi
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+import sympy as sp
+
+from mbkit._check import Array
+from mbkit.errors import InputError
+from mbkit.lagrangian.trig.polynomial import Harmonic, Key, Space
+from mbkit.lagrangian.trig.shortest_form import number, written_out
+from mbkit.model import Joint, JointCoupling, Model
+from mbkit.model.joint_types import cross3
+from mbkit.model.parts import Loop, Prescribed
+
+__all__ = ["SymbolicKinematics", "angle", "closure", "instead_of_writing", "motion"]
+
+
+Vector = list[Any]
+#: (linear, angular) velocity per unit of one velocity.
+Column = tuple[Vector, Vector]
+#: What enters the formulas of joints and energies; springs and dampers are kept as they are written.
+_FIELDS: Final = {
+    "bodies": ("mass", "com", "inertia"),
+    "joints": ("rotation", "translation", "axes", "pitch", "armature"),
+    "springs": ("point_a", "point_b"),
+    "couplings": ("factors", "armature"),
+    "loops": ("rotation_a", "translation_a", "rotation_b", "translation_b"),
+}
+#: What rounded rotations leave of a term that is zero.
+_DUST: Final = Fraction(1, 10**15)
+
+
+def instead_of_writing(model: Model) -> str:
+    """Return what computes a model that is too large to be written out, for a message."""
+    features = [f for f in ("loops", "prescribed") if getattr(model, f)]
+    if not features:
+        return 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+    told = ", ".join(map(repr, features))
+    return (
+        f"leave out bodies, as engines do not take its {' and '.join(features)}; "
+        f'mbkit.dynamics(model.without({told}), "lagrangian") computes the tree without them'
+    )
+
+
+class SymbolicKinematics:
+    """T's mass matrix, V and the dissipation of a model of coordinate velocities.
+
+    Parameters
+    ----------
+    model : Model
+        Without ball and free joints. Loops stay open here, and what is prescribed is a coordinate.
+    coordinates, velocities : list of sympy.Symbol
+    parameters : dict of str to sympy.Symbol
+    progress : callable
+        Called with a fraction and a text.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        coordinates: list[sp.Symbol],
+        velocities: list[sp.Symbol],
+        parameters: dict[str, sp.Symbol],
+        progress: Callable[[float, str], None],
+    ) -> None:
+        self.model, self.velocities, self._progress = model, velocities, progress
+        bound = {
+            # The exponent one half is the only float that comes this way.
+            (b.where, b.part, b.field, b.index): sp.nsimplify(
+                b.expression.evaluate(lambda p: parameters[p.name], exact), rational=True
+            )
+            for b in model.bindings
+        }
+        opaque = {x for x in bound.values() if not _is_polynomial(x)}
+        self._opaque = {x: sp.Dummy(f"n{i}") for i, x in enumerate(sorted(opaque, key=sp.default_sort_key))}
+        self._bound = {place: self._opaque.get(x, x) for place, x in bound.items()}
+        self._q = {j.name: self._own(j, coordinates, model.layout.q) for j in model.joints}
+        self._v = {j.name: self._own(j, velocities, model.layout.v, still=True) for j in model.joints}
+        angles = list(dict.fromkeys(_turn(self._q[j.name][i]) for j in model.joints for i in j.type.angular))
+        lengths = {
+            s for j in model.joints for i, x in enumerate(self._q[j.name]) if _advances(j, i) for s in x.free_symbols
+        }
+        generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
+        self.coordinates = coordinates
+        self.space = Space(model.name, angles, generators, instead=instead_of_writing(model))
+        self.values = {
+            (where, part.name): self._read(where, part, fields)
+            for where, fields in _FIELDS.items()
+            for part in getattr(model, where)
+        }
+        self._placements = {j.name: self._placement(j) for j in model.tree}
+        self._carrier = {j.child: j for j in model.joints}
+        self._lengths = [i for i, g in enumerate(generators) if g in lengths]
+
+    # Numbers
+
+    def value(self, where: str, part: str, field: str, source: Any, *index: int) -> sp.Expr:
+        """Return a number of a part, exactly, or the expression of parameters that it stands for."""
+        if (where, part, field, index) in self._bound:
+            return self._bound[where, part, field, index]
+        x = getattr(source, field)
+        return exact(float(x[index] if index else x))
+
+    def _read(self, where: str, part: Any, fields: tuple[str, ...]) -> SimpleNamespace:
+        def entries(field: str, x: Any, *index: int) -> Any:
+            if getattr(x, "ndim", 0):
+                return [entries(field, y, *index, i) for i, y in enumerate(x)]
+            return self.space.of(self.value(where, part.name, field, part, *index))
+
+        return SimpleNamespace(**{f: entries(f, getattr(part, f)) for f in fields})
+
+    def _own(self, joint: Joint, symbols: list[sp.Symbol], layout: Any, *, still: bool = False) -> list[sp.Expr]:
+        """Return a joint's coordinates or velocities; those of a mimic joint from its leader's."""
+        if not joint.mimic:
+            return symbols[layout[joint.name]] if joint.type.nv else []
+        (leader,) = symbols[layout[joint.mimic.joint]]
+        ratio, offset = (self.value("joints", joint.name, f, joint.mimic) for f in ("ratio", "offset"))
+        return [ratio * leader + (0 if still else offset)]
+
+    # Kinematics
+
+    def _arguments(self, joint: Joint) -> list[Any]:
+        """Return a joint's coordinates as its formulas take them."""
+        q = self._q[joint.name]
+        return [self.space.of(x) if _advances(joint, i) else SimpleNamespace(expression=x) for i, x in enumerate(q)]
+
+    def _placement(self, joint: Joint) -> tuple[Any, Vector]:
+        q = self._arguments(joint)
+        return joint.type.placement(self.space, self.values["joints", joint.name], q)  # type: ignore[arg-type]
+
+    def _columns(self) -> dict[str, dict[int, Column]]:
+        """Return each body's velocity in its own axes per unit of each velocity that moves it."""
+        out: dict[str, dict[int, Column]] = {"world": {}}
+        for joint in self.model.tree:
+            values = self.values["joints", joint.name]
+            R, p = self._placements[joint.name]
+            moved = {}
+            for i, (linear, angular) in out[joint.parent].items():
+                at_joint = _add(linear, cross3(angular, values.translation))
+                turned = _transposed_times(values.rotation, angular)
+                along = _add(_transposed_times(values.rotation, at_joint), cross3(turned, p))
+                moved[i] = (_transposed_times(R, along), _transposed_times(R, turned))
+            for i, column in self._own_columns(joint):
+                moved[i] = tuple(map(_add, moved[i], column)) if i in moved else column  # type: ignore[assignment]
+            out[joint.child] = moved
+        return out
+
+    def _own_columns(self, joint: Joint) -> Iterator[tuple[int, Column]]:
+        q = self._arguments(joint)
+        for k in range(joint.type.nv):
+            unit = [self.space.number(int(i == k)) for i in range(joint.type.nv)]
+            values = self.values["joints", joint.name]
+            linear, angular = joint.type.twist(self.space, values, q, unit)  # type: ignore[arg-type]
+            i, ratio = self._velocity(joint, k)
+            yield i, ([ratio * x for x in linear], [ratio * x for x in angular])
+
+    def _velocity(self, joint: Joint, k: int) -> tuple[int, Harmonic]:
+        """Return the index of a joint's velocity, its leader's if it mimics, and the ratio to it."""
+        at = self.model.layout.v[joint.mimic.joint if joint.mimic else joint.name].start + k
+        return at, self.space.of(self._v[joint.name][k] / self.velocities[at])
+
+    def _to_world(self, body: str, x: Vector) -> Vector:
+        for joint in self.way(body):
+            x = self.to_parent(joint, x, 1)
+        return x
+
+    def way(self, body: str) -> list[Joint]:
+        """Return the joints from a body down to the ground."""
+        out: list[Joint] = []
+        while body != "world":
+            out.append(self._carrier[body])
+            body = out[-1].parent
+        return out
+
+    def to_parent(self, joint: Joint, x: Vector, weight: Any) -> Vector:
+        """Return a point (weight 1) or a direction (0) of a joint's child in the parent's axes, or a moment of mass."""
+        R, p = self._placements[joint.name]
+        values = self.values["joints", joint.name]
+        in_J = _add(_times(R, x), [weight * c for c in p])
+        return _add(_times(values.rotation, in_J), [weight * c for c in values.translation])
+
+    # Energies
+
+    @cached_property
+    def mass_matrix(self) -> list[list[sp.Expr]]:
+        """M of T = ½ vᵀ M v."""
+        n = self.model.nv
+        M: list[list[Any]] = [[self.space.number(0)] * n for _ in range(n)]
+        columns = self._columns()
+        for done, body in enumerate(self.model.bodies):
+            self._progress(0.5 * done / len(self.model.bodies), f"kinetic energy of {body.name}")
+            values = self.values["bodies", body.name]
+            own = columns.get(body.name, {})
+            at_com = {i: _add(linear, cross3(angular, values.com)) for i, (linear, angular) in own.items()}
+            spun = {i: _times(values.inertia, angular) for i, (_, angular) in own.items()}
+            for i in own:
+                for j in own:
+                    if i <= j:
+                        M[i][j] = M[i][j] + values.mass * _dot(at_com[i], at_com[j]) + _dot(own[i][1], spun[j])
+        for joint in self.model.joints:
+            for k, rotor in enumerate(self.values["joints", joint.name].armature):
+                i, ratio = self._velocity(joint, k)
+                M[i][i] = M[i][i] + rotor * ratio * ratio
+        for coupling in self.model.couplings:
+            values = self.values["couplings", coupling.name]
+            moved = [self._velocity(self.model.joint(name), 0) for name in coupling.joints]
+            rates = [(i, c * ratio) for (i, ratio), c in zip(moved, values.factors, strict=True)]
+            for i, x in rates:
+                for j, y in rates:
+                    if i <= j:
+                        M[i][j] = M[i][j] + values.armature * x * y
+        self.drop_dust([x for row in M for x in row])
+        made: dict[tuple[int, int], sp.Expr] = {}
+        for i in range(n):
+            self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
+            made.update({(i, j): self.shown(M[i][j]) for j in range(i, n)})
+        return [[made[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
+
+    @cached_property
+    def gravity_energy(self) -> sp.Expr:
+        """-Σ m g · p_com."""
+        model = self.model
+        masses: dict[str, Any] = {"world": self.space.number(0)}
+        moments: dict[str, Vector] = {"world": [self.space.number(0)] * 3}
+        for body in model.bodies:
+            values = self.values["bodies", body.name]
+            masses[body.name] = values.mass
+            moments[body.name] = [values.mass * c for c in values.com]
+        for joint in reversed(model.tree):
+            up = self.to_parent(joint, moments[joint.child], masses[joint.child])
+            moments[joint.parent] = _add(moments[joint.parent], up)
+            masses[joint.parent] = masses[joint.parent] + masses[joint.child]
+        gravity = [self.space.of(self.value("gravity", "", "gravity", model, i)) for i in range(3)]
+        total = -_dot(gravity, moments["world"])
+        self.drop_dust([total])
+        # Height by height rather than with g before them all, so that forces read term by term.
+        return self._back(written_out(total, whole=False))
+
+    @cached_property
+    def spring_energy(self) -> sp.Expr:
+        """What the springs of joints, of couplings and between points store."""
+        total = sp.Integer(0)
+        for joint in self.model.joints:
+            for k, q in enumerate(self._q[joint.name]):
+                stiffness, rest = (self.written("joints", joint, f, k) for f in ("stiffness", "rest"))
+                total += stiffness * (self._back(q) - rest) ** 2 / 2
+        for coupling in self.model.couplings:
+            stiffness, rest = (self.written("couplings", coupling, f) for f in ("stiffness", "rest_length"))
+            total += stiffness * (self._coupled(coupling, self._q) - rest) ** 2 / 2
+        for spring, square in self._squares():
+            stiffness, rest = (self.written("springs", spring, f) for f in ("stiffness", "rest_length"))
+            total += stiffness * (square if rest == 0 else (sp.sqrt(square) - rest) ** 2) / 2
+        return total
+
+    @cached_property
+    def dissipation(self) -> sp.Expr:
+        """Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
+        total = sp.Integer(0)
+        for joint in self.model.joints:
+            for k, v in enumerate(self._v[joint.name]):
+                total += self.written("joints", joint, "damping", k) * self._back(v) ** 2 / 2
+        for coupling in self.model.couplings:
+            total += self.written("couplings", coupling, "damping") * self._coupled(coupling, self._v) ** 2 / 2
+        for spring, square in self._squares():
+            damping = self.written("springs", spring, "damping")
+            if damping != 0:
+                pairs = zip(self.coordinates, self.velocities, strict=True)
+                rate = sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / 2
+                total += damping * rate**2 / square / 2
+        return total
+
+    def _coupled(self, coupling: JointCoupling, of: dict[str, list[sp.Expr]]) -> sp.Expr:
+        """Return a coupling's sum of factors times coordinates, or velocities."""
+        factors = (self.written("couplings", coupling, "factors", k) for k in range(len(coupling.joints)))
+        return sum(
+            (c * self._back(of[joint][0]) for c, joint in zip(factors, coupling.joints, strict=True)), sp.Integer(0)
+        )
+
+    def _squares(self) -> Iterator[tuple[Any, sp.Expr]]:
+        """Yield each spring between points with the square of its length."""
+        for spring in self.model.springs:
+            values = self.values["springs", spring.name]
+            ends = self._to_world(spring.body_a, values.point_a), self._to_world(spring.body_b, values.point_b)
+            gap = [y - x for x, y in zip(*ends, strict=True)]
+            yield spring, self.shown(_dot(gap, gap))
+
+    def coordinates_of(self, joint: Joint) -> list[sp.Expr]:
+        """Return a joint's coordinates, those of a mimic joint by its leader's."""
+        return [self._back(x) for x in self._q[joint.name]]
+
+    def written(self, where: str, part: Any, field: str, *index: int) -> sp.Expr:
+        """Return a number as it is shown, for what is written down as it stands."""
+        x = self.value(where, part.name, field, part, *index)
+        return number(Fraction(int(x.p), int(x.q))) if x.is_Rational else self._back(x)
+
+    def shown(self, x: Any) -> sp.Expr:
+        """Return a sum as it is shown."""
+        return self._back(written_out(x))
+
+    def moves(self, key: Key) -> bool:
+        """Return whether a term of a sum depends on a coordinate."""
+        _, multiples, powers = key
+        return any(multiples) or any(powers[i] for i in self._lengths)
+
+    def _back(self, x: sp.Expr) -> sp.Expr:
+        return x.subs({dummy: e for e, dummy in self._opaque.items()}) if self._opaque else x
+
+    def drop_dust(self, sums: list[Any]) -> None:
+        """Drop the terms that only rounding of the model's rotations has left, of those with the same unit."""
+        largest: dict[Any, Fraction] = {}
+        for x in sums:
+            for (_, _, powers), value in x.terms.items():
+                largest[powers] = max(largest.get(powers, Fraction(0)), abs(value))
+        for x in sums:
+            for key in [k for k, value in x.terms.items() if abs(value) < _DUST * largest[k[2]]]:
+                del x.terms[key]
+
+
+def exact(x: float) -> sp.Rational:
+    """Return the decimal that was written: 0.1 is 1/10, which rounds to the same double."""
+    top, bottom = Fraction(repr(float(x))).as_integer_ratio()
+    return sp.Rational(top, bottom)
+
+
+def _is_polynomial(x: sp.Expr) -> bool:
+    """Return whether an expression is a sum of rational multiples of products of whole powers of symbols."""
+    for term in sp.Add.make_args(sp.expand(x)):
+        value, rest = term.as_coeff_Mul()
+        factors = () if rest == 1 else sp.Mul.make_args(rest)
+        powers = [f.as_base_exp() for f in factors]
+        if not value.is_Rational or any(not b.is_Symbol or not e.is_Integer for b, e in powers):
+            return False
+    return True
+
+
+def _advances(joint: Joint, i: int) -> bool:
+    """Return whether a coordinate moves something by its own length; others only turn."""
+    return i in joint.type.lengths or joint.kind == "helical"
+
+
+def _turn(angle: sp.Expr) -> sp.Expr:
+    """Return what a cosine is taken of: a coordinate where an angle is a whole multiple of it."""
+    value, rest = sp.expand(angle).as_coeff_Mul()
+    return rest if value.is_Integer and rest.is_Symbol else sp.expand(angle)
+
+
+def _add(a: Vector, b: Vector) -> Vector:
+    return [x + y for x, y in zip(a, b, strict=True)]
+
+
+def _dot(a: Vector, b: Vector) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _times(R: Any, x: Vector) -> Vector:
+    return [_dot(R[i], x) for i in range(3)]
+
+
+def _transposed_times(R: Any, x: Vector) -> Vector:
+    return [_dot([R[0][i], R[1][i], R[2][i]], x) for i in range(3)]
+
+
+# Coordinates that are moved in time, as expressions of it.
+
+_EPS: Final = 2.0**-52
+
+
+def motion(kin: SymbolicKinematics, given: Prescribed, t: sp.Symbol) -> sp.Expr:
+    """Return offset + rate t + amplitude sin(frequency t + phase)."""
+    fields = ("offset", "rate", "amplitude", "frequency", "phase")
+    offset, rate, amplitude, frequency, phase = (kin.written("prescribed", given, f) for f in fields)
+    if kin.model.joint(given.joint).type.angular:
+        offset = _read(offset)
+    return offset + rate * t + amplitude * sp.sin(frequency * t + _read(phase))
+
+
+def angle(x: float) -> sp.Expr:
+    """Return a number as people write an angle: a twelfth of π, and its multiples, where it is one to rounding."""
+    twelfths = round(12 * x / pi)
+    if abs(x - twelfths * pi / 12) <= 2 * _EPS * abs(x):
+        return sp.Rational(twelfths, 12) * sp.pi
+    return number(Fraction(repr(x)))
+
+
+def _read(x: sp.Expr) -> sp.Expr:
+    return angle(float(x)) if x.is_Number else x
+
+
+# Loop closures of a model as holonomic constraints, in SymPy.
+#
+# Both ends are written in the axes of the body that carries both, the last one that their ways to
+# the ground share. So only the joints of the loop stand in the rows, and a mechanism in a plane has
+# no row across it, whatever carries the plane. Rows that say nothing of their own are left out.
+
+#: Of the largest coefficient: what rounded rotations leave where one row is made of the others.
+_DEPENDENT: Final = 1e-12
+#: Of the largest number, or rad: what a few typed digits leave where ends can meet.
+_MEETS: Final = 1e-9
+
+
+def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
+    """Return what is zero where a loop is closed.
+
+    Of points, and of the frames' origins: r_a - r_b, three rows or those that are independent, so that their
+    multipliers are the force on body a. Of orientations, where all axes in the loop are parallel:
+    2 sin(φ/2) of the angle φ from frame b to frame a, which is zero at whole turns only and has the torque on body
+    a for its multiplier (its negative after an odd number of turns). Else ½ Σ b_k x a_k of the frames'
+    axes, the sine of their angle about its axis; it is zero at half a turn too, where its rows depend on each other.
+
+    Raises
+    ------
+    InputError
+        The ends can never meet, or nothing moves between them.
+    """
+    ends = _ways(kin, loop)
+    rows = _meeting(kin, loop, ends)
+    if loop.kind == "frame":
+        rows += _aligned(kin, loop, ends)
+    if not rows:
+        raise InputError(
+            f"{kin.model.name}: loop {loop.name!r} closes nothing: no joint moves its ends against each other; "
+            "leave it out"
+        )
+    return rows
+
+
+#: From a body of the loop up to the one that carries both ends.
+_Way = list[Joint]
+
+
+def _ways(kin: SymbolicKinematics, loop: Loop) -> tuple[_Way, _Way]:
+    """Return the joints from either end to the body that carries both."""
+    a, b = kin.way(loop.body_a), kin.way(loop.body_b)
+    while a and b and a[-1] is b[-1]:
+        a.pop()
+        b.pop()
+    return a, b
+
+
+def _meeting(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
+    values = kin.values["loops", loop.name]
+    points = [
+        _carried(kin, way, x, 1) for way, x in zip(ends, (values.translation_a, values.translation_b), strict=True)
+    ]
+    gap = [x - y for x, y in zip(*points, strict=True)]
+    return _independent(kin, gap, f"loop {loop.name!r}: its points never meet")
+
+
+def _carried(kin: SymbolicKinematics, way: _Way, x: list[Any], weight: int) -> list[Any]:
+    """Return a point (weight 1) or a direction (0) of the first body in the axes of the last."""
+    for joint in way:
+        x = kin.to_parent(joint, x, weight)
+    return x
+
+
+def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
+    told = f"loop {loop.name!r}: its frames are never parallel"
+    axes = [axis for way in ends for axis in _axes(way)]
+    if all(np.linalg.norm(np.cross(axis, axes[0])) < _DEPENDENT for axis in axes):
+        return _in_plane(kin, loop, ends, axes[0] if axes else None, told)
+    values = kin.values["loops", loop.name]
+    frames = [
+        [_carried(kin, way, [row[k] for row in R], 0) for k in range(3)]
+        for way, R in zip(ends, (values.rotation_a, values.rotation_b), strict=True)
+    ]
+    half = kin.space.number(Fraction(1, 2))
+    turned = [cross3(y, x) for x, y in zip(*frames, strict=True)]
+    return _independent(kin, [half * (turned[0][i] + turned[1][i] + turned[2][i]) for i in range(3)], told)
+
+
+def _in_plane(
+    kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way], axis: Array | None, told: str
+) -> list[sp.Expr]:
+    """Return the row of the angle about the axis that all joints share."""
+    a, b = (_at_rest(way) @ R for way, R in zip(ends, (loop.rotation_a, loop.rotation_b), strict=True))
+    E = a @ b.T
+    axis = np.zeros(3) if axis is None else axis
+    turn = np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]]) / 2
+    about = float(turn @ axis)
+    start = atan2(about, (np.trace(E) - 1) / 2)
+    # Whatever turns about the axis leaves the rest as it is.
+    if np.abs(E @ axis - axis).max() > _MEETS or (not axis.any() and np.abs(E - np.eye(3)).max() > _MEETS):
+        raise InputError(f"{kin.model.name}: {told}, whatever the joints do; turn one of them by rotation_a")
+    total = angle(start)
+    for sign, way in zip((1, -1), ends, strict=True):
+        # An axis that points the other way turns back.
+        signs = [int(np.sign(x @ axis)) for x in _axes(way)]
+        angles = [kin.coordinates_of(joint)[i] for joint in way for i in joint.type.angular]
+        total += sp.Add(*(sign * s * x for s, x in zip(signs, angles, strict=True)))
+    total = sp.expand(total)
+    if not total.free_symbols & set(kin.coordinates):
+        if abs(sp.sin(total / 2).evalf()) < _MEETS:
+            return []
+        raise InputError(f"{kin.model.name}: {told}: between them stays an angle of {total}")
+    return [2 * sp.sin(total / 2)]
+
+
+def _axes(way: _Way) -> list[Array]:
+    """Return what a way's joints turn about, each in the axes of the body at its end while no other has moved."""
+    out = []
+    for k, joint in enumerate(way):
+        own = joint.axes if joint.type.n_axes else np.eye(3)[3 - len(joint.type.angular) :]
+        out += [_at_rest(way[k:]) @ x for x in own if joint.type.angular]
+    return out
+
+
+def _at_rest(way: _Way) -> Array:
+    R = np.eye(3)
+    for joint in way:
+        R = joint.rotation @ R
+    return R
+
+
+def _independent(kin: SymbolicKinematics, sums: list[Harmonic], told: str) -> list[sp.Expr]:
+    """Return those of three sums that the others do not imply."""
+    # This loads SciPy.
+    from scipy.linalg import qr
+
+    kin.drop_dust(sums)
+    keys = list(dict.fromkeys(key for x in sums for key in x.terms))
+    moving = np.array([kin.moves(key) for key in keys], dtype=bool)
+    A = np.array([[float(x.terms.get(key, 0)) for key in keys] for x in sums]).reshape(3, len(keys))
+    largest = float(np.abs(A).max(initial=0.0))
+    kept: list[int] = []
+    if moving.any():
+        _, R, order = qr(A[:, moving].T, mode="economic", pivoting=True)
+        sizes = np.abs(np.diag(R))
+        kept = sorted(order[: int(np.count_nonzero(sizes > _DEPENDENT * sizes[0]))].tolist())
+    for i in set(range(3)) - set(kept):
+        weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
+        left = A[i] - weights @ A[kept]
+        if np.abs(left[~moving]).max(initial=0.0) > _MEETS * largest:
+            rest = kin.shown(Harmonic(kin.space, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
+            why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
+            raise InputError(f"{kin.model.name}: {told}, whatever the joints do{'' if weights.any() else why}")
+    return [kin.shown(sums[i]) for i in kept]

@@ -1,0 +1,1 @@
+"""Systems defined by their energies: symbols, equations of motion, models."""

@@ -1,0 +1,196 @@
+"""The equation of motion in symbols, term by term, to read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import sympy as sp
+from sympy.matrices.exceptions import NonInvertibleMatrixError
+
+from mbkit._escape import one_line, terminal
+from mbkit.errors import UnsupportedError
+from mbkit.lagrangian.trig.simplify import gradient, slope, tidy, tidy_matrix
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.system import Lagrangian
+
+__all__ = ["EquationsOfMotion", "christoffel", "equations_of_motion"]
+
+
+@dataclass(frozen=True)
+class EquationsOfMotion:
+    """M v̇ + C v + d + ∂V/∂q = Q (+ Jᵀ λ), with q̇ = D v.
+
+    Attributes
+    ----------
+    coordinates, velocities, accelerations : tuple of sympy.Symbol
+    mass_matrix : (n, n) sympy.Matrix
+        M = ∂²T/∂v².
+    coriolis_matrix : (n, n) sympy.Matrix
+        C of Christoffel's symbols, so that Ṁ - 2C is skew.
+    drift : (n, 1) sympy.Matrix
+        d: gyroscopic terms of T1, rates of M and T1 with time, centrifugal ones of T0.
+        Zero where T has neither time nor terms below the second degree.
+    potential_gradient : (n, 1) sympy.Matrix
+        ∂V/∂q.
+    forces : (n, 1) sympy.Matrix
+        Q: generalized forces, Rayleigh's dissipation -∂R/∂v among them.
+    constraint_jacobian : (m, n) sympy.Matrix
+        J; no rows without constraints.
+    constraint_acceleration : (m, 1) sympy.Matrix
+        γ: J̇ v and the time's own terms, so that J v̇ + γ = 0.
+    constraints : (m, 1) sympy.Matrix
+        f(q, t), which is zero.
+    multipliers : tuple of sympy.Symbol
+        λ.
+    """
+
+    coordinates: tuple[sp.Symbol, ...]
+    velocities: tuple[sp.Symbol, ...]
+    accelerations: tuple[sp.Symbol, ...]
+    mass_matrix: sp.ImmutableMatrix
+    coriolis_matrix: sp.ImmutableMatrix
+    drift: sp.ImmutableMatrix
+    potential_gradient: sp.ImmutableMatrix
+    forces: sp.ImmutableMatrix
+    constraint_jacobian: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 0, []))
+    constraint_acceleration: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 1, []))
+    constraints: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 1, []))
+    multipliers: tuple[sp.Symbol, ...] = ()
+
+    @cached_property
+    def coriolis_force(self) -> sp.ImmutableMatrix:
+        """C v, (n, 1)."""
+        C, v = self.coriolis_matrix, sp.Matrix(self.velocities)
+        # One product is as short as its factors.
+        return tidy_matrix(C * v) if len(v) > 1 else sp.ImmutableMatrix(C * v)
+
+    @property
+    def applied(self) -> sp.ImmutableMatrix:
+        """Q - C v - d - ∂V/∂q (+ Jᵀ λ): what M v̇ is, (n, 1)."""
+        out = self.forces - self.coriolis_force - self.drift - self.potential_gradient
+        if self.multipliers:
+            out += self.constraint_jacobian.T * sp.Matrix(self.multipliers)
+        return sp.ImmutableMatrix(out)
+
+    def _rows(self) -> list[tuple[list[sp.Expr], sp.Expr]]:
+        """Return the terms of each left side in the order of a blackboard, and its right side."""
+        right = self.forces
+        if self.multipliers:
+            right += self.constraint_jacobian.T * sp.Matrix(self.multipliers)
+        out = []
+        for i, force in enumerate(right):
+            terms = [m * a for m, a in zip(self.mass_matrix[i, :], self.accelerations, strict=True)]
+            terms += [self.coriolis_force[i], self.drift[i], self.potential_gradient[i]]
+            out.append(([x for x in terms if x != 0], force))
+        return out + [([f], sp.Integer(0)) for f in self.constraints]
+
+    def equations(self) -> tuple[sp.Eq, ...]:
+        """Return one equation per coordinate: M v̇ + C v + d + ∂V/∂q on the left, Q on the right.
+
+        Constraints follow, f = 0 each.
+        """
+        return tuple(sp.Eq(sp.Add(*terms), force, evaluate=False) for terms, force in self._rows())
+
+    def explicit(self) -> tuple[sp.Eq, ...]:
+        """Return v̇ of each velocity, solved for in symbols: M⁻¹ (Q - C v - d - ∂V/∂q).
+
+        Grows fast with the number of coordinates; `Lagrangian.dynamics` solves numerically instead.
+
+        Raises
+        ------
+        UnsupportedError
+            The mass matrix alone has no inverse, as of coordinates that only constraints bind.
+        """
+        n = len(self.accelerations)
+        # One quotient is worth shortening; SymPy has no bound on its time for a solved system.
+        shorter = tidy if n == 1 else sp.factor_terms
+        try:
+            solved = self.mass_matrix.LUsolve(self.applied)
+        except NonInvertibleMatrixError:
+            raise UnsupportedError(
+                "explicit: the mass matrix has no inverse without the constraints; Lagrangian.dynamics solves with them"
+            ) from None
+        return tuple(sp.Eq(a, shorter(x), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True))
+
+    def latex(self) -> str:
+        """Return the equations as an aligned LaTeX block, in the order of a blackboard."""
+        from mbkit.lagrangian.printing.equation_text import board_of, letters_for, lines
+
+        board, short = board_of(self), letters_for(self)
+        told = lines(self, board, short, latex=True)
+        told += [(board.latex(letter), board.latex(root)) for letter, root in short.roots.items()]
+        rows = (f"{left} &= {right}" for left, right in told)
+        return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
+
+    def _repr_latex_(self) -> str:
+        return f"${self.latex()}$"
+
+    def __repr__(self) -> str:
+        return f"<EquationsOfMotion: {one_line(str(self))}>"
+
+    def __str__(self) -> str:
+        return terminal("\n".join(f"{_joined(terms, str)} = {force}" for terms, force in self._rows()))
+
+
+def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
+    """Return a sum in the order given: SymPy's own order is the alphabet's."""
+    flat = [x for term in terms for x in sp.Add.make_args(term)]
+    out = ""
+    for x in flat:
+        text = printed(x)
+        if not out:
+            out = text
+        else:
+            out += f" - {text.removeprefix('-').lstrip()}" if text.startswith("-") else f" + {text}"
+    return out or "0"
+
+
+def equations_of_motion(system: Lagrangian, *, coriolis: bool = True) -> EquationsOfMotion:
+    """Return Lagrange's equations of a system: d/dt ∂L/∂v - ∂L/∂q = Q + Jᵀ λ; C is zero where nobody asks for it."""
+    q, v, k, t = system.coordinates, sp.Matrix(system.velocities), system.kinetic, system.time
+    n, m = len(q), len(system.constraints)
+    drift = sp.zeros(n, 1)
+    if any(k.b) or k.T0 != 0:
+        curl = k.b.jacobian(q)
+        drift += (curl - curl.T) * v - sp.Matrix(gradient(k.T0, q))
+    if t is not None:
+        drift += sp.diff(k.M, t) * v + sp.diff(k.b, t)
+    friction = [sp.diff(system.dissipation, w) for w in system.velocities]
+    inputs = [system.inputs.get(x, sp.Integer(0)) for x in q]
+    forces = sp.Matrix(system.forces) + sp.Matrix(inputs) - sp.Matrix(friction)
+    f = sp.Matrix(m, 1, system.constraints)
+    jacobian = f.jacobian(q) if m else sp.zeros(0, n)
+    rate = jacobian * v + (sp.zeros(m, 1) if t is None else sp.diff(f, t))
+    gamma = rate.jacobian(q) * v + (sp.zeros(m, 1) if t is None else sp.diff(rate, t)) if m else rate
+    return EquationsOfMotion(
+        coordinates=q,
+        velocities=system.velocities,
+        accelerations=system.accelerations,
+        mass_matrix=k.M,
+        coriolis_matrix=christoffel(k.M, q, system.velocities) if coriolis else sp.ImmutableMatrix.zeros(n),
+        drift=tidy_matrix(drift),
+        potential_gradient=sp.ImmutableMatrix(gradient(system.V, q)),
+        forces=tidy_matrix(forces),
+        constraint_jacobian=sp.ImmutableMatrix(jacobian),
+        constraint_acceleration=tidy_matrix(gamma),
+        constraints=sp.ImmutableMatrix(f),
+        multipliers=system.multiplier_symbols,
+    )
+
+
+def christoffel(M: Any, coordinates: Any, velocities: Any) -> sp.ImmutableMatrix:
+    """Return C_ij = ½ Σ_k (∂M_ij/∂q_k + ∂M_ik/∂q_j - ∂M_jk/∂q_i) v_k.
+
+    Spong, Hutchinson, Vidyasagar 2006, Robot Modeling and Control, eq. (7.63).
+    """
+    n = len(coordinates)
+    dM = [sp.Matrix(M).applyfunc(lambda x, q=q: slope(x, q)) for q in coordinates]
+
+    def entry(i: int, j: int) -> sp.Expr:
+        return tidy(sum((dM[k][i, j] + dM[j][i, k] - dM[i][j, k]) * velocities[k] for k in range(n)) / 2)
+
+    return sp.ImmutableMatrix(n, n, entry)

@@ -1,0 +1,373 @@
+"""T as a polynomial of the velocities: its degree is checked, and its parts are told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any, Final, Protocol
+
+import mpmath
+import numpy as np
+import sympy as sp
+
+from mbkit.errors import InputError
+from mbkit.lagrangian.trig.shortest_form import cost
+from mbkit.lagrangian.trig.simplify import LARGE, tidy
+from mbkit.lagrangian.trig.zero_test import DIGITS, Probe
+
+__all__ = ["KineticSplit", "Squares", "blocks", "inverse", "require_inertia", "split"]
+
+
+#: Lines through the velocities, and places on each.
+_LINES: Final = 4
+_STEPS: Final = (3, 1, -1, -3)
+#: Of 30 digits, what a third difference that is zero has left.
+_ROUNDED: Final = 1e-20
+
+
+@dataclass(frozen=True)
+class KineticSplit:
+    """T = T2 + T1 + T0, of second, first and zeroth degree in the velocities.
+
+    Attributes
+    ----------
+    T2, T1, T0 : sympy.Expr
+        T2 = ½ vᵀ M v, T1 = bᵀ v.
+    M : (n, n) sympy.Matrix
+        ∂²T/∂v².
+    b : (n, 1) sympy.Matrix
+        ∂T/∂v at v = 0; not zero only where time or a drift carries the system along.
+
+    References
+    ----------
+    Goldstein, Poole, Safko 2002, Classical Mechanics, eq. (1.73); Lanczos 1970, ch. V.
+    """
+
+    T2: sp.Expr
+    T1: sp.Expr
+    T0: sp.Expr
+    M: sp.ImmutableMatrix
+    b: sp.ImmutableMatrix
+
+
+def split(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> KineticSplit:
+    """Return the parts of T.
+
+    Raises
+    ------
+    InputError
+        T is not of second degree in the velocities; the offending term is named.
+    """
+    n = len(velocities)
+    p = [sp.diff(T, w) for w in velocities]
+    seconds = {(i, j): sp.diff(p[i], velocities[j]) for i in range(n) for j in range(i, n)}
+    if any(_moves(x, velocities) for x in seconds.values()):
+        _check(T, velocities)
+    entries = {place: tidy(_at_rest(x, velocities, sp.Integer(0))) for place, x in seconds.items()}
+    M = sp.ImmutableMatrix(n, n, lambda i, j: entries[min(i, j), max(i, j)])
+    v = sp.Matrix(velocities)
+    b = sp.ImmutableMatrix(n, 1, [tidy(_at_rest(x, velocities, (M[i, :] * v)[0])) for i, x in enumerate(p)])
+    T2, T1 = (v.T * M * v)[0] / 2, (b.T * v)[0]
+    return KineticSplit(T2=T2, T1=T1, T0=tidy(_at_rest(T, velocities, T2 + T1)), M=M, b=b)
+
+
+def _moves(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
+    return bool(x.free_symbols & set(velocities))
+
+
+def _at_rest(x: sp.Expr, velocities: Sequence[sp.Symbol], gained: sp.Expr) -> sp.Expr:
+    """Return an expression at rest; where it has no value there, at other velocities and less what it gains by them."""
+    n = len(velocities)
+    for speeds in ((0,) * n, range(1, n + 1), range(2, 2 * n + 1, 2)):
+        put = dict(zip(velocities, map(sp.Integer, speeds), strict=True))
+        out = x.subs(put)
+        if not out.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+            return out - gained.subs(put)
+    return x
+
+
+def _check(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> None:
+    """Refuse T where it is no polynomial of second degree, with the first term that is none either."""
+    if _quadratic(T, velocities):
+        return
+    terms = sp.Add.make_args(sp.expand_mul(T) if T.count_ops() <= LARGE else T)
+    told = next((x for x in terms if not _quadratic(x, velocities)), T)
+    raise InputError(
+        f"T: expected at most the second degree in the velocities {', '.join(map(str, velocities))}, "
+        f"but its term {told} is not"
+    )
+
+
+def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
+    """Return whether an expression is of second degree at most: along random lines its third differences are zero."""
+    probe = Probe([x], velocities)
+    with mpmath.workdps(DIGITS):
+        for seed in range(_LINES):
+            start, way = probe.place(2 * seed), probe.place(2 * seed + 1)
+            # Through velocities of both signs, where what has a kink shows it.
+            places = ({c: y / 3 + s * way[c] if c in velocities else y for c, y in start.items()} for s in _STEPS)
+            values = [point[0] for point in map(probe, places) if point is not None]
+            if len(values) < len(_STEPS):
+                continue
+            third = sum(k * value for k, value in zip((1, -3, 3, -1), values, strict=True))
+            if abs(third) > _ROUNDED * max(abs(value) for value in values):
+                return False
+    return True
+
+
+# Whether every motion has kinetic energy, or is bound by a constraint.
+
+_PLACES: Final = 3
+#: Letters of a matrix that is told.
+_TOLD: Final = 200
+
+
+def require_inertia(
+    M: sp.ImmutableMatrix, coordinates: Sequence[sp.Symbol], velocities: Sequence[sp.Symbol], constraints: Sequence[Any]
+) -> None:
+    """Refuse a mass matrix that is singular everywhere, unless constraints bind what it leaves without mass.
+
+    M + Jᵀ J has an inverse exactly where M v̇ - Jᵀ λ = f, J v̇ = -γ determines v̇.
+
+    Raises
+    ------
+    InputError
+        With the velocities that have no kinetic energy.
+    """
+    n = len(velocities)
+    J = sp.Matrix(len(constraints), 1, list(constraints)).jacobian(coordinates) if constraints else sp.zeros(0, n)
+    idle = [w for i, w in enumerate(velocities) if not any(M[i, :]) and not any(J[:, i])]
+    if idle:
+        bound = " and no constraint holds its coordinate" if constraints else ""
+        names = ", ".join(w.name for w in idle)
+        raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {names}{bound}")
+    probe = Probe([*M, *J])
+    for seed in range(_PLACES):
+        values = probe(probe.place(seed))
+        if values is None:
+            # No judgement where it has no value.
+            return
+        with mpmath.workdps(DIGITS):
+            A = mpmath.matrix(n, n)
+            for i in range(n):
+                for j in range(n):
+                    pulls = (mpmath.conj(values[k + i]) * values[k + j] for k in range(n * n, len(values), n))
+                    A[i, j] = values[n * i + j] + mpmath.fsum(pulls)
+            rows = [mpmath.norm(A[i, :]) for i in range(n)]
+            if any(x == 0 for x in rows):
+                continue
+            # Masses may differ by any number of decades.
+            scaled = mpmath.matrix(n, n)
+            for i in range(n):
+                for j in range(n):
+                    scaled[i, j] = A[i, j] / mpmath.sqrt(rows[i] * rows[j])
+            sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
+            if abs(mpmath.det(scaled)) > _ROUNDED * mpmath.fprod(sizes):
+                return
+    told = f" {M.tolist()}" if len(str(M)) <= _TOLD else ""
+    raise InputError(
+        f"T: its mass matrix{told} is singular everywhere: {_unmoved(A, velocities)} can change without kinetic "
+        "energy; a velocity is missing, or there is a coordinate too many"
+    )
+
+
+def _unmoved(A: Any, velocities: Sequence[sp.Symbol]) -> str:
+    """Return the velocities of a motion that moves no mass."""
+    _, _, V = np.linalg.svd(np.array(A.tolist(), dtype=complex))
+    names = [w.name for w, x in zip(velocities, V[-1], strict=True) if abs(x) > 1e-6]
+    return names[0] if len(names) == 1 else f"{', '.join(names)} together"
+
+
+# The inverse of a matrix in symbols, block by block.
+
+# Above this size cofactors grow faster than elimination does.
+_BY_COFACTORS: Final = 4
+
+
+def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
+    """Return A⁻¹ with each entry tidied.
+
+    Rows and columns that are coupled with no others are inverted by themselves, which
+    keeps the answer as short as the matrix allows.
+
+    Parameters
+    ----------
+    A : (n, n) sympy.Matrix
+    what : str
+        Its name, for the message.
+
+    Raises
+    ------
+    InputError
+        The matrix is singular everywhere.
+    """
+    A = sp.Matrix(A)
+    out = sp.zeros(*A.shape)
+    for block in blocks(A):
+        part = A.extract(block, block)
+        det = tidy(part.det(method="berkowitz"))
+        if det == 0:
+            raise InputError(f"{what}: {part.tolist()} is singular everywhere")
+        if len(block) <= _BY_COFACTORS:
+            turned = part.adjugate(method="berkowitz") / det
+        else:
+            turned = part.LUsolve(sp.eye(len(block)))
+        for i, row in enumerate(block):
+            for j, column in enumerate(block):
+                out[row, column] = tidy(turned[i, j])
+    return sp.ImmutableMatrix(out)
+
+
+def blocks(A: sp.Matrix) -> list[list[int]]:
+    """Return the indices that A's entries connect, each set in order."""
+    left, out = list(range(A.shape[0])), []
+    while left:
+        block = [left.pop(0)]
+        for i in block:
+            block += [j for j in left if A[i, j] != 0 or A[j, i] != 0]
+            left = [j for j in left if j not in block]
+        out.append(sorted(block))
+    return out
+
+
+# xᵀ M⁻¹ y of a mass matrix in symbols, in the shortest of several forms.
+#
+# Completed squares are how books write H and effective potentials: (p_φ - p_ψ cos θ)² / (2 A sin² θ) + p_ψ² / (2 C),
+# where entries of M⁻¹ would be long. Which coordinate is eliminated first makes the difference. Where all squares
+# hold quotients of quotients, the cofactors of M over its determinant are shorter.
+
+#: Coupled coordinates of which every order is tried.
+_TRIED: Final = 3
+#: Operations of three coupled rows up to which they are.
+_SMALL: Final = 24
+#: Operations up to which a step of an elimination is tidied.
+_LONG: Final = 250
+
+
+class _Inverse(Protocol):
+    """The inverse of one block of M."""
+
+    def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr: ...
+
+    def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]: ...
+
+
+class Squares:
+    """The inverse of a symmetric positive definite matrix, each set of coupled coordinates by itself.
+
+    Parameters
+    ----------
+    M : (n, n) sympy.Matrix
+    what : str
+        Its name, for the message.
+
+    Raises
+    ------
+    InputError
+        The matrix is singular everywhere.
+    """
+
+    def __init__(self, M: Any, what: str) -> None:
+        self._blocks: list[tuple[list[int], _Inverse]] = []
+        for block in blocks(M):
+            part = sp.ImmutableMatrix(M.extract(block, block))
+            p = sp.symbols(f"p0:{len(block)}", cls=sp.Dummy)
+            tried = _tried(part, f"{what} {sp.Matrix(M).tolist()}")
+            self._blocks.append((block, min(tried, key=lambda a: cost(a.form(p, p)) if len(tried) > 1 else 0)))
+
+    def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
+        """Return xᵀ M⁻¹ y."""
+        parts = (a.form([x[i] for i in block], [y[i] for i in block]) for block, a in self._blocks)
+        return sum(parts, sp.Integer(0))
+
+    def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
+        """Return M⁻¹ x."""
+        out = list(x)
+        for block, a in self._blocks:
+            for i, value in zip(block, a.solve([x[i] for i in block]), strict=True):
+                out[i] = value
+        return out
+
+
+def _tried(M: sp.ImmutableMatrix, what: str) -> list[_Inverse]:
+    n = M.shape[0]
+    few = n <= _TRIED and (n < _TRIED or sum(x.count_ops() for x in M) <= _SMALL)
+    out: list[_Inverse] = []
+    for order in permutations(range(n)) if few else (None,):
+        with suppress(_NoPivotError):
+            out.append(_Eliminated(M, order))
+    if not out or (few and n > 1):
+        out.append(_Cofactors(M, what))
+    return out
+
+
+def _shorter(x: sp.Expr) -> sp.Expr:
+    """Return an expression tidied; one that nobody reads as it is."""
+    return tidy(x) if x.count_ops() <= _LONG else x
+
+
+class _NoPivotError(Exception):
+    """All pivots that are left are zero."""
+
+
+class _Eliminated:
+    """M = L D Lᵀ, with pivots in an order, or the shortest first."""
+
+    def __init__(self, M: sp.ImmutableMatrix, order: Sequence[int] | None = None) -> None:
+        left, entries = list(range(M.shape[0])), {(i, j): M[i, j] for i in range(M.shape[0]) for j in range(i + 1)}
+
+        def entry(i: int, j: int) -> sp.Expr:
+            return entries[max(i, j), min(i, j)]
+
+        #: Of each pivot: its index, its D, and how much of its row goes off each later one.
+        self._steps: list[tuple[int, sp.Expr, dict[int, sp.Expr]]] = []
+        while left:
+            pivots = {i: entry(i, i) for i in left if entry(i, i) != 0}
+            if not pivots:
+                raise _NoPivotError
+            k = min(pivots, key=lambda i: (pivots[i].count_ops(), left.index(i)))
+            if order is not None:
+                k = next(i for i in order if i in pivots)
+            left.remove(k)
+            factors = {i: _shorter(entry(i, k) / pivots[k]) for i in left if entry(i, k) != 0}
+            for i, factor in factors.items():
+                for j in factors:
+                    if j <= i:
+                        entries[i, j] = _shorter(entries[i, j] - factor * entry(j, k))
+            self._steps.append((k, pivots[k], factors))
+
+    def _lowered(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
+        """Return L⁻¹ x."""
+        out = list(x)
+        for k, _, factors in self._steps:
+            for i, factor in factors.items():
+                out[i] = _shorter(out[i] - factor * out[k])
+        return out
+
+    def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
+        a, b = self._lowered(x), self._lowered(y)
+        return sum((a[k] * b[k] / pivot for k, pivot, _ in self._steps), sp.Integer(0))
+
+    def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
+        out = self._lowered(x)
+        for k, pivot, factors in reversed(self._steps):
+            out[k] = out[k] / pivot - sum((factor * out[i] for i, factor in factors.items()), sp.Integer(0))
+        return out
+
+
+class _Cofactors:
+    """M⁻¹ = adj M / det M."""
+
+    def __init__(self, M: sp.ImmutableMatrix, what: str) -> None:
+        self._below = tidy(M.det(method="berkowitz"))
+        if self._below == 0:
+            raise InputError(f"{what} is singular everywhere")
+        self._above = M.adjugate(method="berkowitz").applyfunc(tidy)
+
+    def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
+        return tidy((sp.Matrix([x]) * self._above * sp.Matrix(list(y)))[0]) / self._below
+
+    def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
+        return [tidy(e) / self._below for e in self._above * sp.Matrix(list(x))]

@@ -1,0 +1,230 @@
+"""A system written as energies, in the shape in which engines, simulation and studies take a model."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import cached_property, partial
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sympy as sp
+
+from mbkit._check import Array, count, generator, real
+from mbkit._escape import html, one_line
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.lagrangian.constraints.manifold import Manifold, manifold_of
+from mbkit.lagrangian.constraints.redundancy import is_judged, refuse_unreachable, require_independent
+from mbkit.lagrangian.energies.casadi_equations import WrittenEquations
+from mbkit.model import Model
+from mbkit.model.model import Needs
+from mbkit.model.parts import Body, Frame, Joint
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.system import Lagrangian
+
+__all__ = ["WrittenModel", "abstract_parts"]
+
+
+# Bodies and joints for a model of which nothing but its coordinates is known.
+
+
+def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint, ...]]:
+    """Return what gives a model coordinates of these names, and nothing else."""
+    # One coordinate a joint, each on the one before: the pattern of a full mass matrix.
+    joints = tuple(_coordinate(name, before) for name, before in zip(names, ["world", *names], strict=False))
+    return tuple(_massless(name) for name in names), joints
+
+
+def _coordinate(name: str, before: str) -> Joint:
+    zero, endless = np.zeros(1), np.full(1, np.inf)
+    return Joint(
+        name=name,
+        kind="prismatic",
+        parent=before,
+        child=name,
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+        axes=np.array([[1.0, 0.0, 0.0]]),
+        pitch=0.0,
+        lower=-endless,
+        upper=endless,
+        velocity_limit=endless,
+        effort_limit=endless,
+        armature=zero,
+        damping=zero,
+        friction=zero,
+        stiffness=zero,
+        rest=zero,
+    )
+
+
+def _massless(name: str) -> Body:
+    return Body(name=name, mass=0.0, com=np.zeros(3), inertia=np.zeros((3, 3)))
+
+
+#: Random states that are tried, of which each may be too far from the constraints.
+_DRAWS = 50
+
+
+class WrittenModel(Model):
+    """A `Lagrangian` as a model: coordinates that add, named parameters, and no bodies.
+
+    Parameters
+    ----------
+    system : Lagrangian
+    values : mapping of str to float or None, optional
+        Of its parameters, instead of their own.
+    """
+
+    def __init__(self, system: Lagrangian, values: Mapping[str, float | None] | None = None) -> None:
+        bodies, joints = abstract_parts([q.name for q in system.coordinates])
+        # The parts of a frozen class are set once, here.
+        put = object.__setattr__
+        put(self, "system", system)
+        put(self, "_values", dict(values or {s.name: x for s, x in system.parameters.items()}))
+        super().__init__(system.name, np.zeros(3), bodies, joints)
+
+    system: Lagrangian
+    _values: dict[str, float | None]
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        return type(self), (self.system, self._values)
+
+    @property
+    def written(self) -> Callable[..., WrittenEquations]:
+        """What makes the equations: a function of how numbers stand in them."""
+        return partial(WrittenEquations, self)
+
+    @property
+    def clock(self) -> str | None:
+        """Name of the time, a parameter that simulation moves."""
+        return self.system.time.name if self.system.time is not None else None
+
+    @property
+    def constrained(self) -> bool:
+        """Whether constraints bind the coordinates to each other."""
+        return bool(self.system.constraints)
+
+    @cached_property
+    def parameters(self) -> Mapping[str, float | None]:
+        """Value of each named parameter, None where it has none; the time is the last of them."""
+        time = {self.clock: self._values.get(self.clock, 0.0)} if self.clock else {}
+        return MappingProxyType({**self._values, **time})
+
+    @property
+    def mass(self) -> float:
+        """Not known: energies do not tell."""
+        raise UnsupportedError(f"mass: {self.name} was written as energies and has no bodies")
+
+    @cached_property
+    def needs(self) -> Needs:
+        """Damping where a force or dissipation stands; energies tell nothing else apart."""
+        s = self.system
+        flags = dict.fromkeys(Needs.__dataclass_fields__, False)
+        return Needs(**{**flags, "damping": any(x != 0 for x in (s.dissipation, *s.forces))})
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over the expressions and the values of the parameters."""
+        return _sha(self._form, *(f"{n}={x!r}" for n, x in self.parameters.items()))
+
+    @cached_property
+    def form_digest(self) -> str:
+        """The digest without the values."""
+        return _sha(self._form, *self.parameters)
+
+    @cached_property
+    def _form(self) -> str:
+        s = self.system
+        parts = (s.T, s.V, s.dissipation, s.forces, s.constraints, s.coordinates, s.velocities, s.time)
+        return "\n".join((s.name, *(sp.srepr(sp.sympify(x)) for x in parts)))
+
+    def with_nominal(self, values: Mapping[str, Any]) -> WrittenModel:
+        """Return the same system at other values of its parameters."""
+        for name in values:
+            if name not in self.parameters:
+                raise UnknownNameError("parameter", name, self.parameters)
+        moved = {n: real(f"parameter {n!r}", x) for n, x in values.items()}
+        out = object.__new__(type(self))
+        # Nothing but the values differs: what was derived from the rest is kept.
+        kept = {k: x for k, x in self.__dict__.items() if k not in ("parameters", "digest", "_states")}
+        out.__dict__.update(kept, _values={**self._values, **moved})
+        return out
+
+    def with_parameters(self, /, **values: float) -> WrittenModel:
+        """Return the same system with plain numbers for some or all parameters."""
+        return self.with_nominal(values).system_at(tuple(values))
+
+    def system_at(self, names: tuple[str, ...]) -> WrittenModel:
+        """Return the model in which these parameters are the numbers that they have now."""
+        own = {s.name: s for s in self.system.parameters}
+        numbers = {own[n]: sp.Float(self.parameters[n], 17) for n in names if n in own}
+        return self.system.substituted(numbers).model
+
+    def without(self, *features: str) -> Model:
+        """Return the same system less its damping; energies do not tell what else there is."""
+        if set(features) == {"damping"}:
+            return self.system.conservative().model
+        raise UnsupportedError(
+            f"without: {self.name} was written as energies, of which only 'damping' can be left out, got {features}"
+        )
+
+    def random_state(self, rng: np.random.Generator | int, size: int | None = None) -> tuple[Array, Array]:
+        """Draw a random state as `Model.random_state` does; under constraints the consistent one that is nearest.
+
+        Singular poses are drawn again.
+        """
+        if not self.constrained:
+            return super().random_state(rng, size)
+        rng = generator("rng", rng)
+        drawn = [self._consistent_state(rng) for _ in range(1 if size is None else count("size", size))]
+        q, v = np.array(drawn).reshape(len(drawn), 2, self.nv).transpose(1, 0, 2)
+        return (q[0], v[0]) if size is None else (q, v)
+
+    def _consistent_state(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        for _ in range(_DRAWS):
+            # From some places there is no way to the constraints; on some branches they depend on each other.
+            with suppress(InputError, NumericalError):
+                state = self._states.project(*super().random_state(rng))
+                require_independent(self._states.dyn, state[0])
+                return state
+        refuse_unreachable(self._states.dyn)
+        return self._states.project(*super().random_state(rng))
+
+    def require_independent(self, q: Array) -> None:
+        """Refuse constraints that follow from each other at a configuration or contradict each other, with the rows.
+
+        Not while a parameter has no value, on which it may depend.
+        """
+        if self.constrained and None not in self.parameters.values():
+            require_independent(self._states.dyn, q)
+
+    def require_meaningful(self, q: Array) -> None:
+        """Refuse constraints that depend on each other at the first configuration that is evaluated."""
+        if self.constrained and len(q) and None not in self.parameters.values() and not is_judged(self):
+            require_independent(self._states.dyn, np.atleast_2d(q)[0])
+
+    @cached_property
+    def _states(self) -> Manifold:
+        return manifold_of(LagrangianDynamics(self, compile=False))
+
+    def frame(self, name: str) -> Frame:
+        """Refuse: energies have no frames."""
+        raise UnsupportedError(f"frame {name!r}: {self.name} was written as energies and has no frames")
+
+    def __repr__(self) -> str:
+        return one_line(f"<WrittenModel {self.name!r}: coordinates {', '.join(self.coordinate_names)}>")
+
+    def _repr_html_(self) -> str:
+        return f"<p><b>{html(self.name)}</b>: {html(self.system._repr_latex_())}</p>"
+
+
+def _sha(*parts: str) -> str:
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(part.encode() + b"\0")
+    return total.hexdigest()

@@ -1,0 +1,202 @@
+"""A model's equations to read: its energies in SymPy, its loops as constraints, and what is moved in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, count
+from typing import Any, Final
+
+import sympy as sp
+
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, instead_of_writing, motion
+from mbkit.lagrangian.energies.model import WrittenModel
+from mbkit.lagrangian.energies.symbols import velocity_of
+from mbkit.lagrangian.printing.catalog_symbols import in_symbols
+from mbkit.lagrangian.system import Lagrangian
+from mbkit.model import Model
+
+__all__ = ["from_model"]
+
+#: Velocities up to which anybody reads a matrix.
+_MOST: Final = 24
+#: The same with loops or motions in time. A row of 40 four-bars has 81 coordinates.
+_MOST_BOUND: Final = 100
+
+
+def from_model(
+    model: Model,
+    *,
+    symbols: bool | None = None,
+    coordinates: Sequence[str] | None = None,
+    drives: bool = False,
+    progress: Callable[[float, str], None] | None = None,
+) -> Lagrangian:
+    """Return a model as a `Lagrangian` to read and to run: T, V and Rayleigh's dissipation in its coordinates.
+
+    The joints' own formulas are evaluated on exact sums of cosines and sines, which are
+    short without a search: a planar chain has cos(theta2 + theta3) where one would write it.
+    Numbers are the decimals of the description. Springs are in V, dampers in the
+    dissipation, armature in T; dry friction and limits are left out, as in every engine.
+
+    Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
+    both ends. A point closure has three rows, two where the loop lies in a plane, and its multipliers are
+    the force on body a; a frame closure has three more of the orientation, one where all axes in the
+    loop are parallel (`mbkit.lagrangian.description_kinematics`). Coordinates that are prescribed become
+    functions of the time, and T has terms of first and zeroth degree then.
+
+    Parameters
+    ----------
+    model : Model
+        Of joints whose velocities are the rates of their coordinates: not ball and free ones.
+    symbols : bool, optional
+        Whether a system of the catalog is written in the textbooks' symbols, with the model's
+        numbers as values of the parameters: cart_pole in m_c, m_p, l and g. Not given, it is if
+        the model has no named parameters of its own.
+    coordinates : sequence of str, optional
+        Names instead of the model's, such as ``["q1", "q2"]``, prescribed ones included.
+    drives : bool
+        Whether prescribed coordinates stay, each bound by a constraint behind those of the loops: its
+        multiplier is the force (or torque) of the drive that moves it.
+    progress : callable, optional
+        Called with a fraction and a text.
+
+    Raises
+    ------
+    UnsupportedError
+        Ball or free joints, more terms than anybody reads, or no coordinate that is left to move.
+    InputError
+        `symbols` asked for of a model that is no system of the catalog, names that do not fit, or
+        a loop whose ends never meet or do not move against each other.
+
+    Notes
+    -----
+    Where a spatial loop has more rows than it takes freedoms (Bricard's, Bennett's), the set is redundant: which
+    rows are enough changes from pose to pose, and running it is refused with the rows by name.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> lag = mb.lagrangian.from_model(mb.catalog.pendulum(mass=2.0))
+    >>> lag.T, lag.V
+    (l**2*m*thetadot**2/2, -g*l*m*cos(theta))
+    >>> {s.name: x for s, x in lag.parameters.items()}
+    {'g': 9.81, 'm': 2.0, 'l': 1.0}
+
+    A slider-crank is two rods, a piston, and the pin that closes the loop.
+
+    >>> b = mb.ModelBuilder("slider_crank", gravity=(0, 0, 0))
+    >>> b.add_body("crank", mass=1.0, com=(0.1, 0, 0), inertia=(0, 0.01, 0.01))
+    >>> b.add_body("rod", mass=1.0, com=(0.3, 0, 0), inertia=(0, 0.03, 0.03))
+    >>> b.add_body("piston", mass=2.0)
+    >>> b.add_joint("theta", "revolute", parent="world", child="crank", axis=(0, 0, 1))
+    >>> b.add_joint("phi", "revolute", parent="crank", child="rod", axis=(0, 0, 1), translation=(0.2, 0, 0))
+    >>> b.add_joint("x", "prismatic", parent="world", child="piston", axis=(1, 0, 0))
+    >>> b.add_loop("pin", "point", body_a="rod", translation_a=(0.6, 0, 0), body_b="piston")
+    >>> for row in mb.lagrangian.from_model(b.build()).constraints:
+    ...     print(row)
+    -x + 0.2*cos(theta) + 0.6*cos(phi + theta)
+    0.2*sin(theta) + 0.6*sin(phi + theta)
+    """
+    if not isinstance(model, Model):
+        raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) gives one")
+    if isinstance(model, WrittenModel):
+        return model.system
+    _check(model)
+    q = _coordinates(model, coordinates)
+    named = None
+    if symbols or symbols is None:
+        named = in_symbols(model)
+        if named is None and symbols:
+            known = "it has named parameters already" if model.parameters else "it is no system of the catalog"
+            raise InputError(f"symbols: {model.name}: {known}; leave symbols out to keep its numbers")
+    source = named or model
+    parameters = {name: sp.Symbol(name) for name in source.parameters}
+    clash = [s.name for s in q if s.name in parameters]
+    if clash:
+        raise InputError(f"coordinates: {clash[0]!r} is a parameter of {model.name}; give coordinates=... other names")
+    v = [velocity_of(s) for s in q]
+    kin = SymbolicKinematics(source, q, v, parameters, progress or _silent)
+    T, V, R = _kinetic(kin.mass_matrix, v), kin.gravity_energy + kin.spring_energy, kin.dissipation
+    t = _time({*parameters, *(s.name for s in (*q, *v))})
+    moved = {model.coordinate_names.index(p.joint): motion(kin, p, t) for p in model.prescribed}
+    rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
+    if drives:
+        rows += [(model.coordinate_names[i], q[i] - x) for i, x in moved.items()]
+        moved = {}
+    put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
+    T, V, R, *constraints = (x.xreplace(put) for x in (T, V, R, *(row for _, row in rows)))
+    kept = [i for i in range(len(q)) if i not in moved]
+    # Dampers on prescribed joints alone act on no coordinate that is left.
+    R = R if R.free_symbols & {v[i] for i in kept} else sp.Integer(0)
+    _check_kept(model, {q[i] for i in kept}, zip((name for name, _ in rows), constraints, strict=True))
+    used = set().union(*(x.free_symbols for x in (T, V, R, *constraints)))
+    return Lagrangian(
+        T,
+        V,
+        [q[i] for i in kept],
+        [v[i] for i in kept],
+        time=t,
+        dissipation=R,
+        constraints=constraints,
+        # What only a frame needs is no part of the equation; a name of the user's own is kept all the same.
+        parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used},
+        name=model.name,
+    )
+
+
+def _silent(_fraction: float, _text: str) -> None:
+    pass
+
+
+def _check(model: Model) -> None:
+    turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
+    if turning:
+        raise UnsupportedError(
+            f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate; write it in Euler "
+            "angles (mbkit.lagrangian.systems.heavy_top, or spherical_zyx joints), or use Lagrangian.quasi_velocities"
+        )
+    if not model.nv:
+        raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
+    # Engines take trees of any size. What they refuse is solved here alone.
+    bound = model.needs.loops or model.needs.time
+    most = _MOST_BOUND if bound else _MOST
+    if model.nv > most:
+        raise UnsupportedError(
+            f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of "
+            f"{model.name}; {instead_of_writing(model)}"
+        )
+
+
+def _time(taken: set[str]) -> sp.Symbol:
+    names = chain(("t", "time"), (f"t_{k}" for k in count()))
+    return sp.Symbol(next(name for name in names if name not in taken))
+
+
+def _check_kept(model: Model, kept: set[sp.Symbol], rows: Iterable[tuple[str, sp.Expr]]) -> None:
+    """Refuse what the prescribed motions leave nothing of."""
+    if not kept:
+        raise UnsupportedError(
+            f"{model.name}: every coordinate is prescribed, so there is no equation; drives=True keeps them, with the "
+            "forces that move them as multipliers"
+        )
+    for name, row in rows:
+        if not row.free_symbols & kept:
+            raise InputError(
+                f"{model.name}: loop {name!r}: the prescribed motions alone move it, so that it is open or "
+                f"says nothing: {row} = 0; leave out one of them"
+            )
+
+
+def _coordinates(model: Model, names: Sequence[str] | None) -> list[sp.Symbol]:
+    told = list(model.coordinate_names if names is None else names)
+    if len(told) != model.nq or not all(isinstance(n, str) and n for n in told) or len(set(told)) != len(told):
+        raise InputError(f"coordinates: expected {model.nq} different names, got {names!r}")
+    return [sp.Symbol(n) for n in told]
+
+
+def _kinetic(M: list[list[Any]], v: list[sp.Symbol]) -> sp.Expr:
+    n = len(v)
+    terms = [sp.Mul(sp.Rational(1, 2), M[i][i], v[i] ** 2) for i in range(n)]
+    terms += [sp.Mul(M[i][j], v[i], v[j]) for i in range(n) for j in range(i + 1, n)]
+    return sp.Add(*terms)

@@ -1,0 +1,232 @@
+"""The symbols in which textbooks write the catalog's systems, and the numbers that stand for them."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from itertools import count
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit import catalog
+from mbkit.errors import MbkitError
+from mbkit.load.urdf import Snapper
+from mbkit.model import Expression, Model, Parameter
+
+__all__ = ["in_symbols", "letters", "with_plain_turns"]
+
+#: Of each system's arguments: a name, or three for a vector.
+_SYMBOLS: Final[dict[str, dict[str, str | tuple[str, str, str]]]] = {
+    "acrobot": {"com1": "l_c1", "com2": "l_c2", "inertia1": "I1", "inertia2": "I2"},
+    "cart_pole": {"cart_mass": "m_c", "pole_mass": "m_p"},
+    "clamped_beam": {"length": "L", "bending_stiffness": "EI"},
+    "flexible_spacecraft": {
+        "length": "L",
+        "bending_stiffness": "EI",
+        "hub_mass": "m_h",
+        "hub_inertia": ("J_x", "J_y", "J"),
+        "hub_radius": "r",
+    },
+    "furuta_pendulum": {
+        "arm_length": "L",
+        "arm_mass": "m_a",
+        "arm_com": "l_a",
+        "arm_inertia": "J_a",
+        "pendulum_mass": "m",
+        "pendulum_com": "l",
+        "pendulum_inertia": ("J_x", "J_y", "J_z"),
+    },
+    "gyroscope": {
+        "rotor_mass": "m",
+        "rotor_axial": "C",
+        "rotor_across": "A",
+        "offset": "l",
+        "gimbal_mass": "m_g",
+        "inner_inertia": ("A_i", "B_i", "C_i"),
+        "outer_inertia": "J_o",
+    },
+    "slider_crank": {"crank": "L1", "rod": "L2", "crank_mass": "m1", "rod_mass": "m2", "piston_mass": "m3"},
+}
+#: Of coordinates that the catalog calls by a word.
+_LETTERS: Final = {
+    "elastic_pendulum": ("theta", "s"),
+    "furuta_pendulum": ("alpha", "theta"),
+    "gyroscope": ("alpha", "beta", "gamma"),
+}
+_LETTER: Final = re.compile(r"([A-Za-z]|alpha|beta|gamma|delta|theta|phi|psi)(_?\d+)?")
+_USUAL: Final = {"gravity": "g", "mass": "m", "length": "l", "stiffness": "k", "damping": "d", "inertia": "J"}
+#: Two descriptions are the same where their numbers differ by rounding only.
+_SAME: Final = 1e-13
+
+
+def in_symbols(model: Model) -> Model | None:
+    """Return a catalog system with a parameter for each argument, at the values of a model; None if it is none.
+
+    Nothing has to be known of how the model was made: a system of the same form is made with
+    parameters, its numbers are solved for theirs, and every number is compared.
+    An argument of zero stays the number zero.
+    """
+    system = next((n for n in catalog.systems() if model.name == n or _numbered(model.name, n)), None)
+    if system is None or model.parameters:
+        return None
+    for counts in _counts(catalog.systems()[system], model.nv):
+        try:
+            made = _with_parameters(system, counts)
+        except (MbkitError, TypeError):
+            # A system of another size, or one that takes no parameters.
+            continue
+        if _form(made) != _form(model):
+            continue
+        values = _solved(made, model)
+        try:
+            moved = made.with_nominal(values)
+        except MbkitError:
+            return None
+        if not _same(moved, model):
+            return None
+        nothing = {name: 0.0 for name, x in values.items() if x == 0.0}
+        return moved.with_parameters(**nothing) if nothing else moved
+    return None
+
+
+def letters(model: Model) -> list[str] | None:
+    """Return names of coordinates that are short enough for equations; None where the model's own are."""
+    if all(_LETTER.fullmatch(n) for n in model.coordinate_names):
+        return None
+    if model.name in _LETTERS and len(_LETTERS[model.name]) == model.nq:
+        return list(_LETTERS[model.name])
+    # Of a joint with several coordinates, such as hub.x, the last part may be one.
+    tails = [n.rpartition(".")[2] for n in model.coordinate_names]
+    known = {t for t in tails if _LETTER.fullmatch(t) and tails.count(t) == 1 and not t.startswith("q")}
+    numbers = count(1)
+    return [t if t in known else f"q{next(numbers)}" for t in tails]
+
+
+def with_plain_turns(model: Model, reach: float) -> tuple[Model, str | None]:
+    """Return a model for reading, without the last digits of rounded quarter turns, and a note if it is another one.
+
+    A file's 1.57079632679 for π/2 leaves 5e-12 where a zero is meant, and with it a term in every equation.
+
+    Parameters
+    ----------
+    model : Model
+    reach : float
+        How near to 0, 1 or -1 an entry of a rotation matrix or an axis is set to it.
+    """
+    snap = Snapper(reach)
+    joints = tuple(
+        replace(j, rotation=snap(j.rotation), axes=np.array([snap(axis) for axis in j.axes]).reshape(-1, 3))
+        for j in model.joints
+    )
+    if not snap.count:
+        return model, None
+    return replace(model, joints=joints), snap.note
+
+
+def _numbered(name: str, system: str) -> bool:
+    return name.startswith(f"{system}_") and name.removeprefix(f"{system}_").isdigit()
+
+
+def _counts(function: Callable[..., Model], most: int) -> Iterator[dict[str, int]]:
+    """Yield the arguments that count parts, for each size that there may be."""
+    names = [n for n, p in inspect.signature(function).parameters.items() if type(p.default) is int]
+    if not names:
+        yield {}
+    for n in range(1, most + 1) if names else ():
+        yield dict.fromkeys(names, n)
+
+
+def _with_parameters(system: str, counts: Mapping[str, int]) -> Model:
+    function, own = catalog.systems()[system], _SYMBOLS.get(system, {})
+    given: dict[str, Any] = dict(counts)
+    for name, argument in inspect.signature(function).parameters.items():
+        default, symbol = argument.default, own.get(name) or _usual(name)
+        if isinstance(default, float):
+            given[name] = Parameter(str(symbol), default)
+        elif isinstance(default, tuple) and all(isinstance(x, float) for x in default):
+            names = symbol if isinstance(symbol, tuple) else [f"{symbol}_{axis}" for axis in "xyz"]
+            given[name] = [Parameter(n, x) for n, x in zip(names, default, strict=True)]
+    return function(**given)
+
+
+def _usual(name: str) -> str:
+    stem = name.rstrip("0123456789")
+    return _USUAL.get(stem, stem) + name[len(stem) :]
+
+
+def _form(model: Model) -> Any:
+    """Return what a description has beside numbers."""
+    joints = [(j.name, j.kind, j.parent, j.child, j.mimic is None) for j in model.joints]
+    return (
+        [b.name for b in model.bodies],
+        joints,
+        [*(s.name for s in model.springs), *(c.name for c in model.couplings)],
+        [(x.name, x.kind, x.body_a, x.body_b) for x in model.loops],
+    )
+
+
+def _solved(made: Model, model: Model) -> dict[str, float]:
+    """Return the values of parameters that give a model's numbers, as far as they can be told."""
+    values: dict[str, float] = {}
+    # Frames move nothing, and a model may be without them.
+    left = [(b.expression, _number(model, b)) for b in made.bindings if b.where != "frames"]
+    progress = True
+    while progress:
+        progress = False
+        for expression, target in left:
+            unknown = {p.name for p in expression.parameters()} - set(values)
+            if len(unknown) == 1:
+                (name,) = unknown
+                at = [_evaluated(expression, {**values, name: x}) for x in (0.0, 1.0, 2.0)]
+                slope = at[1] - at[0]
+                # Only what is linear can be read off.
+                if slope and np.isfinite(at).all() and abs(at[2] - at[1] - slope) <= 1e-9 * abs(slope):
+                    values[name], progress = _rounded((target - at[0]) / slope), True
+    return values
+
+
+def _rounded(x: float) -> float:
+    """Return the shorter decimal where a number is one to rounding."""
+    short = float(f"{x:.12g}")
+    return short if abs(short - x) <= _SAME * abs(x) else x
+
+
+def _evaluated(expression: Expression, values: Mapping[str, float]) -> float:
+    try:
+        return float(expression.evaluate(lambda p: values[p.name], float))
+    except ZeroDivisionError:
+        return float("nan")
+
+
+def _number(model: Model, binding: Any) -> float:
+    part: Any = model
+    if binding.where != "gravity":
+        part = next(p for p in getattr(model, binding.where) if p.name == binding.part)
+    value = getattr(part, binding.field)
+    return float(value[binding.index] if binding.index else value)
+
+
+def _same(a: Model, b: Model) -> bool:
+    """Return whether all numbers of two descriptions of one form are equal to rounding."""
+    for x, y in zip(_numbers(a), _numbers(b), strict=True):
+        if not np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0))):
+            return False
+    return True
+
+
+def _numbers(model: Model) -> Iterator[np.ndarray]:
+    yield model.gravity
+    for b in model.bodies:
+        yield from (np.array(b.mass), b.com, b.inertia)
+    for j in model.joints:
+        yield from (j.rotation, j.translation, j.axes, np.array(j.pitch))
+        yield from (j.armature, j.damping, j.stiffness, j.rest)
+    for s in model.springs:
+        yield from (s.point_a, s.point_b, np.array([s.stiffness, s.rest_length, s.damping]))
+    for c in model.couplings:
+        yield np.array([*c.factors, c.stiffness, c.rest_length, c.damping, c.armature])
+    for x in model.loops:
+        yield from (x.rotation_a, x.translation_a, x.rotation_b, x.translation_b)

@@ -1,0 +1,362 @@
+"""Expressions in the order of a blackboard: ½ (m₁ + m₂) l₁² θ̇₁² + m₂ l₁ l₂ θ̇₁ θ̇₂ cos(θ₁ - θ₂).
+
+SymPy's printers take factors in the order of the alphabet. Here a number comes first, then masses and inertias, g and
+lengths, coordinates, velocities, accelerations, and cosines last; in sums what turns comes after what does not.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+import sympy as sp
+from sympy.printing.latex import LatexPrinter
+from sympy.printing.pretty.pretty_symbology import pretty_symbol
+
+from mbkit._escape import latex, one_line
+
+__all__ = ["Abbreviations", "Blackboard", "folded", "matrix", "spread", "written"]
+
+
+_FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
+_HIGH: Final = str.maketrans("0123456789-/", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ")
+_MASS: Final = re.compile(r"[mM](\d*|_\w+)")
+#: Denominators that are read as such; longer fractions are decimals.
+_READ: Final = 10_000
+_INERTIA: Final = re.compile(r"[A-CIJ](\d*|_\w+)|EI")
+
+
+class Blackboard:
+    """How expressions of one system are written, on one line of text or in LaTeX.
+
+    Parameters
+    ----------
+    *groups : sequences of sympy.Symbol
+        What moves, in the order in which factors are written: coordinates, velocities, accelerations, momenta.
+    time : sympy.Symbol, optional
+    """
+
+    def __init__(self, *groups: Iterable[sp.Symbol], time: sp.Symbol | None = None) -> None:
+        self._moving = {s: k for k, group in enumerate(groups) for s in group}
+        #: Velocities, accelerations and momenta: what holds most of them comes first in a sum.
+        self._fast = {s: k for s, k in self._moving.items() if k}
+        self._time = time
+
+    # Order
+
+    def _rank(self, x: sp.Expr) -> tuple[Any, ...]:
+        """Return what a factor is ordered by: its kind, its place among the coordinates, what is Greek, its name."""
+        base = x.base if x.is_Pow and x.exp.is_number else x
+        if base.is_Number:
+            return (0, 0, False, "")
+        if base.is_Symbol:
+            if base in self._moving:
+                return (5 + self._moving[base], list(self._moving).index(base), False, "")
+            name = base.name
+            kinds = (_MASS.fullmatch(name), _INERTIA.fullmatch(name), name == "g")
+            kind = 4.5 if base == self._time else next((k for k, hit in enumerate(kinds, start=1) if hit), 4)
+            return (kind, 0, written(name)[0] != name[0], name)
+        if base.is_Add:
+            inside = [self._rank(s)[0] for s in base.free_symbols]
+            parameters = max(inside, default=0) <= 4 and not base.has(sp.sin, sp.cos)
+            return (min(inside, default=4) if parameters else 4.7, 0, False, str(base))
+        if isinstance(base, sp.Function):
+            return (12, *self._place(base.args[0]), base.func is sp.cos, str(base))
+        return (11, 0, False, str(base))
+
+    def _place(self, x: sp.Expr) -> tuple[int, str]:
+        """Return what the argument of a function is ordered by: how many coordinates stand in it, and which."""
+        order = list(self._moving)
+        places = sorted(order.index(s) if s in self._moving else -1 for s in x.free_symbols)
+        return len(places), " ".join(f"{k:4d}" for k in places) + str(x)
+
+    def _ordered(self, terms: Iterable[sp.Expr]) -> list[sp.Expr]:
+        """Return the terms of a sum, positive ones and those that do not turn first."""
+
+        def key(term: sp.Expr) -> tuple[Any, ...]:
+            factors = sp.Mul.make_args(term)
+            powers = {b: int(e) if e.is_Integer else 1 for b, e in (f.as_base_exp() for f in factors)}
+            speeds = [-powers.get(s, 0) for s in self._fast]
+            degree = sum(e for b, e in powers.items() if b.free_symbols & self._fast.keys())
+            turned = sorted((*self._place(a.args[0]), str(a)) for a in term.atoms(sp.sin, sp.cos))
+            ranks = sorted(self._rank(f) for f in factors if not f.is_Number)
+            return (-degree, speeds, len(turned), turned, _signed(term)[0], len(ranks) > 1, ranks, str(term))
+
+        out = sorted(terms, key=key)
+        # A sum does not begin with a minus where it need not.
+        first = next((t for t in out if not _signed(t)[0]), None)
+        if first is not None and _signed(out[0])[0]:
+            out.remove(first)
+            out.insert(0, first)
+        return out
+
+    def _factors(self, x: sp.Expr) -> list[sp.Expr]:
+        return sorted(sp.Mul.make_args(x), key=self._rank)
+
+    # Text
+
+    def text(self, x: Any) -> str:
+        """Return an expression on one line."""
+        return self.text_of([sp.sympify(x)])
+
+    def text_of(self, parts: Iterable[sp.Expr]) -> str:
+        """Return a sum on one line, each part of which is ordered by itself."""
+        return self._joined(self._terms(parts))
+
+    def _terms(self, parts: Iterable[sp.Expr]) -> list[sp.Expr]:
+        return [term for part in parts if part != 0 for term in self._ordered(sp.Add.make_args(part))]
+
+    def _joined(self, terms: list[sp.Expr]) -> str:
+        out = ""
+        for term in terms:
+            minus, size = _signed(term)
+            told = self._product(size)
+            out += (("-" if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
+        return out or "0"
+
+    def _product(self, x: sp.Expr) -> str:
+        if x.is_Add:
+            return self._atom(x)
+        number, rest = x.as_coeff_Mul()
+        below = sp.Mul(*(1 / f for f in sp.Mul.make_args(rest) if _below(f)))
+        above = sp.Mul(*(f for f in sp.Mul.make_args(rest) if not _below(f)))
+        factors = self._factors(above) if above != 1 else []
+        told = [self._atom(f) for f in factors]
+        if number != 1 or not told:
+            told.insert(0, _number(number))
+        line = " ".join(told)
+        if below == 1:
+            return line
+        under = self._factors(below)
+        bottom = " ".join(self._atom(f) for f in under)
+        return f"{line}/{bottom}" if len(under) == 1 else f"{line}/({bottom})"
+
+    def _atom(self, x: sp.Expr) -> str:
+        if x.is_Add:
+            return f"({self.text(x)})"
+        if x.is_Symbol:
+            return written(x.name)
+        if x.is_Number:
+            return _number(x)
+        if x.is_Pow and x.exp == sp.Rational(1, 2):
+            return f"√{self._atom(x.base)}" if x.base.is_Symbol else f"√({self.text(x.base)})"
+        if x.is_Pow and x.exp.is_Rational:
+            high = str(x.exp).translate(_HIGH)
+            if isinstance(x.base, (sp.sin, sp.cos, sp.tan)) and x.exp.is_Integer:
+                told = self._argument(x.base.args[0])
+                return f"{x.base.func.__name__}{high}{'' if told.startswith('(') else ' '}{told}"
+            return f"{self._atom(x.base) if x.base.is_Symbol or x.base.is_Add else f'({self.text(x.base)})'}{high}"
+        if isinstance(x, sp.Abs):
+            return f"|{self.text(x.args[0])}|"
+        if isinstance(x, sp.Function) and len(x.args) == 1:
+            space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
+            told = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
+            return f"{x.func.__name__}{space if not told.startswith('(') else ''}{told}"
+        if x.is_Mul:
+            return self._product(x)
+        return one_line(str(x))
+
+    def _argument(self, x: sp.Expr) -> str:
+        if x.is_Symbol:
+            return self._atom(x)
+        number, rest = x.as_coeff_Mul()
+        if rest.is_Symbol and number.is_Integer and number > 0:
+            return f"{number}{self._atom(rest)}"
+        return f"({self.text(x)})"
+
+    # LaTeX
+
+    def latex(self, x: Any) -> str:
+        """Return an expression in LaTeX."""
+        return self.latex_of([sp.sympify(x)])
+
+    def latex_of(self, parts: Iterable[sp.Expr]) -> str:
+        """Return a sum in LaTeX, each part of which is ordered by itself."""
+        return self._latex(self._terms(parts))
+
+    def _latex(self, terms: list[sp.Expr]) -> str:
+        printer = _Latex({"order": "none", "full_prec": False, "fold_func_brackets": True})
+        out = ""
+        for term in terms:
+            minus, size = _signed(term)
+            told = printer.doprint(self._arranged(size))
+            out += (("- " if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
+        return out or "0"
+
+    def _arranged(self, x: sp.Expr) -> sp.Expr:
+        """Return an expression whose sums and products are in order, for a printer that keeps it."""
+        if x.is_Add:
+            return sp.Add(*(self._arranged(t) for t in self._ordered(x.args)), evaluate=False)
+        if x.is_Mul:
+            return sp.Mul(*(self._arranged(f) for f in self._factors(x)), evaluate=False)
+        if x.is_Pow:
+            return sp.Pow(self._arranged(x.base), x.exp, evaluate=False)
+        return x
+
+
+class _Latex(LatexPrinter):  # type: ignore[misc]
+    """SymPy's, with ½ before what it halves, and with names that are no TeX."""
+
+    def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
+        return latex(expr.name, lambda name: str(super(_Latex, self)._print_Symbol(sp.Symbol(name), style)))
+
+    def _print_Mul(self, expr: sp.Expr) -> str:
+        number = expr.args[0]
+        if number.is_Rational and number.q != 1 and len(expr.args) > 1 and not any(_below(f) for f in expr.args):
+            rest = sp.Mul(*expr.args[1:], evaluate=False) if len(expr.args) > 2 else expr.args[1]
+            told = self._print(rest)
+            told = rf"\left({told}\right)" if rest.is_Add else told
+            return rf"\tfrac{{{number.p}}}{{{number.q}}} {told}"
+        return str(super()._print_Mul(expr))
+
+
+def spread(x: sp.Expr) -> sp.Expr:
+    """Return a sum over angles without what its terms share in front: m g l sin θ + m g l sin φ."""
+    number, rest = x.as_coeff_Mul()
+    sums = [f for f in sp.Mul.make_args(rest) if f.is_Add and f.has(sp.sin, sp.cos)]
+    others = [f for f in sp.Mul.make_args(rest) if f not in sums]
+    if (
+        len(sums) != 1
+        or any(f.has(sp.sin, sp.cos) for f in others)
+        or not all(t.has(sp.sin, sp.cos) for t in sums[0].args)
+    ):
+        return x
+    return sp.Add(*(sp.Mul(number, *others, term) for term in sums[0].args))
+
+
+def written(name: str) -> str:
+    """Return a symbol's name in Unicode: θ̇₁; a letter below the line stays behind its mark: m_p."""
+    name = one_line(name)
+    stem, mark, index = name.partition("_")
+    split = mark and index[:1].isalpha() and stem
+    # One letter with its dot where there is such a letter.
+    told = f"{pretty_symbol(stem)}_{pretty_symbol(index)}" if split else str(pretty_symbol(name))
+    return unicodedata.normalize("NFC", told)
+
+
+def _below(x: sp.Expr) -> bool:
+    return bool(x.is_Pow and x.exp.is_Rational and x.exp.is_negative)
+
+
+def _signed(x: sp.Expr) -> tuple[bool, sp.Expr]:
+    """Return whether a term has a minus in front, and the term without; a sum of negative terms has one."""
+    number, rest = x.as_coeff_Mul()
+    factors = list(sp.Mul.make_args(rest))
+    flipped = bool(number.is_negative)
+    for k, f in enumerate(factors):
+        if f.is_Add and all(t.as_coeff_Mul()[0].is_negative for t in f.args):
+            factors[k], flipped = -f, not flipped
+    return flipped, sp.Mul(abs(number), *factors)
+
+
+def _number(x: sp.Expr) -> str:
+    if x.is_Rational and 1 < x.q <= _READ:
+        return _FRACTIONS.get((int(x.p), int(x.q)), str(x))
+    return str(x) if x.is_Integer or not x.is_Number else f"{float(x):.15g}"
+
+
+# Text within a width: sums on several lines, matrices in brackets.
+
+#: Dots above letters take no column.
+_MARKS: Final = "\u0307\u0308"
+_LOW: Final = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+
+
+def matrix(name: str, A: sp.ImmutableMatrix, text: Callable[[sp.Expr], str], width: int) -> list[str]:
+    """Return a matrix in brackets, or its entries one a line where it is too wide."""
+    cells = [[text(x) for x in A[i, :]] for i in range(A.rows)]
+    widths = [max(_width(row[j]) for row in cells) for j in range(A.cols)]
+    if sum(widths) + 3 * A.cols + 4 <= width:
+        edges = "[]" if A.rows == 1 else ("⎡⎤", *("⎢⎥",) * (A.rows - 2), "⎣⎦")
+        rows = zip(cells, edges if A.rows > 1 else (edges,), strict=True)
+        return [
+            f"  {edge[0]} {'   '.join(c + ' ' * (w - _width(c)) for c, w in zip(row, widths, strict=True))} {edge[1]}"
+            for row, edge in rows
+        ]
+    out = []
+    symmetric = name == "M"
+    for i in range(A.rows):
+        for j in range(i if symmetric else 0, A.cols):
+            if cells[i][j] != "0":
+                place = f"{i + 1}{j + 1}" if A.cols < 10 else f"{i + 1},{j + 1}"
+                if A.cols == 1:
+                    place = str(i + 1) if A.rows > 1 else ""
+                equal = f" = {name}{f'{j + 1}{i + 1}'.translate(_LOW)}" if symmetric and i != j and A.cols < 10 else ""
+                out += folded(f"  {name}{place.translate(_LOW)}{equal} = {cells[i][j]}", width)
+    return out
+
+
+def _width(text: str) -> int:
+    """Return how many columns a text takes: dots above letters take none."""
+    return sum(c not in _MARKS for c in text)
+
+
+def folded(text: str, width: int) -> list[str]:
+    """Return a sum on lines of a width, broken before + and - outside of brackets where there are such."""
+    out: list[str] = []
+    indent = " " * (len(text) - len(text.lstrip()) + 6)
+    while _width(text) > width:
+        places, depth, column = [], 0, 0
+        for k, c in enumerate(text):
+            column += c not in _MARKS
+            if column > width:
+                break
+            depth += (c in "([") - (c in ")]")
+            if k > len(indent) + 2 and text[k : k + 3] in (" + ", " - ", " = "):
+                places.append((depth, -k))
+        if not places:
+            break
+        # The last place on the line that is within the fewest brackets.
+        cut = -min(places)[1]
+        out.append(text[:cut])
+        text = indent + text[cut + 1 :]
+    return [*out, text]
+
+
+# Letters for roots that an equation holds in many places: ρ = √(l² - r² sin² θ).
+
+#: Operations of a root, and how often it stands somewhere, from which a letter is worth it.
+_LONG: Final = 4
+_OFTEN: Final = 3
+
+
+class Abbreviations:
+    """Letters for the long roots among some expressions.
+
+    Parameters
+    ----------
+    expressions : iterable of sympy.Expr
+    taken : iterable of sympy.Symbol
+        Whose names are no letters to take.
+
+    Attributes
+    ----------
+    roots : dict of sympy.Symbol to sympy.Expr
+        ρ -> what it stands for; ρ1, ρ2 where there are several.
+    """
+
+    def __init__(self, expressions: Iterable[sp.Expr], taken: Iterable[sp.Symbol]) -> None:
+        counts: Counter[sp.Expr] = Counter()
+        found: set[sp.Expr] = set()
+        for x in expressions:
+            for part in sp.preorder_traversal(x):
+                if part.is_Pow and part.base.is_Add and part.base.count_ops() >= _LONG:
+                    counts[part.base] += 1
+                    if part.exp.is_Rational and part.exp.q == 2:
+                        found.add(part.base)
+        # In the order in which they were met.
+        bases = [base for base, n in counts.items() if base in found and n >= _OFTEN]
+        names = {s.name for s in taken}
+        letter = next(name for name in ("rho", "varrho", "rho_") if name not in names)
+        letters = [letter] if len(bases) == 1 else [f"{letter}{k + 1}" for k in range(len(bases))]
+        self.roots = {sp.Symbol(name): sp.sqrt(base) for name, base in zip(letters, bases, strict=True)}
+
+    def __call__(self, x: Any) -> Any:
+        """Return an expression or a matrix with the letters."""
+        for letter, root in self.roots.items():
+            base = root.base
+            x = x.replace(lambda e, base=base: e.is_Pow and e.base == base, lambda e, s=letter: s ** (2 * e.exp))
+        return x

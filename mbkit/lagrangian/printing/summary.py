@@ -1,0 +1,230 @@
+"""All that is told of a system on one page: energies, matrices, equations, and what it keeps."""
+
+from __future__ import annotations
+
+import keyword
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any, Final
+
+import sympy as sp
+
+from mbkit._escape import identifier, one_line
+from mbkit._version import __version__
+from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
+from mbkit.lagrangian.printing.equation_text import lines
+from mbkit.lagrangian.printing.printer import Abbreviations, Blackboard, folded, matrix, spread, written
+from mbkit.lagrangian.system import Lagrangian
+
+__all__ = ["Account"]
+
+#: Operations of T above which C and the equations are left out of a page.
+_READABLE: Final = 1500
+#: And above which M is.
+_WRITTEN: Final = 6000
+#: Letters above which a conserved quantity is only named.
+_LONG: Final = 800
+
+
+class Account:
+    """A system's energies, matrices and equations as text, LaTeX or data.
+
+    Parameters
+    ----------
+    system : Lagrangian
+    names : mapping of str to str, optional
+        What each coordinate was called where it came from.
+    progress : callable, optional
+        Gets the fraction done and the part that is next.
+    """
+
+    def __init__(
+        self,
+        system: Lagrangian,
+        names: Mapping[str, str] | None = None,
+        progress: Callable[[float, str], object] = lambda fraction, what: None,  # noqa: ARG005
+    ) -> None:
+        self.system, self._names, self._progress = system, dict(names or {}), progress
+        self._size = int(system.T.count_ops())
+        self.long = self._size > _READABLE
+
+    @cached_property
+    def equations(self) -> EquationsOfMotion:
+        """The equations of motion; where they are too long for a page, without C."""
+        if self.long and type(self.system) is Lagrangian:
+            return equations_of_motion(self.system, coriolis=False)
+        return self.system.equations()
+
+    @cached_property
+    def _board(self) -> Blackboard:
+        e = self.equations
+        return Blackboard(e.coordinates, e.velocities, e.accelerations, e.multipliers, time=self.system.time)
+
+    @cached_property
+    def _short(self) -> Abbreviations:
+        """Letters for the roots that stand on the page; where it is long there are none."""
+        s = self.system
+        shown = [] if self.long else [s.T, s.V, *(x for A, _ in self._matrices.values() for x in A)]
+        symbols = (*s.parameters, *s.coordinates, *s.velocities, *s.inputs.values())
+        return Abbreviations(shown, symbols)
+
+    def _equations(self, *, latex: bool = False) -> list[tuple[str, str]]:
+        return [] if self.long else self._lines(self._short, latex=latex)
+
+    def _lines(self, short: Abbreviations, *, latex: bool) -> list[tuple[str, str]]:
+        # The matrices are there before; they take about a third of the time.
+        return lines(
+            *(self.equations, self._board, short),
+            latex=latex,
+            progress=lambda x, what: self._progress(0.3 + 0.7 * x, what),
+        )
+
+    @cached_property
+    def _matrices(self) -> dict[str, tuple[sp.ImmutableMatrix, str]]:
+        """Name -> matrix and what it is; of those that are not zero."""
+        self._progress(0.0, "mass matrix and Coriolis matrix")
+        e = self.equations
+        out = {"M": (e.mass_matrix, "mass matrix")}
+        if not self.long:
+            out["C"] = (e.coriolis_matrix, "Coriolis matrix, of Christoffel's symbols")
+        out |= {
+            "g": (e.potential_gradient.applyfunc(spread), "∂V/∂q"),
+            "d": (e.drift, "drift: what time and T1, T0 add"),
+        }
+        out["Q"] = (e.forces, "forces")
+        return {n: (A, told) for n, (A, told) in out.items() if n == "M" or any(x != 0 for x in A)}
+
+    @cached_property
+    def _kept(self) -> list[tuple[str, sp.Expr, str]]:
+        return [(c.name, c.expression, c.meaning) for c in self.system.conserved_quantities()]
+
+    # Text
+
+    def text(self, width: int = 100) -> str:
+        """Return the page for a terminal, matrices within a width if they can be."""
+        s, board = self.system, self._board
+        q = ", ".join(self._named(x) for x in s.coordinates)
+        out = [f"{one_line(s.name)}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
+        if s.parameters:
+            given = (written(p.name) + ("" if x is None else f" = {x:g}") for p, x in s.parameters.items())
+            out.append(f"parameters {', '.join(given)}")
+        if s.time:
+            out.append(f"time {written(s.time.name)}")
+        kinetic = [f"T is too long for a page ({self._size} operations): ½ vᵀ M v with"] if self.long else None
+        out += ["", *(kinetic or self._sum("T", s.T, width)), *self._sum("V", s.V, width)]
+        if s.dissipation != 0:
+            out += self._sum("R", s.dissipation, width)
+        for letter, root in self._short.roots.items():
+            out.append(f"with {board.text(letter)} = {board.text(root)}")
+        for name, (A, told) in self._matrices.items():
+            if name == "M" and self._size > _WRITTEN:
+                out += ["", f"M is too long for a page as well; its size is {A.rows} by {A.cols}."]
+                continue
+            out += ["", f"{name}, {told}:", *matrix(name, A.applyfunc(self._short), board.text, width)]
+        out.append("")
+        if self.long:
+            out.append("The equations are too long for a page; --python and --c write them.")
+        else:
+            out.append(f"Equation{'s' * (len(s.coordinates) > 1)} of motion:")
+            for left, right in self._equations():
+                out += ["  " + line for line in folded(f"{left} = {right}", width - 2)]
+        out += ["", *self._conserved(width)]
+        return "\n".join(out)
+
+    def _named(self, coordinate: sp.Symbol) -> str:
+        told, own = written(coordinate.name), self._names.get(coordinate.name, coordinate.name)
+        return f"{told}" if own == coordinate.name else f"{told} ({one_line(own)})"
+
+    def _sum(self, name: str, x: sp.Expr, width: int) -> list[str]:
+        return folded(f"{name} = {self._board.text(self._short(x))}", width)
+
+    def _conserved(self, width: int) -> list[str]:
+        cyclic = [written(q.name) for q in self.system.cyclic_coordinates()]
+        out = [f"Cyclic: {', '.join(cyclic) or 'no coordinate'}"]
+        if not self._kept:
+            return [*out, "Conserved: nothing that is told by the coordinates or the time"]
+        for name, x, meaning in self._kept:
+            # T and V stand above.
+            told = "T + V" if x == self.system.T + self.system.V else self._board.text(self._short(x))
+            note = f" ({meaning})" if name == "h" else ""
+            if len(told) > _LONG:
+                told, note = "∂T/∂v" if name != "h" else "T2 - T0 + V", ", too long for a page"
+            out += folded(f"Conserved: {written(name)} = {told}{note}", width)
+        return out
+
+    # LaTeX
+
+    def latex(self) -> str:
+        """Return display equations that stand in any document with amsmath."""
+        s, board = self.system, self._board
+        rows = [f"{name} &= {board.latex(self._short(x))}" for name, x in (("T", s.T), ("V", s.V))]
+        if s.dissipation != 0:
+            rows.append(f"R &= {board.latex(self._short(s.dissipation))}")
+        rows += [f"{board.latex(letter)} &= {board.latex(root)}" for letter, root in self._short.roots.items()]
+        for name, (given, _) in self._matrices.items():
+            A = given.applyfunc(self._short)
+            entries = r" \\ ".join(" & ".join(board.latex(x) for x in A[i, :]) for i in range(A.rows))
+            rows.append(rf"{name} &= \begin{{bmatrix}} {entries} \end{{bmatrix}}")
+        out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
+        if not self.long:
+            out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(latex=True)]))
+        if self._kept:
+            out.append(_aligned([f"{board.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
+        return "\n".join(out)
+
+    # Data
+
+    def data(self) -> dict[str, Any]:
+        """Return everything as text that `sympy.sympify` reads, with the equations in LaTeX too.
+
+        SymPy evaluates text as Python, so a symbol whose name is no Python name has underscores in it here.
+        """
+        s, e = self.system, self.equations
+        names = self._python_names()
+
+        def name(x: sp.Symbol) -> str:
+            return str(names.get(x, x))
+
+        def text(x: sp.Basic) -> str:
+            return str(x.xreplace(names))
+
+        out: dict[str, Any] = {"name": s.name, "mbkit": __version__, "sympy": sp.__version__}
+        out["coordinates"] = [name(q) for q in s.coordinates]
+        out["velocities"] = [name(v) for v in s.velocities]
+        out["accelerations"] = [name(a) for a in e.accelerations]
+        out["names"] = [self._names.get(q.name, q.name) for q in s.coordinates]
+        out["time"] = name(s.time) if s.time else None
+        out["parameters"] = {name(p): x for p, x in s.parameters.items()}
+        out |= {"T": text(s.T), "V": text(s.V), "dissipation": text(sp.sympify(s.dissipation))}
+        out["mass_matrix"] = [[text(x) for x in e.mass_matrix[i, :]] for i in range(e.mass_matrix.rows)]
+        C = None if self.long else e.coriolis_matrix
+        out["coriolis_matrix"] = None if C is None else [[text(x) for x in C[i, :]] for i in range(C.rows)]
+        out["gravity"] = [text(x) for x in e.potential_gradient]
+        out["drift"] = [text(x) for x in e.drift]
+        out["forces"] = [text(x) for x in e.forces]
+        out["constraints"] = [text(x) for x in s.constraints]
+        # Each by itself: no letter is explained elsewhere.
+        plain = Abbreviations((), ())
+        rows = [] if self.long else self._lines(plain, latex=True)
+        out["equations"] = [] if self.long else [f"{text(x.lhs)} = {text(x.rhs)}" for x in e.equations()]
+        out["latex"] = [f"{left} = {right}" for left, right in rows]
+        out["cyclic"] = [name(q) for q in s.cyclic_coordinates()]
+        out["conserved"] = [{"name": n, "expression": text(x), "meaning": m} for n, x, m in self._kept]
+        return out
+
+    def _python_names(self) -> dict[sp.Symbol, sp.Symbol]:
+        """Return another symbol for each whose name is no Python name."""
+        s, e = self.system, self.equations
+        every = (*s.coordinates, *s.velocities, *e.accelerations, *s.parameters, *s.inputs.values(), *e.multipliers)
+        every = (*every, *([s.time] if s.time else []))
+        taken = {x.name for x in every}
+        out: dict[sp.Symbol, sp.Symbol] = {}
+        for x in every:
+            if not x.name.isidentifier() or keyword.iskeyword(x.name):
+                out[x] = sp.Symbol(identifier(x.name, taken))
+                taken.add(out[x].name)
+        return out
+
+
+def _aligned(rows: list[str]) -> str:
+    return "\\begin{align*}\n" + " \\\\\n".join(rows) + "\n\\end{align*}"

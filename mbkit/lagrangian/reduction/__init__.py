@@ -1,0 +1,1 @@
+"""Conserved quantities, Routh's and Hamilton's equations, quasi-velocities."""

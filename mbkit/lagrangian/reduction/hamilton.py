@@ -1,0 +1,340 @@
+"""Hamilton's function and the canonical equations of a system written as energies.
+
+With p = ∂T/∂v = M v + b the Legendre transform of L = T2 + T1 + T0 - V is ::
+
+    H(q, p, t) = ½ (p - b)ᵀ M⁻¹ (p - b) - T0 + V
+    q̇ = ∂H/∂p        ṗ = -∂H/∂q + Q
+
+(Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 8.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, real, rows
+from mbkit._escape import one_line, terminal
+from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.lagrangian.energies.kinetic_energy import Squares
+from mbkit.lagrangian.energies.symbols import free_name, in_symbols_of, velocity_of
+from mbkit.lagrangian.energies.sympy_to_casadi import Numeric, values_of
+from mbkit.lagrangian.printing.printer import Blackboard
+from mbkit.lagrangian.reduction import conserved
+from mbkit.lagrangian.reduction.conserved import ConservedQuantity
+from mbkit.lagrangian.trig.simplify import slope, tidy
+from mbkit.lagrangian.trig.zero_test import vanishes
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.system import Lagrangian
+
+__all__ = ["CanonicalEquations", "Hamiltonian", "bracket", "hamiltonian", "momentum_symbols", "shorter"]
+
+
+# Canonical momenta as symbols, and Poisson's bracket on coordinates and momenta.
+
+# Operations up to which a bracket is tidied.
+_SHORT: Final = 100
+
+
+def momentum_symbols(system: Lagrangian, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
+    """Return a symbol for each coordinate's momentum: theta -> p_theta, or P_theta where that is taken already."""
+    own = (*system.parameters, *system.coordinates, *system.velocities, *system.inputs.values())
+    taken = {s.name for s in (*own, *([system.time] if system.time is not None else []))}
+    out = []
+    for q in coordinates:
+        out.append(sp.Symbol(free_name(f"p_{q.name}", taken)))
+        taken.add(out[-1].name)
+    return tuple(out)
+
+
+def bracket(f: Any, g: Any, coordinates: Sequence[sp.Symbol], momenta: Sequence[sp.Symbol]) -> sp.Expr:
+    """Return {f, g} = Σ ∂f/∂q ∂g/∂p - ∂f/∂p ∂g/∂q, tidied, so that {q, p} = 1.
+
+    Goldstein, Poole, Safko 2002, Classical Mechanics, eq. (9.67).
+    """
+    terms = (
+        sp.diff(f, q) * sp.diff(g, p) - sp.diff(f, p) * sp.diff(g, q) for q, p in zip(coordinates, momenta, strict=True)
+    )
+    return shorter(sum(terms, sp.Integer(0)))
+
+
+def shorter(x: sp.Expr) -> sp.Expr:
+    """Return a short bracket tidied, and a long one as it is unless it is zero: nested ones grow fast."""
+    if vanishes(x):
+        return sp.Integer(0)
+    return tidy(x) if x.count_ops() <= _SHORT else x
+
+
+@dataclass(frozen=True)
+class CanonicalEquations:
+    """q̇ = ∂H/∂p and ṗ = -∂H/∂q + Q.
+
+    Attributes
+    ----------
+    coordinates, momenta : tuple of sympy.Symbol
+    velocities, momentum_rates : tuple of sympy.Symbol
+        What stands on the left: q̇ and ṗ.
+    qdot : (n, 1) sympy.Matrix
+    pdot : (n, 1) sympy.Matrix
+        With the generalized forces, in coordinates and momenta.
+    """
+
+    coordinates: tuple[sp.Symbol, ...]
+    momenta: tuple[sp.Symbol, ...]
+    velocities: tuple[sp.Symbol, ...]
+    momentum_rates: tuple[sp.Symbol, ...]
+    qdot: sp.ImmutableMatrix
+    pdot: sp.ImmutableMatrix
+
+    def equations(self) -> tuple[sp.Eq, ...]:
+        """Return the 2 n equations, those of the coordinates first."""
+        left = (*self.velocities, *self.momentum_rates)
+        return tuple(sp.Eq(a, b, evaluate=False) for a, b in zip(left, (*self.qdot, *self.pdot), strict=True))
+
+    def latex(self) -> str:
+        """Return the equations as an aligned LaTeX block."""
+        board = Blackboard(self.coordinates, self.momenta)
+        rows = (f"{board.latex(e.lhs)} &= {board.latex(e.rhs)}" for e in self.equations())
+        return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
+
+    def _repr_latex_(self) -> str:
+        return f"${self.latex()}$"
+
+    def __repr__(self) -> str:
+        return f"<CanonicalEquations: {one_line(str(self))}>"
+
+    def __str__(self) -> str:
+        return terminal("\n".join(f"{e.lhs} = {e.rhs}" for e in self.equations()))
+
+
+@dataclass(frozen=True, eq=False)
+class Hamiltonian:
+    """H of a system and what it says; made by `Lagrangian.hamiltonian`.
+
+    Attributes
+    ----------
+    system : Lagrangian
+    H : sympy.Expr
+        Of coordinates, momenta, time and parameters.
+    momenta : tuple of sympy.Symbol
+        p, one for each coordinate: ``p_theta`` for ``theta``.
+    definitions : (n, 1) sympy.Matrix
+        p in velocities: M v + b.
+    velocities : (n, 1) sympy.Matrix
+        v in momenta: M⁻¹ (p - b).
+    """
+
+    system: Lagrangian = field(repr=False)
+    H: sp.Expr
+    momenta: tuple[sp.Symbol, ...]
+    definitions: sp.ImmutableMatrix
+    velocities: sp.ImmutableMatrix
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return hamiltonian, (self.system,)
+
+    @property
+    def coordinates(self) -> tuple[sp.Symbol, ...]:
+        """q."""
+        return self.system.coordinates
+
+    @cached_property
+    def is_energy(self) -> bool:
+        """Whether H is T + V: where T has neither terms linear in the velocities nor terms without them."""
+        return conserved.is_energy(self.system)
+
+    @cached_property
+    def is_conserved(self) -> bool:
+        """Whether dH/dt = ∂H/∂t + Qᵀ q̇ vanishes."""
+        return conserved.keeps_energy(self.system)
+
+    @cached_property
+    def _equations(self) -> CanonicalEquations:
+        s = self.system
+        forces = [self.canonical(x) for x in conserved.acting(s)]
+        return CanonicalEquations(
+            coordinates=s.coordinates,
+            momenta=self.momenta,
+            velocities=s.velocities,
+            momentum_rates=tuple(velocity_of(p) for p in self.momenta),
+            qdot=self.velocities,
+            # The squares of H stay together.
+            pdot=sp.ImmutableMatrix([x - slope(self.H, q) for q, x in zip(s.coordinates, forces, strict=True)]),
+        )
+
+    def equations(self) -> CanonicalEquations:
+        """Return the canonical equations, frozen."""
+        return self._equations
+
+    # Brackets
+
+    def canonical(self, f: Any) -> sp.Expr:
+        """Return an expression with the velocities in it written in momenta.
+
+        Raises
+        ------
+        InputError
+            Symbols that the system does not know.
+        """
+        out = in_symbols_of(self.system, "f", f, self.momenta)
+        return sp.sympify(out.subs(dict(zip(self.system.velocities, self.velocities, strict=True)), simultaneous=True))
+
+    def poisson(self, f: Any, g: Any) -> sp.Expr:
+        """Return Poisson's bracket {f, g} = Σ ∂f/∂q ∂g/∂p - ∂f/∂p ∂g/∂q.
+
+        Velocities in f and g are written in momenta first.
+        """
+        return bracket(self.canonical(f), self.canonical(g), self.coordinates, self.momenta)
+
+    def time_derivative(self, f: Any) -> sp.Expr:
+        """Return df/dt along the motion: {f, H} + ∂f/∂t + Σ ∂f/∂p Q."""
+        f = self.canonical(f)
+        out = bracket(f, self.H, self.coordinates, self.momenta)
+        if self.system.time is not None:
+            out += sp.diff(f, self.system.time)
+        forces = (self.canonical(x) for x in conserved.acting(self.system))
+        pushed = sum((sp.diff(f, p) * x for p, x in zip(self.momenta, forces, strict=True)), sp.Integer(0))
+        return shorter(out + pushed)
+
+    def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
+        """Return the momenta of the cyclic coordinates, and H if it is constant, in coordinates and momenta."""
+        symbols = dict(zip(self.coordinates, self.momenta, strict=True))
+        moving = (self.coordinates, self.momenta)
+        out = [
+            ConservedQuantity(symbols[q].name, symbols[q], f"momentum of {q.name}, which is cyclic", moving)
+            for q in conserved.conserved_momenta(self.system)
+        ]
+        if self.is_conserved:
+            told = "energy T + V" if self.is_energy else "Jacobi's integral T2 - T0 + V, not the energy T + V"
+            out.append(ConservedQuantity("H", self.H, told, moving))
+        return tuple(out)
+
+    # Numbers
+
+    @cached_property
+    def _linear(self) -> Numeric:
+        k, s = self.system.kinetic, self.system
+        time = (s.time,) if s.time is not None else ()
+        return Numeric(sp.Matrix.hstack(k.M, k.b), s.coordinates, (*time, *s.parameters))
+
+    @cached_property
+    def _rates(self) -> Numeric:
+        s, eq = self.system, self.equations()
+        time = (s.time,) if s.time is not None else ()
+        names = (s.coordinates, self.momenta, (*s.inputs.values(), *time, *s.parameters))
+        return Numeric(sp.Matrix.vstack(eq.qdot, eq.pdot), *names)
+
+    def _behind(self, t: float, values: dict[str, float], what: str) -> Array:
+        told = values_of(self.system, values, what)
+        return told if self.system.time is None else np.array([real("t", t), *told])
+
+    def _mass(self, q: ArrayLike, other: ArrayLike, name: str, t: float, values: dict[str, float]) -> Any:
+        n = len(self.coordinates)
+        q, other = rows("q", q, n, self.system.name, "nq"), rows(name, other, n, self.system.name, "nv")
+        both = self._linear(q, self._behind(t, values, name))
+        return both[..., :n], both[..., n], other
+
+    def to_momentum(self, q: ArrayLike, v: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
+        """Return p = M v + b in numbers.
+
+        Parameters
+        ----------
+        q, v : (n,) or (N, n) array_like
+        t : float
+            s; where time enters.
+        **values
+            Of parameters, by name; the others keep theirs.
+        """
+        M, b, velocity = self._mass(q, v, "v", t, values)
+        return np.asarray((M @ velocity[..., None])[..., 0] + b)
+
+    def to_velocity(self, q: ArrayLike, p: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
+        """Return v = M⁻¹ (p - b) in numbers, with the arguments of `to_momentum`.
+
+        Raises
+        ------
+        NumericalError
+            The mass matrix is singular at one of the configurations.
+        """
+        M, b, momentum = self._mass(q, p, "p", t, values)
+        try:
+            out = np.linalg.solve(M, (momentum - b)[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            out = np.full(1, np.nan)
+        if not np.isfinite(out).all():
+            raise NumericalError(f"{self.system.name}: the mass matrix is singular at q = {np.asarray(q).tolist()}")
+        return np.asarray(out)
+
+    def field(self, tau: ArrayLike | None = None, **values: float) -> Callable[[float, ArrayLike], Array]:
+        """Return f(t, y) = (q̇, ṗ) with y = (q, p), as SciPy's integrators take it.
+
+        Where the mass matrix is singular the answer is not finite, at which an integrator takes a shorter step.
+
+        Parameters
+        ----------
+        tau : (n,) array_like, optional
+            What the inputs are, one entry a coordinate; zero when not given.
+        **values
+            Of parameters, by name; the others keep theirs.
+        """
+        s, n = self.system, len(self.coordinates)
+        force = np.zeros(n) if tau is None else rows("tau", tau, n, s.name, "nv")
+        acting = force[[s.coordinates.index(q) for q in s.inputs]] if s.inputs else np.empty(0)
+        idle = [q.name for q, x in zip(s.coordinates, force, strict=True) if q not in s.inputs and x]
+        if idle:
+            raise InputError(f"tau: {s.name} has no input along {', '.join(idle)}; add forces={{{idle[0]}: tau}} to it")
+        told, timed = values_of(s, values, "field"), s.time is not None
+
+        def f(t: float, y: ArrayLike) -> Array:
+            y = rows("y", y, 2 * n, s.name, "nq + nv")
+            behind = np.concatenate([acting, [real("t", t)] if timed else [], told])
+            return self._rates(y[..., :n], y[..., n:], behind)[..., 0]
+
+        return f
+
+    # Reading
+
+    def latex(self) -> str:
+        """Return H = ... ."""
+        return f"H = {Blackboard(self.coordinates, self.momenta, time=self.system.time).latex(self.H)}"
+
+    def _repr_latex_(self) -> str:
+        return f"${self.latex()}$"
+
+    def __repr__(self) -> str:
+        return f"<Hamiltonian: {one_line(str(self))}>"
+
+    def __str__(self) -> str:
+        return terminal(f"H = {self.H}")
+
+
+def hamiltonian(system: Lagrangian) -> Hamiltonian:
+    """Return H of a system.
+
+    Raises
+    ------
+    UnsupportedError
+        Constraints act, whose forces no H holds.
+    """
+    if system.constraints:
+        raise UnsupportedError(
+            f"hamiltonian: {system.name} has constraints, whose forces no H holds; embed them first, or leave them out"
+        )
+    k = system.kinetic
+    momenta = momentum_symbols(system, system.coordinates)
+    p = [symbol - x for symbol, x in zip(momenta, k.b, strict=True)]
+    squares = Squares(k.M, "T: its mass matrix")
+    return Hamiltonian(
+        system=system,
+        H=squares.form(p, p) / 2 - k.T0 + system.V,
+        momenta=momenta,
+        definitions=system.momenta,
+        velocities=sp.ImmutableMatrix(squares.solve(p)),
+    )

@@ -1,0 +1,1 @@
+"""Equilibria, force balance, small motions and virtual work."""

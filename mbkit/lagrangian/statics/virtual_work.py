@@ -1,0 +1,229 @@
+"""Generalized forces by virtual work: what given forces do along each coordinate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import sympy as sp
+
+from mbkit.errors import InputError
+from mbkit.lagrangian.energies.symbols import Plain, expression, listed, plain
+from mbkit.lagrangian.system import Lagrangian
+from mbkit.lagrangian.trig.simplify import tidy
+
+__all__ = ["check_places", "from_particles", "generalized_force", "vectors"]
+
+
+def generalized_force(
+    forces: Any,
+    points: Any,
+    coordinates: Sequence[Any],
+    *,
+    torques: Any = (),
+    angular_velocities: Any = (),
+    velocities: Sequence[Any] | None = None,
+    time: sp.Symbol | None = None,
+) -> dict[Any, sp.Expr]:
+    """Return Q_j = Σ f_i · ∂R_i/∂q_j + Σ n_k · ∂ω_k/∂v_j of each coordinate.
+
+    Parameters
+    ----------
+    forces : sequence of vectors
+        f_i: of 1, 2 or 3 components along fixed axes, N; a single vector where there is
+        one point.
+    points : sequence of vectors
+        R_i(q, t), where the forces act, along the same axes, m.
+    coordinates : sequence of sympy symbols
+        Plain symbols or dynamicsymbols.
+    torques : sequence of vectors, optional
+        n_k on bodies, N m.
+    angular_velocities : sequence of vectors, optional
+        ω_k(q, v, t) of those bodies, along the torques' axes; in a plane of one component.
+    velocities : sequence of sympy symbols, optional
+        As of `Lagrangian`, for forces and angular velocities that contain them.
+    time : sympy.Symbol, optional
+
+    Returns
+    -------
+    dict
+        Coordinate as it was given -> Q_j, fit to be the `forces` of a `Lagrangian`. At
+        the given time: what the time moves does no virtual work.
+
+    Raises
+    ------
+    InputError
+        Other numbers of forces than of points, vectors of other lengths, points that depend on a
+        velocity, or an angular velocity that depends on none.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> import mbkit as mb
+    >>> th, l, m, g = sp.symbols("theta l m g")
+    >>> tip = [l * sp.sin(th), -l * sp.cos(th)]
+    >>> mb.lagrangian.generalized_force([[0, -m * g]], [tip], [th])
+    {theta: -g*l*m*sin(theta)}
+    """
+    into = Plain(coordinates, velocities, time)
+    f, R = vectors("forces", forces, into), vectors("points", points, into)
+    n, w = vectors("torques", torques, into), vectors("angular_velocities", angular_velocities, into)
+    _pairs("forces", f, "points", R)
+    _pairs("torques", n, "angular_velocities", w)
+    check_places("points", R, into)
+    for k, turn in enumerate(w):
+        if any(turn) and not any(x.free_symbols & set(into.velocities) for x in turn):
+            raise InputError(
+                f"angular_velocities[{k}]: {list(turn)} holds none of the velocities {plain(into.velocities)}; "
+                "velocities=... gives them other names"
+            )
+    out = {}
+    for key, q, v in zip(listed("coordinates", coordinates), into.coordinates, into.velocities, strict=True):
+        work = [a * sp.diff(b, q) for fi, Ri in zip(f, R, strict=True) for a, b in zip(fi, Ri, strict=True)]
+        work += [a * sp.diff(b, v) for nk, wk in zip(n, w, strict=True) for a, b in zip(nk, wk, strict=True)]
+        out[key] = tidy(sp.Add(*work))
+    return out
+
+
+def check_places(what: str, places: list[tuple[sp.Expr, ...]], into: Plain) -> None:
+    """Refuse places that depend on a velocity, where nothing can be."""
+    for k, place in enumerate(places):
+        moving = {s for x in place for s in x.free_symbols} & set(into.velocities)
+        if moving:
+            raise InputError(f"{what}[{k}]: expected coordinates and time only, got the velocity {plain(moving)}")
+
+
+def vectors(what: str, given: Any, into: Plain) -> list[tuple[sp.Expr, ...]]:
+    """Return vectors of expressions in plain symbols; a single vector is a list of one."""
+    try:
+        rows = [list(x) if _several(x) else x for x in given]
+    except TypeError:
+        raise InputError(f"{what}: expected a list of vectors, got {given!r}") from None
+    if rows and not any(isinstance(x, list) for x in rows):
+        rows = [rows]
+    out = []
+    for k, row in enumerate(rows):
+        name = f"{what}[{k}]"
+        if not isinstance(row, list) or not 1 <= len(row) <= 3:
+            raise InputError(f"{name}: expected a vector of 1, 2 or 3 components, got {row!r}")
+        out.append(tuple(into(name, expression(name, x)) for x in row))
+    return out
+
+
+def _several(x: Any) -> bool:
+    return isinstance(x, (list, tuple, sp.Tuple, sp.MatrixBase)) or (hasattr(x, "__len__") and not isinstance(x, str))
+
+
+def _pairs(first: str, a: list[tuple[sp.Expr, ...]], second: str, b: list[tuple[sp.Expr, ...]]) -> None:
+    if len(a) != len(b):
+        raise InputError(f"{first}: {len(a)} of them for {len(b)} {second}; give one for each")
+    for k, (x, y) in enumerate(zip(a, b, strict=True)):
+        if len(x) != len(y):
+            raise InputError(f"{first}[{k}]: {len(x)} components, but {second}[{k}] has {len(y)}")
+
+
+# d'Alembert: particles whose places are functions of coordinates, as a `Lagrangian`.
+
+
+def from_particles(
+    masses: Sequence[Any],
+    positions: Sequence[Any],
+    coordinates: Sequence[Any],
+    velocities: Sequence[Any] | None = None,
+    *,
+    gravity: Sequence[Any] | None = None,
+    potential: Any = 0,
+    forces: Sequence[Any] | None = None,
+    generalized: Mapping[Any, Any] | None = None,
+    dissipation: Any = 0,
+    time: sp.Symbol | None = None,
+    parameters: Mapping[sp.Symbol, float | None] | Iterable[sp.Symbol] | None = None,
+    constraints: Sequence[Any] = (),
+    name: str = "particles",
+) -> Lagrangian:
+    """Return the system of particles at R_i(q, t): Σ (m_i R̈_i - f_i) · δR_i = 0.
+
+    Parameters
+    ----------
+    masses : sequence of sympy.Expr
+        m_i, kg.
+    positions : sequence of vectors
+        R_i(q, t): 1, 2 or 3 components along fixed axes, m.
+    coordinates, velocities
+        As of `Lagrangian`.
+    gravity : vector, optional
+        Its acceleration along the same axes, m/s²: V = -Σ m_i gravity · R_i.
+    potential : sympy.Expr, optional
+        Other potential energy, such as of springs, J.
+    forces : sequence of vectors, optional
+        f_i on each particle beside gravity, N, of coordinates, velocities, time and
+        parameters; None for a particle that has none.
+    generalized : mapping of coordinate to sympy.Expr, optional
+        Generalized forces besides.
+    dissipation, time, parameters, constraints, name
+        As of `Lagrangian`.
+
+    Raises
+    ------
+    InputError
+        Other numbers of masses, positions and forces, or what `Lagrangian` refuses.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> import mbkit as mb
+    >>> th, m, l, g = sp.symbols("theta m l g")
+    >>> R = [l * sp.sin(th), -l * sp.cos(th)]
+    >>> lag = mb.lagrangian.from_particles([m], [R], [th], gravity=[0, -g], parameters=[m, l, g])
+    >>> print(lag.equations())
+    l**2*m*thetaddot + g*l*m*sin(theta) = 0
+    """
+    into = Plain(coordinates, velocities, time)
+    R = vectors("positions", positions, into)
+    check_places("positions", R, into)
+    # A single vector stands for one particle, of which the mass may stand alone.
+    m = [into("masses", x) for x in ([masses] if isinstance(masses, (sp.Basic, int, float)) else masses)]
+    if len(m) != len(R):
+        raise InputError(f"masses: {len(m)} of them for {len(R)} positions; give one for each")
+    T, V = [], [into("potential", potential)]
+    for mass, place in zip(m, R, strict=True):
+        T.append(mass * sp.Add(*(_rate(x, into) ** 2 for x in place)) / 2)
+    if gravity is not None:
+        ((*down,),) = vectors("gravity", [gravity], into)
+        for k, (mass, place) in enumerate(zip(m, R, strict=True)):
+            if len(down) != len(place):
+                raise InputError(f"gravity: {len(down)} components, but positions[{k}] has {len(place)}")
+            V.append(-mass * sp.Add(*(a * x for a, x in zip(down, place, strict=True))))
+    Q = {into("generalized", key): into(f"generalized[{key}]", x) for key, x in (generalized or {}).items()}
+    for q, work in _work(forces or [], R, into).items():
+        # What is zero must not hide an input that stands alone.
+        if work != 0:
+            Q[q] = Q.get(q, 0) + work
+    return Lagrangian(
+        tidy(sp.Add(*T)),
+        tidy(sp.Add(*V)),
+        into.coordinates,
+        into.velocities,
+        time=into.time,
+        forces=Q,
+        dissipation=into("dissipation", dissipation),
+        parameters=parameters,
+        constraints=[into(f"constraints[{k}]", c) for k, c in enumerate(constraints)],
+        name=name,
+    )
+
+
+def _rate(x: sp.Expr, into: Plain) -> sp.Expr:
+    """Return Ṙ's component: along the coordinates' velocities and with the time."""
+    along = [sp.diff(x, q) * v for q, v in zip(into.coordinates, into.velocities, strict=True)]
+    return sp.Add(*along, sp.diff(x, into.time) if into.time is not None else 0)
+
+
+def _work(forces: Sequence[Any], R: list[tuple[sp.Expr, ...]], into: Plain) -> dict[Any, sp.Expr]:
+    if not len(forces):
+        return {}
+    if len(forces) != len(R):
+        raise InputError(f"forces: {len(forces)} of them for {len(R)} positions; give one for each, or None")
+    given = [[0] * len(x) if f is None else f for f, x in zip(forces, R, strict=True)]
+    plain = [[into(f"forces[{k}]", x) for x in f] for k, f in enumerate(given)]
+    return generalized_force(plain, R, into.coordinates, velocities=into.velocities, time=into.time)

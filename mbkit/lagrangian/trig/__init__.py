@@ -1,0 +1,1 @@
+"""Exact normal form of trigonometric expressions."""

@@ -1,0 +1,202 @@
+"""MJCF's settings: compiler, default classes, and the many ways to write a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.load.xml_reader import Element, Reader
+
+__all__ = ["HERE", "ORIENTATIONS", "Compiler", "Defaults", "Pose", "about", "has_length", "pose", "z_to"]
+
+ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
+
+
+@dataclass(frozen=True)
+class Pose:
+    """R and p of a frame in another."""
+
+    R: Array
+    p: Array
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.R @ other.R, self.p + self.R @ other.p)
+
+
+HERE: Final = Pose(np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """The settings of <compiler> that change a model's numbers.
+
+    Attributes
+    ----------
+    angle : float
+        Radians per unit of angle in the file.
+    eulerseq : str
+        Three of xyzXYZ; small letters turn with the body, capitals stay.
+    autolimits : bool
+    inertiafromgeom : bool or None
+        None: only where there is no <inertial>.
+    groups : (float, float)
+        First and last geom group that has mass.
+    balanceinertia : bool
+    boundmass, boundinertia, settotalmass : float
+    """
+
+    angle: float = np.pi / 180
+    eulerseq: str = "xyz"
+    autolimits: bool = True
+    inertiafromgeom: bool | None = None
+    groups: tuple[float, float] = (0.0, 5.0)
+    balanceinertia: bool = False
+    boundmass: float = 0.0
+    boundinertia: float = 0.0
+    settotalmass: float = -1.0
+
+    @classmethod
+    def of(cls, mujoco: Element, read: Reader) -> Compiler:
+        """Read every <compiler> of the file; later ones win."""
+        merged = Element("compiler", {}, mujoco.line)
+        for element in mujoco.all("compiler"):
+            merged.attributes.update(element.attributes)
+            merged.line, merged.file = element.line, element.file
+        given = merged.attributes
+        who = "the file"
+        if given.get("coordinate", "local") != "local":
+            read.fault("compiler coordinate: only 'local' is read; convert the file with MuJoCo 2.3.3", merged)
+        if given.get("alignfree", "false") != "false":
+            read.fault("compiler alignfree moves the frames of free bodies; set it to false", merged)
+        seq = given.get("eulerseq", "xyz")
+        if len(seq) != 3 or set(seq.lower()) - set("xyz"):
+            read.fault(f"compiler eulerseq: expected three of xyzXYZ, got {seq[:20]!r}", merged)
+            seq = "xyz"
+        low, high = read.numbers(merged, "inertiagrouprange", who, count=2, default=(0.0, 5.0))
+        return cls(
+            angle={"degree": np.pi / 180, "radian": 1.0}[read.choice(merged, "angle", ("degree", "radian"))],
+            eulerseq=seq,
+            autolimits=read.choice(merged, "autolimits", ("true", "false")) == "true",
+            inertiafromgeom={"auto": None, "true": True, "false": False}[
+                read.choice(merged, "inertiafromgeom", ("auto", "true", "false"))
+            ],
+            groups=(low, high),
+            balanceinertia=read.choice(merged, "balanceinertia", ("false", "true")) == "true",
+            boundmass=read.number(merged, "boundmass", who, 0.0),
+            boundinertia=read.number(merged, "boundinertia", who, 0.0),
+            settotalmass=read.number(merged, "settotalmass", who, -1.0),
+        )
+
+
+class Defaults:
+    """The default classes: what an element has without saying so."""
+
+    def __init__(self, mujoco: Element, read: Reader) -> None:
+        self.read = read
+        self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+        for element in mujoco.all("default"):
+            if element.attributes.get("class", "main") != "main":
+                read.fault("the outermost <default> has another class than 'main'; put a <default> around it", element)
+            self._collect(element, self.classes["main"], "main")
+
+    def _collect(self, element: Element, values: dict[str, dict[str, str]], name: str) -> None:
+        for child in element.children:
+            if child.tag != "default":
+                values[child.tag] = _over(values.get(child.tag, {}), child.attributes)
+        for child in element.all("default"):
+            inner = self.read.name(child, "class", f"the class inside {name!r}")
+            if inner in self.classes:
+                self.read.fault(f"default class {inner!r}: declared twice; names must differ", child)
+            self.classes[inner] = {tag: dict(v) for tag, v in values.items()}
+            self._collect(child, self.classes[inner], inner)
+
+    def known(self, name: str | None, element: Element) -> str | None:
+        """Return the class name, or None after a fault."""
+        if name is None or name in self.classes:
+            return name
+        told = ", ".join(sorted(self.classes)[:20])
+        self.read.fault(f"<{element.tag}>: unknown default class {name!r}; there are: {told}", element)
+        return None
+
+    def filled(self, element: Element, childclass: str | None) -> Element:
+        """Return the element with its defaults: its own class, else the enclosing childclass."""
+        name = self.known(element.attributes.get("class"), element) or childclass or "main"
+        values = self.classes[name].get(element.tag, {})
+        return replace(element, attributes=_over(values, element.attributes))
+
+
+def _over(values: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+    """Return `values` overridden by `own`; any orientation of its own replaces every other."""
+    kept = {k: v for k, v in values.items() if k not in ORIENTATIONS or not ORIENTATIONS.keys() & own.keys()}
+    return {**kept, **own}
+
+
+def pose(element: Element, compiler: Compiler, read: Reader, who: str) -> Pose:
+    """Return the pose that an element's pos and orientation give."""
+    p = np.array(read.numbers(element, "pos", who, count=3, default=(0, 0, 0)))
+    given = [name for name in ORIENTATIONS if name in element.attributes]
+    if not given:
+        return Pose(np.eye(3), p)
+    if len(given) > 1:
+        read.fault(f"{who}: {element.tag} has {' and '.join(given)}; keep one orientation", element)
+    before = len(read.faults)
+    values = np.array(read.numbers(element, given[0], who, count=ORIENTATIONS[given[0]]))
+    if len(read.faults) > before:
+        return Pose(np.eye(3), p)
+    R = _rotation(given[0], values, compiler)
+    if R is None:
+        read.fault(f"{who}: {element.tag} {given[0]}: expected directions of some length, got zeros", element)
+        R = np.eye(3)
+    return Pose(R, p)
+
+
+def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
+    """Return the matrix of one of MuJoCo's orientations, or None for a zero vector."""
+    if name == "quat":
+        return spatial.matrix_from_quaternion(spatial.normalized(x[[1, 2, 3, 0]])) if has_length(x) else None
+    if name == "axisangle":
+        return about(x[:3], compiler.angle * x[3]) if has_length(x[:3]) else None
+    if name == "euler":
+        R = np.eye(3)
+        for letter, angle in zip(compiler.eulerseq, compiler.angle * x, strict=True):
+            turn = about(np.eye(3)["xyz".index(letter.lower())], float(angle))
+            R = R @ turn if letter.islower() else turn @ R
+        return R
+    if name == "zaxis":
+        return z_to(x) if has_length(x) else None
+    first, second = x[:3], x[3:]
+    if not has_length(first):
+        return None
+    first = spatial.normalized(first)
+    second = second - first * (first @ second)
+    if not np.linalg.norm(second) > 1e-10:
+        return None
+    second = spatial.normalized(second)
+    return np.column_stack([first, second, np.cross(first, second)])
+
+
+def has_length(x: Array) -> bool:
+    """Return whether a direction can be normalized; the squares of numbers below 1e-162 vanish."""
+    return bool(np.linalg.norm(x) > 0)
+
+
+def about(axis: Array, angle: float) -> Array:
+    """Return the rotation about an axis of any length."""
+    half = angle / 2
+    quaternion = np.array([*(np.sin(half) * spatial.normalized(axis)), np.cos(half)])
+    return spatial.matrix_from_quaternion(quaternion)
+
+
+def z_to(direction: Array) -> Array:
+    """Return the shortest rotation that takes z to a direction."""
+    z = spatial.normalized(direction)
+    axis = np.array([-z[1], z[0], 0.0])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-10:
+        axis = np.array([1.0, 0.0, 0.0])
+    return about(axis, float(np.arctan2(sine, z[2])))

@@ -1,0 +1,207 @@
+"""The tree of an MJCF: bodies, joints and sites, with defaults and frames resolved."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.load.mjcf_attributes import HERE, Compiler, Defaults, Pose, has_length, pose
+from mbkit.load.mjcf_mass import body_lump, counts
+from mbkit.load.shapes import NOTHING, Lump
+from mbkit.load.xml_reader import Element, Reader
+
+__all__ = ["KINDS", "MjcfBody", "MjcfJoint", "Scene", "unfolded", "walk"]
+
+KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
+_NAMED: Final = {"body": "body", "joint": "joint", "freejoint": "joint", "site": "site"}
+
+
+@dataclass
+class MjcfJoint:
+    """A joint as the file has it.
+
+    Attributes
+    ----------
+    element : Element
+        With the defaults of its class filled in.
+    kind : str
+        hinge, slide, ball or free.
+    anchor, axis : (3,) arrays
+        In the body's axes.
+    ref : float
+        Where it stands in the pose that is drawn, rad or m.
+    """
+
+    name: str
+    element: Element
+    kind: str
+    anchor: Array
+    axis: Array
+    ref: float
+
+
+@dataclass
+class MjcfBody:
+    """A body as the file has it.
+
+    Attributes
+    ----------
+    pose : Pose
+        In the parent's axes, with the <frame> elements around it.
+    lump : Lump
+        In its own axes; nothing while ``Scene.inferred`` has the body.
+    sites : list of (str, Pose)
+    """
+
+    name: str
+    parent: str
+    pose: Pose
+    joints: list[MjcfJoint]
+    lump: Lump
+    sites: list[tuple[str, Pose]]
+
+    @property
+    def anchor(self) -> Array:
+        """Where the frame of the `Model`'s body stands in the file's body."""
+        return self.joints[-1].anchor if self.joints else np.zeros(3)
+
+
+@dataclass
+class Scene:
+    """What is known while the tree is walked.
+
+    Attributes
+    ----------
+    called : dict
+        The names of bodies and joints, given or made up, by the id of the element.
+    inferred : dict
+        Bodies whose inertia MuJoCo's compiler infers, and the geoms with their meshes that count for it.
+    bounded : dict
+        The compiler's settings that changed a body's mass or inertia, and the bodies.
+    left_out : collections.Counter
+        What the file says about the motion and a `Model` does not hold.
+    """
+
+    compiler: Compiler
+    defaults: Defaults
+    read: Reader
+    bodies: list[MjcfBody] = field(default_factory=list)
+    names: dict[str, set[str]] = field(default_factory=lambda: {"body": {"world"}, "joint": set(), "site": set()})
+    called: dict[int, str] = field(default_factory=dict)
+    unnamed: Counter[str] = field(default_factory=Counter)
+    inferred: dict[str, list[tuple[Element, str]]] = field(default_factory=dict)
+    bounded: dict[str, list[str]] = field(default_factory=dict)
+    left_out: Counter[str] = field(default_factory=Counter)
+
+    def collect_names(self, world: Element) -> None:
+        """Take note of all names that are given, so that made-up ones keep clear of them."""
+        for element in world.walk():
+            kind, name = _NAMED.get(element.tag), element.attributes.get("name", "")
+            if kind and name in self.names[kind]:
+                why = "that name is the ground's" if name == "world" else "declared more than once"
+                self.read.fault(f"{kind} {name!r}: {why}; names must differ", element)
+            if kind and name:
+                self.names[kind].add(name)
+
+    def name(self, element: Element, kind: str, fallback: str) -> str:
+        """Return the element's name, or one made up."""
+        name = element.attributes.get("name", "")
+        if not name:
+            self.unnamed[kind] += 1
+            name = self.unused(kind, fallback)
+        self.called[id(element)] = name
+        return name
+
+    def unused(self, kind: str, name: str) -> str:
+        """Return this name, or a longer one that is free, and take it."""
+        while name in self.names[kind]:
+            name += "_"
+        self.names[kind].add(name)
+        return name
+
+
+def unfolded(
+    owner: Element, X: Pose, childclass: str | None, scene: Scene, who: str
+) -> Iterator[tuple[Element, Pose, str | None]]:
+    """Yield the children of a body, with those of its <frame> elements, their pose and their class."""
+    for child in owner.children:
+        if child.tag != "frame":
+            yield child, X, childclass
+            continue
+        # MuJoCo takes a frame's class for its childclass.
+        own = child.attributes.get("childclass", child.attributes.get("class"))
+        inner = scene.defaults.known(own, child) or childclass
+        yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, who), inner, scene, who)
+
+
+def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: Scene) -> None:
+    """Read a body and everything below it into the scene."""
+    name = scene.name(element, "body", f"body{len(scene.bodies) + 1}")
+    who = f"body {name!r}"
+    read, compiler = scene.read, scene.compiler
+    childclass = scene.defaults.known(element.attributes.get("childclass"), element) or childclass
+    own = pose(element, compiler, read, who)
+    if read.number(element, "gravcomp", who, 0.0):
+        scene.left_out["gravity compensation"] += 1
+    if element.attributes.get("mocap") == "true":
+        scene.left_out["motion capture"] += 1
+    parts = list(unfolded(element, HERE, childclass, scene, who))
+    joints = [_joint(e, name, Y, c, scene) for e, Y, c in parts if e.tag in ("joint", "freejoint")]
+    _check_joints(joints, parent, who, read)
+    inertials = [(e, Y) for e, Y, _ in parts if e.tag == "inertial"]
+    geoms = [(e, scene.defaults.filled(e, c), Y) for e, Y, c in parts if e.tag == "geom"]
+    geoms = [(e, full, Y) for e, full, Y in geoms if counts(full, compiler, read, who)]
+    lump, changed = body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, who)
+    if lump is None:
+        scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
+    for setting in changed:
+        scene.bounded.setdefault(setting, []).append(name)
+    body = MjcfBody(name, parent, X @ own, joints, lump or NOTHING, [])
+    scene.bodies.append(body)
+    for e, Y, c in parts:
+        if e.tag == "site":
+            site = scene.defaults.filled(e, c)
+            if e.attributes.get("name") and "fromto" not in site.attributes:
+                body.sites.append((e.attributes["name"], Y @ pose(site, compiler, read, f"site in {who}")))
+        elif e.tag == "body":
+            walk(e, name, Y, c, scene)
+        elif e.tag == "plugin":
+            scene.left_out["plugin"] += 1
+
+
+def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: Scene) -> MjcfJoint:
+    read = scene.read
+    free = element.tag == "freejoint"
+    full = element if free else scene.defaults.filled(element, childclass)
+    name = scene.name(element, "joint", f"{body}_joint")
+    who = f"joint {name!r}"
+    type_ = "free" if free else full.attributes.get("type", "hinge")
+    if type_ not in KINDS:
+        read.fault(f"{who}: type {type_[:40]!r}; expected one of {', '.join(KINDS)}", element)
+        type_ = "hinge"
+    if free and element.attributes.get("align") == "true":
+        read.fault(f"{who}: align moves the body's frame; set it to false", element)
+    anchor, axis, ref = np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0
+    if type_ != "free":
+        anchor = X.p + X.R @ np.array(read.numbers(full, "pos", who, count=3, default=(0, 0, 0)))
+    if type_ in ("hinge", "slide"):
+        axis = np.array(read.numbers(full, "axis", who, count=3, default=(0, 0, 1)))
+        if not has_length(axis):
+            read.fault(f"{who}: axis is zero; expected a direction, such as 0 0 1", element)
+            axis = np.array([0.0, 0.0, 1.0])
+        axis = X.R @ axis
+        ref = read.number(full, "ref", who, 0.0) * (scene.compiler.angle if type_ == "hinge" else 1.0)
+    return MjcfJoint(name, full, type_, anchor, axis, ref)
+
+
+def _check_joints(joints: list[MjcfJoint], parent: str, who: str, read: Reader) -> None:
+    kinds = [j.kind for j in joints]
+    if "free" in kinds and len(kinds) > 1:
+        read.fault(f"{who}: a free joint and others; a free body has no other joint")
+    if "free" in kinds and parent != "world":
+        read.fault(f"{who}: a free joint below {parent!r}; only bodies of the world may be free")

@@ -1,0 +1,1 @@
+"""Methods of integration as data: names, Butcher tableaus, step control."""

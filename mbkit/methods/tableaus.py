@@ -1,0 +1,528 @@
+"""Butcher tableaus that check themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations_with_replacement
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array
+from mbkit.errors import InputError
+
+__all__ = [
+    "RK4",
+    "EmbeddedTableau",
+    "ImplicitTableau",
+    "RosenbrockTableau",
+    "Tableau",
+    "Tree",
+    "density",
+    "dormand_prince_853",
+    "rodas5p",
+    "rooted_trees",
+]
+
+
+Tree = tuple[Any, ...]  # a tree is the tuple of its branches, each a tree
+
+
+@cache
+def rooted_trees(order: int) -> tuple[Tree, ...]:
+    """Return the rooted trees of `order` nodes: 1, 1, 2, 4, 9, 20, ... of them."""
+    return tuple(tuple(branches) for branches in _forests(order - 1, order - 1))
+
+
+def _forests(nodes: int, largest: int) -> list[list[Tree]]:
+    # Sets of trees with `nodes` nodes together, none above `largest`.
+    if nodes == 0:
+        return [[]]
+    out = []
+    for size in range(min(nodes, largest), 0, -1):
+        for count in range(1, nodes // size + 1):
+            for same in combinations_with_replacement(rooted_trees(size), count):
+                out += [[*same, *rest] for rest in _forests(nodes - count * size, size - 1)]
+    return out
+
+
+def _nodes(tree: Tree) -> int:
+    return 1 + sum(_nodes(branch) for branch in tree)
+
+
+def density(tree: Tree) -> int:
+    """Return γ(tree): its nodes, times the densities of its branches."""
+    out = _nodes(tree)
+    for branch in tree:
+        out *= density(branch)
+    return out
+
+
+def _stage_weights(A: Array, tree: Tree) -> Array:
+    out = np.ones(len(A))
+    for branch in tree:
+        out = out * (A @ _stage_weights(A, branch))
+    return out
+
+
+def _require_order(name: str, matrix: Array, weights: Array, order: int) -> None:
+    slack = 16 * len(weights) * np.finfo(float).eps
+    for p in range(1, order + 1):
+        for tree in rooted_trees(p):
+            stages = _stage_weights(matrix, tree)
+            got, wanted = float(weights @ stages), 1 / density(tree)
+            if abs(got - wanted) > slack * float(np.abs(weights) @ np.abs(stages)):
+                raise InputError(
+                    f"tableau {name!r}: order {p} condition of tree {tree}: got {got:.17g}, "
+                    f"expected 1/{density(tree)}; the method has not order {order}"
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Tableau:
+    """An explicit Runge-Kutta method.
+
+    The constructor checks the shape, the row sums c = A 1, and every order
+    condition Σ b Φ(tree) = 1 / γ(tree) up to `order`
+    (Hairer, Nørsett, Wanner 1993, theorem II.2.13).
+
+    Parameters
+    ----------
+    name : str
+    A : (s, s) array_like
+        Strictly lower triangular.
+    b : (s,) array_like
+    order : int
+        The order that the method must have.
+
+    Attributes
+    ----------
+    c : (s,) array
+        Stage times as fractions of the step.
+
+    Raises
+    ------
+    InputError
+        With the condition that fails.
+    """
+
+    name: str
+    A: Array
+    b: Array
+    order: int
+    explicit: ClassVar[bool] = True
+
+    def __init__(self, name: str, A: ArrayLike, b: ArrayLike, order: int) -> None:
+        matrix, weights = np.array(A, dtype=np.float64), np.array(b, dtype=np.float64)
+        s = len(weights) if weights.ndim == 1 else 0
+        if not s or matrix.shape != (s, s):
+            raise InputError(f"tableau {name!r}: expected A (s, s) and b (s,), got {matrix.shape} and {weights.shape}")
+        if not np.isfinite(matrix).all() or not np.isfinite(weights).all():
+            raise InputError(f"tableau {name!r}: expected finite numbers")
+        if self.explicit and np.any(np.triu(matrix)):
+            raise InputError(f"tableau {name!r}: A is not strictly lower triangular, so the method is not explicit")
+        _require_order(name, matrix, weights, order)
+        for array in (matrix, weights):
+            array.setflags(write=False)
+        object.__setattr__(self, "name", name)
+        object.__setattr__(self, "A", matrix)
+        object.__setattr__(self, "b", weights)
+        object.__setattr__(self, "order", order)
+
+    @property
+    def c(self) -> Array:
+        """Stage times as fractions of the step, shape (s,)."""
+        return np.asarray(self.A.sum(axis=1))
+
+    @property
+    def stages(self) -> int:
+        """Number of stages."""
+        return len(self.b)
+
+    def __reduce__(self) -> tuple[type, tuple[str, Array, Array, int]]:
+        return type(self), (self.name, self.A, self.b, self.order)
+
+
+class ImplicitTableau(Tableau):
+    """A Runge-Kutta method whose stages depend on one another: A is any matrix, checked as that of a `Tableau`."""
+
+    explicit: ClassVar[bool] = False
+
+
+#: Kutta's classical method (1901), MuJoCo's too.
+RK4: Final = Tableau(
+    "rk4",
+    [[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
+    [1 / 6, 1 / 3, 1 / 3, 1 / 6],
+    order=4,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class EmbeddedTableau(Tableau):
+    """An explicit method with others of lower order on the same stages, to tell its error by.
+
+    Parameters
+    ----------
+    name, A, b, order
+        As of a `Tableau`.
+    lower : sequence of (int, (s,) array_like)
+        Of each other method the order, and b minus its weights. Its order conditions
+        are checked too.
+
+    Attributes
+    ----------
+    errors : tuple of (s,) arrays
+        b minus the weights of each of the others.
+    """
+
+    errors: tuple[Array, ...]
+
+    def __init__(
+        self, name: str, A: ArrayLike, b: ArrayLike, order: int, lower: Sequence[tuple[int, ArrayLike]]
+    ) -> None:
+        super().__init__(name, A, b, order)
+        errors = []
+        for p, given in lower:
+            error = np.array(given, dtype=np.float64)
+            if error.shape != self.b.shape:
+                raise InputError(f"tableau {name!r}: expected {self.b.shape} errors of order {p}, got {error.shape}")
+            _require_order(f"{name}, embedded", self.A, self.b - error, p)
+            error.setflags(write=False)
+            errors.append(error)
+        object.__setattr__(self, "errors", tuple(errors))
+        object.__setattr__(self, "_orders", tuple(p for p, _ in lower))
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        orders: tuple[int, ...] = self.__dict__["_orders"]
+        return type(self), (self.name, self.A, self.b, self.order, tuple(zip(orders, self.errors, strict=True)))
+
+
+@cache
+def dormand_prince_853() -> EmbeddedTableau:
+    """Return Dormand and Prince's pair of order 8, with errors told by orders 5 and 3.
+
+    Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.5 and
+    its program DOP853. Made when first asked for: 218 order conditions are checked.
+    """
+    A = np.zeros((12, 12))
+    for i, row in enumerate(_A_853):
+        A[i, : len(row)] = row
+    b = np.array(_B_853)
+    third = b.copy()
+    third[[0, 8, 11]] -= _B_3
+    return EmbeddedTableau("dormand_prince_853", A, b, 8, [(5, _E_853), (3, third)])
+
+
+_A_853: Final[tuple[tuple[float, ...], ...]] = (
+    (),
+    (0.05260015195876773,),
+    (0.0197250569845379, 0.0591751709536137),
+    (0.02958758547680685, 0.0, 0.08876275643042054),
+    (0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792),
+    (0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242),
+    (0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125),
+    (
+        0.03709200011850479,
+        0.0,
+        0.0,
+        0.17038392571223998,
+        0.10726203044637328,
+        -0.015319437748624402,
+        0.008273789163814023,
+    ),
+    (
+        0.6241109587160757,
+        0.0,
+        0.0,
+        -3.3608926294469414,
+        -0.868219346841726,
+        27.59209969944671,
+        20.154067550477894,
+        -43.48988418106996,
+    ),
+    (
+        0.47766253643826434,
+        0.0,
+        0.0,
+        -2.4881146199716677,
+        -0.590290826836843,
+        21.230051448181193,
+        15.279233632882423,
+        -33.28821096898486,
+        -0.020331201708508627,
+    ),
+    (
+        -0.9371424300859873,
+        0.0,
+        0.0,
+        5.186372428844064,
+        1.0914373489967295,
+        -8.149787010746927,
+        -18.52006565999696,
+        22.739487099350505,
+        2.4936055526796523,
+        -3.0467644718982196,
+    ),
+    (
+        2.273310147516538,
+        0.0,
+        0.0,
+        -10.53449546673725,
+        -2.0008720582248625,
+        -17.9589318631188,
+        27.94888452941996,
+        -2.8589982771350235,
+        -8.87285693353063,
+        12.360567175794303,
+        0.6433927460157636,
+    ),
+)
+_B_853: Final = (
+    0.054293734116568765,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    4.450312892752409,
+    1.8915178993145003,
+    -5.801203960010585,
+    0.3111643669578199,
+    -0.1521609496625161,
+    0.20136540080403034,
+    0.04471061572777259,
+)
+#: b minus the weights of order 5.
+_E_853: Final = (
+    0.01312004499419488,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    -1.2251564463762044,
+    -0.4957589496572502,
+    1.6643771824549864,
+    -0.35032884874997366,
+    0.3341791187130175,
+    0.08192320648511571,
+    -0.022355307863886294,
+)
+#: Weights of order 3, of the first, the ninth and the last stage.
+_B_3: Final = (0.2440944881889764, 0.7338466882816118, 0.022058823529411766)
+
+
+# Tableaus of Rosenbrock's methods that check themselves.
+#
+# A stage solves one linear system with the Jacobian J in it (Hairer, Wanner 1996, Solving Ordinary Differential
+# Equations II, IV.7)::
+#
+#     (1/(γ h) - J) k_i = f(t + c_i h, y + Σ a_ij k_j) + Σ (C_ij/h) k_j + d_i h ∂f/∂t      y1 = y + Σ b_i k_i
+
+#: What the coefficients' sixteen digits leave of a sum.
+_DIGITS: Final = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class RosenbrockTableau:
+    """A Rosenbrock method with another of lower order on the same stages.
+
+    The constructor checks the shapes and, for both methods, all order conditions
+    (Hairer, Wanner 1996, theorem IV.7.4).
+
+    Parameters
+    ----------
+    name : str
+    gamma : float
+        γ, the same in all stages.
+    A, C : (s, s) array_like
+        Strictly lower triangular.
+    b, error : (s,) array_like
+        Weights, and b minus those of the other method.
+    dense : (3, s) array_like
+        Of the state within a step, at t + θ h and with D = dense k::
+
+            y(θ) = (1 - θ) y + θ (y1 + (1 - θ) (D₁ + θ (D₂ + θ D₃)))
+    order, lower : int
+        The orders that both must have.
+
+    Attributes
+    ----------
+    c, d : (s,) arrays
+        Stage times, and factors of ∂f/∂t, that make a method of y' = f(t, y) out of it.
+
+    Raises
+    ------
+    InputError
+        With the condition that fails.
+    """
+
+    name: str
+    gamma: float
+    A: Array
+    C: Array
+    b: Array
+    error: Array
+    dense: Array
+    order: int
+    lower: int
+
+    def __post_init__(self) -> None:
+        for name in ("A", "C", "b", "error", "dense"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        s = self.stages
+        if self.A.shape != (s, s) or self.C.shape != (s, s) or self.error.shape != (s,) or self.dense.shape != (3, s):
+            raise InputError(f"tableau {self.name!r}: expected A, C ({s}, {s}), error ({s},) and dense (3, {s})")
+        if np.any(np.triu(self.A)) or np.any(np.triu(self.C)):
+            raise InputError(f"tableau {self.name!r}: A and C are not strictly lower triangular")
+        self._require(self.b, self.order)
+        self._require(self.b - self.error, self.lower)
+
+    @property
+    def stages(self) -> int:
+        """Number of stages."""
+        return len(self.b)
+
+    @property
+    def c(self) -> Array:
+        """Stage times as fractions of the step, shape (s,)."""
+        found = np.asarray(self._alpha.sum(axis=1))
+        # No stage lies behind the end of the step by a rounding.
+        return np.where(np.abs(found - 1.0) < _DIGITS, 1.0, found)
+
+    @property
+    def d(self) -> Array:
+        """Factors of ∂f/∂t, shape (s,)."""
+        found = np.asarray(self._coupling.sum(axis=1))
+        return np.where(np.abs(found) < _DIGITS, 0.0, found)
+
+    @property
+    def _coupling(self) -> Array:
+        """Γ of the form in which stages are h f + h J Σ Γ_ij k_j: C = 1/γ - Γ⁻¹."""
+        return np.asarray(np.linalg.inv(np.eye(self.stages) / self.gamma - self.C))
+
+    @property
+    def _alpha(self) -> Array:
+        return np.asarray(self.A @ self._coupling)
+
+    def _require(self, weights: Array, order: int) -> None:
+        alpha, coupling = self._alpha, self._coupling
+        b = weights @ coupling
+        for p in range(1, order + 1):
+            for tree in rooted_trees(p):
+                got, wanted = float(b @ _weights(alpha, alpha + coupling, tree)), 1 / density(tree)
+                if abs(got - wanted) > _DIGITS:
+                    raise InputError(
+                        f"tableau {self.name!r}: order {p} condition of tree {tree}: got {got:.17g}, "
+                        f"expected {wanted:.17g}; the method has not order {order}"
+                    )
+
+
+def _weights(alpha: Array, beta: Array, tree: Tree) -> Array:
+    # Where a node has one branch alone, the Jacobian's part is added.
+    matrix = beta if len(tree) == 1 else alpha
+    out = np.ones(len(alpha))
+    for branch in tree:
+        out = out * (matrix @ _weights(alpha, beta, branch))
+    return out
+
+
+@cache
+def rodas5p() -> RosenbrockTableau:
+    """Return Rodas5P, of order 5 with one of order 4 inside: L-stable, and of nearly its order on stiff systems too.
+
+    Steinebach 2023, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks
+    within the Julia Differential Equations package, BIT Numerical Mathematics 63:27.
+    """
+    last = (*_LAST, 1.0, 1.0)
+    return RosenbrockTableau(
+        "rodas5p",
+        _GAMMA,
+        _lower((*_A, _LAST, last[:6], last[:7])),
+        _lower(_C),
+        np.array((*last, 1.0)),
+        np.array((0.0,) * 7 + (1.0,)),
+        np.array(_DENSE),
+        order=5,
+        lower=4,
+    )
+
+
+def _lower(rows: tuple[tuple[float, ...], ...]) -> Array:
+    out = np.zeros((8, 8))
+    for i, row in enumerate(rows):
+        out[i, : len(row)] = row
+    return out
+
+
+_GAMMA: Final = 0.21193756319429014
+_A: Final[tuple[tuple[float, ...], ...]] = (
+    (),
+    (3.0,),
+    (2.849394379747939, 0.45842242204463923),
+    (-6.954028509809101, 2.489845061869568, -10.358996098473584),
+    (2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641),
+)
+#: Weights of the last stages' places and of the step itself, which ends where the method is stiffly accurate.
+_LAST: Final = (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946)
+_C: Final[tuple[tuple[float, ...], ...]] = (
+    (),
+    (-14.155112264123755,),
+    (-17.97296035885952, -2.859693295451294),
+    (147.12150275711716, -1.41221402718213, 71.68940251302358),
+    (165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306),
+    (24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471),
+    (
+        30.91273214028599,
+        -3.1208243349937974,
+        77.79954646070892,
+        34.28646028294783,
+        -19.097331116725623,
+        -28.087943162872662,
+    ),
+    (
+        37.80277123390563,
+        -3.2571969029072276,
+        112.26918849496327,
+        66.9347231244047,
+        -40.06618937091002,
+        -54.66780262877968,
+        -9.48861652309627,
+    ),
+)
+_DENSE: Final = (
+    (
+        25.948786856663858,
+        -2.5579724845846235,
+        10.433815404888879,
+        -2.3679251022685204,
+        0.524948541321073,
+        1.1241088310450404,
+        0.4272876194431874,
+        -0.17202221070155493,
+    ),
+    (
+        -9.91568850695171,
+        -0.9689944594115154,
+        3.0438037242978453,
+        -24.495224566215796,
+        20.176138334709044,
+        15.98066361424651,
+        -6.789040303419874,
+        -6.710236069923372,
+    ),
+    (
+        11.419903575922262,
+        2.8879645146136994,
+        72.92137995996029,
+        80.12511834622643,
+        -52.072871366152654,
+        -59.78993625266729,
+        -0.15582684282751913,
+        4.883087185713722,
+    ),
+)

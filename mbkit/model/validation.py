@@ -1,0 +1,524 @@
+"""Faults in how the parts of a description hang together."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.errors import InputError, Suggestions, nearest
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
+from mbkit.spatial import skew
+
+if TYPE_CHECKING:
+    from mbkit.model.model import Model
+
+__all__ = [
+    "body_fault",
+    "body_faults",
+    "grouped",
+    "idle_joints",
+    "sample_mass_matrix",
+    "scale_doubts",
+    "static_bodies",
+    "structure_faults",
+    "suspects",
+]
+
+
+# Up to so many names stand in a message.
+_FEW: Final = 40
+# M of so many velocities takes 200 MB.
+_MOST_VELOCITIES: Final = 5000
+
+
+def structure_faults(
+    bodies: Sequence[Body],
+    joints: Sequence[Joint],
+    frames: Sequence[Frame],
+    springs: Sequence[PointSpring],
+    couplings: Sequence[JointCoupling],
+    loops: Sequence[Loop],
+    prescribed: Sequence[Prescribed],
+) -> list[str]:
+    """Return one sentence per fault: names, the tree, mimics, and what joints may carry."""
+    known = {b.name for b in bodies} | {"world"}
+    faults: list[str] = []
+    if not bodies:
+        faults.append("no bodies; add at least one")
+    velocities = sum(j.type.nv for j in joints)
+    if velocities > _MOST_VELOCITIES:
+        faults.append(f"{velocities} velocities; up to {_MOST_VELOCITIES} are taken, because M takes their square")
+    for what, names in (
+        ("body", [b.name for b in bodies]),
+        ("joint", [j.name for j in joints]),
+        ("frame", [f.name for f in frames]),
+        ("spring", [s.name for s in springs]),
+        ("coupling", [c.name for c in couplings]),
+        ("loop", [x.name for x in loops]),
+    ):
+        faults += [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
+    if any(f.name == "world" for f in frames):
+        faults.append("frame 'world': that name is the ground's; choose another")
+    if any(b.name == "world" for b in bodies):
+        faults.append("body 'world': that name is the ground's; choose another")
+    suggestions = Suggestions()
+    bodily = known - {"world"}
+    for joint in joints:
+        faults += _unknown(f"joint {joint.name!r}", (joint.parent, joint.child), known, suggestions)
+        faults += _joint_faults(joint)
+    for frame in frames:
+        faults += _unknown(f"frame {frame.name!r}", (frame.body,), bodily, suggestions)
+    for spring in springs:
+        faults += _unknown(f"spring {spring.name!r}", (spring.body_a, spring.body_b), known, suggestions)
+        faults += [
+            f"spring {spring.name!r}: {n} {getattr(spring, n):g} is negative"
+            for n in ("stiffness", "rest_length", "damping")
+            if getattr(spring, n) < 0
+        ]
+        if spring.body_a == spring.body_b:
+            faults.append(f"spring {spring.name!r}: both ends on {spring.body_a!r}; it would never act")
+    for coupling in couplings:
+        faults += _coupling_faults(coupling, joints)
+    for loop in loops:
+        faults += _unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b), known, suggestions)
+        if loop.body_a == loop.body_b:
+            faults.append(f"loop {loop.name!r}: both ends on {loop.body_a!r}; it would close nothing")
+    faults += _tree_faults(bodies, joints)
+    faults += _mimic_faults(joints)
+    one = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
+    there = ", ".join(sorted(one)) or "none"
+    faults += [
+        f"prescribed {p.joint!r}: expected a joint of one velocity that mimics none; there are: {there}"
+        for p in prescribed
+        if p.joint not in one
+    ]
+    moved = Counter(p.joint for p in prescribed)
+    faults += [f"prescribed {n!r}: moved {k} times; give one motion" for n, k in moved.items() if k > 1]
+    return faults
+
+
+def _unknown(who: str, names: Iterable[str], known: Set[str], suggestions: Suggestions) -> list[str]:
+    out = []
+    for name in names:
+        if name not in known:
+            near = suggestions.near(name, known)
+            few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _FEW else "; declare it"
+            out.append(f"{who}: unknown body {name!r}" + (f"; did you mean {near!r}?" if near else few))
+    return out
+
+
+def _joint_faults(joint: Joint) -> list[str]:
+    who, out = f"joint {joint.name!r}", []
+    if joint.child == "world":
+        out.append(f"{who}: the world cannot be a child; swap parent and child")
+    if np.any(joint.lower > joint.upper):
+        out.append(f"{who}: lower limit {joint.lower} above upper limit {joint.upper}")
+    signed = ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
+    out += [f"{who}: {n} {getattr(joint, n)} is negative" for n in signed if np.any(getattr(joint, n) < 0)]
+    if joint.type.quaternion is not None:
+        turning = slice(joint.type.quaternion, None)
+        if np.isfinite([joint.lower[turning], joint.upper[turning]]).any():
+            out.append(f"{who}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite")
+    if np.any(joint.armature) and joint.type.nv != 1:
+        out.append(
+            f"{who}: armature on a {joint.kind} joint; expected a joint of one velocity "
+            "(engines leave out the gyroscopic term otherwise): add a rotor as a body"
+        )
+    if np.any(joint.stiffness) and not joint.type.coordinate_velocities:
+        out.append(f"{who}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring")
+    if joint.pitch and joint.kind != "helical":
+        out.append(f"{who}: pitch {joint.pitch} on a {joint.kind} joint; only helical joints have one")
+    return out
+
+
+def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterator[str]:
+    who, sizes = f"coupling {coupling.name!r}", {j.name: j.type.nv for j in joints}
+    for name in coupling.joints:
+        if name not in sizes:
+            near = nearest(name, sizes)
+            yield f"{who}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
+        elif sizes[name] != 1:
+            yield f"{who}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
+    for n in ("stiffness", "damping", "armature"):
+        if getattr(coupling, n) < 0:
+            yield f"{who}: {n} {getattr(coupling, n):g} is negative"
+    if not np.any(coupling.factors):
+        yield f"{who}: no joint has a factor other than zero; it would never act"
+
+
+def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
+    out = []
+    carriers: dict[str, list[Joint]] = {}
+    carried: dict[str, list[Joint]] = {}
+    for joint in joints:
+        carriers.setdefault(joint.child, []).append(joint)
+        carried.setdefault(joint.parent, []).append(joint)
+    for name, several in carriers.items():
+        if len(several) > 1 and name != "world":
+            told = ", ".join(repr(j.name) for j in several)
+            out.append(
+                f"body {name!r}: carried by {len(several)} joints ({told}); keep one and close the loop with add_loop"
+            )
+    reached = {"world"}
+    stack = ["world"]
+    while stack:
+        for joint in carried.get(stack.pop(), ()):
+            if joint.child not in reached:
+                reached.add(joint.child)
+                stack.append(joint.child)
+    for body in bodies:
+        if body.name in reached:
+            continue
+        if body.name in carriers:
+            out.append(f"body {body.name!r}: not connected to the world; its joints form a cycle or hang in the air")
+        else:
+            out.append(f"body {body.name!r}: no joint carries it; add a joint with child={body.name!r}")
+    return out
+
+
+def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
+    out = []
+    by_name = {j.name: j for j in joints}
+    suggestions = Suggestions()
+    # Joints from which following the leaders ends.
+    ends: set[str] = set()
+    for joint in joints:
+        if joint.mimic is None:
+            continue
+        who = f"joint {joint.name!r}"
+        leader = by_name.get(joint.mimic.joint)
+        if leader is None:
+            near = suggestions.near(joint.mimic.joint, by_name)
+            out.append(f"{who}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near!r}" if near else ""))
+            continue
+        if joint.type.nv != 1 or leader.type.nv != 1:
+            out.append(f"{who}: mimics {leader.name!r}, but both must have one velocity")
+        seen, at = {joint.name}, leader
+        while at.name not in ends and at.mimic is not None and at.mimic.joint in by_name:
+            if at.name in seen:
+                out.append(f"{who}: mimics in a circle through {at.name!r}")
+                break
+            seen.add(at.name)
+            at = by_name[at.mimic.joint]
+        ends |= seen
+    return out
+
+
+# Whether a body can exist, and whether every joint moves some inertia.
+
+# Descriptions carry rounded decimals; a thin plate written with six digits may
+# miss A + B >= C by its last digit.
+_TRIANGLE = 1e-6
+# Bodies in one sentence.
+_MOST_TOLD = 20
+_JOINT = re.compile(r"joint '.*?'(?=, so)")
+# Ten times mjMINVAL is left of MuJoCo's smallest numbers, in kg and kg m².
+_LEAST = 1e-14
+# Of two numbers this far apart, the sum keeps five digits of the smaller. Real robots stay below 1e8.
+_APART = 1e11
+# The largest coordinate at which M is sampled.
+_FAR = 1e6
+
+
+def body_fault(body: Body, *, point_masses: bool) -> str | None:
+    """Return why no matter can have this mass and inertia, or None.
+
+    A body of zero mass and zero inertia is no fault: it is a frame, and
+    `idle_joints` finds the joints that would then move nothing.
+
+    Parameters
+    ----------
+    body : Body
+    point_masses : bool
+        Whether a positive mass with zero inertia is meant that way.
+    """
+    eigenvalues = np.asarray(np.linalg.eigvalsh(body.inertia), dtype=np.float64)
+    largest = float(np.max(np.abs(eigenvalues)))
+    if body.mass < 0:
+        return f"mass {body.mass:g} is negative"
+    if body.mass == 0:
+        return f"no mass but inertia: up to {largest:.3g} kg m²" if largest else None
+    if largest == 0:
+        return None if point_masses else "mass without inertia: give the inertia, however small"
+    if eigenvalues[0] < -1e-12 * largest:
+        return f"inertia is not positive: principal moments {_told(eigenvalues)} kg m²"
+    if eigenvalues[0] <= 1e-12 * largest and not point_masses:
+        return f"inertia is not positive: principal moments {_told(eigenvalues)} kg m²"
+    if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
+        return f"inertia violates A + B >= C: principal moments {_told(eigenvalues)} kg m²"
+    return None
+
+
+def static_bodies(joints: Iterable[Joint]) -> set[str]:
+    """Return the bodies that are fixed to the world, whose inertia cannot act."""
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        if joint.kind == "fixed":
+            below.setdefault(joint.parent, []).append(joint.child)
+    found: set[str] = set()
+    waiting = ["world"]
+    while waiting:
+        new = [child for child in below.get(waiting.pop(), ()) if child not in found]
+        found.update(new)
+        waiting += new
+    return found
+
+
+def _told(values: Array) -> str:
+    return ", ".join(f"{x:.4g}" for x in values)
+
+
+def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[str, str], ...]:
+    """Return the bodies that cannot exist, each with the reason.
+
+    A body that waits for a parameter's value is not judged yet.
+    """
+    return tuple(
+        (b.name, why)
+        for b in bodies
+        if np.isfinite([b.mass, *b.inertia.flat]).all() and (why := body_fault(b, point_masses=point_masses))
+    )
+
+
+def suspects(model: Model, *, point_masses: bool) -> tuple[tuple[str, str], ...]:
+    """Return the bodies that cannot exist or that leave a joint idle, each with the reason.
+
+    What waits for a parameter's value is not judged yet.
+    """
+    found = dict(body_faults(model.bodies, point_masses=point_masses))
+    # A negative mass makes M indefinite, and joints look idle that are not.
+    if all(x is not None for x in model.parameters.values()) and not any(b.mass < 0 for b in model.bodies):
+        idle, alone = idle_joints(model)
+        for name in idle:
+            others = ", ".join(repr(n) for n in idle if n != name)
+            why = f"no mass moves with joint {name!r}" if alone else f"joints {name!r} and {others} move the same mass"
+            if not alone and not others:
+                why = f"two velocities of joint {name!r} move the same mass"
+            found.setdefault(model.joint(name).child, f"{why}, so M is singular: give mass, inertia or armature")
+    return tuple(found.items())
+
+
+def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
+    """Return one sentence per kind of fault, with every body that has it.
+
+    Parameters
+    ----------
+    found : iterable of (str, str)
+        Bodies with the reason.
+    parts : mapping of str to sequence of (str, str)
+        Of a body that was merged from links: the links at fault, each with the reason. They are named instead.
+    """
+    kinds: dict[str, list[tuple[str, str, str, str]]] = {}
+    for body, why in found:
+        moved = _JOINT.search(why)
+        named = [("link", *part) for part in parts.get(body, ())] if not moved else []
+        for what, name, reason in named or [("body", body, why)]:
+            sentence, _, detail = reason.partition(": ")
+            if moved:
+                sentence, detail = sentence.replace(moved[0], "their joints"), moved[0]
+            if what == "link" and name != body:
+                detail = ", ".join(x for x in (detail, f"part of {body!r}") if x)
+            kinds.setdefault(sentence, []).append((what, name, reason, detail))
+    out = []
+    for sentence, members in kinds.items():
+        if len(members) == 1:
+            what, name, reason, _ = members[0]
+            out.append(f"{what} {name!r}: {reason}")
+            continue
+        plural = "links" if all(what == "link" for what, *_ in members) else "bodies"
+        told = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members[:_MOST_TOLD]]
+        more = f" and {len(members) - _MOST_TOLD} more" if len(members) > _MOST_TOLD else ""
+        out.append(f"{len(members)} {plural}: {sentence}: {', '.join(told)}{more}")
+    return out
+
+
+def idle_joints(model: Model) -> tuple[list[str], bool]:
+    """Return the joints whose motion costs no kinetic energy, so that M is singular, and whether each alone costs none.
+
+    M is formed at one random state from the definition, Σ Jᵀ I J, and scaled to
+    a unit diagonal; a null vector names its joints. Motions that loops do not allow count as if they moved mass.
+    """
+    if not model.nv:
+        return [], True
+    with np.errstate(over="ignore", invalid="ignore"):
+        sample = _sample(model)
+    M, diagonal = sample.M, np.diag(sample.M)
+    if not np.isfinite(M).all():
+        wild = [j.name for j in model.independent_joints if not np.isfinite(diagonal[model.layout.v[j.name]]).all()]
+        told = ", ".join(repr(n) for n in wild[:_MOST_TOLD]) or "all joints together"
+        raise InputError(f"{model.name}: the mass matrix overflows at {told}; give smaller masses and lengths")
+    rows = [sample.held(loop) @ model.layout.G for loop in model.loops]
+    if rows and (size := float(np.trace(M))):
+        held = np.concatenate(rows)
+        # M need have an inverse only on what loops allow.
+        M = M + size / len(M) * held.T @ held
+    diagonal, alone = np.diag(M), True
+    # What is left of a mass on its own axis is the square of a rounded length.
+    zero = diagonal <= 1e-28 * float(diagonal.max())
+    if not zero.any():
+        # One root after the other: the product of two would leave the range of doubles.
+        root = np.sqrt(diagonal)
+        scaled = M / root[:, None] / root
+        values, vectors = np.linalg.eigh(scaled)
+        if values[0] > 4 * model.nv * np.finfo(float).eps:
+            return [], True
+        alone = False
+        zero = np.abs(vectors[:, 0]) > 0.3 * np.abs(vectors[:, 0]).max()
+    return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()], alone
+
+
+def scale_doubts(model: Model) -> list[str]:
+    """Return why engines may lose digits: sizes too far apart for double precision, one sentence for each cause.
+
+    For a hinge, the inertia about its axis M_ii stands against m L², with m the mass that it carries and L the
+    extent of the mechanism: an engine whose moments are about a common centre takes M_ii as a difference of numbers
+    of that size. MuJoCo takes inertias below 1e-15 (mjMINVAL) for zero. And a null direction of the scaled M to
+    rounding leaves no digits in accelerations.
+    """
+    if not model.nv or any(x is None for x in model.parameters.values()):
+        return []
+    with np.errstate(over="ignore", invalid="ignore"):
+        sample = _sample(model)
+    M, places = sample.M, sample.places
+    diagonal = np.diag(M)
+    if not (diagonal > 0).all() or not np.isfinite(M).all():
+        return []
+    extent = float(np.max(np.ptp(np.array([*places.values()]), axis=0)))
+    carried: dict[str, float] = {b.name: b.mass for b in model.bodies}
+    small, far = [], []
+    for joint in reversed(model.tree):
+        if joint.parent != "world":
+            carried[joint.parent] += carried[joint.child]
+        if joint.mimic is not None or not joint.type.nv:
+            continue
+        least = float(diagonal[model.layout.v[joint.name]].min())
+        if least < _LEAST:
+            small.append(f"{joint.name!r} ({least:.1e})")
+        elif joint.kind != "prismatic" and carried[joint.child] * extent**2 > _APART * least:
+            far.append(f"{joint.name!r} ({least:.1e} kg m² of {carried[joint.child]:.1e} kg over {extent:.1e} m)")
+    root = np.sqrt(diagonal)
+    values = np.linalg.eigvalsh(M / root[:, None] / root)
+    out = []
+    if small:
+        out.append(f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero: {_listed(small)}")
+    if far:
+        out.append(f"joints whose inertia is lost beside m L² of the whole mechanism: {_listed(far)}")
+    if values[0] * _APART * 10 < values[-1]:
+        out.append(f"M is nearly singular (eigenvalues {values[0]:.1e} to {values[-1]:.1e}, scaled to a unit diagonal)")
+    return out
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_TOLD} more" if len(names) > _MOST_TOLD else ""
+    return f"{', '.join(names[:_MOST_TOLD])}{more}"
+
+
+def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
+    """Return M at a pose, or at one fixed random state: composite inertias give it, and Σ Jᵀ I J its diagonal.
+
+    The definition gives the diagonal as a sum of squares, which stays small where a mass is on its own axis; it alone
+    takes the square of the number of joints, as does M itself.
+    """
+    return _sample(model, q).M
+
+
+class _Sample(NamedTuple):
+    """M at one pose, and where bodies are there.
+
+    Attributes
+    ----------
+    M : (nv, nv) array
+    places : dict of str to (3,) array
+        Centre of mass in the world of each body with mass.
+    jacobians : dict of str to (list of int, (6, k) array)
+        Of each body the velocities that move it, and its Jacobian for them in its own axes, linear above angular.
+    rotations : dict of str to (3, 3) array
+        From each body's axes to the world's.
+    size : int
+        Number of velocities before reduction.
+    """
+
+    M: Array
+    places: dict[str, Array]
+    jacobians: dict[str, tuple[list[int], Array]]
+    rotations: dict[str, Array]
+    size: int
+
+    def held(self, loop: Loop) -> Array:
+        """Return the rows of what a loop holds at rest, in world axes, for all velocities."""
+        ends = []
+        for body, point in ((loop.body_a, loop.translation_a), (loop.body_b, loop.translation_b)):
+            moving, own = self.jacobians[body]
+            J, R = np.zeros((6, self.size)), self.rotations[body]
+            J[:, moving] = own
+            moved = [R @ (J[:3] - skew(np.asarray(point)) @ J[3:]), R @ J[3:]]
+            ends.append(np.concatenate(moved if loop.kind == "frame" else moved[:1]))
+        return np.asarray(ends[0] - ends[1])
+
+
+def _sample(model: Model, q: Array | None = None) -> _Sample:
+    """Return M and the places of bodies at a pose or the random state."""
+    places = {"": np.zeros(3)}
+    poses = {"world": (np.eye(3), np.zeros(3))}
+    if q is None:
+        q, _ = model.random_state(np.random.default_rng(0))
+    # Limits may be as wide as doubles go; the squares of lengths must not overflow.
+    q_full = model.layout.expand_q(np.clip(q, -_FAR, _FAR))
+    n = model.layout.sizes[3]
+    bodies = {b.name: b for b in model.bodies}
+    # Motion of the child's frame for that of the parent's, and for the joint's velocities; linear above angular.
+    steps: dict[str, tuple[Array, Array, slice]] = {}
+    carried: dict[str, list[str]] = {}
+    diagonal = np.zeros(n)
+    jacobians: dict[str, tuple[list[int], Array]] = {"world": ([], np.zeros((6, 0)))}
+    for joint in model.tree:
+        carried.setdefault(joint.parent, []).append(joint.name)
+        part = model.layout.full_v[joint.name]
+        at = list(q_full[model.layout.full_q[joint.name]])
+        R_JC, p_JC = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, at))
+        R, p = joint.rotation @ R_JC, joint.translation + joint.rotation @ p_JC
+        X = np.block([[R.T, -R.T @ skew(p)], [np.zeros((3, 3)), R.T]])
+        S = np.zeros((6, joint.type.nv))
+        for k in range(joint.type.nv):
+            unit = [float(i == k) for i in range(joint.type.nv)]
+            S[:, k] = np.array([x for half in joint.type.twist(np, joint, at, unit) for x in half], dtype=float)
+        steps[joint.name] = X, S, part
+        moving, above = jacobians[joint.parent]
+        moving, J = [*moving, *range(part.start, part.stop)], np.hstack([X @ above, S])
+        jacobians[joint.child] = moving, J
+        body = bodies[joint.child]
+        R_W, p_W = poses[joint.parent]
+        poses[joint.child] = R_W @ R, p_W + R_W @ p
+        if body.mass:
+            places[joint.child] = poses[joint.child][1] + poses[joint.child][0] @ body.com
+        at_com = J[:3] - skew(body.com) @ J[3:]
+        diagonal[moving] += body.mass * (at_com**2).sum(axis=0) + (J[3:] * (body.inertia @ J[3:])).sum(axis=0)
+    M = np.zeros((n, n))
+    composite: dict[str, Array] = {}
+    # Momentum of the bodies beyond a joint for a unit velocity of each joint there, and which velocities those are.
+    momenta: dict[str, tuple[list[int], Array]] = {}
+    for joint in reversed(model.tree):
+        X, S, part = steps[joint.name]
+        body = bodies[joint.child]
+        c = skew(body.com)
+        inertia = np.block([[body.mass * np.eye(3), -body.mass * c], [body.mass * c, body.inertia - body.mass * c @ c]])
+        beyond = [momenta.pop(name) for name in carried.get(joint.child, ())]
+        inertia = inertia + sum((composite.pop(name) for name in carried.get(joint.child, ())), np.zeros((6, 6)))
+        moving = [*range(part.start, part.stop), *(k for several, _ in beyond for k in several)]
+        F = np.hstack([inertia @ S, *(f for _, f in beyond)])
+        M[part, moving] = S.T @ F
+        M[moving, part] = M[part, moving].T
+        composite[joint.name] = X.T @ inertia @ X
+        momenta[joint.name] = moving, X.T @ F
+        diagonal[part] += joint.armature
+    np.fill_diagonal(M, diagonal)
+    for coupling in model.couplings:
+        row = model.layout.coupling_row(coupling)
+        M += coupling.armature * np.outer(row, row)
+    M = np.asarray(model.layout.G.T @ M @ model.layout.G) if model.layout.reduced else M
+    return _Sample(M, places, jacobians, {name: R for name, (R, _) in poses.items()}, n)

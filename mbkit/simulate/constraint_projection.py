@@ -1,0 +1,194 @@
+"""Runs under constraints: from consistent states, along consistent states.
+
+The equation itself holds f̈ = 0 only, so that f and ḟ drift off as any other error of a
+method does. One-step methods go on from each state's foot on the constraints, by
+Newton's iteration with the mass matrix as the weight; it moves a state by what the step's
+own error is, so that their order stays. Near a singular pose explicit ones evaluate their stages on the constraints
+too: f̈ = 0 alone divides what a stage is off by J's smallest singular value, which is zero at the pose, through which
+the motion on the constraints is smooth as a rule. Multistep methods (BDF, LSODA, CVODES) have a
+history that a move would spoil: of them the states that are kept are brought back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.base import at_times
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.simulate.result import Outcome
+
+__all__ = [
+    "LOOSEST",
+    "Approach",
+    "SingularPoses",
+    "along_constraints",
+    "beside",
+    "from_consistent",
+    "refuse_constraints",
+    "settled",
+]
+
+#: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
+LOOSEST: Final = 1e-9
+#: Steps ahead in which a pose would be singular at the present pace.
+_AHEAD: Final = 4
+#: A sign change of the smallest singular value makes its third differences smaller than this part of those without.
+_SMOOTHER: Final = 0.5
+#: Steps' ends that decide on one interval.
+_WINDOW: Final = 4
+#: Of a unit vector: the entries of the constraints that depend on each other.
+_TAKES_PART: Final = 0.1
+
+
+def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array, Array]:
+    """Return initial states, at a time, freed of rounding.
+
+    Raises
+    ------
+    InputError
+        One is inconsistent, with the residuals; or the constraints themselves are no
+        independent set.
+    """
+    if not dyn.model.constrained:
+        return q, v
+    # This and what follows loads CasADi.
+    from mbkit.lagrangian.constraints.manifold import manifold_of
+    from mbkit.lagrangian.constraints.redundancy import refuse_unreachable, require_independent
+
+    manifold = manifold_of(dyn).at(t)
+    try:
+        manifold.check(q, v)
+    except InputError:
+        refuse_unreachable(manifold.member(0).dyn, np.atleast_2d(q)[0])
+        raise
+    for k, one in enumerate(np.atleast_2d(q)):
+        require_independent(manifold.member(k).dyn, one)
+    return manifold.pulled(q, v)
+
+
+def settled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return the consistent states beside those that a step has led to."""
+    from mbkit.lagrangian.constraints.manifold import manifold_of
+
+    return manifold_of(dyn).at(t).pulled(q, v)
+
+
+def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return the state after one step of Newton's iteration onto the constraints."""
+    from mbkit.lagrangian.constraints.manifold import manifold_of
+
+    q, v, *_ = manifold_of(dyn).at(t).call("constraint_step", q, v)
+    return q[..., 0], v[..., 0]
+
+
+class Approach:
+    """Whether a run comes near a singular pose, by the smallest singular value of J at the ends of its last two steps.
+
+    Attributes
+    ----------
+    near : bool
+        Whether it would be zero within a few steps, of any state of a batch. True until two steps have shown the pace.
+    """
+
+    def __init__(self) -> None:
+        self.near = True
+        self._size = np.inf
+
+    def saw(self, dyn: Dynamics, t: float, q: Array) -> None:
+        """Take in the end of a step."""
+        from mbkit.lagrangian.constraints.manifold import manifold_of
+
+        J = manifold_of(dyn).at(t).jacobian(q)
+        size = float(np.linalg.svd(J, compute_uv=False)[..., -1].min()) if np.isfinite(J).all() else np.inf
+        self.near = not size >= _AHEAD * abs(size - self._size)
+        self._size = size
+
+
+class SingularPoses:
+    """The singular poses that one trajectory passes, found from J's smallest singular value at the ends of steps.
+
+    The value itself is positive on both sides. Through a singular pose it is smooth once its sign is changed there.
+
+    Parameters
+    ----------
+    dyn : Dynamics
+        Of one trajectory.
+    """
+
+    def __init__(self, dyn: Dynamics) -> None:
+        self._dyn = dyn
+        self._seen: list[tuple[float, float, Array]] = []
+        self.times: list[float] = []
+        self._rows: list[int] = []
+
+    def saw(self, t: float, q: Array) -> None:
+        """Take in the end of a step."""
+        from mbkit.lagrangian.constraints.manifold import manifold_of
+
+        J = manifold_of(self._dyn).at(t).jacobian(q)
+        J = J.reshape(-1, J.shape[-1])
+        if not np.isfinite(J).all():
+            return
+        U, sizes, _ = np.linalg.svd(J)
+        self._seen = [*self._seen[1 - _WINDOW :], (t, float(sizes[-1]), U[:, -1])]
+        if len(self._seen) == _WINDOW:
+            self._decide()
+
+    def _decide(self) -> None:
+        times, sizes, _ = (np.array(x) for x in zip(*self._seen, strict=True))
+        if not (sizes[1] <= sizes[0] and sizes[2] <= sizes[3]) or (self.times and self.times[-1] >= times[0]):
+            return
+        middle = times - times[1]
+        plain, turned = (np.polyfit(middle, sizes * signs, 3) for signs in (1.0, np.array([1, 1, -1, -1])))
+        roots = np.roots(turned)
+        within = roots[(abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= middle[2])].real
+        if abs(turned[0]) < _SMOOTHER * abs(plain[0]) and len(within):
+            nearest = 1 if sizes[1] < sizes[2] else 2
+            self._rows = np.flatnonzero(np.abs(self._seen[nearest][2]) > _TAKES_PART).tolist()
+            self.times.append(float(times[1] + within[0]))
+
+    def told(self) -> str:
+        """Return the poses in a sentence; empty where there are none."""
+        if not self.times:
+            return ""
+        when = ", ".join(f"{t:.4g}" for t in self.times[:3])
+        when += " and later" if len(self.times) > 3 else ""
+        rows = " and ".join(f"constraints[{k}]" for k in self._rows)
+        return (
+            f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
+            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
+        )
+
+
+def along_constraints(dyn: Dynamics, outcome: Outcome) -> Outcome:
+    """Return what was kept of a run, with consistent states."""
+    if not dyn.model.constrained or not outcome.q.size:
+        return outcome
+    from mbkit.lagrangian.constraints.manifold import manifold_of
+
+    q, v = outcome.q.copy(), outcome.v.copy()
+    shape = q.shape
+    flat_q, flat_v = q.reshape(-1, shape[-1]), v.reshape(-1, shape[-1])
+    good = np.flatnonzero(np.isfinite(flat_q).all(axis=1) & np.isfinite(flat_v).all(axis=1))
+    own = manifold_of(dyn).dyn
+    trajectories = shape[0] if q.ndim == 3 else None
+    if own.model.clock is not None:
+        own = at_times(own, outcome.t, trajectories)
+    elif trajectories is not None:
+        own = own.of_samples(np.repeat(np.arange(trajectories), shape[1]))
+    flat_q[good], flat_v[good] = manifold_of(own.of_samples(good)).pulled(flat_q[good], flat_v[good])
+    return replace(outcome, q=q, v=v)
+
+
+def refuse_constraints(dyn: Dynamics, method: str, why: str) -> None:
+    """Say that a method does not run under constraints."""
+    if dyn.model.constrained:
+        raise UnsupportedError(
+            f"{method}: {dyn.model.name} has constraints, {why}; 'gauss4' and 'gauss6' are the implicit methods "
+            "for it, 'rk853' and 'taylor' the accurate ones"
+        )

@@ -1,0 +1,1 @@
+"""Diagnostics of a run: linearization, eigenvalues, stability of a step, checks."""

@@ -1,0 +1,1 @@
+"""Figures of a trajectory: time series, stick figures, motion strips."""

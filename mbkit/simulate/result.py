@@ -1,0 +1,98 @@
+"""What an integrator hands back to `simulate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mbkit._check import Array
+from mbkit.errors import FunctionError
+from mbkit.simulate.events import Hit
+
+__all__ = ["Ended", "Outcome", "Stats"]
+
+
+# What a run cost and how it ended.
+
+Ended = Literal["finished", "event", "diverged", "step_too_small", "function_failed"]
+
+
+@dataclass(frozen=True)
+class Stats:
+    """Cost and end of a run.
+
+    Attributes
+    ----------
+    steps : int
+        Accepted steps, summed over a batch.
+    evaluations : int
+        Evaluations of the forward dynamics, summed over a batch.
+    seconds : float
+        Time on the wall.
+    ended : {"finished", "event", "diverged", "step_too_small", "function_failed"}
+        ``"event"`` when one asked for the end; ``"diverged"`` when a state or
+        acceleration of any trajectory stopped being finite, or a state passed 1e100;
+        ``"step_too_small"`` when an adaptive method could not go on;
+        ``"function_failed"`` when a torque or event function did.
+    reached : float or tuple of float
+        Time of the last good state, s; one per trajectory of a batch.
+    message : str
+        Why a run ended early; empty for one that finished.
+    rejected : int
+        Steps that an adaptive method tried in vain, where it tells.
+    jacobians : int
+        Of ``"rodas5"``, ``"radau"``, ``"bdf"``, ``"lsoda"`` and ``"cvodes"``: evaluations of the Jacobian of
+        the forward dynamics, summed over a batch; of ``"implicit_midpoint"``: iterations
+        of Newton's method, each with the exact Jacobian of the step's equations.
+    chosen : str
+        Of ``"auto"``: which methods ran, from when to when, and why.
+    doubts : tuple of str
+        What speaks against a run that finished, each with its measured reason and a remedy.
+    """
+
+    steps: int
+    evaluations: int
+    seconds: float
+    ended: Ended
+    reached: float | tuple[float, ...]
+    message: str = ""
+    rejected: int = 0
+    jacobians: int = 0
+    chosen: str = ""
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def finished(self) -> bool:
+        """Whether every trajectory reached the end, or the event that was to stop it."""
+        return self.ended in ("finished", "event")
+
+    def __str__(self) -> str:
+        end = self.message or ("finished, with doubts" if self.doubts else "finished")
+        chosen = f"; {self.chosen}" if self.chosen else ""
+        return f"{self.steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {end}{chosen}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Kept states and the figures of a run; `reached` has shape () or (N,).
+
+    `last` is the last good configuration of the first trajectory that could not go on, where the method tells it.
+
+    The `error` of a torque or event function is handed on with what was computed before it.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    steps: int
+    evaluations: int
+    ended: Ended
+    reached: Array
+    message: str
+    rejected: int = 0
+    jacobians: int = 0
+    events: tuple[Hit, ...] = ()
+    error: FunctionError | None = None
+    chosen: str = ""
+    doubts: tuple[str, ...] = ()
+    last: Array | None = None

@@ -1,0 +1,1 @@
+"""Solvers: fixed step, adaptive, automatic, and those of SciPy, heyoka, SUNDIALS, MuJoCo and Drake."""

@@ -1,0 +1,297 @@
+"""The adaptive run of a one-step method with an embedded error on the manifold: rk853, rodas5.
+
+Own steps do not depend on what is saved or looked for. A state within a step is made
+by a shorter step from the same start, of the same order as all others, so that there is
+no interpolant whose error would have to be told apart; compiled, several of these
+stand side by side in a vector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.errors import FunctionError
+from mbkit.methods.registry import Tolerances
+from mbkit.model.integration_space import Space
+from mbkit.simulate.events import Event, Hit, State, Watch
+from mbkit.simulate.problem import Asked
+from mbkit.simulate.result import Outcome
+from mbkit.simulate.solvers.adaptive_numpy import StageTrials
+from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, credible
+from mbkit.simulate.solvers.step_attempts import Stretch, Trials
+from mbkit.simulate.solvers.trajectory_record import Member, gathered, member_of
+from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.torque import Torque
+
+__all__ = ["Track", "make_trials", "march", "outcome_of", "run_embedded", "stops_of"]
+
+_BEYOND: Final = f"diverged: {RAN_AWAY}"
+
+
+def run_embedded(asked: Asked) -> Outcome:
+    """Integrate one state, or a batch of them, each with steps of its own.
+
+    Where the own derivation is compiled and the torque is no function, the steps run
+    as machine code; elsewhere stage by stage, by the same formulas. Torques held as an
+    array start a new step at each interval.
+    """
+    dyn, tolerances, batch, save = asked.dyn, asked.tolerances, asked.batch, asked.save
+    q0, v0, space = asked.q, asked.v, Space(asked.dyn.model)
+    trials = make_trials(asked.method, dyn, space, tolerances, asked.torque, asked.duration, batch)
+    tracks = []
+    for i in range(len(q0)):
+        member = member_of(dyn, asked.member(i), asked.start, asked.duration)
+        tracks.append(Track(space, q0.shape[1], i, batch, save, asked.events, tolerances, member))
+    stops = stops_of(asked)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for first in range(0, len(q0), trials.width):
+            part = slice(first, first + trials.width)
+            group = tracks[part]
+            try:
+                for track, q, v in zip(group, q0[part], v0[part], strict=True):
+                    track.begin(q, v)
+                begun = space.enter(q0[part], v0[part])
+                trials.start(range(first, first + len(group)), q0[part], begun, asked.start)
+                for _ in march(trials, group, stops):
+                    done = sum(track.member.reached - asked.start for track in group) / asked.duration
+                    asked.bar.update((first + done) / len(q0))
+            except FunctionError as error:
+                # Where the torque is a function, trajectories run one by one.
+                which = getattr(error, "member", None)
+                group[0 if which is None else which - first].member.fail(error)
+                break
+    return outcome_of(dyn, tracks, batch, save, trials.evaluations, trials.jacobians)
+
+
+def make_trials(
+    method: str,
+    dyn: Dynamics,
+    space: Space,
+    tolerances: Tolerances,
+    torque: Torque,
+    duration: float,
+    batch: int | None,
+) -> Trials:
+    """Return what tries the steps of ``"rk853"`` or ``"rodas5"``: machine code where there can be some."""
+    given = dyn, space, tolerances, torque, duration, batch
+    # A compiled step has one value of the time, and does not look for constraints.
+    plain = not torque.callable and not dyn.model.clock and not dyn.model.constrained
+    if dyn.engine == "lagrangian" and plain and dyn.model.nv:
+        # Other engines need no CasADi.
+        from mbkit.codegen.backend import has_compiler
+        from mbkit.engines.lagrangian import LagrangianDynamics
+
+        if isinstance(dyn, LagrangianDynamics) and dyn.compile and dyn.written_out and has_compiler():
+            # Loads LLVM, which interpreting never needs.
+            from mbkit.simulate.solvers.adaptive_compiled import LaneTrials
+
+            return LaneTrials(dyn, *given[1:], method)
+    if method == "rodas5":
+        # Its Jacobian loads CasADi.
+        from mbkit.simulate.solvers.adaptive_numpy import RosenbrockTrials
+
+        return RosenbrockTrials(*given)
+    return StageTrials(*given)
+
+
+def stops_of(asked: Asked) -> list[float]:
+    """Return the times at which a run must stop on its way: where a held torque jumps, and the end."""
+    held = asked.save.tolist() if asked.save is not None and asked.torque.held else []
+    return sorted({*held, asked.end} - {asked.start})
+
+
+def march(
+    trials: Trials, group: Sequence[Track], stops: Sequence[float], first: int = 0
+) -> Iterator[list[tuple[int, Stretch]]]:
+    """Take trajectories to the end; yields what was made, after each look at it.
+
+    Parameters
+    ----------
+    trials : Trials
+        Begun.
+    group : sequence of Track
+    stops : sequence of float
+        As of `stops_of`.
+    first : int
+        Index of the stop to go to first.
+    """
+    for k in range(first, len(stops)):
+        trials.hold(k, stops[k])
+        while made := trials.advance():
+            for place, stretch in made:
+                track = group[place]
+                if not track.take(trials, place, stretch) or track.stuck(trials, place):
+                    trials.drop(place)
+            yield made
+
+
+class Track:
+    """One trajectory: what is kept of it, and how it ends.
+
+    Parameters
+    ----------
+    space : Space
+    nq : int
+    index : int
+        Which trajectory.
+    batch : int or None
+    save : (K,) array or None
+    events : tuple of Event
+    tolerances : Tolerances
+    member : Member
+        Of which this holds the states.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        nq: int,
+        index: int,
+        batch: int | None,
+        save: Array | None,
+        events: tuple[Event, ...],
+        tolerances: Tolerances,
+        member: Member,
+    ) -> None:
+        which = None if batch is None else index
+        self.member, self._nq, self._start = member, nq, member.reached
+        self._space, self._save, self._tolerances = space, save, tolerances
+        self._watch = Watch(events, which) if events else None
+        self._kept: list[tuple[Array, Array, Array]] = []
+
+    def begin(self, q: Array, v: Array) -> None:
+        """Start at a state."""
+        if self._save is None or (len(self._save) and self._save[0] == self._start):
+            self._kept.append((np.array([self._start]), q[None], v[None]))
+        if self._watch is not None:
+            self._watch.start(self._start, q, v)
+
+    def states(self) -> tuple[Array, Array, Array]:
+        """Return t, q and v of all that was kept."""
+        space = self._space
+        if not self._kept:
+            return np.empty(0), np.empty((0, self._nq)), np.empty((0, space.nv))
+        t, q, v = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
+        return t, q, v
+
+    def take(self, trials: Trials, place: int, made: Stretch) -> bool:
+        """Take in some steps; return whether to go on."""
+        member = self.member
+        steps = len(made.t) - 1
+        member.rejected += made.tried - steps
+        # A state that is none stays so: the last one tells.
+        lost = not (credible(made.q[-1]) and credible(made.w[-1]))
+        if lost:
+            good = credible(made.q[1:]) & credible(made.w[1:])
+            steps = int(np.argmin(good)) if len(good) else 0
+        hit = self._look(trials, place, made, steps)
+        if hit is not None:
+            steps = int(np.searchsorted(made.t, hit.t))
+        until = float(made.t[steps]) if hit is None else hit.t
+        if not self._keep(trials, place, made, steps, until):
+            # Never seen: a shorter step than one that was good met what is no number.
+            steps, hit, lost = 0, None, True
+            until = float(made.t[0])
+        member.steps += steps
+        member.reached = until
+        for k in range(1 if member.poses is not None else max(steps, 1), steps + 1):
+            member.saw(float(made.t[k]), made.q[k])
+        if hit is not None:
+            self._stop_at(hit)
+        elif lost:
+            member.stop("diverged", _BEYOND)
+        return hit is None and not lost
+
+    def stuck(self, trials: Trials, place: int) -> bool:
+        """Return whether no step can be made any more, and end there."""
+        stuck = trials.stuck(place)
+        if stuck:
+            self.member.stop("diverged", f"diverged: {trials.why(place)}")
+        elif stuck is False:
+            rtol, atol = self._tolerances
+            own = "" if atol == rtol else f", atol = {atol:g}"
+            told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
+            self.member.stop("step_too_small", told)
+        return stuck is not None or (self.member.ended == "finished" and self.member.crawls())
+
+    def _look(self, trials: Trials, place: int, made: Stretch, steps: int) -> Hit | None:
+        if self._watch is None:
+            return None
+        for k in range(steps):
+            hits, last = self._watch.look(float(made.t[k + 1]), self._within(trials, place, made, k))
+            self.member.events += hits
+            if last is not None:
+                return last
+        return None
+
+    def _within(self, trials: Trials, place: int, made: Stretch, k: int) -> State:
+        """Return the states of step k by time, each made by a step that ends there."""
+
+        def state(t: float) -> tuple[Array, Array]:
+            if t in (made.t[k], made.t[k + 1]):
+                at = k + int(t == made.t[k + 1])
+                return made.q[at], self._space.leave(made.q[at], made.w[at])
+            q, w = trials.within(place, _rows(made, np.array([k])), np.array([t]))
+            return q[0], self._space.leave(q[0], w[0])
+
+        return state
+
+    def _keep(self, trials: Trials, place: int, made: Stretch, steps: int, until: float) -> bool:
+        """Keep what is wanted after the start, up to a time in or at the end of the last step.
+
+        Returns whether all that was wanted is a state; if not, nothing is kept.
+        """
+        if self._save is None:
+            ends = slice(1, steps + 1 - int(until != made.t[steps]))
+            return self._add(made.t[ends], made.q[ends], made.w[ends])
+        first, last = np.searchsorted(self._save, (made.t[0], until), side="right")
+        times = self._save[first:last]
+        after = np.searchsorted(made.t, times)
+        q, w = made.q[after], made.w[after]
+        between = np.flatnonzero(made.t[after] != times)
+        if len(between):
+            q[between], w[between] = trials.within(place, _rows(made, after[between] - 1), times[between])
+        return self._add(times, q, w)
+
+    def _add(self, t: Array, q: Array, w: Array) -> bool:
+        good = bool(credible(q).all() and credible(w).all())
+        if good and len(t):
+            self._kept.append((t, q, self._space.leave(q, w)))
+        return good
+
+    def _stop_at(self, hit: Hit) -> None:
+        self.member.stop_at(hit)
+        # Of one of a batch the state is with the event, off the common times.
+        if hit.member is None and not (self._kept and self._kept[-1][0][-1] == hit.t):
+            self._kept.append((np.array([hit.t]), hit.q[None], hit.v[None]))
+
+
+def _rows(made: Stretch, which: Indices) -> Stretch:
+    return Stretch(made.t[which], made.q[which], made.w[which], 0)
+
+
+def outcome_of(
+    dyn: Dynamics, tracks: Sequence[Track], batch: int | None, save: Array | None, evaluations: int, jacobians: int
+) -> Outcome:
+    """Return all trajectories as an outcome."""
+    for track in tracks:
+        # The states are put in below, whole arrays of them.
+        track.member.t, track.member.y = [], []
+    members = [track.member for track in tracks]
+    told = gathered(dyn.model, members, batch, save, evaluations=evaluations, jacobians=jacobians)
+    kept = [track.states() for track in tracks]
+    if batch is None:
+        t, q, v = kept[0]
+        return replace(told, t=t, q=q, v=v)
+    assert save is not None
+    count = max((len(t) for t, _, _ in kept), default=len(save))
+    q, v = (np.full((batch, count, n), np.nan) for n in (dyn.model.nq, dyn.model.nv))
+    for i, (t, *state) in enumerate(kept):
+        q[i, : len(t)], v[i, : len(t)] = state
+    return replace(told, t=save[:count], q=q, v=v)

@@ -1,0 +1,560 @@
+"""Runs of the implicit midpoint rule in (q, p), on `mbkit.derivation.steps.midpoint`'s parts.
+
+The state from step to step is (q, π), and velocities are made of it only where they are
+kept. With no torque or an array, blocks of steps run as machine code, chunks of a batch
+on all cores; the chunks are the same whatever the number of cores. A function as torque
+is evaluated at the midpoint and taken along in the iteration, which then converges
+linearly, at the rate of the step times the torque's derivative.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from itertools import pairwise
+from math import isqrt
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit.codegen.compiled import Call, CallSequence, aligned
+from mbkit.codegen.interpreter import Machine
+from mbkit.derivation.steps.fixed import Part
+from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
+from mbkit.engines import Dynamics
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import FunctionError, UnsupportedError
+from mbkit.model.integration_space import Space
+from mbkit.simulate.constraint_projection import refuse_constraints
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.result import Outcome
+from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, RUNAWAY
+from mbkit.simulate.time_grid import Grid, Indices, check_room
+from mbkit.simulate.torque import Torque
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["WIDEST", "MidpointChunk", "MidpointSolver", "called", "run_midpoint"]
+
+
+# One step of the implicit midpoint rule at a time, for torque functions and what is not compiled.
+
+# With a torque function the iteration converges linearly.
+_WITH_FUNCTION: Final = 60
+_EPS: Final = float(np.finfo(float).eps)
+
+
+def called(
+    dyn: LagrangianDynamics, part: Part, members: slice | Indices, t: Array | float, *arguments: Array
+) -> list[Array]:
+    """Return a part's results for members of a batch: vectors as (n, rows), matrices as (n, rows, columns).
+
+    `t`, one for all or (n,), is the time of evaluation, where the dynamics depends on it.
+    """
+    n = len(arguments[0])
+    given = [np.broadcast_to(x, (n, x.shape[-1])) for x in arguments]
+    if dyn.model.parameters:
+        values = dyn.parameter_values
+        own = values[members] if values.ndim == 2 else np.broadcast_to(values, (n, len(values)))
+        if dyn.model.clock is not None:
+            own = own.copy()
+            own[:, list(dyn.model.parameters).index(dyn.model.clock)] = t
+        given.append(own)
+    results = dyn.code(part.name, make=part.make)(*given, threads=dyn.threads)
+    return [
+        x[..., 0] if x.shape[-1] == 1 and name not in ("M", "jacobian") else x
+        for name, x in zip(part.writes, results, strict=True)
+    ]
+
+
+class MidpointSolver:
+    """Newton's iteration for trajectories side by side.
+
+    Parameters
+    ----------
+    dyn : LagrangianDynamics
+    torque : Torque
+    single : bool
+        Whether there is one trajectory, no batch.
+
+    Attributes
+    ----------
+    iterations : int
+        Summed over the trajectories.
+    """
+
+    def __init__(self, dyn: LagrangianDynamics, torque: Torque, *, single: bool) -> None:
+        self._dyn, self._torque, self._single = dyn, torque, single
+        self._midpoint, self._space = Midpoint(dyn.equations), Space(dyn.model)
+        self.iterations = 0
+
+    def velocity(
+        self, members: Indices, k: int, t: float, h: float, q: Array, pi: Array, guess: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the velocity of step k, the torque that acted, and whether the step is solved, per trajectory.
+
+        With a torque function it goes on until corrections stop shrinking.
+        """
+        w, good = guess.copy(), np.full(len(q), False)
+        tau = np.empty(w.shape)
+        if not self._torque.callable:
+            tau[:] = self._torque.columns(members, k, k + 1)[0].T
+        last, todo = np.full(len(q), np.inf), np.arange(len(q))
+        for _ in range(_WITH_FUNCTION if self._torque.callable else MOST):
+            # A user's function never sees a state that is none.
+            todo = todo[np.isfinite(w[todo]).all(axis=1) & ~good[todo]]
+            if not len(todo):
+                break
+            if self._torque.callable:
+                tau[todo] = self._function(members[todo], k, t, h, q[todo], w[todo])
+            w1, solved = self._newton(members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
+            change = np.abs(w1 - w[todo]).max(axis=1, initial=0.0)
+            if self._torque.callable:
+                solved &= (change <= 4 * _EPS * np.abs(w1).max(axis=1, initial=0.0)) | (change >= last[todo] / 2)
+            w[todo], good[todo], last[todo] = w1, solved, change
+        return w, tau, good
+
+    def _function(self, members: Indices, k: int, t: float, h: float, q: Array, w: Array) -> Array:
+        force = self._torque.during(k, None if self._single else members)
+        assert callable(force)
+        q_m = self._space.move(q, (h / 2) * w)
+        state = q_m, self._space.leave(q_m, w)
+        if self._single:
+            return np.asarray(force(t + h / 2, *(x[0] for x in state)))[None]
+        return force(t + h / 2, *state)
+
+    def _newton(
+        self, members: Indices, t: float, q: Array, pi: Array, w: Array, tau: Array, h: float
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        self.iterations += len(q)
+        given = (q, pi, w, tau, np.array([[h]]))
+        if self._dyn.written_out:
+            w1, miss = called(self._dyn, self._midpoint.newton, members, t, *given)
+            return w1, miss[:, 0] == 0
+        residual, jacobian = called(self._dyn, self._midpoint.system, members, t, *given)
+        change = _solved(jacobian, residual)
+        w1 = w - change
+        limit = SMALL**2 * np.sum(w1**2, axis=1) + (LEAST / h) ** 2 * (1 + np.sum(q**2, axis=1))
+        return w1, np.sum(change**2, axis=1) < limit
+
+    def end(
+        self, members: Indices, t: float, h: float, q: Array, pi: Array, ws: list[Array], tau: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return q and π after the step, and the first guess of the next velocity, from those of the last steps."""
+        zero = np.zeros((1, 1))
+        outs = called(self._dyn, self._midpoint.end, members, t + h / 2, q, pi, *ws, tau, np.array([[h]]), zero, zero)
+        return outs[0], outs[1], outs[2]
+
+
+def _solved(A: Array, b: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        # One singular matrix must not stop the others of a batch.
+        out = np.full(b.shape, np.nan)
+        for i in range(len(b)):
+            try:
+                out[i] = np.linalg.solve(A[i], b[i])
+            except np.linalg.LinAlgError:
+                continue
+        return out
+
+
+_UNSOLVED: Final = "Newton's iteration does not solve the step's equations"
+# Numbers that are turned from momenta into velocities at a time.
+_SLICE: Final = 2**16
+
+
+def run_midpoint(
+    dyn: Dynamics,
+    method: str,
+    q0: Array,
+    v0: Array,
+    grid: Grid,
+    kept: Indices,
+    torque: Torque,
+    bar: Progress,
+) -> Outcome:
+    """Step one state or a batch over the grid; a trajectory that diverges stops there, and the others go on."""
+    if not isinstance(dyn, LagrangianDynamics):
+        raise UnsupportedError(
+            f"{method}: {dyn.engine} gives neither momenta nor ∂T/∂q, which the midpoint rule in (q, p) is made of; "
+            "mbkit.dynamics(model, 'lagrangian') has them; 'gauss4' and 'gauss6' run on any engine"
+        )
+    refuse_constraints(dyn, method, "which its step in (q, p) does not know")
+    single = q0.ndim == 1
+    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
+    check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])
+    run = _Run(dyn, q0, v0, grid, kept, torque)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        if _machine_code(dyn, torque):
+            run.in_chunks(bar)
+        else:
+            run.step_by_step(bar, single=single)
+        return run.outcome(single)
+
+
+def _machine_code(dyn: LagrangianDynamics, torque: Torque) -> bool:
+    if torque.callable or not dyn.model.nv or not dyn.compile or not dyn.written_out:
+        return False
+    midpoint = Midpoint(dyn.equations)
+    return not any(isinstance(dyn.code(p.name, make=p.make), Machine) for p in (midpoint.newton, midpoint.end))
+
+
+class _Run:
+    """Kept states of all trajectories: momenta at first, velocities in the end."""
+
+    def __init__(
+        self, dyn: LagrangianDynamics, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque
+    ) -> None:
+        self._dyn, self._grid, self._kept, self._torque = dyn, grid, kept, torque
+        self._midpoint = Midpoint(dyn.equations)
+        self._q0, self._v0, self._w0 = q0, v0, Space(dyn.model).enter(q0, v0)
+        n, rows = len(q0), len(kept)
+        (self._pi0,) = called(self._dyn, self._midpoint.momentum, slice(None), grid.start, q0, v0)
+        self._q, self._v = np.full((n, rows, q0.shape[1]), np.nan), np.full((n, rows, v0.shape[1]), np.nan)
+        self._steps = np.zeros(n, dtype=np.intp)
+        self._last = np.zeros(n)
+        # Threads append to it.
+        self._iterations: list[int] = []
+        self._error: FunctionError | None = None
+
+    def _rows(self, first: int, last: int) -> slice:
+        """Return the rows of what is kept of the states from the first to the last."""
+        return slice(*np.searchsorted(self._kept, (first, last + 1), side="left"))
+
+    # In machine code
+
+    def in_chunks(self, bar: Progress) -> None:
+        """Run every trajectory, some side by side, and such chunks at once on several cores."""
+        # These load LLVM, which interpreting never needs.
+        from mbkit.codegen.compiled import cores
+
+        n, workers = len(self._q0), self._dyn.threads or cores()
+        parts = -(-n // WIDEST)
+        ends = [n * i // max(parts, 1) for i in range(parts + 1)]
+        chunks = [slice(a, b) for a, b in pairwise(ends)]
+        done, stop = [0] * parts, threading.Event()
+        total = max(parts * self._grid.steps, 1)
+
+        def work(i: int, tell: Callable[[], None]) -> None:
+            def progress(k: int) -> bool:
+                done[i] = k
+                tell()
+                return stop.is_set()
+
+            members = chunks[i]
+            chunk = MidpointChunk(self._dyn, members.stop - members.start, self._grid.steps, torques=self._torque.held)
+            self._march(chunk, members, progress)
+
+        if parts < 2 or workers < 2:
+            for i in range(parts):
+                work(i, lambda: bar.update(sum(done) / total))
+            return
+        with ThreadPoolExecutor(min(workers, parts)) as pool:
+            waiting: set[Future[None]] = {pool.submit(work, i, lambda: None) for i in range(parts)}
+            try:
+                while waiting:
+                    finished, waiting = wait(waiting, timeout=0.1, return_when=FIRST_EXCEPTION)
+                    for future in finished:
+                        future.result()
+                    bar.update(sum(done) / total)
+            finally:
+                stop.set()
+
+    def _march(self, chunk: MidpointChunk, members: slice, progress: Callable[[int], bool]) -> None:
+        grid, held = self._grid, self._torque.held
+        values = self._dyn.parameter_values
+        own = values[members] if values.ndim == 2 else values
+        chunk.begin(self._q0[members], self._pi0[members], self._w0[members], own)
+        alive, k, torques = np.full(members.stop - members.start, True), 0, np.empty(0)
+        while k < grid.steps and alive.any():
+            # The last step may have a length of its own.
+            whole = grid.steps - 1 if grid.last != grid.dt and k < grid.steps - 1 else grid.steps
+            n = min(chunk.block, whole - k)
+            if held or not torques.size:
+                torques = self._torque.columns(members, k, k + n)
+            good = chunk.advance(n, grid.time(k), grid.step(k), torques)
+            if (rows := self._rows(k + 1, k + n)).start < rows.stop:
+                at = self._kept[rows] - k
+                self._q[members, rows], self._v[members, rows] = chunk.states("q", at), chunk.states("pi", at)
+            self._steps[members][alive] = k + good[alive]
+            for m in np.flatnonzero(alive & (good < n)):
+                last = [chunk.states(name, good[m : m + 1])[m] for name in ("q", "pi")]
+                self._last[members.start + m] = max(np.abs(x).max() for x in last)
+            alive &= good == n
+            chunk.again()
+            k += n
+            if progress(k):
+                break
+        self._iterations.append(chunk.iterations)
+
+    # In Python
+
+    def step_by_step(self, bar: Progress, *, single: bool) -> None:
+        """Run all trajectories side by side, with a look at every step."""
+        grid = self._grid
+        members: Indices = np.arange(len(self._q0))
+        solver = MidpointSolver(self._dyn, self._torque, single=single)
+        q, pi, ws, guess = self._q0, self._pi0, [self._w0] * len(GUESS), self._w0
+        try:
+            for k in range(grid.steps):
+                w, tau, good = solver.velocity(members, k, grid.time(k), grid.step(k), q, pi, guess)
+                ws = [w, *ws[:-1]]
+                q1, pi1, guess = solver.end(members, grid.time(k), grid.step(k), q, pi, ws, tau)
+                good &= (np.abs(q1) < RUNAWAY).all(axis=1) & (np.abs(pi1) < RUNAWAY).all(axis=1)
+                if not good.all():
+                    self._last[members[~good]] = np.maximum(np.abs(q).max(axis=1), np.abs(pi).max(axis=1))[~good]
+                    members, q1, pi1, guess = members[good], q1[good], pi1[good], guess[good]
+                    ws = [w[good] for w in ws]
+                    if not len(members):
+                        break
+                q, pi = q1, pi1
+                self._steps[members] = k + 1
+                if (rows := self._rows(k + 1, k + 1)).start < rows.stop:
+                    self._q[members, rows.start], self._v[members, rows.start] = q, pi
+                bar.update((k + 1) / grid.steps)
+        except FunctionError as error:
+            self._error = error
+        self._iterations.append(solver.iterations)
+
+    # In the end
+
+    def outcome(self, single: bool) -> Outcome:
+        """Return what was kept, with velocities."""
+        grid, kept, steps = self._grid, self._kept, self._steps
+        for i in np.flatnonzero(steps < grid.steps):
+            self._q[i, kept > steps[i]], self._v[i, kept > steps[i]] = np.nan, np.nan
+        self._to_velocities()
+        if kept[0] == 0:
+            self._q[:, 0], self._v[:, 0] = self._q0, self._v0
+        rows = int(np.count_nonzero(kept <= steps.max())) if len(steps) else len(kept)
+        q, v = self._q[:, :rows], self._v[:, :rows]
+        times = np.array([grid.time(int(k)) for k in steps])
+        message = self._message(single)
+        return Outcome(
+            t=np.array([grid.time(int(k)) for k in kept[:rows]]),
+            q=q[0] if single else q,
+            v=v[0] if single else v,
+            steps=int(steps.sum()),
+            # Each iteration is one, and so is the end of each step.
+            evaluations=sum(self._iterations) + int(steps.sum()),
+            ended="function_failed" if self._error else "diverged" if message else "finished",
+            reached=np.asarray(times[0] if single else times),
+            message=message,
+            jacobians=sum(self._iterations),
+            error=self._error,
+        )
+
+    def _to_velocities(self) -> None:
+        n, rows, nv = self._v.shape
+        times = np.array([self._grid.time(int(k)) for k in self._kept])
+        size = max(_SLICE // max(n * (nv or 1), 1), 1)
+        for start in range(0, rows, size):
+            q, v = (x[:, start : start + size] for x in (self._q, self._v))
+            good = np.isfinite(v).all(axis=2)
+            who, at = np.nonzero(good)
+            if len(who):
+                v[who, at] = self._velocities(who, times[start + at], q[who, at], v[who, at])
+
+    def _velocities(self, members: Indices, t: Array, q: Array, pi: Array) -> Array:
+        if self._dyn.written_out:
+            return called(self._dyn, self._midpoint.velocity, members, t, q, pi)[0]
+        M, p = called(self._dyn, self._midpoint.velocity_system, members, t, q, pi)
+        return np.asarray(np.linalg.solve(M, p[..., None])[..., 0])
+
+    def _message(self, single: bool) -> str:
+        grid, steps = self._grid, self._steps
+        if self._error is not None:
+            return str(self._error)
+        short = np.flatnonzero(steps < grid.steps)
+        if not len(short):
+            return ""
+        i = int(short[np.argmin(steps[short])])
+        t = grid.time(int(steps[i]))
+        # What overflows in the middle of a step leaves no number for the iteration either.
+        why = RAN_AWAY if self._last[i] > RUNAWAY**0.5 else _UNSOLVED
+        message = f"diverged after t = {t:.6g} s (step {steps[i] + 1}): {why}; dt = {grid.dt:g} s may be too long"
+        if not single:
+            message += f"; {len(short)} of {len(steps)} trajectories diverged, see reached"
+        return message
+
+
+# Many steps of the implicit midpoint rule for states side by side, in machine code.
+
+#: States that go side by side, at most: enough for the processor's vectors, and nine
+#: cache lines in a row of them, because an even number would meet in the same sets.
+WIDEST: Final = 72
+# Blocks without a miss after which one iteration less is tried.
+_PATIENCE: Final = 32
+# Steps of a block: until its states fill half of what a core has in its second cache.
+_CACHE: Final = 2**19
+_SHORTEST, _LONGEST = 16, 256
+# Until there are velocities to guess the next one from, more iterations are needed.
+_FIRST: Final = len(GUESS)
+_LANES: Final = 8
+
+
+class MidpointChunk:
+    """Room for the states of a block of steps, one trajectory in each column.
+
+    All steps of a block are made with the same number of Newton's iterations, without a
+    look in between. Where one of them turns out not to be solved, the block is made
+    again with more.
+
+    Parameters
+    ----------
+    dyn : LagrangianDynamics
+        Its functions are machine code.
+    count : int
+        Trajectories, at most `WIDEST`.
+    steps : int
+        That are to be made, so that little is prepared for few.
+    torques : bool
+        Whether each step has a torque of its own.
+
+    Attributes
+    ----------
+    block : int
+        Steps of the next block, at most.
+    iterations : int
+        Newton's iterations so far, summed over the trajectories.
+    """
+
+    def __init__(self, dyn: LagrangianDynamics, count: int, steps: int, *, torques: bool) -> None:
+        midpoint, nq, nv = Midpoint(dyn.equations), dyn.model.nq, dyn.model.nv
+        self._newton, self._end = midpoint.newton, midpoint.end
+        self._codes = {part.name: dyn.code(part.name, make=part.make) for part in (self._newton, self._end)}
+        self._count = count
+        width = -(-count // _LANES) * _LANES | _LANES if count > _LANES else _LANES
+        most = min(_CACHE // (8 * width * (nq + 3 * nv + 1)), _LONGEST, isqrt(steps))
+        n, back = max(most, _SHORTEST), len(GUESS) - 1
+        self._longest, self.block = n, _FIRST
+        rooms = [("q", n + 1, nq), ("pi", n + 1, nv), ("misses", n + 1, 1), ("tau", n if torques else 1, nv)]
+        # The velocity of each step behind those of the last ones before the block.
+        rooms += [("w", n + back, nv), ("guess", 2, nv), ("trial", 2, nv), ("miss", 1, 1), ("dt", 1, 1)]
+        # The time is one of them, and another in each step.
+        names, clock = list(dyn.model.parameters), dyn.model.clock
+        self._clock = None if clock is None else names.index(clock)
+        rooms += [("parameters", 1 if clock is None else n, len(names))]
+        self._rooms = {name: _room(places, rows, width) for name, places, rows in rooms}
+        self._back = back
+        self._sequences: dict[tuple[int, int], CallSequence] = {}
+        self._iterations, self._smooth = 2, 0
+        self._taken = 0
+        self.iterations = 0
+        self._alive = np.full(count, True)
+
+    def begin(self, q: Array, pi: Array, w: Array, parameters: Array) -> None:
+        """Put (n, nq) configurations, (n, nv) momenta and velocities in, and the parameters' values, (p,) or (n, p)."""
+        self._fill("q", 0, q.T)
+        self._fill("pi", 0, pi.T)
+        self._fill("guess", 0, w.T)
+        for place in range(self._back):
+            self._fill("w", place, w.T)
+        for place in range(len(self._rooms["parameters"]) if parameters.size else 0):
+            self._fill("parameters", place, np.atleast_2d(parameters).T)
+
+    def _fill(self, name: str, place: int, columns: Array) -> None:
+        # Columns beyond the states repeat the last one.
+        room = self._rooms[name][place]
+        room[:, : self._count] = columns
+        room[:, self._count :] = room[:, self._count - 1 : self._count]
+
+    def _sequence(self, iterations: int) -> CallSequence:
+        key = iterations, self.block
+        if key not in self._sequences:
+            calls = [call for j in range(self.block) for call in self._step(j, iterations)]
+            self._sequences[key] = CallSequence(calls)
+        return self._sequences[key]
+
+    def _step(self, j: int, iterations: int) -> list[Call]:
+        def at(name: str, place: int) -> Array:
+            room = self._rooms[name]
+            return np.asarray(room[place % len(room)].T)
+
+        held = {name: at(name, j) for name in ("q", "pi", "tau", "misses", "parameters")}
+        held |= {name: at(name, 0) for name in ("dt", "miss")}
+        new = {"q1": at("q", j + 1), "pi1": at("pi", j + 1), "misses1": at("misses", j + 1), "guess": at("guess", 1)}
+        # The block's first guess stays where it is, so that the block can be made again.
+        tries = [at("guess", min(j, 1)), *(at("trial", i) for i in range(iterations - 1)), at("w", j + self._back)]
+        calls = []
+        for w, w1 in pairwise(tries):
+            given = {**held, "w": w}
+            calls.append(self._call(self._newton.name, self._newton.reads, given, [w1, held["miss"]]))
+        past = {name: at("w", j + self._back - i) for i, name in enumerate(("w", "w_1", "w_2"))}
+        outs = [new[name] for name in self._end.writes]
+        return [*calls, self._call(self._end.name, self._end.reads, {**held, **past}, outs)]
+
+    def _call(self, name: str, reads: tuple[str, ...], given: dict[str, Array], outs: list[Array]) -> Call:
+        return Call(self._codes[name], [given[n] for n in reads], outs)
+
+    def advance(self, steps: int, start: float, dt: float, torques: Array) -> NDArray[np.intp]:
+        """Take some steps, at most `block`, from where the last ones ended.
+
+        Parameters
+        ----------
+        steps : int
+        start, dt : float
+            Time at which the first begins, and length of each; s.
+        torques : (steps or 1, nv, n or 1) array
+
+        Returns
+        -------
+        (n,) array of int
+            How many of them are good, per trajectory.
+        """
+        self._rooms["dt"][:] = dt
+        for j in range(min(steps, len(self._rooms["tau"]))):
+            self._fill("tau", j, torques[j])
+        if self._clock is not None:
+            middles = start + (np.arange(steps) + 0.5) * dt
+            self._rooms["parameters"][:steps, self._clock] = middles[:, None]
+        self._rooms["misses"][0] = 0.0
+        if self._smooth >= _PATIENCE and self._iterations > 1:
+            self._iterations, self._smooth = self._iterations - 1, 0
+        iterations = self._iterations
+        while True:
+            self._sequence(iterations).run(0, steps * (iterations + 1))
+            self.iterations += iterations * steps * int(self._alive.sum())
+            missed = self._rooms["misses"][steps, 0, : self._count] > 0
+            if not (missed & self._alive).any():
+                self._smooth += 1
+                break
+            self._smooth = 0
+            if iterations == MOST:
+                break
+            iterations = min(iterations + max(iterations // 2, 1), MOST)
+        self._iterations, self._taken = iterations, steps
+        good = np.full(self._count, steps)
+        if missed.any():
+            good = np.count_nonzero(self._rooms["misses"][1 : steps + 1, 0, : self._count] == 0, axis=0)
+            # What is lost asks for no more iterations.
+            self._alive &= ~missed
+            if self._iterations == MOST:
+                self._iterations = 2
+        return good
+
+    def again(self) -> None:
+        """Make the last state the first one of the next block."""
+        n = self._taken
+        if self.block != self._longest:
+            self.block, self._iterations = self._longest, 2
+        for name in ("q", "pi"):
+            self._rooms[name][0] = self._rooms[name][n]
+        self._rooms["guess"][0] = self._rooms["guess"][1]
+        self._rooms["w"][: self._back] = self._rooms["w"][n : n + self._back].copy()
+
+    def states(self, name: str, which: Indices) -> Array:
+        """Return q or pi after these many steps of the block, (n, steps, rows)."""
+        return np.asarray(self._rooms[name][which, :, : self._count].transpose(2, 0, 1))
+
+
+def _room(places: int, rows: int, width: int) -> Array:
+    out = aligned(places * rows * width).reshape(places, rows, width)
+    out[:] = 0.0
+    return out

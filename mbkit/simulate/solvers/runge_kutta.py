@@ -1,0 +1,175 @@
+"""One step of each fixed-step method, on the space of `mbkit.model.integration_space`.
+
+A free joint's linear velocity is integrated in the axes of the joint's fixed
+frame and its position by addition (see `mbkit.model.joint_types`); a rotation
+is moved by the exponential of what its body-axes velocity adds up to, and inside
+a Runge-Kutta step the velocities are pulled back by the inverse of exp's
+differential (Munthe-Kaas 1999, High order Runge-Kutta methods on manifolds).
+MuJoCo 4 does the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.base import at_time
+from mbkit.errors import InputError, NumericalError
+from mbkit.methods.tableaus import RK4, Tableau
+from mbkit.model.integration_space import Space
+from mbkit.simulate.constraint_projection import Approach, beside, settled
+from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.torque import Force
+
+__all__ = ["RAN_AWAY", "RUNAWAY", "DivergenceError", "Field", "Step", "credible", "make_step", "reason"]
+
+#: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
+Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
+
+RAN_AWAY: Final = "the state grew beyond all bounds"
+#: A state with a number of this size is none any more.
+RUNAWAY: Final = 1e100
+
+
+class DivergenceError(Exception):
+    """A state or an acceleration is none any more; never leaves `mbkit.simulate`."""
+
+
+def credible(x: Array) -> NDArray[np.bool_]:
+    """Return, per state, whether all its numbers are finite and below 1e100.
+
+    No machine goes there, and energies of what lies below can still be computed.
+    """
+    return np.asarray((np.abs(x) < RUNAWAY).all(axis=-1))
+
+
+def _finite(q: Array, v: Array) -> bool:
+    return bool(np.isfinite(q).all() and np.isfinite(v).all())
+
+
+class Field:
+    """ẇ of the integrators' state, from an engine's forward dynamics.
+
+    Attributes
+    ----------
+    evaluations : int
+        Of the forward dynamics so far, summed over a batch.
+    """
+
+    def __init__(self, dyn: Dynamics, space: Space) -> None:
+        self._dyn, self._space = dyn, space
+        self._use(dyn)
+        self.evaluations = 0
+
+    def only(self, members: Indices) -> None:
+        """Go on with these members of the whole batch."""
+        self._use(self._dyn.of_samples(members))
+
+    def _use(self, own: Dynamics) -> None:
+        self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.clock is not None
+        self._approach = Approach()
+
+    @property
+    def near_singular(self) -> bool:
+        """Whether constraints may soon depend on each other."""
+        return self._own.model.constrained and self._approach.near
+
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+        """Return the state that a step led to, on its constraints if there are some."""
+        if not self._own.model.constrained:
+            return q, w
+        q, w = settled(self._own, t, q, w)
+        self._approach.saw(self._own, t, q)
+        return q, w
+
+    def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
+        if self.near_singular:
+            q, w = beside(self._own, t, q, w)
+        return self(t, q, w, force)
+
+    def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ, or raise `DivergenceError`."""
+        v = self._space.leave(q, w)
+        if not isinstance(force, np.ndarray):
+            # A user's function never sees a state that is none.
+            if not (credible(q).all() and credible(v).all()):
+                raise DivergenceError(RAN_AWAY)
+            force = force(t, q, v)
+        self.evaluations += 1 if q.ndim == 1 else len(q)
+        if self._timed:
+            self._forward = at_time(self._own, t).forward_dynamics
+        try:
+            a = self._forward(q, v, force)
+        except NumericalError as error:
+            raise DivergenceError(_blamed(str(error), q, v)) from None
+        except InputError:
+            if _finite(q, v):
+                raise
+            raise DivergenceError(RAN_AWAY) from None
+        return np.asarray(self._space.acceleration(q, v, a))
+
+
+def _blamed(told: str, q: Array, v: Array) -> str:
+    # An engine overflows before its state does, and blames the model for it.
+    largest = max(float(np.abs(x).max()) for x in (q, v))
+    return told if largest < 1e50 else RAN_AWAY
+
+
+def reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, force: Array) -> str:
+    """Return why the step from a batch of one state diverges, in the engine's words if it has some."""
+    space = Space(dyn.model)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        try:
+            make_step(method, Field(dyn, space), space)(t, h, q, w, force)
+        except DivergenceError as error:
+            return str(error)
+    return RAN_AWAY
+
+
+def make_step(method: str, field: Field, space: Space) -> Step:
+    """Return the step of a fixed-step method."""
+    if method in _TABLEAUS:
+        return _runge_kutta(_TABLEAUS[method], field, space)
+    if method.startswith("gauss"):
+        # It takes this module's own names.
+        from mbkit.simulate.solvers.gauss import gauss_step
+
+        return gauss_step(method, field, space)
+    return _semi_implicit_euler(field, space)
+
+
+def _semi_implicit_euler(field: Field, space: Space) -> Step:
+    def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        w = w + h * field(t, q, w, force)
+        return space.move(q, h * w), w
+
+    return step
+
+
+def _runge_kutta(tableau: Tableau, field: Field, space: Space) -> Step:
+    A, b, c, s, nv = tableau.A, tableau.b, tableau.c.tolist(), tableau.stages, space.nv
+
+    def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        # The rates (u̇, ẇ) of all stages; a row of A times them is one product.
+        rates = np.empty((s, *w.shape[:-1], 2 * nv))
+        flat = rates.reshape(s, -1)
+        rates[0, ..., :nv] = w
+        rates[0, ..., nv:] = field.consistent(t, q, w, force)
+        for i in range(1, s):
+            moved = ((h * A[i, :i]) @ flat[:i]).reshape(rates.shape[1:])
+            u, w_i = moved[..., :nv], w + moved[..., nv:]
+            rates[i, ..., :nv] = space.rate(u, w_i)
+            rates[i, ..., nv:] = field.consistent(t + c[i] * h, space.move(q, u), w_i, force)
+        moved = ((h * b) @ flat).reshape(rates.shape[1:])
+        return space.move(q, moved[..., :nv]), w + moved[..., nv:]
+
+    return step
+
+
+_TABLEAUS: Final = {"rk4": RK4}

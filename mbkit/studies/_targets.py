@@ -1,0 +1,181 @@
+"""What a person asks about: a robot, a catalog system, a file, or a function of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from mbkit import catalog
+from mbkit.engines import ENGINES
+from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError
+from mbkit.load import load
+from mbkit.load.robot_data import find
+from mbkit.model import Model
+
+__all__ = ["checked_target", "is_code", "kept", "model_of", "not_installed", "resolved"]
+
+
+_FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
+
+
+def model_of(target: str, options: Mapping[str, Any] | None = None) -> Model:
+    """Return the model that a text names.
+
+    Parameters
+    ----------
+    target : str
+        A robot's name, a catalog system's, a path, or ``package.module:function``
+        for a function without arguments that returns a `Model`; the current folder
+        is looked in first.
+    options : mapping, optional
+        Keyword arguments of `mbkit.load`, for robots and files only.
+
+    Raises
+    ------
+    UnknownNameError, LoadError, ModelError
+        With the culprit; whatever a user's function raises is told in a `LoadError`.
+    """
+    options = options or {}
+    if _FUNCTION.fullmatch(target) and not os.path.exists(target):
+        _refuse(options, "a function")
+        return _from_function(*target.split(":"))
+    named = catalog.systems()
+    if target in named:
+        if find(target) is None:
+            _refuse(options, "a catalog system")
+            return named[target]()
+        told = f"{target!r} is a robot and a catalog system; this is the robot, mbkit.catalog:{target} is the other"
+        warnings.warn(told, MbkitWarning, stacklevel=2)
+    try:
+        return load(target, **options)
+    except UnknownNameError as error:
+        hint = "(mbkit robots lists them; a path ends in .urdf or .xml, a function is package.module:function)"
+        raise UnknownNameError("robot or catalog system", target, [*named, *error.known], hint) from None
+
+
+def is_code(target: str) -> bool:
+    """Return whether `model_of` would import and call what a text names: a function, and no system of mbkit's own."""
+    if not _FUNCTION.fullmatch(target):
+        return False
+    module, _, name = target.partition(":")
+    if module == "mbkit.lagrangian.systems":
+        from mbkit.lagrangian import systems
+
+        return name not in systems.names()
+    return module != "mbkit.catalog" or name not in catalog.systems()
+
+
+def _refuse(options: Mapping[str, Any], what: str) -> None:
+    if options:
+        told = ", ".join(options)
+        raise InputError(f"{told}: only for robots and files; the target is {what}, which makes its own model")
+
+
+def _from_function(module_name: str, name: str) -> Model:
+    target = f"{module_name}:{name}"
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    with _blamed(f"{target}: cannot import {module_name!r}"):
+        made: Any = importlib.import_module(module_name)
+    where = module_name
+    for part in name.split("."):
+        if not hasattr(made, part):
+            raise UnknownNameError("function", part, [n for n in dir(made) if n[0] != "_"], f"(in {where})")
+        made, where = getattr(made, part), f"{where}.{part}"
+    if callable(made):
+        with _blamed(f"{target}: the function failed"):
+            made = made()
+    if not isinstance(made, Model) and isinstance(getattr(made, "model", None), Model):
+        # A system on paper, which knows itself as a model.
+        made = made.model
+    if not isinstance(made, Model):
+        told = f"expected a Model, got {type(made).__name__}; return mbkit.load(...) or builder.build()"
+        raise LoadError(f"{target}: {told}")
+    return made
+
+
+@contextlib.contextmanager
+def _blamed(what: str) -> Iterator[None]:
+    """Turn any exception of a user's code into a `LoadError` that says where it was."""
+    try:
+        # What it prints must not end up among a caller's JSON.
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise LoadError(f"{what}: {type(error).__name__}: {error}{_place(error)}") from error
+
+
+def _place(error: BaseException) -> str:
+    """Return where a user's code failed, unless the message itself says it or the fault is not in code."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    ours = place.filename == __file__ or place.filename.startswith("<frozen")
+    if ours or isinstance(error, (SyntaxError, MbkitError)):
+        return ""
+    return f" ({place.filename}, line {place.lineno})"
+
+
+# What a baseline was recorded of, as text: a robot's name, a function, or a file by its place beside the baseline.
+
+
+def checked_target(target: object, options: object = None) -> None:
+    """Refuse what a baseline cannot keep as a target, or as the options that it is loaded with."""
+    if not isinstance(target, str):
+        raise InputError(f"target: expected a text such as 'panda' or './arm.urdf', got {type(target).__name__}")
+    if options is None:
+        return
+    kept_kinds = (bool, int, float, str)
+    if not isinstance(options, Mapping) or not all(
+        isinstance(k, str)
+        and (isinstance(x, kept_kinds) or (isinstance(x, (list, tuple)) and all(isinstance(y, kept_kinds) for y in x)))
+        for k, x in options.items()
+    ):
+        raise InputError(f"options: expected keyword arguments of mbkit.load, of numbers and texts, got {options!r}")
+
+
+def kept(target: str, baseline: Path) -> str:
+    """Return a target as it is kept: a file relative to the baseline, so that both can move together.
+
+    It then begins with a dot, as no name does.
+    """
+    if not os.path.isfile(target):
+        return target
+    try:
+        relative = Path(os.path.relpath(target, baseline.absolute().parent)).as_posix()
+    except ValueError:
+        # Another drive: there is no way from one to the other.
+        return Path(target).absolute().as_posix()
+    return relative if relative.startswith(".") else f"./{relative}"
+
+
+def resolved(target: str, baseline: Path) -> str:
+    """Return a kept target as it is loaded from the current folder."""
+    return os.path.normpath(baseline.absolute().parent / target) if target.startswith(".") else target
+
+
+# Which engines are there.
+
+
+def not_installed(engines: Iterable[str]) -> dict[str, str]:
+    """Return the engines that are not installed, each with how to get it; unknown names are left to others."""
+    out = {}
+    for name in engines:
+        if name not in ENGINES:
+            continue
+        module, _, package = ENGINES[name]
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name and error.name.startswith("mbkit"):
+                raise
+            out[name] = f"not installed; pip install {package}"
+    return out

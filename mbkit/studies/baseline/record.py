@@ -1,0 +1,287 @@
+"""`record`: what engines say of a model today, into a file."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array, count
+from mbkit.engines import ENGINES, Dynamics, dynamics
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.model import Model
+from mbkit.model.builder import expect_model
+from mbkit.studies import _results
+from mbkit.studies._targets import checked_target
+from mbkit.studies.baseline import record as engines_
+from mbkit.studies.baseline.content import ROLLOUT, Baseline, Rollout
+from mbkit.studies.baseline.description import described, links_of
+from mbkit.studies.baseline.file import check_replaceable, path_of, store, text_of
+from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Yardstick, relevant
+from mbkit.studies.compare.result import Refusal
+from mbkit.studies.compare.rollouts import quiet_simulate
+from mbkit.studies.compare.study import COMPARABLE
+from mbkit.studies.compare.terms import TERMS, States, states
+
+__all__ = ["LONG", "checked_model", "checked_names", "evaluated", "made", "record", "states_of", "with_values"]
+
+
+# What is recorded, evaluated: the states, every term at them, and where a short rollout ends.
+
+# The same formula everywhere: MuJoCo by its own steps, the others by mbkit's.
+_METHODS: Final = {"mujoco": "mujoco_rk4"}
+_METHOD: Final = "rk4"
+#: Of the motion of a robot an excerpt, in which rounding does not grow.
+LONG: Final = Rollout(dt=2e-3, steps=25)
+# States are written in a file for people: of these decimals every double is its own shortest text.
+_DECIMALS: Final = 6
+
+
+def states_of(model: Model, samples: int, seed: int) -> States:
+    """Return `samples` random states, and one that is near singular."""
+    drawn = states(model, samples, seed)
+    # Limits act on no term, and at zero axes are aligned as they are near singular: a file is read by people.
+    which = [*range(samples), *[k for k, kind in enumerate(drawn.kinds) if kind == "near singular"][:1]]
+    v, a, tau = (np.round(x[which], _DECIMALS // 2) + 0.0 for x in (drawn.v, drawn.a, drawn.tau))
+    if model.constrained:
+        # Rounded, a state would be off the constraints.
+        v = drawn.v[which]
+    return States(_rounded(model, drawn.q[which]), v, a, tau, tuple(drawn.kinds[k] for k in which))
+
+
+def _rounded(model: Model, q: Array) -> Array:
+    if model.constrained:
+        return q
+    out = np.round(q, _DECIMALS)
+    for start, _ in model.quaternions:
+        # Unit length needs every digit.
+        out[..., start : start + 4] = q[..., start : start + 4]
+    return np.asarray(out + 0.0)
+
+
+def evaluated(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Array], list[Refusal]]:
+    """Return every term that an engine gives, and why it does not give the others."""
+    values: dict[str, Array] = {}
+    refusals = []
+    with warnings.catch_warnings():
+        # A defect that was there before is recorded, and no news.
+        warnings.simplefilter("ignore", KnownDefectWarning)
+        for term in TERMS:
+            try:
+                values[term.name] = term.call(dyn, at)
+            except MbkitError as error:
+                refusals.append(_refusal(dyn, term.name, error))
+        try:
+            values[ROLLOUT] = _rolled(dyn, at, rollout)
+        except MbkitError as error:
+            refusals.append(_refusal(dyn, ROLLOUT, error))
+    return values, refusals
+
+
+def _refusal(dyn: Dynamics, term: str, error: MbkitError) -> Refusal:
+    return Refusal(dyn.engine, term, str(error).removeprefix(f"{dyn.engine}: "))
+
+
+def _rolled(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
+    """Return q and v at the end of a rollout from the first state, one after the other."""
+    # MuJoCo's own steps make a mimic joint a soft equality, which is another system.
+    method = _METHOD if dyn.model.layout.reduced else _METHODS.get(dyn.engine, _METHOD)
+    run = quiet_simulate(dyn, at.q[0], at.v[0], rollout.dt * rollout.steps, method, rollout.dt)
+    if run.stats.ended != "finished":
+        raise NumericalError(f"{dyn.engine}: {method}: {run.stats.message}")
+    return np.concatenate([run.q[-1], run.v[-1]])
+
+
+Progress = Callable[[float, str], object]
+
+
+def record(
+    model: Model,
+    path: str | os.PathLike[str],
+    engines: Sequence[str] | None = None,
+    *,
+    samples: int = 2,
+    seed: int = 0,
+    target: str = "",
+    options: Mapping[str, Any] | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Baseline:
+    """Record what engines say of a model, for `check` to hold them against later.
+
+    The file has the model's parameters, every term at a few seeded states and the end of a
+    short rollout, by the oracle; how far each engine was from these; and versions. The same
+    model, versions and processor give the same bytes.
+
+    Parameters
+    ----------
+    model : Model
+        Whose named parameters have values.
+    path : path
+        A TOML file, of which folders are made. The baseline of the same model is replaced.
+    engines : sequence of str, optional
+        By default all that are installed and hold the model.
+    samples : int
+        Random states, beside which stands one near singular.
+    seed : int
+    target, options : str and mapping, optional
+        What `mbkit baseline check` loads, as `mbkit check` takes it, and how: keyword arguments of
+        `mbkit.load`. A function, ``package.module:function``, is loaded only where ``--target`` names it. A file's
+        path is relative to the baseline's folder, and begins with a dot. Of a
+        URDF, links that are fixed to each other are recorded each by itself then, beside the body
+        that they make.
+    force : bool
+        Whether to replace whatever file is there.
+    progress : callable, optional
+        Called as ``progress(fraction, text)``.
+
+    Returns
+    -------
+    Baseline
+        Of which `disagreements` tells where an engine was not right even now.
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        For unusable arguments.
+    UnsupportedError
+        An engine that was asked for is not installed, or none holds the model.
+    OutputError
+        The file cannot be written, or is not this model's to replace; it stays as it was.
+    """
+    model, where = engines_.checked_model(model), path_of(path)
+    names = engines_.checked_names(engines)
+    count("samples", samples, least=1)
+    count("seed", seed)
+    checked_target(target, options)
+    if not force:
+        check_replaceable(where, model.name)
+    made = _recorded(model, names, engines is not None, samples, seed, progress or _silent)
+    given = dict(options or {})
+    description = made.description | links_of(model, target, given, where)
+    made = replace(made, target=target, options=given, description=description)
+    store(where, text_of(made), model.name, force=force)
+    return made
+
+
+def _silent(_fraction: float, _text: str) -> None:
+    """Tell nobody."""
+
+
+def _recorded(
+    model: Model,
+    names: Sequence[str],
+    asked: bool,
+    samples: int,
+    seed: int,
+    tell: Progress,
+) -> Baseline:
+    tell(0.0, "building")
+    plain = engines_.with_values(model)
+    made, refused, missing = engines_.made(plain, names)
+    if asked and missing:
+        raise UnsupportedError("; ".join(f"{m.engine}: {m.reason}" for m in missing))
+    if not made:
+        why = "; ".join(f"{r.engine}: {r.reason}" for r in refused)
+        raise UnsupportedError(f"no engine holds {model.name}, so there is nothing to record: {why}")
+    at = states_of(plain, samples, seed)
+    tell(0.1, "34 digits")
+    terms, untold = evaluated(OracleDynamics(plain), at, LONG)
+    description = described(model)
+    yardstick = Yardstick(terms, at, description, model.coordinate_names, model.velocity_names)
+    errors: dict[str, dict[str, float]] = {}
+    own: dict[str, dict[str, Array]] = {}
+    left_out: list[Refusal] = [*refused, *untold]
+    for k, (name, dyn) in enumerate(made.items()):
+        tell(0.6 + 0.4 * k / len(made), name)
+        values, without = evaluated(dyn, at, LONG)
+        left_out += [r for r in without if r.term in terms]
+        errors[name] = {t: _error(yardstick, t, x, terms[t]) for t, x in values.items() if t in terms}
+        wrong = {t: values[t] for t, x in errors[name].items() if x > ROUNDING}
+        if wrong:
+            own[name] = wrong
+    tell(1.0, "done")
+    return Baseline(
+        model=model.name,
+        digest=model.digest,
+        target="",
+        options={},
+        seed=seed,
+        processor=_results.processor(),
+        versions=relevant(errors),
+        description=description,
+        coordinates=tuple(model.coordinate_names),
+        velocities=tuple(model.velocity_names),
+        states=at,
+        rollout=LONG,
+        terms=terms,
+        errors=errors,
+        own=own,
+        left_out=tuple(left_out),
+    )
+
+
+def _error(yardstick: Yardstick, term: str, value: Array, reference: Array) -> float:
+    error = float(np.max(yardstick.errors(term, value, reference).relative))
+    return error if error > FINE else 0.0
+
+
+# The engines of a baseline, made; one that is not installed is told apart from one that refuses.
+
+# A few states are no reason to compile.
+_OPTIONS: Final[dict[str, dict[str, Any]]] = {"lagrangian": {"compile": False}}
+
+
+def checked_model(given: object) -> Model:
+    """Return a model that has something to record."""
+    model = expect_model(given)
+    if not model.nv:
+        raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to record; add a joint")
+    model.require_values("a baseline")
+    return model
+
+
+def checked_names(engines: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of engines, all that there are where none were given."""
+    if engines is None:
+        return COMPARABLE
+    if isinstance(engines, str):
+        raise InputError(f"engines: expected several names, got the string {engines!r}; write [{engines!r}]")
+    for name in engines:
+        if name not in COMPARABLE:
+            raise UnknownNameError("engine", str(name), COMPARABLE)
+    if not engines:
+        raise InputError(f"engines: expected at least one of {', '.join(COMPARABLE)}")
+    return tuple(dict.fromkeys(engines))
+
+
+def with_values(model: Model) -> Model:
+    """Return the model with numbers for its named parameters, which not every engine takes."""
+    values = {name: x for name, x in model.parameters.items() if x is not None}
+    return model.with_parameters(**values) if values else model
+
+
+def made(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[Refusal], list[Refusal]]:
+    """Return the engines that hold a model, those that refuse it, and those that are not installed."""
+    found: dict[str, Dynamics] = {}
+    refused: list[Refusal] = []
+    missing: list[Refusal] = []
+    for name in names:
+        try:
+            found[name] = dynamics(model, name, **_OPTIONS.get(name, {}))
+        except UnsupportedError as error:
+            absent = isinstance(error.__cause__, ModuleNotFoundError)
+            told = f"not installed; pip install {ENGINES[name][2]}" if absent else _plain(name, error)
+            (missing if absent else refused).append(Refusal(name, "", told))
+        except MbkitError as error:
+            refused.append(Refusal(name, "", _plain(name, error)))
+    return found, refused, missing
+
+
+def _plain(name: str, error: MbkitError) -> str:
+    return str(error).removeprefix(f"{name}: ")

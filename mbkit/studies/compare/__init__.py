@@ -1,0 +1,1 @@
+"""Comparison of engines: terms, rollouts, what was left out."""

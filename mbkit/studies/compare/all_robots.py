@@ -1,0 +1,222 @@
+"""`all_robots`: compare the engines on every robot of example-robot-data."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError
+from mbkit.load import load, robots
+from mbkit.load.robot_data import find
+from mbkit.studies import _results
+from mbkit.studies._processes import run
+from mbkit.studies.compare.result import Comparison
+from mbkit.studies.compare.study import compare
+
+__all__ = ["RobotOutcome", "Sweep", "all_robots"]
+
+Status = Literal["agree", "differ", "refused", "failed"]
+STATUSES: Final[tuple[Status, ...]] = ("agree", "differ", "refused", "failed")
+
+
+@dataclass(frozen=True)
+class RobotOutcome:
+    """How one robot ended.
+
+    Attributes
+    ----------
+    robot : str
+        Its name, folder and file.
+    status : str
+        ``"agree"``; ``"differ"``; ``"refused"`` where the file, or all engines but
+        one, do not hold it; ``"failed"`` where something broke that should not.
+    reason : str
+        Why it is not agreement of all engines; empty where it is.
+    comparison : Comparison or None
+    """
+
+    robot: str
+    status: Status
+    reason: str = ""
+    comparison: Comparison | None = None
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What became of many robots.
+
+    Attributes
+    ----------
+    outcomes : tuple of RobotOutcome
+        By name.
+    expected : int
+        How many were asked for; more than there are outcomes after an interruption.
+    engines : tuple of str
+    samples, seed : int
+    seconds : float
+        Time of the whole sweep.
+    versions : dict
+    processor : str
+    """
+
+    outcomes: tuple[RobotOutcome, ...]
+    expected: int
+    engines: tuple[str, ...]
+    samples: int
+    seed: int
+    seconds: float
+    versions: dict[str, str] = field(default_factory=_results.versions)
+    processor: str = field(default_factory=_results.processor)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many ended in which status."""
+        found = Counter(o.status for o in self.outcomes)
+        return {status: found[status] for status in STATUSES}
+
+    @property
+    def passed(self) -> bool:
+        """Whether all were reached, one agrees at least, and each other does too or is refused with a reason."""
+        states = {o.status for o in self.outcomes}
+        return len(self.outcomes) == self.expected and "agree" in states and states <= {"agree", "refused"}
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: how many agree, in how many engines, and what became of the others."""
+        agreed = [o.comparison for o in self.outcomes if o.status == "agree" and o.comparison]
+        parts = []
+        for n, count in sorted(Counter(len(c.engines) for c in agreed).items(), reverse=True):
+            digits = min(c.digits for c in agreed if len(c.engines) == n)
+            parts.append(f"{count} agree in {n} engines, to {digits:.1f} digits or more")
+        counts = self.counts
+        for status, words in (("differ", "differ"), ("refused", "refused"), ("failed", "failed")):
+            parts += [f"{counts[status]} {words}"] if counts[status] else []
+        missing = self.expected - len(self.outcomes)
+        parts += [f"{missing} not reached"] if missing else []
+        return f"{self.expected} robots: " + ("; ".join(parts) or "nothing compared")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain data; NaN is None."""
+        return {
+            "passed": self.passed,
+            "verdict": self.verdict,
+            "counts": self.counts,
+            "expected": self.expected,
+            "engines": list(self.engines),
+            "samples": self.samples,
+            "seed": self.seed,
+            "seconds": self.seconds,
+            "versions": self.versions,
+            "processor": self.processor,
+            "robots": [
+                {
+                    "robot": o.robot,
+                    "status": o.status,
+                    "reason": o.reason,
+                    "comparison": json.loads(o.comparison.to_json()) if o.comparison else None,
+                }
+                for o in self.outcomes
+            ],
+        }
+
+    def to_json(self) -> str:
+        """Return the sweep as JSON. NaN becomes null."""
+        return json.dumps(self.to_dict(), indent=1, allow_nan=False)
+
+
+def all_robots(
+    names: Sequence[str] | None = None,
+    *,
+    engines: Sequence[str] = ("pinocchio", "lagrangian", "mujoco"),
+    samples: int = 64,
+    seed: int = 0,
+    floating_base: bool = False,
+    mimic: Literal["reduce", "free"] = "reduce",
+    executor: Executor | None = None,
+    jobs: int | None = None,
+) -> Iterator[RobotOutcome]:
+    """Compare the terms of many robots, each in its own call to an executor.
+
+    Parameters
+    ----------
+    names : sequence of str, optional
+        Robots; by default all of `mbkit.robots`.
+    engines, samples, seed
+        As in `mbkit.compare`.
+    floating_base, mimic
+        As in `mbkit.load`.
+    executor : concurrent.futures.Executor, optional
+        Where to compute: any, such as Dask's or MPI's. By default a pool of
+        processes of our own; a script then needs ``if __name__ == "__main__":``.
+    jobs : int, optional
+        Size of our own pool; by default as many as there are processors.
+
+    Yields
+    ------
+    RobotOutcome
+        As each is finished; nothing that happens to one robot ends the others.
+
+    Raises
+    ------
+    UnknownNameError
+        A name is no robot's.
+    """
+    known = {r.name: r.path for r in robots()}
+    shorter = {alias: r.name for r in robots() for alias in r.aliases}
+    wanted = []
+    for name in known if names is None else names:
+        if name not in known and name not in shorter:
+            raise UnknownNameError("robot", name, [*shorter, *known])
+        wanted.append(shorter.get(name, name))
+    # The largest first, or the last processor would work alone at the end.
+    wanted.sort(key=lambda n: -_size(known[n]))
+    calls = {
+        name: partial(outcome_of, name, tuple(engines), samples, seed, floating_base=floating_base, mimic=mimic)
+        for name in wanted
+    }
+    for name, result in run(calls, executor=executor, jobs=jobs):
+        if isinstance(result, Exception):
+            yield RobotOutcome(name, "failed", f"{type(result).__name__}: {result}")
+        else:
+            yield result
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
+
+
+def outcome_of(
+    name: str,
+    engines: tuple[str, ...],
+    samples: int,
+    seed: int,
+    *,
+    floating_base: bool,
+    mimic: Literal["reduce", "free"],
+) -> RobotOutcome:
+    """Compare one robot, and say how it ended."""
+    with warnings.catch_warnings():
+        # Nonphysical bodies are in the comparison's facts.
+        warnings.simplefilter("ignore", MbkitWarning)
+        try:
+            model = load(name, floating_base=floating_base, mimic=mimic)
+        except MbkitError as error:
+            file = find(name)
+            return RobotOutcome(name, "refused", str(error).removeprefix(f"{file.path}: " if file else ""))
+        result = compare(model, engines, samples, seed, terms_only=True)
+    told = (f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in result.refusals)
+    refused = "; ".join(dict.fromkeys(told))
+    if result.nothing:
+        return RobotOutcome(name, "refused", refused or result.verdict, result)
+    if result.passed:
+        allowed = [f"{r.engine}, {r.term}: {r.reason}" for r in result.rows if r.reason]
+        return RobotOutcome(name, "agree", "; ".join([*allowed, *([refused] if refused else [])]), result)
+    failed = "; ".join(f"{r.engine}, {r.term}: {r.reason}" for r in result.rows if not r.passed)
+    return RobotOutcome(name, "differ", failed + (f"; {refused}" if refused else ""), result)

@@ -1,0 +1,169 @@
+"""How errors are measured: per sample, relative to a scale that does not vanish.
+
+Errors e are an engine's value minus the oracle's, both high and low part, so that
+they are known to many digits however small they are. For a vector x with error e the
+error is ‖e‖ / max(‖x‖, ‖M‖ ‖v‖²): a term that happens to be small is compared with the
+forces at play. Where gravity is among
+them, so is what it could do: |g| √(m M_jj) is the most that it exerts on joint j
+(Cauchy and Schwarz on Σ m_i g · J_ij), and what rounds with it where a pendulum
+hangs straight down. M's error is the largest |e_ij| / √(M_ii M_jj), which no unit
+can change. Forward dynamics loses cond(M) in any arithmetic, so its error is
+divided by that (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 7),
+on a scale that the forces which cancel in M a keep from vanishing; and M e, the
+force that the error amounts to, must be small beside M a whatever cond(M) is. An energy,
+whose zero is arbitrary, is measured by the largest of all samples. Beside each
+stands a figure per joint.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mbkit._check import Array
+
+__all__ = ["Errors", "Scales", "acceleration_errors", "energy_errors", "force_errors", "interleaved", "matrix_errors"]
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What errors are measured against, per sample.
+
+    Attributes
+    ----------
+    M : (N, nv, nv) array
+    diagonal : (N, nv) array
+        Of M.
+    inertial : (N,) array
+        ‖M‖ ‖v‖².
+    weight : (N,) array
+        The norm over j of |g| √(m M_jj).
+    acting : (N, nv) array
+        |τ| + |nle| + |τ_passive|, what cancels in M a.
+    size : (N,) array
+        Norm of M scaled to a unit diagonal.
+    condition : (N,) array
+        cond(M), scaled likewise (no unit can change it).
+    """
+
+    M: Array
+    diagonal: Array
+    inertial: Array
+    weight: Array
+    acting: Array
+    size: Array
+    condition: Array
+
+    @classmethod
+    def of(cls, M: Array, v: Array, acting: Array, weight: float = 0.0) -> Scales:
+        """Take the scales from the reference's values at the samples.
+
+        `weight` is |g| √m.
+        """
+        diagonal = np.einsum("nii->ni", M).copy()
+        norm = np.linalg.norm(M, 2, axis=(1, 2))
+        root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        scaled = M / (root[:, :, None] * root[:, None, :])
+        heavy = weight * np.sqrt(np.sum(np.abs(diagonal), axis=1))
+        inertial = norm * np.sum(v * v, axis=1)
+        size = np.linalg.norm(scaled, 2, axis=(1, 2))
+        return cls(M, diagonal, inertial, heavy, acting, size, np.linalg.cond(scaled))
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one term: per sample, and per velocity (NaN where it has none)."""
+
+    absolute: Array
+    relative: Array
+    per_velocity: Array
+
+    @property
+    def worst(self) -> int:
+        """The worst sample."""
+        return int(np.argmax(self.relative))
+
+
+def _ratio(e: Array, scale: Array) -> Array:
+    # 0/0 is no error: both sides say zero.
+    return np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
+
+
+def force_errors(error: Array, reference: Array, scales: Scales, *, heavy: bool = False) -> Errors:
+    """Measure errors of generalized forces; `heavy` where gravity is among them."""
+    e = np.abs(error)
+    floor = np.maximum(scales.inertial, scales.weight) if heavy else scales.inertial
+    relative = _ratio(np.linalg.norm(e, axis=1), np.maximum(np.linalg.norm(reference, axis=1), floor))
+    # A joint's own scale: its force, or its share of what is at play.
+    trace = scales.diagonal.sum(axis=1, keepdims=True)
+    share = np.sqrt(scales.diagonal / np.where(trace > 0, trace, 1.0))
+    own = np.maximum(np.abs(reference), floor[:, None] * share)
+    return Errors(e.max(axis=1, initial=0.0), relative, _ratio(e, own).max(axis=0))
+
+
+def acceleration_errors(error: Array, reference: Array, scales: Scales) -> Errors:
+    """Measure errors of accelerations in the norm √M_jj a_j, per cond(M)."""
+    e, root = np.abs(error), np.sqrt(scales.diagonal)
+    pushed = np.linalg.norm(scales.acting / np.where(root > 0, root, np.inf), axis=1)
+    size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
+    own = np.maximum(np.abs(reference), scales.acting / np.where(scales.diagonal > 0, scales.diagonal, np.inf))
+    force = np.einsum("nij,nj->ni", scales.M, error) / np.where(root > 0, root, np.inf)
+    backward = _ratio(np.linalg.norm(force, axis=1), scales.size * size)
+    forward = _ratio(np.linalg.norm(root * e, axis=1), size * scales.condition)
+    return Errors(
+        e.max(axis=1, initial=0.0),
+        np.maximum(forward, backward),
+        _ratio(e, own * scales.condition[:, None]).max(axis=0),
+    )
+
+
+def matrix_errors(error: Array, reference: Array, scales: Scales) -> Errors:  # noqa: ARG001  # as the others
+    """Measure errors of mass matrices entry by entry, each by its two diagonal entries."""
+    e = np.abs(error)
+    root = np.sqrt(np.abs(scales.diagonal))
+    ratio = _ratio(e, root[:, :, None] * root[:, None, :])
+    return Errors(e.max(axis=(1, 2), initial=0.0), ratio.max(axis=(1, 2), initial=0.0), ratio.max(axis=(0, 1)))
+
+
+def energy_errors(error: Array, reference: Array, scales: Scales) -> Errors:
+    """Measure errors of energies, by the largest of all samples."""
+    e = np.abs(error)
+    scale = np.maximum(np.abs(reference).max(initial=0.0), scales.inertial)
+    return Errors(e, _ratio(e, scale), np.empty(0))
+
+
+# Timings of small calls: interleaved between engines, repeated, median and spread.
+
+
+def interleaved(
+    calls: Mapping[str, Callable[[], Any]], *, rounds: int = 7, budget: float = 2e-4
+) -> dict[str, tuple[float, float]]:
+    """Return (median, half interquartile range) of each call's time in ns.
+
+    Every round times each call once, over as many repetitions as fill `budget`
+    seconds, so that a drift of the machine's speed meets all of them alike.
+    """
+    repetitions: dict[str, int] = {}
+    for name, call in calls.items():
+        call()
+        start = time.perf_counter()
+        call()
+        once = max(time.perf_counter() - start, 1e-7)
+        repetitions[name] = int(np.clip(budget / once, 1, 1000))
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            n = repetitions[name]
+            start = time.perf_counter()
+            for _ in range(n):
+                call()
+            times[name].append((time.perf_counter() - start) / n * 1e9)
+    out = {}
+    for name, samples in times.items():
+        low, median, high = np.percentile(samples, [25, 50, 75])
+        out[name] = float(median), float(high - low) / 2
+    return out

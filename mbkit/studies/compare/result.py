@@ -1,0 +1,379 @@
+"""What a comparison returns: frozen rows, and ways to read them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit._escape import html, markdown, one_line
+from mbkit.errors import OutputError
+
+if TYPE_CHECKING:
+    from mbkit.studies.work_precision.result import WorkPrecision
+
+__all__ = ["Comparison", "Omission", "Refusal", "RolloutRow", "Row"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One term of one engine against the reference, worst over all samples.
+
+    Attributes
+    ----------
+    term, engine : str
+    reference : str
+        ``"oracle"``, or an engine where the oracle has no value.
+    joint : str
+        The joint with the largest per-joint error; empty for energies.
+    max_abs : float
+        Largest absolute difference of any entry, in the term's own unit.
+    relative : float
+        Worst normwise error of a sample; see `mbkit.studies.compare.errors`.
+    per_joint : float
+        Worst error of a joint relative to its own scale.
+    median : float
+        Median normwise error of the samples.
+    samples : int
+    worst_kind : str
+        The kind of state (random, neutral, at limits, near singular) of the worst sample.
+    worst_q, worst_v : tuple of float
+        That state.
+    ns : float
+        Nanoseconds per evaluation of a single state, the engine's median.
+    ns_spread : float
+        Half the interquartile range of the timings, ns.
+    passed : bool
+    reason : str
+        Why it failed, naming joints and a known defect where there is one; or why
+        more than the comparison's tolerance was allowed.
+    allowed : float
+        The error that passes: the comparison's tolerance, or more where the
+        engine's own formula cannot do better.
+    defect : str
+        The engine's known defect, where the row failed with one announced.
+    zero : bool
+        Whether the reference is zero in every entry at every state, so that the row is no evidence.
+    """
+
+    term: str
+    engine: str
+    reference: str
+    joint: str
+    max_abs: float
+    relative: float
+    per_joint: float
+    median: float
+    samples: int
+    worst_kind: str
+    worst_q: tuple[float, ...]
+    worst_v: tuple[float, ...]
+    ns: float
+    ns_spread: float
+    passed: bool
+    reason: str = ""
+    allowed: float = math.nan
+    defect: str = ""
+    zero: bool = False
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Something that an engine could not do, with its reason; `term` is empty for all of it."""
+
+    engine: str
+    term: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class RolloutRow:
+    """A trajectory of mbkit's integrator on one engine against MuJoCo's own.
+
+    Attributes
+    ----------
+    method : str
+        Integrator, the same formula on both sides.
+    engine, against : str
+    dt, duration : float
+        Step and compared horizon, s.
+    error : float
+        Largest difference of q over the horizon (on the manifold).
+    condition : float
+        The rollout's condition: how far q moves per relative disturbance of the
+        forces, see `mbkit.studies.compare.rollouts`.
+    tolerance : float
+        1e-12, or a multiple of eps times the condition where that is more.
+    steps : int
+    seconds, seconds_against : float
+        Run times of the two.
+    passed : bool
+    note : str
+    judged : bool
+        False where too few steps are well conditioned to say anything.
+    asked : float
+        The horizon that was to be compared, s.
+    """
+
+    method: str
+    engine: str
+    against: str
+    dt: float
+    duration: float
+    error: float
+    condition: float
+    tolerance: float
+    steps: int
+    seconds: float
+    seconds_against: float
+    passed: bool
+    note: str = ""
+    judged: bool = True
+    asked: float = math.nan
+
+    @property
+    def cut(self) -> bool:
+        """Whether the compared horizon is shorter than the one asked for."""
+        return self.duration < self.asked * (1 - 1e-9)
+
+
+@dataclass(frozen=True)
+class Omission:
+    """One thing that was left out, need by need.
+
+    Attributes
+    ----------
+    need : str
+    present : bool
+        Whether the description has it.
+    what : str
+        What was off, in words.
+    saved_ns : float
+        Nanoseconds saved per evaluation, the difference of two medians; NaN where nothing was timed.
+    saved_spread : float
+        Half the interquartile range of that difference, ns.
+    saved_setup : float
+        Seconds of set-up saved; NaN where none.
+    change : float
+        Largest relative change of the accelerations with the thing on.
+    unchanged : bool
+        Whether the change is within rounding.
+    note : str
+    """
+
+    need: str
+    present: bool
+    what: str
+    saved_ns: float
+    saved_spread: float
+    saved_setup: float
+    change: float
+    unchanged: bool
+    note: str = ""
+
+    @property
+    def measurable(self) -> bool:
+        """Whether the time saved stands out from the spread of the timings, by twice that."""
+        return abs(self.saved_ns) > 2 * self.saved_spread
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Several engines on one description: do they agree, to how many digits, at what cost.
+
+    Attributes
+    ----------
+    model : str
+        Name of the model.
+    facts : dict
+        nq, nv, mass, digest, needs and notes of the model.
+    engines : tuple of str
+        The engines compared.
+    reference : str
+        What their terms were measured by: the oracle.
+    samples, seed : int
+    tolerance : float
+    rows : tuple of Row
+    rollouts : tuple of RolloutRow
+    precision : WorkPrecision or None
+        Error against run time of a few methods on a short horizon.
+    omissions : tuple of Omission
+    refusals : tuple of Refusal
+    setup : dict
+        Seconds each engine took to be made; the derivation works when first asked.
+    versions : dict
+    processor : str
+    seconds : float
+        Time of the whole study.
+    """
+
+    model: str
+    facts: dict[str, Any]
+    engines: tuple[str, ...]
+    reference: str
+    samples: int
+    seed: int
+    tolerance: float
+    rows: tuple[Row, ...]
+    rollouts: tuple[RolloutRow, ...] = ()
+    precision: WorkPrecision | None = None
+    omissions: tuple[Omission, ...] = ()
+    refusals: tuple[Refusal, ...] = ()
+    setup: dict[str, float] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    processor: str = ""
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether at least two engines were compared, in terms that are not all zero, and nothing differed."""
+        agreed = bool(self.rows) and not self.nothing and all(r.passed for r in self.rows)
+        return agreed and all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
+
+    @property
+    def worst(self) -> Row | None:
+        """The row with the largest relative error; a failed one first."""
+        return max(self.rows, key=lambda r: (not r.passed, r.relative), default=None)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: agree, and to how many digits, or who differs in what, and by which known defect."""
+        if self.nothing:
+            return f"nothing compared: {self.nothing}"
+        missing = "".join(f"; {x}" for x in self.shortened)
+        if self.passed:
+            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits{missing}"
+        known: dict[tuple[str, str], list[str]] = {}
+        for r in self.rows:
+            if r.defect:
+                known.setdefault((r.engine, r.defect), []).append(r.term)
+        parts = [f"{engine} differs in {', '.join(terms)}: {defect}" for (engine, defect), terms in known.items()]
+        if self.only_known_defects:
+            return f"{'; '.join(parts)}; all else agrees to {self.digits:.1f} digits{missing}"
+        failed = [r for r in self.rows if not r.passed and not r.defect]
+        parts += [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
+        parts += [f"rollout {r.method} on {r.engine} differs" for r in self.rollouts if not r.passed]
+        parts += [f"leaving out {o.need} changes the accelerations" for o in self.omissions if not o.unchanged]
+        return "; ".join(parts) + missing
+
+    @property
+    def nothing(self) -> str:
+        """Why the comparison says nothing although no row differs; empty where it does say something."""
+        if not self.rows:
+            # Engines that refuse a model for the same reason say so once.
+            return "; ".join(dict.fromkeys(r.reason for r in self.refusals)) or "no engines"
+        if any(not r.passed for r in self.rows):
+            return ""
+        if any(r.zero for r in self.rows if r.term == "M"):
+            return "the mass matrix is zero at every state, as no joint moves any mass"
+        return "every term is zero at every state" if all(r.zero for r in self.rows) else ""
+
+    @property
+    def only_known_defects(self) -> bool:
+        """Whether something differs, and all of it by known defects of engines."""
+        failed = [r for r in self.rows if not r.passed]
+        beyond = all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
+        return bool(failed) and all(r.defect for r in failed) and beyond
+
+    @property
+    def shortened(self) -> tuple[str, ...]:
+        """What is missing: terms, engines, whole studies, curves, and horizons that were cut."""
+        out = [f"not compared: {', '.join(self.not_compared)}"] if self.not_compared else []
+        absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
+        out += [f"{', '.join(absent)} left out"] if absent else []
+        out += [f"no {r.term}" for r in self.refusals if not r.engine]
+        unjudged = [r for r in self.rollouts if not r.judged]
+        cut = [r for r in self.rollouts if r.judged and r.cut]
+        out += [f"{len(unjudged)} of {len(self.rollouts)} rollouts not judged"] if unjudged else []
+        if cut:
+            least = min(r.duration for r in cut)
+            out.append(f"{len(cut)} of {len(self.rollouts)} rollouts cut, to {least:.3g} s at the least")
+        if self.precision is not None:
+            out += [f"error against run time: {x}" for x in self.precision.shortened]
+        return tuple(out)
+
+    @property
+    def not_compared(self) -> tuple[str, ...]:
+        """Terms that no engine could give, as where M is singular; `refusals` has the reasons."""
+        given = {r.term for r in self.rows}
+        return tuple(dict.fromkeys(r.term for r in self.refusals if r.engine and r.term and r.term not in given))
+
+    @property
+    def digits(self) -> float:
+        """Decimal digits on which all terms agree, known defects apart, at most 16; zeros are no evidence."""
+        errors = [r.relative for r in self.rows if not r.zero and not r.defect]
+        if not errors or any(math.isnan(e) for e in errors):
+            return math.nan
+        return -math.log10(max(*errors, 1e-16))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        precision = self.precision.to_dict() if self.precision is not None else None
+        judged = {"passed": self.passed, "verdict": self.verdict, "digits": self.digits}
+        judged["shortened"] = list(self.shortened)
+        omissions = [asdict(o) | {"measurable": o.measurable} for o in self.omissions]
+        return asdict(self) | {"precision": precision, "omissions": omissions} | judged
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """Return the result as JSON, and write it to `path` if given. NaN becomes null."""
+        text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False)
+        if path is not None:
+            try:
+                Path(path).write_text(text, encoding="utf-8")
+            except OSError as error:
+                raise OutputError(f"cannot write {path}: {error.strerror}; the result itself is kept") from error
+        return text
+
+    def to_markdown(self) -> str:
+        """Return the table of terms in Markdown."""
+        head = "| term | engine | worst | median | per joint | joint | ns | |\n|---|---|---|---|---|---|---|---|"
+        lines = [
+            f"| {markdown(r.term)} | {markdown(r.engine)} | {r.relative:.1e} | {r.median:.1e} | {r.per_joint:.1e} "
+            f"| {markdown(r.joint)} | {r.ns:.0f} | {markdown(_outcome(r))} |"
+            for r in self.rows
+        ]
+        told = [
+            f"- {markdown(r.engine + (' ' + r.term if r.term else ''))}: {markdown(r.reason)}" for r in self.refusals
+        ]
+        first = f"**{markdown(self.model)}**: {markdown(self.verdict)}"
+        return "\n".join([first, "", head, *lines, "", *told]).rstrip() + "\n"
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f"<tr><td>{html(r.term)}</td><td>{html(r.engine)}</td><td>{r.relative:.1e}</td><td>{r.median:.1e}</td>"
+            f"<td>{html(r.joint)}</td><td>{r.ns:.0f}</td>"
+            f"<td>{html(_outcome(r))}</td></tr>"
+            for r in self.rows
+        )
+        head = "".join(f"<th>{h}</th>" for h in ("term", "engine", "worst", "median", "joint", "ns", ""))
+        refusals = "".join(f"<li>{html(r.engine)}: {html(r.reason)}</li>" for r in self.refusals)
+        return f"<p><b>{html(self.model)}</b>: {html(self.verdict)}</p><table><tr>{head}</tr>{cells}</table>" + (
+            f"<ul>{refusals}</ul>" if refusals else ""
+        )
+
+    def __repr__(self) -> str:
+        return f"<Comparison of {self.model!r}: {one_line(self.verdict)}>"
+
+
+def _outcome(row: Row) -> str:
+    return row.reason if not row.passed else "zero in all states" if row.zero else "agree"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def tupled(x: Array) -> tuple[float, ...]:
+    """Return a vector as plain floats."""
+    return tuple(float(a) for a in x)

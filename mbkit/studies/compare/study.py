@@ -1,0 +1,404 @@
+"""`compare`: the terms of the equation of motion from several engines, judged."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array, count, real
+from mbkit.engines import ENGINES, Dynamics, dynamics
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError
+from mbkit.model import Model
+from mbkit.model.builder import expect_model
+from mbkit.studies import _results
+from mbkit.studies._results import facts_of
+from mbkit.studies.compare.errors import Errors, Scales, interleaved
+from mbkit.studies.compare.omissions import omissions
+from mbkit.studies.compare.result import Comparison, Refusal, Row, tupled
+from mbkit.studies.compare.rollouts import free_of_mimic, rollouts
+from mbkit.studies.compare.terms import TERMS, States, Term, power_rows, states
+from mbkit.studies.work_precision.study import work_precision
+
+__all__ = ["COMPARABLE", "Judge", "announced", "compare"]
+
+
+# Every term in every engine, judged against the oracle.
+
+_EPS: Final = float(np.finfo(float).eps)
+# Each of the largest terms went through about this many roundings on the way.
+_ROUNDINGS: Final = 4.0
+#: Where a warning of a known defect goes on with the joints of this model.
+_AS_IT_IS: Final = "; returned as it is"
+Progress = Callable[[float, str], None]
+
+
+class Judge:
+    """Evaluates every term in every engine, and judges it against the oracle.
+
+    A term for which the oracle has no value, as where M is singular, is judged
+    against the first engine that gives one.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        made: dict[str, Dynamics],
+        oracle: OracleDynamics,
+        at: States,
+        tolerance: float,
+        defects: Mapping[str, str] | None = None,
+    ) -> None:
+        self.model, self.made, self.oracle = model, made, oracle
+        #: What engines announced when they were made, of all their terms.
+        self.defects = defects or {}
+        self.at, self.tolerance = at, tolerance
+        self.refusals: list[Refusal] = []
+        acting = np.abs(at.tau)
+        for quantity in (oracle.nle, oracle.passive):
+            # Where a term has no value, its own row says so.
+            with contextlib.suppress(NumericalError):
+                acting = acting + np.abs(quantity(at.q, at.v))
+        gravity = float(np.linalg.norm(model.gravity))
+        heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
+        self.scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
+        #: The joint of each velocity.
+        self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
+
+    def rows(self, tell: Progress) -> tuple[list[Row], list[Refusal]]:
+        """Return a row per term and engine."""
+        rows: list[Row] = []
+        for k, term in enumerate(TERMS):
+            tell(k / (len(TERMS) + 1), term.name)
+            rows += self._term(term)
+        tell(len(TERMS) / (len(TERMS) + 1), "power balance")
+
+        def refuse(engine: str, error: MbkitError) -> None:
+            self._refuse(engine, "power balance", error)
+
+        for name, errors in power_rows(self.made, self.oracle, self.at, self.scales, refuse):
+            rows.append(self._row("power balance", name, errors, (np.nan, np.nan), self.defects.get(name, "")))
+        return rows, self.refusals
+
+    def _term(self, term: Term) -> list[Row]:
+        values: dict[str, Array] = {}
+        defects: dict[str, str] = {}
+        broken: dict[str, str] = {}
+        for name, dyn in self.made.items():
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                try:
+                    values[name] = term.call(dyn, self.at)
+                except NumericalError as error:
+                    broken[name] = str(error).removeprefix(f"{name}: ")
+                except MbkitError as error:
+                    self._refuse(name, term.name, error)
+            defects[name] = announced(caught) or self.defects.get(name, "")
+        if broken and not values:
+            # All alike: the model, not an engine. Named, and not counted as agreement.
+            self.refusals += [Refusal(name, term.name, why) for name, why in broken.items()]
+            return []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", KnownDefectWarning)
+            times = interleaved({name: term.single(self.made[name], self.at) for name in values})
+        reference, high, low = self._reference(term, values)
+        rows = [self._broken_row(term.name, name, reference, why) for name, why in broken.items()]
+        for name, value in values.items():
+            errors = term.errors((value - high) - low, high, self.scales)
+            allowed = self._allowed(term, name, errors)
+            zero = not high.any()
+            rows.append(self._row(term.name, name, errors, times[name], defects[name], allowed, reference, zero))
+        return rows
+
+    def _reference(self, term: Term, values: dict[str, Array]) -> tuple[str, Array, Array]:
+        """Return who has the reference values, and their high and low part."""
+        try:
+            return self.oracle.engine, *term.reference(self.oracle, self.at)
+        except NumericalError as error:
+            self._refuse(self.oracle.engine, term.name, error)
+        name = next(iter(values))
+        return name, values[name], np.zeros_like(values[name])
+
+    def _refuse(self, engine: str, term: str, error: MbkitError) -> None:
+        self.refusals.append(Refusal(engine, term, str(error).removeprefix(f"{engine}: ")))
+
+    def _broken_row(self, term: str, engine: str, reference: str, why: str) -> Row:
+        """Return the failure of an engine that gives no number where another gives one."""
+        return Row(
+            term=term,
+            engine=engine,
+            reference=reference,
+            joint="",
+            max_abs=float("inf"),
+            relative=float("inf"),
+            per_joint=float("inf"),
+            median=float("inf"),
+            samples=len(self.at.q),
+            worst_kind="",
+            worst_q=(),
+            worst_v=(),
+            ns=float("nan"),
+            ns_spread=float("nan"),
+            passed=False,
+            reason=why,
+            allowed=self.tolerance,
+        )
+
+    def _allowed(self, term: Term, engine: str, errors: Errors) -> float:
+        """Return the tolerance, or the engine's own bound where its formula cannot do better."""
+        # Accelerations are M's solution: they cannot be better than M.
+        if term.quantity not in ("mass_matrix", "forward_dynamics") or errors.relative.max() <= self.tolerance:
+            return self.tolerance
+        amplified = self.made[engine].mass_matrix_rounding(self.at.q[errors.worst])
+        return self.tolerance if amplified is None else max(self.tolerance, _ROUNDINGS * _EPS * float(amplified))
+
+    def _row(
+        self,
+        term: str,
+        engine: str,
+        errors: Errors,
+        ns: tuple[float, float],
+        defect: str,
+        allowed: float | None = None,
+        reference: str | None = None,
+        zero: bool = False,
+    ) -> Row:
+        allowed = self.tolerance if allowed is None else allowed
+        worst = errors.worst
+        relative = float(errors.relative[worst])
+        per = errors.per_velocity
+        joint = self.joint_of[int(np.argmax(per))] if per.size and per.max() > 0 else ""
+        passed = relative <= allowed
+        reason = ""
+        if passed and relative > self.tolerance:
+            reason = (
+                f"{relative:.1e} at {joint} is above {self.tolerance:.0e}, and within the rounding of {engine}'s own "
+                f"formula ({allowed:.0e}): its terms are {allowed / (_ROUNDINGS * _EPS):.0e} times the result"
+            )
+        if not passed:
+            bad = [n for n, e in zip(self.joint_of, per, strict=False) if e > self.tolerance] if per.size else []
+            named = ", ".join(dict.fromkeys(bad)) or "no single joint"
+            reason = f"differs by {relative:.1e} at {named}" if per.size else f"differs by {relative:.1e}"
+            if defect:
+                reason += f"; {defect}"
+        return Row(
+            term=term,
+            engine=engine,
+            reference=reference or self.oracle.engine,
+            joint=joint,
+            max_abs=float(errors.absolute.max()),
+            relative=relative,
+            per_joint=float(per.max()) if per.size else 0.0,
+            median=float(np.median(errors.relative)),
+            samples=len(errors.relative),
+            worst_kind=self.at.kinds[worst],
+            worst_q=tupled(self.at.q[worst]),
+            worst_v=tupled(self.at.v[worst]),
+            ns=ns[0],
+            ns_spread=ns[1],
+            passed=passed,
+            reason=reason,
+            allowed=allowed,
+            defect="" if passed else defect.split(_AS_IT_IS)[0],
+            zero=zero,
+        )
+
+
+def announced(caught: Iterable[warnings.WarningMessage]) -> str:
+    """Return the known defects among recorded warnings, in words."""
+    return "; ".join(dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)))
+
+
+#: Engines that can be compared: all but the one that they are measured by.
+COMPARABLE: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
+
+#: What a comparison shows of `work_precision`: a few methods, runs of little work, and seconds at the most.
+_METHODS: Final = {
+    "pinocchio": ("rk4", "semi_implicit_euler", "dop853"),
+    "lagrangian": ("rk853", "rk4"),
+    "mujoco": ("mujoco_euler", "mujoco_implicitfast", "mujoco_rk4"),
+}
+_HORIZON: Final = 0.5
+_REPEATS: Final = 3
+_WORK: Final = 24_000
+_SECONDS: Final = 60.0
+
+
+def compare(
+    model: Model,
+    engines: Sequence[str] = ("pinocchio", "lagrangian", "mujoco"),
+    samples: int = 64,
+    seed: int = 0,
+    *,
+    tolerance: float = 1e-12,
+    terms_only: bool = False,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Compare engines on one description.
+
+    Parameters
+    ----------
+    model : Model
+    engines : sequence of str
+        At least two. All are measured by the oracle, the own derivation at 34 digits.
+    samples : int
+        Random states, beside which stand neutral, at-limit and near-singular ones.
+    seed : int
+    tolerance : float
+        Largest error that passes, measured as `mbkit.studies.compare.errors` says.
+    terms_only : bool
+        Whether to leave out rollouts, error against run time and omissions.
+    progress : callable, optional
+        Called as ``progress(fraction, text)``.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        For unusable arguments. What an engine cannot do is a row of `refusals`.
+    """
+    begun = time.perf_counter()
+    names = _checked(model, engines, samples, seed, tolerance)
+    if model.parameters:
+        model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
+    tell = progress or _silent
+    made, refusals, setup, defects = _made(model, names, tell, compile=not terms_only)
+    reference = ""
+    rows: list[Row] = []
+    # What was written as energies has the derivation and its 34 digits, and no other engine.
+    enough = len(made) > 1 or (bool(made) and model.written is not None)
+    if enough:
+        tell(0.05, "34 digits")
+        reference = OracleDynamics.engine
+        study = Judge(model, made, OracleDynamics(model), states(model, samples, seed), tolerance, defects)
+        rows, refused = study.rows(lambda f, text: tell(0.05 + f * (0.85 if terms_only else 0.35), text))
+        refusals += refused
+    result: dict[str, Any] = {}
+    # Without mass nothing can be simulated.
+    massless = any(r.term == "M" and r.zero for r in rows)
+    if enough and not terms_only and not massless:
+        result, refused = _beyond_terms(model, made, seed, tell)
+        refusals += refused
+    tell(1.0, "done")
+    return Comparison(
+        model=model.name,
+        facts=facts_of(model),
+        engines=tuple(made),
+        reference=reference,
+        samples=samples,
+        seed=seed,
+        tolerance=tolerance,
+        rows=tuple(rows),
+        refusals=tuple(refusals),
+        setup=setup,
+        versions=_results.versions(),
+        processor=_results.processor(),
+        seconds=time.perf_counter() - begun,
+        **result,
+    )
+
+
+def _beyond_terms(
+    model: Model, made: dict[str, Dynamics], seed: int, tell: Progress
+) -> tuple[dict[str, Any], list[Refusal]]:
+    """Return rollouts, run times and omissions; what fails is told, and loses nothing else."""
+    result: dict[str, Any] = {}
+    refusals: list[Refusal] = []
+    moving, movers, note = model, made, ""
+    if model.layout.reduced:
+        moving, note = free_of_mimic(model), "mimic joints free"
+        movers, _, _, _ = _made(moving, tuple(made), _silent, compile=True)
+
+    def study(fraction: float, name: str, call: Callable[[], None]) -> None:
+        tell(fraction, name)
+        try:
+            call()
+        except MbkitError as error:
+            refusals.append(Refusal("", name, str(error)))
+
+    def run_rollouts() -> None:
+        result["rollouts"] = rollouts(moving, movers, seed, note)
+
+    def run_times() -> None:
+        result["precision"] = work_precision(
+            moving,
+            tuple(movers),
+            {engine: _METHODS[engine] for engine in movers if engine in _METHODS},
+            duration=_HORIZON,
+            seed=seed,
+            repeats=_REPEATS,
+            seconds=_SECONDS,
+            work=_WORK,
+            progress=lambda fraction, text: tell(0.6 + 0.3 * fraction, text),
+        )
+
+    def run_omissions() -> None:
+        result["omissions"] = omissions(model, made, seed)
+
+    study(0.42, "rollouts", run_rollouts)
+    study(0.6, "error against run time", run_times)
+    if model.written is None:
+        study(0.9, "what was left out", run_omissions)
+    return result, refusals
+
+
+def _silent(_fraction: float, _text: str) -> None:
+    """Tell nobody."""
+
+
+def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tolerance: float) -> tuple[str, ...]:
+    expect_model(model)
+    if not model.nv:
+        raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to compare; add a joint")
+    if isinstance(engines, str):
+        raise InputError(f"engines: expected several names, got the string {engines!r}; write ({engines!r}, ...)")
+    for name in engines:
+        if name == OracleDynamics.engine:
+            raise InputError("engines: the oracle is what every engine is measured by; leave it out")
+        if not isinstance(name, str) or name not in COMPARABLE:
+            raise UnknownNameError("engine", str(name), COMPARABLE)
+    unique = tuple(dict.fromkeys(engines))
+    if len(unique) < 2:
+        raise InputError(
+            f"engines: expected at least two to compare, got {list(engines)}; there are {list(COMPARABLE)}"
+        )
+    count("samples", samples, least=1)
+    count("seed", seed)
+    real("tolerance", tolerance, positive=True)
+    return unique
+
+
+def _made(
+    model: Model,
+    names: Sequence[str],
+    tell: Progress,
+    *,
+    compile: bool,  # noqa: A002  # the engine's own word
+) -> tuple[dict[str, Dynamics], list[Refusal], dict[str, float], dict[str, str]]:
+    """Return the engines, who refuses the model, the time each took, and the known defects announced."""
+    made, refusals, setup, defects = {}, [], {}, {}
+    for k, name in enumerate(names):
+        tell(0.05 * k / len(names), f"building {name}")
+        start = time.perf_counter()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", KnownDefectWarning)
+            try:
+                # A few dozen states are no reason to compile; run times are.
+                options = {} if compile or name != "lagrangian" else {"compile": False}
+                made[name] = dynamics(model, name, **options)
+            except MbkitError as error:
+                refusals.append(Refusal(name, "", str(error).removeprefix(f"{name}: ")))
+        setup[name] = time.perf_counter() - start
+        defects[name] = announced(caught)
+        for w in caught:
+            if not issubclass(w.category, KnownDefectWarning):
+                warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
+    return made, refusals, setup, defects

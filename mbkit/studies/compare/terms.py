@@ -1,0 +1,198 @@
+"""The terms of the equation of motion that are compared, and how each is called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.errors import MbkitError
+from mbkit.model import Model
+from mbkit.model.manifold import limits_box
+from mbkit.studies.compare.errors import (
+    Errors,
+    Scales,
+    acceleration_errors,
+    energy_errors,
+    force_errors,
+    matrix_errors,
+)
+
+__all__ = ["TERMS", "States", "Term", "inside", "power_rows", "states"]
+
+
+# States at which engines are compared: random ones, and the hard ones.
+
+# An angle this far from gimbal lock loses four digits in anything that divides
+# by its cosine; none of the terms should.
+_NEAR: float = 1e-4
+
+
+@dataclass(frozen=True)
+class States:
+    """States with accelerations and torques, and the kind of each.
+
+    Attributes
+    ----------
+    q, v, a, tau : (N, n) arrays
+    kinds : tuple of str
+    """
+
+    q: Array
+    v: Array
+    a: Array
+    tau: Array
+    kinds: tuple[str, ...]
+
+
+def states(model: Model, samples: int, seed: int) -> States:
+    """Return `samples` random states, and beside them neutral, at-limit and near-singular ones.
+
+    Near-singular states are at the closed and straight poses where axes align:
+    every angle at a multiple of a right angle, pushed off by 1e-4, which puts
+    spherical-ZYX joints next to gimbal lock and arms next to stretched. Of a model with
+    constraints they are no states, and left out.
+    """
+    rng = np.random.default_rng(seed)
+    q, v = model.random_state(rng, samples)
+    parts, kinds = [q], ["random"] * samples
+    few = max(2, samples // 16)
+    special = (
+        []
+        if model.constrained
+        else [
+            ("neutral", np.tile(model.neutral(), (2, 1))),
+            ("at limits", _at_limits(model, rng, few)),
+            ("near singular", _near_singular(model, rng, few)),
+        ]
+    )
+    for kind, made in special:
+        parts.append(made)
+        kinds += [kind] * len(made)
+    q = np.concatenate(parts)
+    v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
+    a, tau = rng.standard_normal((2, len(q), model.nv))
+    return States(q, v, a, tau, tuple(kinds))
+
+
+def inside(model: Model, rng: np.random.Generator, share: float = 0.5) -> tuple[Array, Array]:
+    """Return a random state in the middle `share` of the limits."""
+    q, v = model.random_state(rng)
+    if model.constrained:
+        return q, v
+    lower, upper = limits_box(model)
+    bounded = np.isfinite(lower)
+    middle = 0.5 * (lower[bounded] + upper[bounded])
+    q[bounded] = middle + share * (q[bounded] - middle)
+    return q, v
+
+
+def _at_limits(model: Model, rng: np.random.Generator, n: int) -> Array:
+    q, _ = model.random_state(rng, n)
+    lower, upper = limits_box(model)
+    for i in range(model.nq):
+        if np.isfinite(lower[i]):
+            q[:, i] = np.where(rng.random(n) < 0.5, lower[i], upper[i])
+    return q
+
+
+def _near_singular(model: Model, rng: np.random.Generator, n: int) -> Array:
+    q, _ = model.random_state(rng, n)
+    for joint in model.independent_joints:
+        start = model.layout.q[joint.name].start
+        for i in joint.type.angular:
+            turns = rng.integers(-1, 3, n)
+            if joint.kind == "spherical_zyx" and i == 1:
+                turns = 2 * rng.integers(0, 2, n) - 1
+            q[:, start + i] = turns * np.pi / 2 + rng.choice([-_NEAR, _NEAR], n)
+    return q
+
+
+@dataclass(frozen=True)
+class Term:
+    """One compared quantity.
+
+    Attributes
+    ----------
+    name : str
+        As it stands in tables.
+    quantity : str
+        Method of `Dynamics`.
+    arguments : tuple of str
+        Fields of `States`.
+    errors : callable
+        (errors, reference values, scales) -> Errors.
+    """
+
+    name: str
+    quantity: str
+    arguments: tuple[str, ...]
+    errors: Callable[[Array, Array, Scales], Errors]
+
+    def call(self, dyn: Dynamics, states: States) -> Array:
+        """Evaluate at all states."""
+        return np.asarray(getattr(dyn, self.quantity)(*(getattr(states, a) for a in self.arguments)))
+
+    def reference(self, oracle: OracleDynamics, states: States) -> tuple[Array, Array]:
+        """Return the oracle's values at all states, high and low part."""
+        return oracle.extended(self.quantity, *(getattr(states, a) for a in self.arguments))
+
+    def single(self, dyn: Dynamics, states: States) -> Callable[[], Any]:
+        """Return a call at one random state, for timing."""
+        method = getattr(dyn, self.quantity)
+        arguments = [np.ascontiguousarray(getattr(states, a)[0]) for a in self.arguments]
+        return lambda: method(*arguments)
+
+
+_HEAVY: Final = partial(force_errors, heavy=True)
+
+TERMS: Final = (
+    Term("M", "mass_matrix", ("q",), matrix_errors),
+    Term("g", "gravity", ("q",), _HEAVY),
+    Term("nle", "nle", ("q", "v"), _HEAVY),
+    Term("C v", "coriolis_force", ("q", "v"), force_errors),
+    Term("passive", "passive", ("q", "v"), force_errors),
+    Term("inverse dynamics", "inverse_dynamics", ("q", "v", "a"), _HEAVY),
+    Term("forward dynamics", "forward_dynamics", ("q", "v", "tau"), acceleration_errors),
+    Term("kinetic energy", "kinetic_energy", ("q", "v"), energy_errors),
+    Term("potential energy", "potential_energy", ("q",), energy_errors),
+)
+
+
+# Power balance: dE/dt = (τ + τ_damping) · v, with each engine's own acceleration.
+#
+# The rate of energy is differentiated exactly from T and V by the oracle;
+# acceleration and damping are the engine's. So it fails if either the engine's
+# dynamics or the energies are wrong, whatever two engines agree on.
+
+
+def power_rows(
+    made: Mapping[str, Dynamics],
+    oracle: OracleDynamics,
+    at: States,
+    scales: Scales,
+    refuse: Callable[[str, MbkitError], None],
+) -> Iterator[tuple[str, Errors]]:
+    """Yield (engine, errors) for every engine; what cannot be had is told to `refuse`."""
+    for name, dyn in made.items():
+        try:
+            a = dyn.forward_dynamics(at.q, at.v, at.tau)
+            damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
+            inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
+        except MbkitError as error:
+            refuse(name, error)
+            continue
+        e = np.abs(rate - np.sum((at.tau + damping) * at.v, axis=1))
+        # M a is as large as M's norm lets it be, and that is where it is rounded.
+        root = np.sqrt(scales.diagonal)
+        speed, size = np.linalg.norm(root * at.v, axis=1), np.linalg.norm(root * a, axis=1)
+        pushes = np.linalg.norm(inertial, axis=1) + np.linalg.norm(at.tau, axis=1) + np.linalg.norm(damping, axis=1)
+        scale = speed * size + np.linalg.norm(at.v, axis=1) * pushes + scales.inertial
+        relative = np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
+        yield name, Errors(e, relative, np.empty(0))

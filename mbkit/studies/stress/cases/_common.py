@@ -1,0 +1,115 @@
+"""What the families share: values over decades, states to measure terms at, and exact motions as a type."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.model import Model
+from mbkit.studies.stress.case import Problem
+
+__all__ = ["EPS", "RK4_IMAGINARY", "RK4_REAL", "Exact", "largest_step", "powers", "stable_steps", "terms_at"]
+
+
+#: From times (K,) to q (K, nq).
+Exact = Callable[[Array], Array]
+
+EPS: Final = float(np.finfo(float).eps)
+
+#: How far along the imaginary and the negative real axis the 8th order of Dormand and Prince 8(5,3) is stable: its
+#: stability polynomial is that of exp to z⁸, with four coefficients of its own behind. From the
+#: coefficients in Hairer, Nørsett, Wanner 1993, II.10.
+_DOP853: Final = (5.96, 6.39)
+
+
+def powers(first: int, last: int, step: int = 1) -> tuple[float, ...]:
+    """Return the powers of ten from one exponent to another, both among them.
+
+    Examples
+    --------
+    >>> powers(0, -6, 2)
+    (1.0, 0.01, 0.0001, 1e-06)
+    """
+    sign = 1 if last >= first else -1
+    # Parsed and not multiplied: 1e-9 is to be the double that everybody writes.
+    return tuple(float(f"1e{n}") for n in range(first, last + sign, sign * step))
+
+
+def stable_steps(duration: float, frequency: float, *, damped: bool = False) -> float:
+    """Return how many steps the explicit Runge-Kutta method of the longest stable one needs at the least.
+
+    Parameters
+    ----------
+    duration : float
+        s.
+    frequency : float
+        Of the fastest mode, rad/s; or its rate of decay, 1/s.
+    damped : bool
+        Whether it decays without turning.
+    """
+    return max(1.0, float(math.ceil(duration * frequency / _DOP853[damped])))
+
+
+def terms_at(
+    model: Model, *, samples: int = 8, seed: int = 0, force: float = 1.0, facts: dict[str, float] | None = None
+) -> Problem:
+    """Return the problem of a model's terms at its neutral configuration and at random states.
+
+    Parameters
+    ----------
+    model : Model
+    samples, seed : int
+    force : float
+        Size of the generalized forces, N or N m.
+    facts : dict, optional
+    """
+    rng = np.random.default_rng(seed)
+    q, v = model.random_state(rng, samples)
+    q[0] = model.neutral()
+    return Problem(model, q, v, tau=force * rng.standard_normal((samples, model.nv)), facts=facts or {})
+
+
+# The step at which linear theory lets a method break on q̈ + 2 ζ ω q̇ + ω² q = 0.
+#
+# With x = ω h the amplification of a step has the characteristic polynomials, stable where both roots are within the
+# unit circle (Jury 1964; for Runge-Kutta methods Hairer, Wanner 1996, IV.2)
+#
+# - semi-implicit Euler, v⁺ = v + h a(q, v): λ² - (2 - 2ζx - x²) λ + 1 - 2ζx; at λ = -1, x² + 4ζx = 4
+# - the same with the damper implicit: (1 + 2ζx) λ² - (2 + 2ζx - x²) λ + 1; at λ = -1, x² - 4ζx = 4
+# - Runge-Kutta of order 4 in 4 stages: λ = 1 + z + z²/2 + z³/6 + z⁴/24 at both roots z of z² + 2ζx z + x²
+# - Gauss's, the midpoint rule, and Euler with damper and spring implicit: every x.
+
+#: How far RK4 is stable along the imaginary axis, and along the negative real one: the root of 24 + 12 z + 4 z² + z³.
+RK4_IMAGINARY: Final = 2 * math.sqrt(2)
+RK4_REAL: Final = 2.785293563405282
+
+_EXPLICIT: Final = ("semi_implicit_euler", "mujoco_euler")
+_DAMPER_IMPLICIT: Final = ("mujoco_implicit", "mujoco_implicitfast")
+_UNLIMITED: Final = ("implicit_midpoint", "gauss4", "gauss6", "mujoco_discrete")
+
+
+def largest_step(method: str, frequency: float, damping: float) -> float | None:
+    """Return the largest stable step, s: infinite where there is none; None for methods without a step.
+
+    Parameters
+    ----------
+    method : str
+        mbkit's step of MuJoCo's Euler takes dampers explicitly.
+    frequency : float
+        ω, rad/s.
+    damping : float
+        ζ: 0 for none, or at least 1, with two real rates.
+    """
+    if method in _EXPLICIT:
+        return 2 * (math.sqrt(damping**2 + 1) - damping) / frequency
+    if method in _DAMPER_IMPLICIT:
+        return 2 * (math.sqrt(damping**2 + 1) + damping) / frequency
+    if method in ("rk4", "mujoco_rk4"):
+        if damping == 0:
+            return RK4_IMAGINARY / frequency
+        return RK4_REAL / (frequency * (damping + math.sqrt(damping**2 - 1)))
+    return math.inf if method in _UNLIMITED else None

@@ -1,0 +1,556 @@
+"""Motions of a hanging chain of thin rods, however different their masses are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, Final
+
+import mpmath as mp
+import numpy as np
+from numpy.polynomial.legendre import leggauss, legroots
+from scipy.spatial.transform import Rotation
+from scipy.special import ellipj, ellipkinc, ellipkm1, elliprf, elliprj
+
+from mbkit._check import Array
+from mbkit.studies.stress.cases._common import Exact
+
+__all__ = [
+    "HangingChain",
+    "cart_pole",
+    "free_rotor",
+    "modal",
+    "past_gimbal_lock",
+    "pendulum",
+    "precession",
+    "released",
+    "ringing_spring",
+    "slow_motion",
+    "slowest_mode",
+    "turning",
+]
+
+
+# Slow motions of stiff systems, by collocation in variables in which nothing is stiff.
+#
+# Where a spring of stiffness k all but holds a coordinate s, k s stays of the size of a force. In it the
+# equations have 1/k in them instead of k, and go over into those of the rigid joint. Collocation at Radau's points
+# solves them for any k with steps that know nothing of the fast mode, which is hardly excited (Hairer, Wanner 1996,
+# VI.3 on singular perturbations, IV.5 on Radau IIA).
+
+_STAGES: Final = 8
+_SMALL: Final = 1e-30
+_ITERATIONS: Final = 30
+
+#: F(y, ẏ), each (s, n), real or complex.
+Residual = Callable[[Any, Any], Any]
+
+
+def slow_motion(residual: Residual, start: Array, duration: float, steps: int) -> Callable[[Array], Array]:
+    """Return y, (K, n), of F(y, ẏ) = 0 up to the duration.
+
+    Parameters
+    ----------
+    residual : callable
+        From y and ẏ, (s, n) each, to F, (s, n); analytic, for it is differentiated by a complex step.
+    start : (n,) array
+    duration : float
+        s.
+    steps : int
+    """
+    points, slopes = _radau()
+    h = duration / steps
+    pieces: list[Array] = []
+
+    def motion(t: Array) -> Array:
+        which = np.minimum((t / h).astype(int), steps - 1)
+        # No farther than it is asked for: making a problem costs nothing.
+        while len(pieces) <= int(which.max(initial=0)):
+            y = pieces[-1][-1] if pieces else np.asarray(start, dtype=np.float64)
+            pieces.append(_step(residual, y, pieces[-1] if pieces else None, h, points, slopes))
+        weights = _lagrange(points, t / h - which)
+        return np.asarray(np.einsum("kj,kjn->kn", weights, np.stack(pieces)[which]))
+
+    return motion
+
+
+def _step(residual: Residual, y: Array, before: Array | None, h: float, points: Array, slopes: Array) -> Array:
+    """Return y at the points of a step, (s + 1, n), by Newton's method with the first iterate's derivatives."""
+    s, n = _STAGES, len(y)
+    Y = np.tile(y, (s, 1)) if before is None else _lagrange(points, 1 + points[1:]) @ before
+    by_y, by_rate = _jacobians(residual, Y, slopes @ np.vstack([y, Y]) / h)
+    J = np.einsum("ik,iab->iakb", slopes[:, 1:] / h, by_rate)
+    J[np.arange(s), :, np.arange(s), :] += by_y
+    inverse = np.linalg.inv(J.reshape(s * n, s * n))
+    last = np.inf
+    for _ in range(_ITERATIONS):
+        F = residual(Y, slopes @ np.vstack([y, Y]) / h)
+        change = (inverse @ F.ravel()).reshape(s, n)
+        Y = Y - change
+        size = float(np.abs(change).max())
+        # Rounding is reached where it no longer falls.
+        if size == 0 or (size < 1e-9 * float(np.abs(Y).max()) and size > 0.5 * last):
+            break
+        last = size
+    return np.vstack([y, Y])
+
+
+def _jacobians(residual: Residual, Y: Array, dY: Array) -> tuple[Array, Array]:
+    """Return ∂F/∂y and ∂F/∂ẏ, (s, n, n) each, of one evaluation at all disturbed states."""
+    s, n = Y.shape
+    unit = np.broadcast_to(1j * _SMALL * np.eye(n)[:, None], (n, s, n))
+    disturbed = np.concatenate([Y + unit, np.broadcast_to(Y, (n, s, n))])
+    rates = np.concatenate([np.broadcast_to(dY, (n, s, n)), dY + unit])
+    F = residual(disturbed.reshape(-1, n), rates.reshape(-1, n)).imag.reshape(2, n, s, n) / _SMALL
+    return np.moveaxis(F[0], 0, -1), np.moveaxis(F[1], 0, -1)
+
+
+@cache
+def _radau() -> tuple[Array, Array]:
+    """Return 0 and Radau's points in (0, 1], and the derivatives there of the polynomial through all of them."""
+    ends = np.zeros(_STAGES + 1)
+    ends[-2:] = -1.0, 1.0
+    points = np.concatenate([[0.0], (np.sort(legroots(ends)) + 1) / 2])
+    points[-1] = 1.0
+    apart = points[:, None] - points + np.eye(len(points))
+    w = 1 / apart.prod(axis=1)
+    slopes = (w / w[:, None]) / apart
+    np.fill_diagonal(slopes, 0.0)
+    np.fill_diagonal(slopes, -slopes.sum(axis=1))
+    return points, slopes[1:]
+
+
+def _lagrange(points: Array, x: Array) -> Array:
+    """Return the weights, (K, s + 1), of values at the points for the polynomial's value at x."""
+    others = x[:, None, None] - points[None, None, :]
+    apart = points[:, None] - points[None, :]
+    own = np.eye(len(points), dtype=bool)
+    return np.asarray(np.where(own, 1.0, others / np.where(own, 1.0, apart)).prod(axis=2))
+
+
+_GRAVITY: Final = 9.81
+#: Steps a second: what rings faster than these can follow hardly rings in a taut chain.
+_STEPS: Final = 200
+
+
+class HangingChain:
+    """Rods of 1 m, hinged end to end, and a load at the last end.
+
+    In angles φ from the vertical, Σ_j a_ij (cos(φ_i - φ_j) φ̈_j + sin(φ_i - φ_j) φ̇_j²) + g w_i sin φ_i = 0, where
+    a_ij sums m f_ki f_kj over the rods k, f being 1 above rod k and ½ on it, and m/12 for its own turn; w_i
+    sums m f_ki (a Lagrangian exercise).
+
+    Parameters
+    ----------
+    masses : sequence of float
+        Of the rods, kg.
+    load : float
+        kg.
+    """
+
+    def __init__(self, masses: Sequence[float], load: float = 0.0) -> None:
+        m, n = np.asarray(masses, dtype=np.float64), len(masses)
+        below = np.tril(np.ones((n, n)), -1) + np.eye(n) / 2
+        self._a = (below.T * m) @ below + np.diag(m) / 12 + load
+        self._w = m @ below + load
+
+    def taut(self, angle: float) -> Array:
+        """Return the angles q, from rod to rod, at which it begins to turn as one, let go at rest.
+
+        Near the straight line where the end is heavy; from there the light rods hardly ring.
+        """
+        n = len(self._w)
+        # The common acceleration, and the angles below the first rod's.
+        x = np.array([-_GRAVITY * np.sin(angle) / n, *[angle] * (n - 1)])
+
+        def residual(x: Array) -> Array:
+            phi = np.concatenate([[angle], x[1:]])
+            pull = self._a * np.cos(phi[:, None] - phi)
+            return np.asarray((x[0] * pull.sum(axis=1) + _GRAVITY * self._w * np.sin(phi)) / self._w)
+
+        for _ in range(20):
+            J = np.stack([residual(x + 1j * _SMALL * e).imag / _SMALL for e in np.eye(n)], axis=1)
+            x = x - np.linalg.solve(J, residual(x))
+        return np.diff([0.0, angle, *x[1:]])
+
+    def motion(self, q: Array, duration: float) -> Exact:
+        """Return q, (K, n), let go at rest."""
+        n, a, w = len(q), self._a, self._w
+
+        def residual(y: Array, rate: Array) -> Array:
+            phi, turn = y[:, :n], y[:, n:]
+            apart = phi[:, :, None] - phi[:, None, :]
+            forces = np.einsum("sij,sj->si", a * np.cos(apart), rate[:, n:])
+            forces += np.einsum("sij,sj->si", a * np.sin(apart), turn**2) + _GRAVITY * w * np.sin(phi)
+            return np.concatenate([rate[:, :n] - turn, forces / w], axis=1)
+
+        start = np.concatenate([np.cumsum(q), np.zeros(n)])
+        solved = slow_motion(residual, start, duration, round(_STEPS * duration))
+        return lambda t: np.diff(solved(t)[:, :n], axis=1, prepend=0.0)
+
+
+# Exact motions of linear systems.
+
+#: Rates of 1 and of 1e12 per second stand side by side.
+_DIGITS: Final = 50
+
+
+def released(start: float, square: float, rate: float) -> Exact:
+    """Return q of q̈ + 2 a q̇ + ω² q = 0, let go at rest (Landau, Lifshitz 1976, §25).
+
+    Parameters
+    ----------
+    start : float
+    square : float
+        ω², 1/s².
+    rate : float
+        a, 1/s.
+    """
+    discriminant = square - rate * rate
+    if discriminant > 0:
+        w = np.sqrt(discriminant)
+        return lambda t: (start * np.exp(-rate * t) * (np.cos(w * t) + rate / w * np.sin(w * t)))[:, None]
+    if discriminant == 0:
+        return lambda t: (start * (1 + rate * t) * np.exp(-rate * t))[:, None]
+    fast = -(rate + np.sqrt(-discriminant))
+    # The other root by the product of the two: a difference would cancel.
+    slow = square / fast
+    return lambda t: (start * (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow))[:, None]
+
+
+def modal(M: Array, C: Array, K: Array, q0: Array, v0: Array) -> Exact:
+    """Return q of M q̈ + C q̇ + K q = 0, by the eigenvalues of the companion matrix with 50 digits.
+
+    No two of them may be the same (critical damping).
+    """
+    n = len(M)
+    with mp.workdps(_DIGITS):
+        inverse = mp.matrix(M.tolist()) ** -1
+        companion = mp.zeros(2 * n)
+        stiff, damped = inverse * mp.matrix(K.tolist()), inverse * mp.matrix(C.tolist())
+        for i in range(n):
+            companion[i, n + i] = mp.mpf(1)
+            for j in range(n):
+                companion[n + i, j], companion[n + i, n + j] = -stiff[i, j], -damped[i, j]
+        values, vectors = mp.eig(companion)
+        weights = mp.lu_solve(vectors, mp.matrix([*q0.tolist(), *v0.tolist()]))
+        rates = np.array([complex(x) for x in values])
+        shapes = np.array([[complex(vectors[i, k] * weights[k]) for k in range(2 * n)] for i in range(n)])
+    return lambda t: np.real(np.exp(np.multiply.outer(t, rates)) @ shapes.T)
+
+
+def slowest_mode(M: Array, stiffness: Array) -> tuple[float, Array, float]:
+    """Return the slowest frequency of M q̈ + diag(k) q = 0, its shape, and the fastest frequency.
+
+    1/ω² are the eigenvalues of k^-½ M k^-½. Of those, the largest one and its shape are known to rounding,
+    however stiff the other springs are.
+    """
+    root = np.sqrt(stiffness)
+    found: tuple[Any, Any] = np.linalg.eigh(M / root[:, None] / root)
+    shape = found[1][:, -1] / root
+    inverse = np.linalg.inv(M)
+    fastest = float(np.sqrt(np.abs(np.linalg.eigvals(inverse * stiffness)).max()))
+    return float(found[0][-1] ** -0.5), shape / shape[0], fastest
+
+
+# Exact motions of the pendulum and the cart-pole, in double.
+
+_NODES: Final = 128
+_TABLE: Final = 4000
+
+
+@cache
+def _nodes() -> tuple[Array, Array]:
+    return leggauss(_NODES)
+
+
+def pendulum(theta: float, speed: float, square: float) -> Exact:
+    """Return θ, (K, 1), of θ̈ + ω² sin θ = 0.
+
+    sin(θ/2) = k sn(ω t + u₀ | k²) where it swings, θ/2 = am(k ω t + u₀ | 1/k²) where it goes round, with
+    k² = sin²(θ₀/2) + θ̇₀²/(4 ω²) (Landau, Lifshitz 1976, §11; Whittaker 1937, §44).
+
+    Parameters
+    ----------
+    theta, speed : float
+        At the start, |θ| below π, rad and rad/s.
+    square : float
+        ω² = g/l, 1/s².
+    """
+    w = math.sqrt(square)
+    # k² ω², which stays what it is where there is no gravity.
+    scaled = (w * math.sin(theta / 2)) ** 2 + (speed / 2) ** 2
+    if scaled < square:
+        k = math.sqrt(scaled) / w
+        start = ellipkinc(math.atan2(math.sin(theta / 2), speed / (2 * w)), k * k)
+        return lambda t: 2 * np.arcsin(k * ellipj(w * t + start, k * k)[0])[:, None]
+    rate, m = math.copysign(math.sqrt(scaled), speed), square / scaled
+    start = ellipkinc(theta / 2, m)
+    return lambda t: 2 * ellipj(rate * t + start, m)[3][:, None]
+
+
+def cart_pole(theta: float, cart: float, square: float = 9.81) -> Exact:
+    """Return (x, θ), (K, 2), of a cart-pole let go at rest at x = 0; pole of 1 kg and 1 m.
+
+    No force acts along x, so x = (sin θ₀ - sin θ)/(M + 1), and energy gives
+    θ̇² = 2 g (M + 1)(cos θ - cos θ₀)/(M + sin² θ). With sin(θ/2) = k sin φ, k = sin(θ₀/2), φ grows for ever, and
+    dt = √(M/(1 - k² sin² φ) + 4 k² sin² φ) dφ/√(g (M + 1)): a quadrature, by Gauss-Legendre in y, φ = ε sinh y, for
+    the root bends within ε = √M/(2 k) of φ = 0. Inverted by a table and Newton's method.
+
+    Parameters
+    ----------
+    theta : float
+        At the start, between 0 and π, rad.
+    cart : float
+        M, kg.
+    square : float
+        g/l, 1/s².
+    """
+    k = math.sin(theta / 2)
+    bend = math.sqrt(cart) / (2 * k)
+    nodes, weights = _nodes()
+    last = math.asinh(math.pi / 2 / bend)
+
+    def slope(y: Array) -> Array:
+        s2 = np.sin(bend * np.sinh(y)) ** 2
+        root = np.sqrt(cart / (1 - k * k * s2) + 4 * k * k * s2)
+        return np.asarray(root * bend * np.cosh(y) / math.sqrt(square * (cart + 1)))
+
+    def spent(y: Array) -> Array:
+        return y / 2 * (slope(y[:, None] / 2 * (1 + nodes)) @ weights)
+
+    quarter = float(spent(np.array([last]))[0])
+
+    def motion(t: Array) -> Array:
+        # φ = π/2 at the start; the time is folded onto the quarter period in which φ runs from 0 to π/2.
+        quarters = t / quarter + 1
+        turns = np.rint(quarters / 2)
+        rest = t - (2 * turns - 1) * quarter
+        table = np.linspace(0, last, _TABLE)
+        y = np.interp(np.abs(rest), spent(table), table)
+        for _ in range(4):
+            y = np.clip(y + (np.abs(rest) - spent(y)) / slope(y), 0, last)
+        phi = np.sign(rest) * bend * np.sinh(y) + math.pi * turns
+        angle = 2 * np.arcsin(k * np.sin(phi))
+        return np.stack([(math.sin(theta) - np.sin(angle)) / (cart + 1), angle], axis=-1)
+
+    return motion
+
+
+# Exact rotations: a free body, a top in steady precession, a turn about one axis past gimbal lock.
+
+
+def turning(axis: Array, speed: float) -> Exact:
+    """Return quaternions (K, 4) of a steady turn about an axis, from the identity."""
+    unit = axis / np.linalg.norm(axis)
+
+    def motion(t: Array) -> Array:
+        half = speed * t / 2
+        return np.concatenate([np.multiply.outer(np.sin(half), unit), np.cos(half)[:, None]], axis=1)
+
+    return motion
+
+
+def free_rotor(inertia: Array, spin: Array) -> tuple[Exact, float]:
+    """Return quaternions (K, 4) of a torque-free body from the identity, and the period of its angular velocity.
+
+    Landau, Lifshitz 1976, §37: with A < B < C, or A > B > C where L² < 2 E B, ω = (a cn, b sn, c dn); the third axis
+    goes round L at φ̇ = (L/C)(1 + (C - A)/A / (1 - n sn²)), an integral of the third kind (Carlson 1979 for it).
+
+    Parameters
+    ----------
+    inertia : (3,) array
+        Three different principal moments, kg m².
+    spin : (3,) array
+        At the start, in body axes, rad/s; about none of the axes alone.
+    """
+    order = np.argsort(inertia)
+    (A, B, C), (x, y, z) = inertia[order], spin[order]
+    # L² - 2 E B, like all that follows of terms that do not cancel.
+    if C * (C - B) * z * z < A * (B - A) * x * x:
+        order = order[::-1]
+        (A, B, C), (x, y, z) = inertia[order], spin[order]
+    upper = A * (C - A) * x * x + B * (C - B) * y * y  # 2 E C - L²
+    lower = B * (B - A) * y * y + C * (C - A) * z * z  # L² - 2 E A
+    a, b, c = math.sqrt(upper / (A * (C - A))), math.sqrt(upper / (B * (C - B))), math.sqrt(lower / (C * (C - A)))
+    m = (B - A) * upper / ((C - B) * lower)
+    rest = (C - A) * (C * (C - B) * z * z - A * (B - A) * x * x) / ((C - B) * lower)  # 1 - m
+    # Euler's equations run backwards in a mirrored frame (an odd order of the axes), and again where the
+    # moments fall instead of rise.
+    even = (order[1] - order[0]) % 3 == 1
+    rate = math.copysign(math.sqrt((C - B) * lower / (A * B * C)), (C - A) * (1 if even else -1))
+    side = math.copysign(1.0, z)
+    momentum = float(np.linalg.norm(inertia * spin))
+    n = -((C * c) ** 2) * m * (C - A) / (A * upper)
+    quarter = float(ellipkm1(rest))
+    whole = 2 * float(_third_kind(n, rest, np.array([1.0]), np.array([0.0]))[0])
+    start = float(ellipkinc(math.atan2(y / b, side * x / a), m))
+
+    def jacobi(t: Array) -> tuple[Array, Array]:
+        """Return the angular velocity and ∫ dt/(1 - n sn²)."""
+        u = rate * t + start
+        turns = np.rint(u / (2 * quarter))
+        sn, cn, dn, _ = ellipj(u - 2 * turns * quarter, m)
+        sign = (-1.0) ** turns
+        spins = np.empty((len(t), 3))
+        spins[:, order] = np.stack([side * a * sign * cn, b * sign * sn, side * c * dn], axis=-1)
+        return spins, (turns * whole + _third_kind(n, rest, sn, cn)) / rate
+
+    (_, before), first = jacobi(np.zeros(1)), _momentum_axes(inertia, spin[None], order[2])[0]
+
+    def motion(t: Array) -> Array:
+        spins, poles = jacobi(t)
+        turned = momentum / C * (t + (C - A) / A * (poles - before))
+        about = Rotation.from_rotvec(np.multiply.outer(turned, [0.0, 0.0, 1.0])).as_matrix()
+        told = first @ about @ np.swapaxes(_momentum_axes(inertia, spins, order[2]), 1, 2)
+        return np.asarray(Rotation.from_matrix(told).as_quat())
+
+    return motion, 4 * quarter / abs(rate)
+
+
+def _third_kind(n: float, rest: float, sn: Array, cn: Array) -> Array:
+    """Return Π(n; φ | m) for |φ| ≤ π/2 and 1 - m, in Carlson's forms."""
+    c2, d2 = cn * cn, cn * cn + rest * sn * sn
+    return np.asarray(sn * elliprf(c2, d2, 1.0) + n / 3 * sn**3 * elliprj(c2, d2, 1.0, 1 - n * sn * sn))
+
+
+def _momentum_axes(inertia: Array, spins: Array, axis: int) -> Array:
+    """Return, in body axes, the columns: the third axis' part normal to L, their product, L's direction."""
+    L = inertia * spins
+    third = L / np.linalg.norm(L, axis=1, keepdims=True)
+    first = np.eye(3)[axis] - third * third[:, axis : axis + 1]
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(third, first), third], axis=-1)
+
+
+def precession(
+    spin: float, tilt: float, moment: float, across: float, along: float
+) -> tuple[Exact, Array, Array, float]:
+    """Return quaternions (K, 4) of a symmetric top in steady precession, its start (4,) and (3,), and its rate.
+
+    The axis is the body's y. A Ω² cos θ - C ω₃ Ω + m g r = 0 (Landau, Lifshitz 1976, §35 problem 2), of which the
+    slow root is taken; below the horizontal (θ > π/2) there is one at any spin.
+
+    Parameters
+    ----------
+    spin : float
+        ω₃, the angular velocity's part along the axis, rad/s.
+    tilt : float
+        θ of the axis from the upward vertical, rad.
+    moment : float
+        m g r, N m.
+    across, along : float
+        A, about the fixed point, and C, kg m².
+    """
+    root = math.sqrt((along * spin) ** 2 - 4 * across * moment * math.cos(tilt))
+    slow = 2 * moment / (along * spin + root)
+    own = spin - slow * math.cos(tilt)
+    leaning = Rotation.from_rotvec([math.pi / 2 - tilt, 0.0, 0.0])
+
+    def motion(t: Array) -> Array:
+        round_ = Rotation.from_rotvec(np.multiply.outer(slow * t, [0.0, 0.0, 1.0]))
+        about = Rotation.from_rotvec(np.multiply.outer(own * t, [0.0, 1.0, 0.0]))
+        return np.asarray((round_ * leaning * about).as_quat())
+
+    v = leaning.inv().apply([0.0, 0.0, slow]) + np.array([0.0, own, 0.0])
+    return motion, np.asarray(leaning.as_quat()), np.asarray(v), slow
+
+
+def past_gimbal_lock(distance: float, speed: float) -> tuple[Exact, Array]:
+    """Return the angles about z, y and x, (K, 3), of a turn about one axis, and their rates at the start.
+
+    From the identity about (0, cos d, sin d): after a quarter of a turn the pitch is π/2 - d, and the other two angles
+    jump by nearly π within the time that it takes to turn by some d. For less than half a turn.
+
+    Parameters
+    ----------
+    distance : float
+        d, rad.
+    speed : float
+        rad/s.
+    """
+    sd, cd = math.sin(distance), math.cos(distance)
+
+    def motion(t: Array) -> Array:
+        s, c = np.sin(speed * t), np.cos(speed * t)
+        yaw = np.arctan2(s * sd, c)
+        # Not by an arcsine, which knows half of the digits near ±1.
+        pitch = np.arctan2(s * cd, np.hypot(c, s * sd))
+        roll = np.arctan2(sd * cd * (1 - c), cd * cd * c + sd * sd)
+        return np.stack([yaw, pitch, roll], axis=-1)
+
+    return motion, speed * np.array([sd, cd, 0.0])
+
+
+# The exact motion of a mass on a spring, without gravity: Kepler's problem with another force.
+
+_POINTS: Final = 256
+
+
+def ringing_spring(square: float, radius: float, push: float, turn: float) -> tuple[Exact, float]:
+    """Return (θ, r - 1), (K, 2), of a mass on a spring of length 1 at rest that turns and rings, and its period.
+
+    Energy and angular momentum L give r² ṙ² = -ω² (r - r₁)(r - r₂)(r² + p r + s) with the turning points r₁, r₂ as
+    roots. With r = a - b cos φ between them, dt = r dφ/(ω √(r² + p r + s)) and dθ = L dt/r² (Landau, Lifshitz 1976,
+    §14), both even and periodic in φ: sums of a Fourier series' integrals.
+
+    Parameters
+    ----------
+    square : float
+        ω² = stiffness/mass, 1/s².
+    radius, push, turn : float
+        r, ṙ > 0 and θ̇ at the start, m, m/s and rad/s.
+    """
+    momentum = radius**2 * turn
+    energy = (push**2 + momentum**2 / radius**2 + square * (radius - 1) ** 2) / 2
+    r1, r2 = _turning_points(square, energy, momentum)
+    p, s = r1 + r2 - 2, momentum**2 / (square * r1 * r2)
+    a, b = (r1 + r2) / 2, (r2 - r1) / 2
+    grid = a - b * np.cos(2 * math.pi * np.arange(_POINTS) / _POINTS)
+    rate = grid / np.sqrt(square * (grid * (grid + p) + s))
+    order = np.arange(1, _POINTS // 2)
+
+    def integral(values: np.ndarray) -> tuple[float, np.ndarray]:
+        terms = np.fft.rfft(values).real / _POINTS
+        return float(terms[0]), 2 * terms[1:-1] / order
+
+    (mean, waves), (mean_turn, waves_turn) = integral(rate), integral(momentum * rate / grid**2)
+    # sin φ from the push and cos φ from the place: either alone is blind somewhere.
+    pace = push * radius / math.sqrt(square * (radius * (radius + p) + s))
+    first = math.atan2(pace, a - radius)
+
+    def spent(phi: np.ndarray, line: float, terms: np.ndarray) -> np.ndarray:
+        told: np.ndarray = line * phi + np.sin(np.multiply.outer(phi, order)) @ terms
+        return told
+
+    def motion(t: np.ndarray) -> np.ndarray:
+        start = spent(np.array([first]), mean, waves)[0]
+        phi = first + t / mean
+        for _ in range(20):
+            r = a - b * np.cos(phi)
+            slope = r / np.sqrt(square * (r * (r + p) + s))
+            phi = phi - (spent(phi, mean, waves) - start - t) / slope
+        theta = spent(phi, mean_turn, waves_turn) - spent(np.array([first]), mean_turn, waves_turn)[0]
+        return np.stack([theta, a - 1 - b * np.cos(phi)], axis=-1)
+
+    return motion, 2 * math.pi * mean
+
+
+def _turning_points(square: float, energy: float, momentum: float) -> tuple[float, float]:
+    """Return the two roots of r² ṙ² = (2 E - ω² (r - 1)²) r² - L² between which it moves.
+
+    By Newton's method from outside: neither the spring nor the turning alone has energy for more.
+    """
+    ends = []
+    for bound in (momentum / math.sqrt(2 * energy), 1 + math.sqrt(2 * energy / square)):
+        r, last = bound, math.inf
+        while abs(step := _step_springs(r, square, energy, momentum)) < last:
+            r, last = r - step, abs(step)
+        ends.append(r)
+    return ends[0], ends[1]
+
+
+def _step_springs(r: float, square: float, energy: float, momentum: float) -> float:
+    kinetic = 2 * energy - square * (r - 1) ** 2
+    return (kinetic * r * r - momentum**2) / (2 * r * kinetic - 2 * square * (r - 1) * r * r)

@@ -1,0 +1,348 @@
+"""What the runs of one problem are measured by, searched for within a time.
+
+Where there is no closed form, two runs that share as little as possible tell by their difference how
+well either is known (Hairer, Nørsett, Wanner 1993, II.4, say why one run alone cannot). Three roads,
+until one is good enough: explicit methods of high order on two engines; implicit methods of different
+families, for what is stiff; Taylor series with 34 digits, for what loses digits in double.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from types import FrameType
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.codegen.extended_precision import arithmetic, solve
+from mbkit.engines import dynamics
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.errors import MbkitError, NumericalError
+from mbkit.methods.registry import METHODS
+from mbkit.studies.compare.errors import Errors, Scales, force_errors, matrix_errors
+from mbkit.studies.compare.rollouts import TooLongError, quiet_simulate
+from mbkit.studies.compare.terms import States
+from mbkit.studies.stress.case import Problem, Truth
+from mbkit.studies.work_precision.reference import gap, reference
+
+__all__ = ["TERMS", "Search", "Terms", "condition", "error_of", "limited", "terms_of"]
+
+
+# An end to calls that take too long and ask nobody whether to go on.
+
+#: A signal that code in C++ lost is sent again, s.
+_AGAIN: Final = 0.25
+
+
+@contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Raise `TooLongError` after so many seconds of the processor's time.
+
+    Python is interrupted wherever it is, and so is CasADi, which looks for signals while CVODES runs. What
+    does not look for them goes on: that takes an end to the process. Threads but the main one get no
+    signals, and no bound.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    sent = threading.Event()
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        sent.set()
+        raise TooLongError(f"given up after {seconds:.2g} s")
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds, _AGAIN)
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not sent.is_set():
+            raise
+        # CasADi's answer to any signal.
+        raise TooLongError(f"given up after {seconds:.2g} s") from None
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
+
+
+_EPS: Final = float(np.finfo(float).eps)
+#: The errors of two runs can partly cancel in their difference.
+_SAFETY: Final = 4.0
+#: A search shorter than this finds nothing, s.
+_LEAST: Final = 0.05
+#: Deriving and compiling series takes seconds that no search counts: with less time left they are not begun, s.
+_SERIES: Final = 5.0
+#: A truth no better than this part of the motion cannot tell even gross errors.
+_WORTHLESS: Final = 1e-3
+#: Parts of the time left that the roads may take, in the order in which they are tried.
+_PARTS: Final = (0.35, 0.5, 1.0)
+#: Engine, method, and tolerance or number of steps: of high order, and the third where the second is not at hand.
+_EXPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
+    ("lagrangian", "rk853", 1e-14),
+    ("pinocchio", "dop853", 1e-13),
+    ("mujoco", "dop853", 1e-13),
+)
+#: Those that can follow stiff motion.
+_IMPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
+    ("lagrangian", "cvodes", 1e-12),
+    ("lagrangian", "gauss6", 1000),
+    ("pinocchio", "radau", 1e-11),
+    ("lagrangian", "gauss6", 4000),
+)
+
+#: What a road finds: q at the times, how well it is known, and how it was made.
+_Found = tuple[Array, float, str]
+_Road = Callable[[Problem, Array, float, float], Iterator[_Found]]
+
+
+class Search:
+    """Searches for the truths of a case, one value after the other."""
+
+    def __init__(self) -> None:
+        #: What led to the end for a milder value is tried first.
+        self._roads: list[_Road] = [partial(_double, _EXPLICIT), partial(_double, _IMPLICIT), _extended]
+
+    def truth(self, problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
+        """Return the truth of a motion, or None, and how it is known or why it is not.
+
+        Parameters
+        ----------
+        problem : Problem
+        times : (K,) array
+        wanted : float
+            How well it should be known, rad or m.
+        seconds : float
+            What the search may take, of the processor's time.
+        """
+        if problem.exact is not None:
+            return _closed(problem, times)
+        end = time.thread_time() + seconds
+        best: _Found | None = None
+        reasons: list[str] = []
+        for road, part in zip(list(self._roads), _PARTS, strict=True):
+            left = end - time.thread_time()
+            if left < (_SERIES if road is _extended else _LEAST):
+                reasons.append("the time was up")
+                break
+            try:
+                for found in road(problem, times, wanted, part * left):
+                    best = found if best is None or found[1] < best[1] else best
+            except MbkitError as error:
+                reasons.append(str(error))
+            if best is not None and best[1] <= wanted:
+                self._roads.remove(road)
+                self._roads.insert(0, road)
+                break
+        if best is None or best[1] > _WORTHLESS * problem.scale:
+            parted = f"{best[2]}, which part by {best[1] / _SAFETY:.1e}" if best else ""
+            return None, "no truth: " + "; ".join(x for x in (parted, *dict.fromkeys(reasons)) if x)
+        q, floor, how = best
+        return Truth(times, q, floor, how), f"{how}; known to {floor:.1e}"
+
+
+def _closed(problem: Problem, times: Array) -> tuple[Truth | None, str]:
+    """Return what a closed form says."""
+    assert problem.exact is not None
+    told: Any = problem.exact(times)
+    q = np.asarray(told, dtype=np.float64)
+    if q.shape != (len(times), problem.model.nq) or not np.isfinite(q).all():
+        what = f"shape {q.shape}" if q.shape != (len(times), problem.model.nq) else "numbers that are not finite"
+        return None, f"no truth: the closed form gave {what}, expected ({len(times)}, {problem.model.nq})"
+    start = float(np.abs(problem.model.difference(np.asarray(problem.q, dtype=np.float64), q[0])).max())
+    floor = max(problem.floor, _rounding(q))
+    if start > max(1e-9 * problem.scale, 2 * floor):
+        return None, f"no truth: the closed form starts {start:.1e} from q; it is of another motion"
+    return Truth(times, q, floor, problem.source), f"{problem.source or 'closed form'}; known to {floor:.1e}"
+
+
+def _rounding(q: Array) -> float:
+    """Return what rounding to double takes away from a motion."""
+    return 0.5 * _EPS * float(np.abs(q).max())
+
+
+def _double(
+    runs: Sequence[tuple[str, str, float]], problem: Problem, times: Array, wanted: float, seconds: float
+) -> Iterator[_Found]:
+    """Several runs in double, until two agree.
+
+    Raises
+    ------
+    NumericalError
+        There are no two that came to the end.
+    """
+    end = time.thread_time() + seconds
+    done: list[tuple[Array, str]] = []
+    best = np.inf
+    for engine, method, setting in runs:
+        left = end - time.thread_time()
+        if left < _LEAST:
+            break
+        fixed = METHODS[method].kind == "fixed"
+        # A whole number of steps to each saved time.
+        each = max(1, round(setting / (len(times) - 1)))
+        given: dict[str, Any] = {"dt": float(times[1]) / each} if fixed else {"rtol": setting}
+        try:
+            dyn = dynamics(problem.model, engine)
+            with limited(left):
+                run = quiet_simulate(dyn, problem.q, problem.v, float(times[-1]), method, save=times, **given)
+        except MbkitError:
+            # One that gives up, or is not there for this model, leaves the others.
+            continue
+        if not run.stats.finished or len(run.q) < len(times):
+            continue
+        told = f"{each * (len(times) - 1)} steps" if fixed else f"rtol {setting:.0e}"
+        how = f"{method} on {engine} ({told})"
+        for other_q, other in done:
+            apart = _SAFETY * float(gap(problem.model, other_q, run.q).max()) + _rounding(run.q)
+            if apart < best:
+                best = apart
+                yield run.q, apart, f"{other} and {how}"
+        done.append((run.q, how))
+        if best <= wanted:
+            return
+    if len(done) < 2:
+        tried = ", ".join(dict.fromkeys(method for _, method, _ in runs))
+        only = f"{done[0][1]} alone" if done else "none"
+        raise NumericalError(f"of {tried}, {only} came to the end in {seconds:.2g} s")
+
+
+def _extended(problem: Problem, times: Array, wanted: float, seconds: float) -> Iterator[_Found]:  # noqa: ARG001  # as the others
+    """Taylor series with more digits than double has."""
+    made = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=seconds)
+    if len(made.t) < len(times):
+        raise NumericalError(made.how)
+    yield np.asarray(made.q), float(made.floor.max()), made.how
+
+
+# Terms at extreme states: values with 34 digits, and the errors of engines beside them.
+#
+# Errors are those of `mbkit.studies.compare.errors`, with one exception. There forward dynamics is divided by
+# cond(M), to judge engines; here it is not, for whoever uses an acceleration has to live with its
+# whole error, about eps cond(M) of what acts.
+
+#: Method of `Dynamics` -> its arguments, fields of `States`.
+TERMS: Final = {
+    "mass_matrix": ("q",),
+    "inverse_dynamics": ("q", "v", "a"),
+    "forward_dynamics": ("q", "v", "tau"),
+}
+#: Beyond it doubles do not know the smallest eigenvalue of a matrix.
+_DOUBLE: Final = 1e15
+#: Columns of an inverse that are found side by side.
+_BLOCK: Final = 16
+#: What an error is at the most, so that JSON can hold it.
+_LARGEST: Final = 1e300
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The states of a problem, and what the oracle says there.
+
+    Attributes
+    ----------
+    at : States
+    values : dict
+        Term -> high and low part.
+    missing : dict
+        Term -> why the oracle has no value.
+    scales : Scales
+        In units of 2**exponent kg, m and s, in which nothing overflows.
+    exponent : int
+    """
+
+    at: States
+    values: dict[str, tuple[Array, Array]]
+    missing: dict[str, str]
+    scales: Scales
+    exponent: int
+
+
+def terms_of(problem: Problem, oracle: OracleDynamics) -> Terms:
+    """Return the oracle's values at a problem's states; accelerations are random, by a fixed seed."""
+    model = problem.model
+    q, v = (np.atleast_2d(x) for x in (model.check_q(problem.q), model.check_v(problem.v)))
+    n = max(len(q), len(v))
+    q, v = np.broadcast_to(q, (n, model.nq)), np.broadcast_to(v, (n, model.nv))
+    tau = np.zeros(model.nv) if problem.tau is None else model.check_v(problem.tau, "tau")
+    a = np.random.default_rng(0).standard_normal((n, model.nv))
+    at = States(q, v, a, np.broadcast_to(tau, (n, model.nv)), ("given",) * n)
+    values, missing = {}, {}
+    for term, arguments in TERMS.items():
+        try:
+            values[term] = oracle.extended(term, *(getattr(at, x) for x in arguments))
+        except NumericalError as error:
+            missing[term] = f"no truth: {error}"
+    M = oracle.mass_matrix(q)
+    exponent = -int(np.frexp(np.abs(M).max())[1])
+    acting = np.abs(at.tau) + np.abs(oracle.nle(q, v)) + np.abs(oracle.passive(q, v))
+    gravity = float(np.linalg.norm(model.gravity))
+    weight = gravity * float(np.sqrt(np.ldexp(model.mass, exponent))) if gravity and model.written is None else 0.0
+    with np.errstate(all="ignore"):
+        scales = Scales.of(np.ldexp(M, exponent), v, np.ldexp(acting, exponent), weight)
+    return Terms(at, values, missing, scales, exponent)
+
+
+def error_of(term: str, value: Array, truth: Terms) -> float:
+    """Return the worst error of a term over the states."""
+    high, low = truth.values[term]
+    with np.errstate(all="ignore"):
+        error = (value - high) - low
+        if term == "forward_dynamics":
+            worst = float(_acceleration(error, high, truth.scales).max())
+        else:
+            # Forces and inertias both are in kg.
+            error, high = np.ldexp(error, truth.exponent), np.ldexp(high, truth.exponent)
+            measured: Errors = (
+                matrix_errors(error, high, truth.scales)
+                if term == "mass_matrix"
+                else force_errors(error, high, truth.scales, heavy=True)
+            )
+            worst = float(measured.relative.max())
+    return min(worst, _LARGEST)
+
+
+def _acceleration(error: Array, reference: Array, scales: Scales) -> Array:
+    """Return errors in the norm √M_jj a_j, relative to the accelerations, or to what cancels in them."""
+    root = np.sqrt(scales.diagonal)
+    pushed = np.linalg.norm(scales.acting / np.where(root > 0, root, np.inf), axis=1)
+    size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
+    off = np.linalg.norm(root * error, axis=1)
+    return np.where(off == 0, 0.0, off / np.where(size > 0, size, np.finfo(float).tiny))
+
+
+def condition(oracle: OracleDynamics, q: Array) -> float:
+    """Return the condition number of M in the 2-norm and SI units, the largest of the states; NaN where M is singular.
+
+    Beyond 1e15 it comes from M with 34 digits.
+    """
+    high, low = oracle.extended("mass_matrix", np.atleast_2d(q))
+    exponent = -int(np.frexp(np.abs(high).max())[1])
+    high, low = np.ldexp(high, exponent), np.ldexp(low, exponent)
+    with np.errstate(all="ignore"):
+        seen = np.linalg.cond(high)
+    if not (seen >= _DOUBLE).any():
+        return float(seen.max())
+    at = int(np.argmax(seen))
+    return float(np.linalg.norm(high[at], 2)) * _norm_of_inverse(high[at], low[at])
+
+
+def _norm_of_inverse(high: Array, low: Array) -> float:
+    """Return the 2-norm of the inverse of a matrix with 34 digits, NaN where there is none."""
+    own, n = arithmetic(), len(high)
+    M, one = own.from_pair(high, low), np.eye(n)
+    pattern = (high != 0) | (low != 0)
+    columns = []
+    for k in range(0, n, _BLOCK):
+        rows = one[k : k + _BLOCK]
+        many = np.broadcast_to(M, (len(rows), n, n))
+        columns.append(own.pair(solve(many, own.array(rows), pattern, range(n), own))[0])
+    inverse = np.concatenate(columns)
+    return float(np.linalg.norm(inverse, 2)) if np.isfinite(inverse).all() else np.nan

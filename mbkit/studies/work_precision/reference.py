@@ -1,0 +1,578 @@
+"""A trajectory that others are measured by, known to a stated number of digits for a stated time.
+
+Two runs of one motion are made so that they share no error but the description: in
+extended precision by Taylor series of different orders, or in double by two engines
+with a method each. Where they stop agreeing, because of chaos or because one gave up,
+the reference ends and says so.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, real
+from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.taylor import PRECISIONS, order_of, precision, taylor_system
+from mbkit.derivation.equations import Equations, equations_of
+from mbkit.engines import dynamics
+from mbkit.engines.base import require_tree
+from mbkit.errors import InputError, MbkitError, MbkitWarning, UnsupportedError
+from mbkit.methods.registry import METHODS
+from mbkit.model import Model
+from mbkit.model.builder import expect_model
+from mbkit.simulate.progress import Progress, ProgressFunction
+from mbkit.simulate.run import simulate
+from mbkit.simulate.solvers.taylor import StoppedError, TaylorSteps
+from mbkit.simulate.time_grid import save_times
+from mbkit.simulate.torque import Torque, TorqueFunction
+
+__all__ = ["Deadline", "Known", "LateError", "Motion", "Reference", "gap", "reference", "taylor_pair", "two_engines"]
+
+
+# Pairs of runs of one motion: by their difference it is told how well either is known.
+
+# Times between which two engines march on by turns: enough to stop soon after they
+# part, few enough for a method's start to cost nothing.
+_LEGS: Final = 20
+# Tolerance of the second Taylor run: one order less, so with other steps, other
+# rounding and a larger truncation, which is still about the rounding's size.
+_COARSER: Final = 8.0
+#: Engine and method of each of two independent roads, best first.
+_ROADS: Final = (
+    (("lagrangian", "taylor"), ("lagrangian", "rk853"), ("lagrangian", "dop853")),
+    (("pinocchio", "dop853"), ("mujoco", "dop853")),
+)
+
+
+class LateError(Exception):
+    """The time is up; never leaves `mbkit.studies`."""
+
+
+class Deadline:
+    """What is left of the time that a search may take, and how far it is.
+
+    Parameters
+    ----------
+    seconds : float
+    tell : callable
+        Gets the fraction done.
+    """
+
+    def __init__(self, seconds: float, tell: Callable[[float], None]) -> None:
+        self._end, self._tell = time.perf_counter() + seconds, tell
+        self._start, self._length = 0.0, 1.0
+        # Seconds that did not count, of all parts together, and those before this part.
+        self._uncounted, self._before = [0.0], 0.0
+
+    @property
+    def left(self) -> float:
+        """Seconds."""
+        return self._end + self._uncounted[0] - self._before - time.perf_counter()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Do not count the time within, for this and all parts: what is derived and compiled."""
+        start = time.perf_counter()
+        yield
+        self._uncounted[0] += time.perf_counter() - start
+
+    def part(self, start: float, length: float, seconds: float | None = None) -> Deadline:
+        """Return the same for a part of the way, with a shorter time of its own if given."""
+        out = Deadline(self.left if seconds is None else min(seconds, self.left), self._tell)
+        out._uncounted, out._before = self._uncounted, self._uncounted[0]
+        out._start, out._length = self._start + start * self._length, length * self._length
+        return out
+
+    def look(self, done: float) -> None:
+        """Tell the fraction done of this part, and raise `LateError` when its time is up."""
+        self._tell(min(self._start + self._length * done, 1.0))
+        if self.left < 0:
+            raise LateError
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What is to be known: start, end, times from 0 and what acts."""
+
+    model: Model
+    q0: Array
+    v0: Array
+    duration: float
+    save: Array
+    torque: Torque
+    given: Any
+
+    @cached_property
+    def equations(self) -> Equations:
+        """The own derivation, with every number of the model as a symbol."""
+        return equations_of(self.model, constants="symbols")
+
+    @property
+    def stops(self) -> list[float]:
+        """Times at which a held torque jumps, and the end."""
+        ends = self.save.tolist() if self.torque.held else []
+        return sorted({*ends, self.duration} - {0.0})
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a pair of runs says, at as many of the times as both reached.
+
+    Attributes
+    ----------
+    q, v : pairs (high, low) of (K, nq) and (K, nv) arrays
+    apart : (2, K) array
+        Largest difference of q and of v between the two.
+    how : str
+        Which runs these are.
+    why : str
+        Why they ended before the duration did; empty if they did not.
+    steps : int
+        Of the first run, 0 if not known.
+    shared : bool
+        Whether both runs have the same formulas.
+    """
+
+    q: tuple[Array, Array]
+    v: tuple[Array, Array]
+    apart: Array
+    how: str
+    why: str = ""
+    steps: int = 0
+    shared: bool = False
+
+
+def gap(model: Model, a: Any, b: Any) -> Array:
+    """Return the largest difference of each pair of configurations, rad or m, from (K, nq) arrays of any format.
+
+    Of two near rotations the angle between them, twice the distance of their quaternions.
+    """
+    apart = np.asarray(a - b, dtype=np.float64)
+    for start, _ in model.quaternions:
+        part = slice(start, start + 4)
+        both = np.asarray(a[:, part] + b[:, part], dtype=np.float64)
+        near = np.minimum(np.linalg.norm(apart[:, part], axis=1), np.linalg.norm(both, axis=1))
+        apart[:, part] = 2 * near[:, None]
+    return np.asarray(np.abs(apart).max(axis=1, initial=0.0))
+
+
+def taylor_pair(motion: Motion, bits: int, deadline: Deadline) -> Known:
+    """Return what two Taylor runs at different orders say, in a format of so many bits.
+
+    Every number of the model and of the state is the double that it is, exactly.
+
+    Raises
+    ------
+    UnsupportedError
+        No heyoka, no such format, or a model too large.
+    """
+    kind = precision(bits)
+    why = ""
+    with deadline.paused():
+        system = taylor_system(motion.equations)
+    runs: list[list[Any]] = []
+    behind = kind.array(motion.equations.constant_values)
+    steps = 0
+    for i, tolerance in enumerate((kind.eps, _COARSER * kind.eps)):
+        half = deadline.part(i / 2, 0.5, None if i else deadline.left / 2)
+        with ExitStack() as stack:
+            with deadline.paused():
+                integrator = stack.enter_context(system.integrator(kind, tolerance))
+            stepper = TaylorSteps(system, integrator, kind, behind)
+            # The second goes no farther than the first came.
+            states, count, early = _states(motion, kind, stepper, half, len(runs[0]) if runs else len(motion.save))
+        runs.append(states)
+        steps, why = steps or count, why or early
+    n, nq = min(map(len, runs)), motion.model.nq
+    first, second = (np.stack(states[:n]) for states in runs)
+    apart = [gap(motion.model, first[:, :nq], second[:, :nq]), _largest(first[:, nq:] - second[:, nq:])]
+    orders = " and ".join(str(order_of(x)) for x in (kind.eps, _COARSER * kind.eps))
+    how = f"Taylor series of orders {orders} in {PRECISIONS[bits]} numbers on the own derivation"
+    return Known(kind.pair(first[:, :nq]), kind.pair(first[:, nq:]), np.array(apart), how, why, steps, shared=True)
+
+
+def _states(motion: Motion, kind: Any, steps: TaylorSteps, deadline: Deadline, most: int) -> tuple[list[Any], int, str]:
+    """Return up to so many saved states as far as they come, the steps, and why they end early."""
+    model, saved = motion.model, motion.save.tolist()[:most]
+    y0 = _unit(model, kind.array(np.concatenate([motion.q0, motion.v0])))
+    out, count, force = [y0], 0, motion.torque.of_member(None)
+    try:
+        for t in steps(0.0, y0, motion.stops, force):
+            count += 1
+            while len(out) < len(saved) and saved[len(out)] <= t:
+                out.append(_unit(model, steps.at(saved[len(out)])))
+            if len(out) == len(saved):
+                break
+            deadline.look(t / motion.duration)
+    except StoppedError as error:
+        return out, count, f"{error} after t = {steps.t:.6g} s"
+    except LateError:
+        return out, count, f"the time was up at t = {steps.t:.6g} s"
+    return out, count, ""
+
+
+def _unit(model: Model, y: Any) -> Any:
+    y = y.copy()
+    for start, _ in model.quaternions:
+        part = y[start : start + 4]
+        y[start : start + 4] = part / np.sqrt((part * part).sum())
+    return y
+
+
+def _largest(x: Any) -> Array:
+    return np.asarray(np.abs(np.asarray(x, dtype=np.float64)).max(axis=1, initial=0.0))
+
+
+def two_engines(motion: Motion, deadline: Deadline) -> Known:
+    """Return what two engines say, each with a method of its own, marching by turns until they part.
+
+    Raises
+    ------
+    UnsupportedError
+        There are no two engines that hold the model.
+    """
+    with deadline.paused():
+        roads = [_road(motion, choices) for choices in _ROADS]
+    how = " and ".join(f"{method} on {engine}" for engine, method, _ in roads)
+    runs = [[motion.q0[None], motion.v0[None]] for _ in roads]
+    times, why = motion.save, ""
+    ends = np.unique(np.linspace(0, len(times) - 1, min(_LEGS, len(times) - 1) + 1).astype(int))
+    for j, (k, end) in enumerate(pairwise(ends.tolist())):
+        legs = []
+        for i, ((_, method, dyn), (q, v)) in enumerate(zip(roads, runs, strict=True)):
+            part = deadline.part((2 * j + i) / (2 * len(ends)), 1 / (2 * len(ends)))
+            leg = _leg(motion, dyn, method, q[-1], v[-1], slice(k, end + 1), part)
+            if leg is None:
+                why = f"the time was up after t = {times[k]:.6g} s"
+                break
+            if not leg.stats.finished:
+                why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
+            legs.append(leg)
+        if len(legs) < len(roads):
+            break
+        n = min(len(leg.t) for leg in legs)
+        runs = [
+            [np.concatenate([q, leg.q[1:n]]), np.concatenate([v, leg.v[1:n]])]
+            for (q, v), leg in zip(runs, legs, strict=True)
+        ]
+        # What has parted for good need not be followed to the end.
+        if why or gap(motion.model, runs[0][0][-1:], runs[1][0][-1:])[0] > 1e-6:
+            break
+    (q, v), (other_q, other_v) = runs
+    apart = np.array([gap(motion.model, q, other_q), _largest(v - other_v)])
+    return Known((q, np.zeros_like(q)), (v, np.zeros_like(v)), apart, how, why)
+
+
+def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[str, str, Any]:
+    reasons = []
+    for engine, method in choices:
+        try:
+            if motion.torque.callable and not METHODS[method].callables:
+                continue
+            dyn = dynamics(motion.model, engine)
+            # Whether the method is there shows when it is asked for nothing.
+            simulate(dyn, motion.q0, motion.v0, 0.0, method)
+        except UnsupportedError as error:
+            reasons.append(f"{engine}: {error}")
+        else:
+            return engine, method, dyn
+    raise UnsupportedError(f"reference: no independent engine for {motion.model.name}; {'; '.join(reasons)}")
+
+
+def _leg(motion: Motion, dyn: Any, method: str, q: Array, v: Array, rows: slice, deadline: Deadline) -> Any:
+    """Return the motion between two of the saved times, or None when the time is up."""
+    times = motion.save[rows]
+    start = float(times[0])
+    given: Any = motion.given
+    if motion.torque.held:
+        given = np.asarray(given)[rows.start : rows.stop - 1]
+    elif callable(given):
+        given = _later(given, start)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MbkitWarning)
+            return simulate(
+                dyn,
+                q,
+                v,
+                float(times[-1] - start),
+                method,
+                rtol=METHODS[method].least,
+                torque=given,
+                save=times - start,
+                progress=deadline.look,
+            )
+    except LateError:
+        return None
+
+
+def _later(function: TorqueFunction, start: float) -> TorqueFunction:
+    return lambda t, q, v: function(start + t, q, v)
+
+
+#: How well two runs must agree, relative to the size of the motion.
+AGREE: Final = 1e-12
+# The errors of two runs can partly cancel in their difference: measured against more
+# digits, either was up to three times as wrong as they were apart.
+_SAFETY: Final = 4.0
+# Quadruple numbers cost about this many seconds per operation, order² and step.
+_QUADRUPLE: Final = 1.0e-8
+# Steps per second of motion that a small system takes: a guess before there is a run.
+_STEPS: Final = 40.0
+# States at which accelerations are compared.
+_WITNESSED: Final = 64
+# Two doubles hold 106 bits of a number, which can be somewhat larger than the motion.
+_PAIR: Final = 2.0**-105
+_EPS: Final = float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A motion as far as it is known; arrays are read-only.
+
+    Attributes
+    ----------
+    t : (K,) array
+        The times asked for, up to `horizon`; s.
+    q : (K, nq) array
+    v : (K, nv) array
+        Rounded to double.
+    q_low, v_low : (K, nq) and (K, nv) arrays
+        What rounding left: q + q_low has the reference's own digits.
+    floor : (K,) array
+        How well q is known, rad or m: four times the largest difference between the
+        two runs so far, and what rounding to double takes away.
+    digits : float
+        How many digits q + q_low and v + v_low have at the least, relative to the size
+        of the motion.
+    scale : (float, float)
+        The size of the motion: the farthest that a coordinate gets from its start
+        (rad or m, of mixed coordinates their largest number), and the largest velocity.
+    horizon : float
+        The last of the times up to which both runs agree to 1e-12 of the size of
+        the motion, in q and in v; s.
+    how : str
+        How it was made, and why it ends where it ends, for a report.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    q_low: Array
+    v_low: Array
+    floor: Array
+    digits: float
+    scale: tuple[float, float]
+    horizon: float
+    how: str
+
+    def __post_init__(self) -> None:
+        for name in ("t", "q", "v", "q_low", "v_low", "floor"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        # Arrays come out of a pickle writeable, unless they are made read-only anew.
+        return type(self), tuple(getattr(self, f.name) for f in fields(self))
+
+    def __repr__(self) -> str:
+        return f"<Reference to t = {self.horizon:g} s, {self.digits:.1f} digits: {self.how}>"
+
+
+def reference(
+    model: Model,
+    q0: ArrayLike,
+    v0: ArrayLike,
+    duration: float,
+    save: ArrayLike,
+    torque: ArrayLike | TorqueFunction | None = None,
+    *,
+    seconds: float = 30.0,
+    progress: bool | ProgressFunction | None = None,
+) -> Reference:
+    """Return the motion from a state, known to 12 digits or cut where it is not.
+
+    Parameters
+    ----------
+    model : Model
+        Whose named parameters have values.
+    q0 : (nq,) array_like
+    v0 : (nv,) array_like
+    duration : float
+        s.
+    save : (K,) array_like
+        Increasing times within the duration, s; 0 is added if it is not among them.
+    torque : array_like or callable, optional
+        (nv,), held all the time; (K - 1, nv), held over each interval of `save`,
+        which then runs from 0 to `duration`; or a function of (t, q, v), for which
+        only two engines make a reference.
+    seconds : float
+        How long the search may take, without what is derived and compiled. What is known by then is
+        returned.
+    progress : bool or callable, optional
+        As in `mbkit.simulate`.
+
+    Returns
+    -------
+    Reference
+
+    Raises
+    ------
+    InputError
+        A wrong shape, state, time or torque.
+    UnsupportedError
+        Neither heyoka nor two engines for this model are at hand, or it has loops or prescribed motions.
+
+    Notes
+    -----
+    In this order, until one holds to the end: Taylor series in quadruple precision, if
+    its cost is small beside `seconds`; in 80-bit numbers, 2000 times finer than double
+    and some 30 times faster than quadruple ones; in quadruple precision, if there is
+    time; Taylor series (or an embedded Runge-Kutta pair) in double on the own derivation
+    beside DOP853 on another engine. Series share the derivation's formulas, so the
+    accelerations along them are compared with another engine's.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> from mbkit.studies.work_precision.reference import reference
+    >>> truth = reference(mb.catalog.pendulum(), [1.0], [0.0], 2.0, [0.0, 1.0, 2.0])
+    >>> truth.horizon
+    2.0
+    """
+    motion = _checked(model, q0, v0, duration, save, torque)
+    seconds = real("seconds", seconds, positive=True)
+    if not motion.duration or not model.nv:
+        return _nothing_moves(motion)
+    with Progress(progress, f"{model.name}: reference") as bar:
+        deadline = Deadline(seconds, bar.update)
+        found, refused = _search(motion, deadline, seconds)
+        bar.update(1.0)
+    if not found:
+        raise UnsupportedError(f"reference: {'; '.join(refused)}")
+    # The one that holds longest, and of those the first.
+    best, known = max(((_cut(motion, known), known) for known in found), key=lambda pair: pair[0].horizon)
+    return replace(best, how=best.how + _witness(motion, best)) if known.shared else best
+
+
+def _checked(model: Model, q0: ArrayLike, v0: ArrayLike, duration: float, save: ArrayLike, torque: Any) -> Motion:
+    expect_model(model)
+    model.require_values("a reference")
+    require_tree(model, "reference")
+    q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
+    if q.ndim != 1 or v.ndim != 1:
+        raise InputError(f"q0, v0: expected one state, got shapes {q.shape} and {v.shape}; give one after the other")
+    duration = real("duration", duration, nonnegative=True)
+    times = save_times(save, 0.0, duration)
+    whole = times[0] == 0 and times[-1] == duration
+    read = Torque(torque, model, None, len(times) - 1 if whole else None)
+    times = times if times[0] == 0 else np.concatenate([[0.0], times])
+    return Motion(model, q, v, duration, times, read, torque)
+
+
+def _nothing_moves(motion: Motion) -> Reference:
+    shape = len(motion.save), 1
+    q, v = np.tile(motion.q0, shape), np.tile(motion.v0, shape)
+    floor = np.zeros(len(q))
+    how = "the given state, since nothing moves"
+    return Reference(motion.save, q, v, 0 * q, 0 * v, floor, float("inf"), (1.0, 1.0), float(motion.save[-1]), how)
+
+
+def _search(motion: Motion, deadline: Deadline, seconds: float) -> tuple[list[Known], list[str]]:
+    found: list[Known] = []
+    refused: list[str] = []
+
+    def look(way: Any, *given: Any, within: float | None = None) -> bool:
+        # Whether a way leads to the end is known at its end: the first gets half of the bar.
+        tried = len(found) + len(refused)
+        part = deadline.part(1 - 0.5**tried, 0.5 ** (tried + 1), within)
+        try:
+            found.append(way(motion, *given, part))
+        except UnsupportedError as error:
+            refused.append(str(error))
+            return False
+        return bool(_cut(motion, found[-1]).horizon == motion.save[-1])
+
+    if not motion.torque.callable:
+        small = _quadruple_seconds(motion, _STEPS * motion.duration) < seconds / 6
+        if small and look(taylor_pair, 113, within=seconds / 2):
+            return found, refused
+        if look(taylor_pair, 64):
+            return found, refused
+        steps = found[-1].steps if found else _STEPS * motion.duration
+        if not small and _quadruple_seconds(motion, steps) < deadline.left:
+            look(taylor_pair, 113)
+    if not found:
+        # Double is never better than what was found with more.
+        look(two_engines)
+    return found, refused
+
+
+def _quadruple_seconds(motion: Motion, steps: float) -> float:
+    """Return about how long two runs of so many steps take in quadruple precision; infinite where there is none."""
+    try:
+        order, operations = order_of(precision(113).eps), taylor_system(motion.equations).operations
+    except UnsupportedError:
+        return float("inf")
+    return 2 * steps * operations * order**2 * _QUADRUPLE
+
+
+def _cut(motion: Motion, known: Known) -> Reference:
+    """Return what a pair of runs says, up to where they part."""
+    model, (q, q_low), (v, v_low) = motion.model, known.q, known.v
+    moved = gap(model, q, np.broadcast_to(q[:1], q.shape))
+    # What rests has no size; it is then known absolutely.
+    scale = float(moved.max()) or 1.0, float(np.abs(v).max()) or 1.0
+    apart = np.maximum.accumulate(known.apart, axis=1)
+    relative = np.max(apart / np.array(scale)[:, None], axis=0)
+    holds = relative <= AGREE
+    n = len(holds) if holds.all() else int(np.argmin(holds))
+    end = float(motion.save[n - 1])
+    worst = max(float(relative[:n].max()), _PAIR)
+    how = f"{known.how}, which agree to {worst:.1e} of the motion"
+    if n < len(motion.save):
+        why = known.why if n == len(q) else f"beyond, they part to {relative[n]:.1e} at t = {motion.save[n]:.6g} s"
+        how += f" until t = {end:.6g} s, where the reference ends: {why}"
+    size = np.abs(q[:n]).max(axis=1, initial=0.0)
+    return Reference(
+        t=motion.save[:n],
+        q=q[:n],
+        v=v[:n],
+        q_low=q_low[:n],
+        v_low=v_low[:n],
+        floor=_SAFETY * apart[0, :n] + 0.5 * _EPS * size,
+        digits=float(-np.log10(_SAFETY * worst)),
+        scale=scale,
+        horizon=end,
+        how=how,
+    )
+
+
+def _witness(motion: Motion, found: Reference) -> str:
+    """Return what another engine says of the formulas along a motion."""
+    which = np.unique(np.linspace(0, len(found.t) - 1, min(_WITNESSED, len(found.t))).astype(int))
+    q, v = found.q[which], found.v[which]
+    force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
+    tau = np.array([force(min(int(k), last)) for k in which])
+    constants = np.broadcast_to(motion.equations.constant_values, (len(q), len(motion.equations.constant_values)))
+    own = Machine(motion.equations.function("forward_dynamics"))
+    a = own(q, v, tau, *([constants] if constants.size else []))[0][..., 0]
+    for engine in ("pinocchio", "mujoco"):
+        try:
+            other = dynamics(motion.model, engine).forward_dynamics(q, v, tau)
+        except MbkitError:
+            continue
+        apart = np.abs(a - other).max() / (np.abs(a).max() or 1.0)
+        return f"; accelerations along it differ by {apart:.1e} from those of {engine}"
+    return "; no other engine holds the model, so nobody but the own derivation vouches for its formulas"

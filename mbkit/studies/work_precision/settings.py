@@ -1,0 +1,179 @@
+"""What a sweep runs: which method on which engine, and with which steps or tolerances."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from mbkit.engines import ENGINES
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.methods.registry import METHODS, Method, method_of
+
+__all__ = ["INTERVALS", "MEASURED", "Plan", "names_of", "pairs", "plans", "save_grid"]
+
+
+#: Errors are measured at the ends of this many equal parts of the horizon.
+INTERVALS: Final = 10
+#: The coarsest step, s, and the finest, as a part of the horizon.
+_COARSEST: Final = 0.05
+_FINEST: Final = 1e-7
+#: Ratio of neighbouring steps, by the method's order: an error falls by 4 to 16 at each.
+_RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
+#: Methods that call the dynamics from Python on every engine, and what such a call costs beside a compiled one.
+_FROM_PYTHON: Final = frozenset({"dop853", "radau", "bdf", "lsoda", "gauss4", "gauss6"})
+_CALL: Final = 8
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The settings of one method on one engine, coarse to fine.
+
+    Attributes
+    ----------
+    engine, method : str
+    setting : {"dt", "rtol"}
+    values : tuple of float
+        Steps, s, or tolerances.
+    asked : bool
+        Whether somebody asked for these values, so that each has to be accounted for;
+        else the sweep ends where finer ones bring nothing or take too much work.
+    """
+
+    engine: str
+    method: str
+    setting: Literal["dt", "rtol"]
+    values: tuple[float, ...]
+    asked: bool
+
+    @property
+    def kind(self) -> Method:
+        """The method as data."""
+        return METHODS[self.method]
+
+    def work(self, steps: int, evaluations: int) -> int:
+        """Return what a run costs, in compiled evaluations of the forward dynamics; the same on every machine."""
+        compiled = self.kind.kind == "native" or self.method.startswith("drake_") or self.engine == "lagrangian"
+        each = 1 if compiled and self.method not in _FROM_PYTHON else _CALL
+        return each * (evaluations or steps * max(self.kind.stages, 1))
+
+
+def save_grid(duration: float) -> np.ndarray:
+    """Return the times at which errors are measured, shape (11,)."""
+    return np.linspace(0.0, duration, INTERVALS + 1)
+
+
+def plans(
+    pairs: Mapping[str, Sequence[str]],
+    interval: float,
+    steps: Sequence[float] | None,
+    tolerances: Sequence[float] | None,
+) -> tuple[Plan, ...]:
+    """Return a plan for every engine's methods.
+
+    Parameters
+    ----------
+    pairs : mapping of str to sequence of str
+        Engine -> methods.
+    interval : float
+        Time between two saved states, s, on which steps must end.
+    steps, tolerances : sequences of float, optional
+        Asked for. A step is shortened so that a whole number of them is an interval; a
+        tolerance below a method's least is left out.
+    """
+    out = []
+    for engine, names in pairs.items():
+        for name in names:
+            method = METHODS[name]
+            if method.kind == "adaptive":
+                given, asked = (tolerances, True) if tolerances is not None else (_tolerances(method), False)
+                values = tuple(sorted({float(x) for x in given if x >= method.least}, reverse=True))
+                out.append(Plan(engine, name, "rtol", values, asked))
+            else:
+                given, asked = (steps, True) if steps is not None else (_steps(method, interval), False)
+                counts = sorted({max(1, int(np.ceil(interval / h * (1 - 1e-9)))) for h in given})
+                out.append(Plan(engine, name, "dt", tuple(interval / n for n in counts), asked))
+    return tuple(out)
+
+
+def _tolerances(method: Method) -> tuple[float, ...]:
+    # A Taylor series is compiled anew for each order that a tolerance asks for.
+    decades = range(3, 16, 4 if method.name == "taylor" else 1)
+    return tuple(x for x in (float(f"1e-{k}") for k in decades) if x >= method.least)
+
+
+def _steps(method: Method, interval: float) -> tuple[float, ...]:
+    ratio = _RATIOS.get(method.order, 2.0)
+    coarsest = min(interval, _COARSEST)
+    count = int(np.log(coarsest / (interval * INTERVALS * _FINEST)) / np.log(ratio)) + 1
+    return tuple(coarsest / ratio**k for k in range(count))
+
+
+# Which methods are asked of which engines.
+
+#: Engines that can be measured.
+MEASURED: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
+
+
+def pairs(
+    engines: Sequence[str], methods: Sequence[str] | Mapping[str, Sequence[str]] | None
+) -> dict[str, tuple[str, ...]]:
+    """Return the methods of each engine, checked.
+
+    Parameters
+    ----------
+    engines : sequence of str
+    methods : sequence of str, or mapping of str to sequence of str, or None
+        For all engines that have them, or for each; None for all methods.
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        What no engine is, or no method of it.
+    """
+    names = names_of("engines", engines)
+    for name in names:
+        if name == OracleDynamics.engine:
+            raise InputError("engines: the oracle is what the others are measured by; leave it out")
+        if name not in MEASURED:
+            raise UnknownNameError("engine", name, MEASURED)
+    if isinstance(methods, Mapping):
+        for engine in methods:
+            if engine not in names:
+                raise InputError(f"methods: {engine!r} is not among the engines {list(names)}")
+        asked = {engine: names_of(f"methods[{engine!r}]", methods[engine]) for engine in names if engine in methods}
+        if not asked:
+            raise InputError("methods: expected the methods of at least one engine, got none")
+        for engine, own in asked.items():
+            for method in map(method_of, own):
+                if method.engines and engine not in method.engines:
+                    raise InputError(
+                        f"methods[{engine!r}]: {method.name} is not on {engine}; it is on {', '.join(method.engines)}"
+                    )
+    else:
+        given = tuple(METHODS) if methods is None else names_of("methods", methods)
+        asked = dict.fromkeys(names, given)
+    out = {e: tuple(m for m in ms if not method_of(m).engines or e in METHODS[m].engines) for e, ms in asked.items()}
+    # A method that none of the engines has was asked for in error.
+    for name in dict.fromkeys(m for ms in asked.values() for m in ms):
+        if methods is not None and not any(name in ms for ms in out.values()):
+            raise InputError(
+                f"methods: {name} is not on {' or '.join(asked)}; it is on {', '.join(METHODS[name].engines)}"
+            )
+    return out
+
+
+def names_of(what: str, given: object) -> tuple[str, ...]:
+    """Return names as a tuple, each once; `what` they are is for the message."""
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise InputError(f"{what}: expected several names, got {given!r}; write ({given!r},)")
+    names = tuple(dict.fromkeys(given))
+    if not names:
+        raise InputError(f"{what}: expected at least one name, got none")
+    for name in names:
+        if not isinstance(name, str):
+            raise InputError(f"{what}: expected names, got {name!r}")
+    return names
