@@ -236,7 +236,7 @@ class Dynamics(ABC):
         the order of ``model.parameters``. The output has the quantity's name and is
         dense: (nv, nv), (nv, 1) or (1, 1); derivatives are by_q, by_v and by_a or
         by_tau. It may be called with MX or SX and differentiated.
-        `mbkit.derivation.export_c` writes it as C.
+        `mbkit.lagrangian.export_c` writes it as C.
         """
         self._require("function")
         return self._function(name)
