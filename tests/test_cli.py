@@ -534,6 +534,8 @@ def test_an_interruption_is_one_line_and_its_status_whoever_swallows_it(then, pr
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | environment,
+        # A job in the background ignores the signal, and its children would too.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     for _ in range(presses):
         process.stdout.readline()
