@@ -1,7 +1,8 @@
 """Questions asked of several engines at once."""
 
 from mbkit.studies import stress
-from mbkit.studies.compare.result import Comparison, Omission, Refusal, RolloutRow, Row
+from mbkit.studies._results import Refusal
+from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 from mbkit.studies.compare.study import compare
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.work_precision.reference import Reference

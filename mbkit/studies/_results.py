@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -14,7 +14,16 @@ from mbkit._version import __version__
 from mbkit.errors import OutputError
 from mbkit.model import Model
 
-__all__ = ["cell", "facts_of", "plain", "processor", "remade", "versions", "write"]
+__all__ = ["Refusal", "cell", "facts_of", "plain", "processor", "remade", "versions", "write"]
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Something that an engine could not do, with its reason; `term` is empty for all of it."""
+
+    engine: str
+    term: str
+    reason: str
 
 
 def plain(value: Any) -> Any:

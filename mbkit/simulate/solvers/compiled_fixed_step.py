@@ -25,7 +25,8 @@ from mbkit.methods.registry import METHODS
 from mbkit.model.integration_space import Space
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Outcome
-from mbkit.simulate.solvers.runge_kutta import RUNAWAY, credible, reason
+from mbkit.simulate.solvers.fixed_step import reason
+from mbkit.simulate.solvers.runge_kutta import RUNAWAY, credible
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
+from mbkit.methods.tableaus import RK4
 from mbkit.model.integration_space import Space
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Ended, Outcome
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, DivergenceError, Field, Step, credible, make_step
+from mbkit.simulate.solvers.gauss import gauss_step
+from mbkit.simulate.solvers.runge_kutta import (
+    RAN_AWAY,
+    DivergenceError,
+    Field,
+    Step,
+    credible,
+    euler_step,
+    runge_kutta_step,
+)
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
-__all__ = ["run_fixed"]
+__all__ = ["make_step", "reason", "run_fixed"]
+
+_TABLEAUS: Final = {"rk4": RK4}
 
 
 def run_fixed(
@@ -149,3 +163,23 @@ class _Run:
             message=message,
             error=self._error,
         )
+
+
+def reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, force: Array) -> str:
+    """Return why the step from a batch of one state diverges, in the engine's words if it has some."""
+    space = Space(dyn.model)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        try:
+            make_step(method, Field(dyn, space), space)(t, h, q, w, force)
+        except DivergenceError as error:
+            return str(error)
+    return RAN_AWAY
+
+
+def make_step(method: str, field: Field, space: Space) -> Step:
+    """Return the step of a fixed-step method."""
+    if method in _TABLEAUS:
+        return runge_kutta_step(_TABLEAUS[method], field, space)
+    if method.startswith("gauss"):
+        return gauss_step(method, field, space)
+    return euler_step(field, space)

@@ -20,13 +20,13 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import InputError, NumericalError
-from mbkit.methods.tableaus import RK4, Tableau
+from mbkit.methods.tableaus import Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import Approach, beside, settled
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
-__all__ = ["RAN_AWAY", "RUNAWAY", "DivergenceError", "Field", "Step", "credible", "make_step", "reason"]
+__all__ = ["RAN_AWAY", "RUNAWAY", "DivergenceError", "Field", "Step", "credible", "euler_step", "runge_kutta_step"]
 
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
@@ -121,30 +121,9 @@ def _blamed(told: str, q: Array, v: Array) -> str:
     return told if largest < 1e50 else RAN_AWAY
 
 
-def reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, force: Array) -> str:
-    """Return why the step from a batch of one state diverges, in the engine's words if it has some."""
-    space = Space(dyn.model)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        try:
-            make_step(method, Field(dyn, space), space)(t, h, q, w, force)
-        except DivergenceError as error:
-            return str(error)
-    return RAN_AWAY
+def euler_step(field: Field, space: Space) -> Step:
+    """Return the step of semi-implicit Euler."""
 
-
-def make_step(method: str, field: Field, space: Space) -> Step:
-    """Return the step of a fixed-step method."""
-    if method in _TABLEAUS:
-        return _runge_kutta(_TABLEAUS[method], field, space)
-    if method.startswith("gauss"):
-        # It takes this module's own names.
-        from mbkit.simulate.solvers.gauss import gauss_step
-
-        return gauss_step(method, field, space)
-    return _semi_implicit_euler(field, space)
-
-
-def _semi_implicit_euler(field: Field, space: Space) -> Step:
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         w = w + h * field(t, q, w, force)
         return space.move(q, h * w), w
@@ -152,7 +131,8 @@ def _semi_implicit_euler(field: Field, space: Space) -> Step:
     return step
 
 
-def _runge_kutta(tableau: Tableau, field: Field, space: Space) -> Step:
+def runge_kutta_step(tableau: Tableau, field: Field, space: Space) -> Step:
+    """Return the step of an explicit Runge-Kutta method."""
     A, b, c, s, nv = tableau.A, tableau.b, tableau.c.tolist(), tableau.stages, space.nv
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
@@ -170,6 +150,3 @@ def _runge_kutta(tableau: Tableau, field: Field, space: Space) -> Step:
         return space.move(q, moved[..., :nv]), w + moved[..., nv:]
 
     return step
-
-
-_TABLEAUS: Final = {"rk4": RK4}

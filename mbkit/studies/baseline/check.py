@@ -14,6 +14,7 @@ from mbkit.engines import Dynamics
 from mbkit.errors import BaselineError
 from mbkit.model import Model
 from mbkit.studies import _results
+from mbkit.studies._results import Refusal
 from mbkit.studies._targets import checked_target
 from mbkit.studies.baseline import record as engines_
 from mbkit.studies.baseline import tolerance
@@ -24,7 +25,6 @@ from mbkit.studies.baseline.file import path_of, read
 from mbkit.studies.baseline.record import evaluated
 from mbkit.studies.baseline.result import BaselineResult, Status
 from mbkit.studies.baseline.tolerance import FINE, OWN, ROUNDING, Moved, VersionChange, Yardstick, allowed
-from mbkit.studies.compare.result import Refusal
 
 __all__ = ["check", "diff"]
 

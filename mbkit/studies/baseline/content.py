@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from mbkit._check import Array
+from mbkit.studies._results import Refusal
 from mbkit.studies.baseline.description import Description
-from mbkit.studies.compare.result import Refusal
 from mbkit.studies.compare.terms import States
 
 __all__ = ["ROLLOUT", "Baseline", "Rollout"]

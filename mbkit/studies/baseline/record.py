@@ -17,13 +17,13 @@ from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalEr
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import _results
+from mbkit.studies._results import Refusal
 from mbkit.studies._targets import checked_target
 from mbkit.studies.baseline import record as engines_
 from mbkit.studies.baseline.content import ROLLOUT, Baseline, Rollout
 from mbkit.studies.baseline.description import described, links_of
 from mbkit.studies.baseline.file import check_replaceable, path_of, store, text_of
 from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Yardstick, relevant
-from mbkit.studies.compare.result import Refusal
 from mbkit.studies.compare.rollouts import quiet_simulate
 from mbkit.studies.compare.study import COMPARABLE
 from mbkit.studies.compare.terms import TERMS, States, states

@@ -11,9 +11,9 @@ from typing import Any, Final, Literal
 
 from mbkit._escape import html, json_text, markdown, one_line
 from mbkit.errors import OutputError
+from mbkit.studies._results import Refusal
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.tolerance import Moved, VersionChange
-from mbkit.studies.compare.result import Refusal
 
 __all__ = ["BaselineResult", "Status"]
 

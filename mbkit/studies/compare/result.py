@@ -13,11 +13,12 @@ import numpy as np
 from mbkit._check import Array
 from mbkit._escape import html, markdown, one_line
 from mbkit.errors import OutputError
+from mbkit.studies._results import Refusal
 
 if TYPE_CHECKING:
     from mbkit.studies.work_precision.result import WorkPrecision
 
-__all__ = ["Comparison", "Omission", "Refusal", "RolloutRow", "Row"]
+__all__ = ["Comparison", "Omission", "RolloutRow", "Row"]
 
 
 @dataclass(frozen=True)
@@ -80,15 +81,6 @@ class Row:
     allowed: float = math.nan
     defect: str = ""
     zero: bool = False
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Something that an engine could not do, with its reason; `term` is empty for all of it."""
-
-    engine: str
-    term: str
-    reason: str
 
 
 @dataclass(frozen=True)

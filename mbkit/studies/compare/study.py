@@ -17,10 +17,10 @@ from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalEr
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import _results
-from mbkit.studies._results import facts_of
+from mbkit.studies._results import Refusal, facts_of
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.omissions import omissions
-from mbkit.studies.compare.result import Comparison, Refusal, Row, tupled
+from mbkit.studies.compare.result import Comparison, Row, tupled
 from mbkit.studies.compare.rollouts import free_of_mimic, rollouts
 from mbkit.studies.compare.terms import TERMS, States, Term, power_rows, states
 from mbkit.studies.work_precision.study import work_precision

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mbkit._escape import csv_text, html, markdown
 from mbkit.errors import InputError
-from mbkit.studies._results import cell, plain, remade, write
-from mbkit.studies.compare.result import Refusal
+from mbkit.studies._results import Refusal, cell, plain, remade, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
