@@ -15,7 +15,7 @@ same accelerations come from Gauss's principle (`mbkit.derivation.least_squares_
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -32,9 +32,6 @@ from mbkit.derivation.model_values import Constants, scalar
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 from mbkit.model.joint_types import cross3
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "FUNCTIONS",

@@ -71,7 +71,7 @@ def adaptive_runner(method: Method) -> Callable[[Asked], Outcome]:
 
         return run_cvodes
     if method.name.startswith("drake_"):
-        from mbkit.simulate.solvers.native import run_drake
+        from mbkit.simulate.solvers.drake import run_drake
 
         return run_drake
     from mbkit.simulate.solvers.scipy import run_scipy
