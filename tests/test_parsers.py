@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -23,7 +24,7 @@ from mbkit.load.urdf_links import urdf_links
 from mbkit.load.xml_reader import Element
 from mbkit.report.page import importers_page
 from mbkit.report.terminal import meaning
-from mbkit.studies.importers.result import TERMS
+from mbkit.studies.importers.result import MISSING, TERMS
 
 LINK = (
     '<link name="{0}"><inertial><origin xyz="0 0.01 0.1" rpy="0.1 0 0"/><mass value="{1}"/>'
@@ -453,3 +454,11 @@ def test_arguments_and_doors(tmp_path: Path) -> None:
     assert "other.urdf has damping 0.6 for 0.5" in " ".join(done.stdout.split())
     assert run(cli, ["diff", str(same), "--engines", "pinocchio,mujoco"]).exit_code == 0
     assert run(cli, ["diff", str(same)]).exit_code == 2
+
+
+def test_what_is_not_installed_refuses_nothing(tmp_path: Path) -> None:
+    result = mb.compare_parsers(write(tmp_path, arm()), ("pinocchio", "mujoco"), samples=1)
+    gone = replace(result.importers[1], version=MISSING, refused="mujoco is not installed", stages=(), explanation=None)
+    verdict = replace(result, importers=(result.importers[0], gone)).verdict
+    assert "mujoco is not installed" in verdict
+    assert "refuse" not in verdict

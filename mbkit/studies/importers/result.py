@@ -9,10 +9,12 @@ from typing import Any, Final
 from mbkit._escape import html, markdown, one_line
 from mbkit.studies.explain.result import Explanation, grouped, saved
 
-__all__ = ["DECIDING", "TERMS", "Parsed", "ParserComparison", "Stage"]
+__all__ = ["DECIDING", "MISSING", "TERMS", "Parsed", "ParserComparison", "Stage"]
 
 #: The terms that each engine computes by itself, on its own model.
 TERMS: Final = ("M", "g", "nle", "passive")
+#: The version of an importer that is not there; it has refused nothing.
+MISSING: Final = "not installed"
 #: The stages that say whether two readings move alike.
 DECIDING: Final = ("joints", "kinds", *TERMS)
 _MARK: Final = {True: "same", False: "differs", None: "not comparable"}
@@ -124,12 +126,14 @@ class ParserComparison:
         """One sentence: who agrees, who differs, who refuses; and what was not compared."""
         same = [p.engine for p in self.importers if p.agrees]
         differ = [p.engine for p in self.importers if p.stages and not p.agrees]
-        refuse = [p.engine for p in self.importers if p.refused]
+        missing = [p.engine for p in self.importers if p.refused and p.version == MISSING]
+        refuse = [p.engine for p in self.importers if p.refused and p.engine not in missing]
         against = "" if self.reference == "file" else f" from the {self.against}"
         alone = [p.engine for p in self.importers if not p.stages and not p.refused]
         parts = [f"{_listed(same)} agree{_s(same)} with the {self.against.split(',')[0]}"] if same else []
         parts += [f"{_listed(differ)} differ{_s(differ)}{against}"] if differ else []
         parts += [f"{_listed(refuse)} refuse{_s(refuse)}"] if refuse else []
+        parts += [f"{_listed(missing)} {'is' if len(missing) == 1 else 'are'} not installed"] if missing else []
         if not self.reference and alone:
             parts.insert(0, f"not compared: mbkit does not read the file; {_listed(alone)} read{_s(alone)} it")
         elif alone and not same and not differ:
@@ -166,7 +170,7 @@ class ParserComparison:
             lines.append("")
         for p in self.importers:
             if p.refused:
-                lines.append(f"- {p.engine} refuses: {markdown(p.refused)}")
+                lines.append(f"- {p.engine}: {markdown(p.refused)}")
             if not p.refused and not p.stages:
                 lines.append(f"- {p.engine} reads it{', and is the reference' if p.engine == self.reference else ''}")
             for kind, says, what in grouped(p.explanation.causes) if p.explanation else ():
@@ -182,7 +186,7 @@ class ParserComparison:
             f"<tr><td>{stage.name}</td>{''.join(f'<td>{html(cell(p.stages[k]))}</td>' for p in read)}</tr>"
             for k, stage in enumerate(read[0].stages if read else ())
         )
-        told = [f"{p.engine} refuses: {p.refused}" for p in self.importers if p.refused]
+        told = [f"{p.engine}: {p.refused}" for p in self.importers if p.refused]
         told += [
             f"{kind}: {says} ({what})"
             for p in read

@@ -31,7 +31,7 @@ from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
 from mbkit.studies.explain.tolerance import Near
 from mbkit.studies.importers.process import ImporterError, Reading, one_at_a_time
-from mbkit.studies.importers.result import TERMS, Parsed, ParserComparison, Stage
+from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 
 __all__ = ["OwnTerms", "compare_parsers", "measured", "own_terms", "stages", "unmimicked", "written"]
 
@@ -360,7 +360,7 @@ def compare_parsers(
     source : str or path
         A URDF or MJCF file, or a robot of example-robot-data.
     importers : sequence of str
-        Of pinocchio, mujoco and drake. One that is not installed is told as refusing.
+        Of pinocchio, mujoco and drake. One that is not installed is named as such.
     floating_base : bool
         Whether the base moves freely, in the file's reading and in every importer's.
     samples, seed : int
@@ -533,4 +533,4 @@ def _version(engine: str) -> str:
     try:
         return metadata.version(IMPORTERS[engine].distribution)
     except metadata.PackageNotFoundError:
-        return "not installed"
+        return MISSING
