@@ -686,3 +686,21 @@ def test_four_bar_conserves_energy_on_both_forms():
     other = mb.simulate(lag.embedded(), q, v, 1.0, "rk853", rtol=1e-12, save=[0.0, 0.5, 1.0])
     assert np.ptp(own.energy()) < 1e-9
     assert np.abs(own.q - other.q).max() < 1e-9
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss4", "rk853", "dop853"])
+@pytest.mark.parametrize("form", ["dynamics", "embedded"])
+def test_a_start_time_shifts_all_times_of_a_constrained_run(form, method):
+    """A pendulum in two coordinates, of which the independent one changes; blocks of steps end at rounded times."""
+    x, y, u, w = sp.symbols("x y u w")
+    lag = Lagrangian((u**2 + w**2) / 2, 9.81 * y, [x, y], [u, w], constraints=[x**2 + y**2 - 1])
+    dyn, start = getattr(lag, form)(), ([np.sin(1.0), -np.cos(1.0)], [0.0, 0.0])
+    setting = {"dt": 1e-3} if method in ("rk4", "gauss4") else {}
+    runs = [
+        mb.simulate(dyn, *start, 1.5, method, save=[t, t + 0.75, t + 1.5], t0=t, **setting) for t in (0.0, 2.0, 1000.0)
+    ]
+    for t, run in zip((0.0, 2.0, 1000.0), runs, strict=True):
+        assert run.t == pytest.approx([t, t + 0.75, t + 1.5], rel=1e-15)
+        assert run.q == pytest.approx(runs[0].q, abs=1e-9)
+        assert [hit.t - t for hit in run.events] == pytest.approx([hit.t for hit in runs[0].events], abs=1e-9)
+        assert run.stats.steps == runs[0].stats.steps or method in ("rk853", "dop853")

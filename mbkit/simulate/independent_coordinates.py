@@ -412,7 +412,7 @@ def _stepped(
         dyn = system.on(chart, q, t)
         end = min(k + _BLOCK, grid.steps)
         part, run.error = _part(
-            *(dyn, q, v, chart, grid.time(end) - t, method), dt=grid.dt, torque=_pulled(dyn, force, t)
+            *(dyn, q, v, chart, grid.span(k, end), method), dt=grid.dt, torque=_pulled(dyn, force, t)
         )
         run.count(part)
         dyn.remember(q)

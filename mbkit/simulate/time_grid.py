@@ -69,6 +69,10 @@ class Grid:
         """Length of the k-th step, s."""
         return self.last if k == self.steps - 1 else self.dt
 
+    def span(self, first: int, end: int) -> float:
+        """Length of the steps from state `first` to state `end`, s; without the rounding of times far from zero."""
+        return (end - first - 1) * self.dt + self.step(end - 1)
+
     def kept(self, save: ArrayLike | int | None, numbers: int) -> Indices:
         """Return the indices of the states to keep.
 
