@@ -1,8 +1,9 @@
 """What a system is: frozen data and its builder. No engine is imported here."""
 
 from mbkit.model.builder import ModelBuilder
+from mbkit.model.description import Needs
 from mbkit.model.joint_types import KINDS, JointKind, kind_of
-from mbkit.model.model import Model, Needs
+from mbkit.model.model import Model
 from mbkit.model.parameters import Expression, Number, Parameter, known, nominal
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
 

@@ -614,20 +614,12 @@ class ModelBuilder:
         if parts is not None and not isinstance(parts, Mapping):
             raise InputError(f"parts: expected a mapping from bodies to links, got {shown(parts)}")
         faults = list(self._read.faults)
-        faults += structure_faults(
-            self._bodies,
-            self._joints,
-            self._frames,
-            self._springs,
-            self._couplings,
-            self._loops,
-            self._prescribed,
-        )
+        faults += structure_faults(self._assemble(self._joints, self._bindings))
         faults += self._two_valued()
         # Joints that move nothing can only be found in a tree that holds together.
         found = body_faults(self._bodies, point_masses=point_masses)
         if not faults:
-            found = suspects(self._assemble(()), point_masses=point_masses)
+            found = suspects(self._assemble(*_resolved(self._joints, self._bindings)), point_masses=point_masses)
         negative = {b.name for b in self._bodies if b.mass < 0}
         still = static_bodies(self._joints) - negative
         idle = grouped([(n, why) for n, why in found if n in still], parts or {})
@@ -640,7 +632,7 @@ class ModelBuilder:
         faults += grouped([(n, why) for n, why in found if n in negative], parts or {})
         if faults:
             raise ModelError(self._name, faults)
-        model = self._assemble(found, notes)
+        model = self._assemble(*_resolved(self._joints, self._bindings), found, notes)
         if found:
             warnings.warn(
                 f"{self._name}: physically impossible, used as written: {'; '.join(grouped(found, parts or {}))}",
@@ -663,21 +655,26 @@ class ModelBuilder:
             if values.setdefault(p.name, p.value) != p.value
         ]
 
-    def _assemble(self, suspects: tuple[tuple[str, str], ...], notes: Iterable[str] = ()) -> Model:
-        joints, bindings = _resolved(self._joints, self._bindings)
+    def _assemble(
+        self,
+        joints: Iterable[Joint],
+        bindings: Iterable[Binding],
+        nonphysical: tuple[tuple[str, str], ...] = (),
+        notes: Iterable[str] = (),
+    ) -> Model:
         return Model(
             name=self._name,
             gravity=self._gravity,
             bodies=tuple(self._bodies),
-            joints=joints,
+            joints=tuple(joints),
             frames=tuple(self._frames),
             springs=tuple(self._springs),
             couplings=tuple(self._couplings),
             loops=tuple(self._loops),
             prescribed=tuple(self._prescribed),
             notes=(*self._notes, *notes),
-            nonphysical=suspects,
-            bindings=bindings,
+            nonphysical=nonphysical,
+            bindings=tuple(bindings),
         )
 
 

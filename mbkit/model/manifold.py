@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import InputError
-from mbkit.model.layout import Layout
-from mbkit.model.parts import Joint
+from mbkit.model.description import Description
 
 __all__ = ["check_quaternions", "difference", "integrate", "limits_box", "neutral", "random_state"]
 
@@ -19,26 +16,7 @@ __all__ = ["check_quaternions", "difference", "integrate", "limits_box", "neutra
 _UNIT = 1e-9
 
 
-class Jointed(Protocol):
-    """What has coordinates: a `Model`."""
-
-    @property
-    def nq(self) -> int: ...
-    @property
-    def nv(self) -> int: ...
-    @property
-    def layout(self) -> Layout: ...
-    @property
-    def independent_joints(self) -> tuple[Joint, ...]: ...
-    @property
-    def quaternions(self) -> tuple[tuple[int, str], ...]: ...
-    @property
-    def lower(self) -> Array: ...
-    @property
-    def upper(self) -> Array: ...
-
-
-def check_quaternions(model: Jointed, q: Array, name: str = "q") -> None:
+def check_quaternions(model: Description, q: Array, name: str = "q") -> None:
     """Raise `InputError` where a quaternion in q is not of unit length."""
     for start, joint in model.quaternions:
         if q.ndim == 1:
@@ -55,7 +33,7 @@ def check_quaternions(model: Jointed, q: Array, name: str = "q") -> None:
             )
 
 
-def neutral(model: Jointed) -> Array:
+def neutral(model: Description) -> Array:
     """Return zeros with identity quaternions, shape (nq,)."""
     q = np.zeros(model.nq)
     for start, _ in model.quaternions:
@@ -63,7 +41,7 @@ def neutral(model: Jointed) -> Array:
     return q
 
 
-def limits_box(model: Jointed) -> tuple[Array, Array]:
+def limits_box(model: Description) -> tuple[Array, Array]:
     """Return lower and upper ends of the box that `random_state` draws from.
 
     The limits of a joint that mimics another bound the one that it follows, as long
@@ -98,7 +76,7 @@ def _clipped(lower: float, upper: float, reach: float) -> tuple[float, float]:
     return max(lower, -reach), min(upper, reach)
 
 
-def random_state(model: Jointed, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
+def random_state(model: Description, rng: np.random.Generator, size: int | None = None) -> tuple[Array, Array]:
     """Draw q uniformly within the limits and v from the standard normal."""
     n = 1 if size is None else size
     lower, upper = limits_box(model)
@@ -112,7 +90,7 @@ def random_state(model: Jointed, rng: np.random.Generator, size: int | None = No
     return (q[0], v[0]) if size is None else (q, v)
 
 
-def integrate(model: Jointed, q: Array, dq: Array) -> Array:
+def integrate(model: Description, q: Array, dq: Array) -> Array:
     """Return q ⊕ dq."""
     if not model.quaternions:
         return np.asarray(q + dq)
@@ -138,7 +116,7 @@ def integrate(model: Jointed, q: Array, dq: Array) -> Array:
     return out
 
 
-def difference(model: Jointed, q0: Array, q1: Array) -> Array:
+def difference(model: Description, q0: Array, q1: Array) -> Array:
     """Return the dq with integrate(q0, dq) = q1."""
     if not model.quaternions:
         return np.asarray(q1 - q0)

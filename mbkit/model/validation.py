@@ -5,21 +5,21 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.errors import InputError, Suggestions, nearest
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
+from mbkit.errors import InputError, ModelError, Suggestions, nearest
+from mbkit.model import manifold
+from mbkit.model.description import Description
+from mbkit.model.parts import Body, Joint, JointCoupling, Loop
 from mbkit.spatial import skew
-
-if TYPE_CHECKING:
-    from mbkit.model.model import Model
 
 __all__ = [
     "body_fault",
     "body_faults",
+    "check_substituted",
     "grouped",
     "idle_joints",
     "sample_mass_matrix",
@@ -36,16 +36,10 @@ _FEW: Final = 40
 _MOST_VELOCITIES: Final = 5000
 
 
-def structure_faults(
-    bodies: Sequence[Body],
-    joints: Sequence[Joint],
-    frames: Sequence[Frame],
-    springs: Sequence[PointSpring],
-    couplings: Sequence[JointCoupling],
-    loops: Sequence[Loop],
-    prescribed: Sequence[Prescribed],
-) -> list[str]:
-    """Return one sentence per fault: names, the tree, mimics, and what joints may carry."""
+def structure_faults(description: Description) -> list[str]:
+    """Return one sentence per fault: names, the tree, mimics, and the values of joints."""
+    bodies, joints, loops = description.bodies, description.joints, description.loops
+    frames, springs, couplings = description.frames, description.springs, description.couplings
     known = {b.name for b in bodies} | {"world"}
     faults: list[str] = []
     if not bodies:
@@ -94,10 +88,10 @@ def structure_faults(
     there = ", ".join(sorted(one)) or "none"
     faults += [
         f"prescribed {p.joint!r}: expected a joint of one velocity that mimics none; there are: {there}"
-        for p in prescribed
+        for p in description.prescribed
         if p.joint not in one
     ]
-    moved = Counter(p.joint for p in prescribed)
+    moved = Counter(p.joint for p in description.prescribed)
     faults += [f"prescribed {n!r}: moved {k} times; give one motion" for n, k in moved.items() if k > 1]
     return faults
 
@@ -285,7 +279,7 @@ def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[st
     )
 
 
-def suspects(model: Model, *, point_masses: bool) -> tuple[tuple[str, str], ...]:
+def suspects(model: Description, *, point_masses: bool) -> tuple[tuple[str, str], ...]:
     """Return the bodies that cannot exist or that leave a joint idle, each with the reason.
 
     What waits for a parameter's value is not judged yet.
@@ -301,6 +295,21 @@ def suspects(model: Model, *, point_masses: bool) -> tuple[tuple[str, str], ...]
                 why = f"two velocities of joint {name!r} move the same mass"
             found.setdefault(model.joint(name).child, f"{why}, so M is singular: give mass, inertia or armature")
     return tuple(found.items())
+
+
+_D = TypeVar("_D", bound=Description)
+
+
+def check_substituted(before: _D, after: _D) -> _D:
+    """Return a description with other parameter values, or raise `ModelError` for what these make impossible."""
+    faults = structure_faults(after)
+    # An impossible body that was accepted before stays accepted, but a mass must not become negative.
+    accepted = {name for name, _ in before.nonphysical}
+    found = suspects(after, point_masses=True)
+    faults += [f"body {n!r}: {why}" for n, why in found if n not in accepted or after.body(n).mass < 0]
+    if faults:
+        raise ModelError(before.name, faults)
+    return after
 
 
 def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
@@ -337,7 +346,7 @@ def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple
     return out
 
 
-def idle_joints(model: Model) -> tuple[list[str], bool]:
+def idle_joints(model: Description) -> tuple[list[str], bool]:
     """Return the joints whose motion costs no kinetic energy, so that M is singular, and whether each alone costs none.
 
     M is formed at one random state from the definition, Σ Jᵀ I J, and scaled to
@@ -372,7 +381,7 @@ def idle_joints(model: Model) -> tuple[list[str], bool]:
     return [j.name for j in model.independent_joints if zero[model.layout.v[j.name]].any()], alone
 
 
-def scale_doubts(model: Model) -> list[str]:
+def scale_doubts(model: Description) -> list[str]:
     """Return why engines may lose digits: sizes too far apart for double precision, one sentence for each cause.
 
     For a hinge, the inertia about its axis M_ii stands against m L², with m the mass that it carries and L the
@@ -418,7 +427,7 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:_MOST_TOLD])}{more}"
 
 
-def sample_mass_matrix(model: Model, q: Array | None = None) -> Array:
+def sample_mass_matrix(model: Description, q: Array | None = None) -> Array:
     """Return M at a pose, or at one fixed random state: composite inertias give it, and Σ Jᵀ I J its diagonal.
 
     The definition gives the diagonal as a sum of squares, which stays small where a mass is on its own axis; it alone
@@ -461,12 +470,12 @@ class _Sample(NamedTuple):
         return np.asarray(ends[0] - ends[1])
 
 
-def _sample(model: Model, q: Array | None = None) -> _Sample:
+def _sample(model: Description, q: Array | None = None) -> _Sample:
     """Return M and the places of bodies at a pose or the random state."""
     places = {"": np.zeros(3)}
     poses = {"world": (np.eye(3), np.zeros(3))}
     if q is None:
-        q, _ = model.random_state(np.random.default_rng(0))
+        q, _ = manifold.random_state(model, np.random.default_rng(0))
     # Limits may be as wide as doubles go; the squares of lengths must not overflow.
     q_full = model.layout.expand_q(np.clip(q, -_FAR, _FAR))
     n = model.layout.sizes[3]

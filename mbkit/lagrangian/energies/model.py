@@ -20,7 +20,7 @@ from mbkit.lagrangian.constraints.manifold import Manifold, manifold_of
 from mbkit.lagrangian.constraints.redundancy import is_judged, refuse_unreachable, require_independent
 from mbkit.lagrangian.energies.casadi_equations import WrittenEquations
 from mbkit.model import Model
-from mbkit.model.model import Needs
+from mbkit.model.description import Needs
 from mbkit.model.parts import Body, Frame, Joint
 
 if TYPE_CHECKING:

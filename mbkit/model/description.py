@@ -1,0 +1,378 @@
+"""The data of a multibody system, and what follows from it by counting and naming.
+
+`Model` adds motion on the configuration manifold, variants and views. Checks and substitutions work on this class.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Any, Self
+
+import numpy as np
+
+from mbkit._check import Array, shown
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.model.layout import Layout
+from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
+
+__all__ = ["Description", "Needs", "digest", "expect_name"]
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, np.ndarray):
+        return [_plain(x) for x in value.tolist()]
+    if isinstance(value, (list, tuple)):
+        return [_plain(x) for x in value]
+    if isinstance(value, float):
+        # + 0.0 makes one of the two zeros: they describe the same system.
+        return (value + 0.0).hex()
+    return value
+
+
+def digest(*parts: Any) -> str:
+    """Return the SHA-256, as 64 hexadecimal digits, of the parts' content."""
+    text = json.dumps([_plain(p) for p in parts], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Needs:
+    """One flag per feature; True where the description has it.
+
+    Friction, limits (of coordinates, and of efforts and velocities) and loops are kept
+    as data and named here; the smooth terms of every engine leave friction and limits out.
+    """
+
+    gravity: bool
+    springs: bool
+    damping: bool
+    armature: bool
+    friction: bool
+    limits: bool
+    effort_limits: bool
+    mimic: bool
+    loops: bool
+    quaternions: bool
+    time: bool
+
+    @classmethod
+    def of(
+        cls,
+        gravity: Array,
+        joints: Iterable[Joint],
+        springs: Iterable[PointSpring],
+        couplings: Iterable[JointCoupling],
+        loops: Iterable[Loop],
+        prescribed: Iterable[Prescribed],
+        bound: Iterable[str] = (),
+    ) -> Needs:
+        """Read the flags off the parts of a description.
+
+        `bound` names the attributes that stand for parameters somewhere: what is
+        zero now may have another value when it is evaluated.
+        """
+        joints, bound = tuple(joints), frozenset(bound)
+        couplings = tuple(couplings)
+        between: tuple[PointSpring | JointCoupling, ...] = (*springs, *couplings)
+        return cls(
+            gravity="gravity" in bound or bool(np.any(gravity)),
+            springs="stiffness" in bound
+            or any(np.any(j.stiffness) for j in joints)
+            or any(s.stiffness for s in between),
+            damping="damping" in bound or any(np.any(j.damping) for j in joints) or any(s.damping for s in between),
+            armature="armature" in bound
+            or any(np.any(j.armature) for j in joints)
+            or any(c.armature for c in couplings),
+            friction=any(np.any(j.friction) for j in joints),
+            limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
+            effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),
+            mimic=any(j.mimic is not None for j in joints),
+            loops=bool(tuple(loops)),
+            quaternions=any(j.type.quaternion is not None for j in joints),
+            time=bool(tuple(prescribed)),
+        )
+
+    def as_dict(self) -> dict[str, bool]:
+        """Return the flags by name."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        present = [k for k, on in self.as_dict().items() if on]
+        absent = [k for k, on in self.as_dict().items() if not on]
+        return f"has {', '.join(present) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """The parts of a multibody system: a tree of bodies and what acts on it.
+
+    Attributes
+    ----------
+    name : str
+    gravity : (3,) array
+        m/s², in world axes.
+    bodies : tuple of Body
+    joints : tuple of Joint
+        In the order of their coordinates; fixed joints are among them.
+    frames : tuple of Frame
+    springs : tuple of PointSpring
+    couplings : tuple of JointCoupling
+    loops : tuple of Loop
+    prescribed : tuple of Prescribed
+    notes : tuple of str
+        What the loader decided or met, for the user to read.
+    nonphysical : tuple of (str, str)
+        Bodies that no matter can have, each with the reason.
+    bindings : tuple of Binding
+        The numbers that stand for expressions of parameters. The parts hold them
+        at the parameters' nominal values, and NaN where one has none.
+    """
+
+    name: str
+    gravity: Array
+    bodies: tuple[Body, ...]
+    joints: tuple[Joint, ...]
+    frames: tuple[Frame, ...] = ()
+    springs: tuple[PointSpring, ...] = ()
+    couplings: tuple[JointCoupling, ...] = ()
+    loops: tuple[Loop, ...] = ()
+    prescribed: tuple[Prescribed, ...] = ()
+    notes: tuple[str, ...] = ()
+    nonphysical: tuple[tuple[str, str], ...] = ()
+    bindings: tuple[Binding, ...] = ()
+    layout: Layout = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        gravity = np.array(self.gravity, dtype=np.float64)
+        gravity.setflags(write=False)
+        object.__setattr__(self, "gravity", gravity)
+        object.__setattr__(self, "layout", Layout(self.joints))
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        return type(self), (
+            self.name,
+            self.gravity,
+            self.bodies,
+            self.joints,
+            self.frames,
+            self.springs,
+            self.couplings,
+            self.loops,
+            self.prescribed,
+            self.notes,
+            self.nonphysical,
+            self.bindings,
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return self.digest == other.digest if isinstance(other, Description) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    # Sizes and names
+
+    @property
+    def nq(self) -> int:
+        """Number of coordinates."""
+        return self.layout.sizes[0]
+
+    @property
+    def nv(self) -> int:
+        """Number of velocities."""
+        return self.layout.sizes[1]
+
+    @cached_property
+    def independent_joints(self) -> tuple[Joint, ...]:
+        """The joints that have coordinates of their own."""
+        return tuple(j for j in self.joints if j.type.nv and not j.mimic)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints that have coordinates of their own, in their order."""
+        return tuple(j.name for j in self.independent_joints)
+
+    @cached_property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """One name per coordinate of q."""
+        return tuple(_named(j.name, s) for j in self.independent_joints for s in j.type.suffixes)
+
+    @cached_property
+    def velocity_names(self) -> tuple[str, ...]:
+        """One name per entry of v."""
+        return tuple(_named(j.name, s) for j in self.independent_joints for s in j.type.velocity_suffixes)
+
+    @property
+    def mass(self) -> float:
+        """Total mass, kg.
+
+        Raises
+        ------
+        InputError
+            It depends on a parameter without a value.
+        """
+        if any(np.isnan(b.mass) for b in self.bodies):
+            self.require_values("mass")
+        return float(sum(b.mass for b in self.bodies))
+
+    @cached_property
+    def parameters(self) -> Mapping[str, float | None]:
+        """Nominal value of each named parameter, None where it has none."""
+        return MappingProxyType({p.name: p.value for b in self.bindings for p in b.expression.parameters()})
+
+    def require_values(self, what: str) -> None:
+        """Raise `InputError` that names the parameters without a value, if there are any."""
+        missing = [name for name, value in self.parameters.items() if value is None]
+        if missing:
+            told = ", ".join(repr(n) for n in missing)
+            raise InputError(
+                f"{what}: {self.name}: no value for parameter {told}; "
+                f"give it with model.with_parameters({', '.join(f'{n}=...' for n in missing)})"
+            )
+
+    @cached_property
+    def needs(self) -> Needs:
+        """What this description needs from an engine."""
+        bound = (b.field for b in self.bindings)
+        return Needs.of(self.gravity, self.joints, self.springs, self.couplings, self.loops, self.prescribed, bound)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over every name, number and parameter of the description (not the notes)."""
+        return digest(
+            self.name,
+            self.gravity,
+            self.bodies,
+            self.joints,
+            self.frames,
+            self.springs,
+            self.loops,
+            self.prescribed,
+            *self.couplings,
+            *self.bindings,
+        )
+
+    @cached_property
+    def form_digest(self) -> str:
+        """The digest without the parameters' values: of what is derived once for all of them."""
+        return self._substituted(lambda p: Parameter(p.name)).digest if self.parameters else self.digest
+
+    # Structure
+
+    @cached_property
+    def tree(self) -> tuple[Joint, ...]:
+        """All joints with every parent before its children, siblings as declared, depth first."""
+        by_parent: dict[str, list[Joint]] = {}
+        for joint in self.joints:
+            by_parent.setdefault(joint.parent, []).append(joint)
+        out: list[Joint] = []
+        stack = list(reversed(by_parent.get("world", [])))
+        while stack:
+            joint = stack.pop()
+            out.append(joint)
+            stack.extend(reversed(by_parent.get(joint.child, [])))
+        return tuple(out)
+
+    @cached_property
+    def chains(self) -> Mapping[str, frozenset[str]]:
+        """Of each joint the names of the joints from the ground to it, itself included."""
+        below: dict[str, frozenset[str]] = {"world": frozenset()}
+        out = {}
+        for joint in self.tree:
+            out[joint.name] = below[joint.child] = below[joint.parent] | {joint.name}
+        return MappingProxyType(out)
+
+    def branched(self, coupling: JointCoupling) -> bool:
+        """Return whether two joints of a coupling are on different branches of the tree."""
+        chains = sorted((self.chains[name] for name in coupling.joints), key=len)
+        return not all(a <= b for a, b in pairwise(chains))
+
+    @cached_property
+    def quaternions(self) -> tuple[tuple[int, str], ...]:
+        """(start in q, joint name) of every quaternion."""
+        return tuple(
+            (self.layout.q[j.name].start + j.type.quaternion, j.name)
+            for j in self.independent_joints
+            if j.type.quaternion is not None
+        )
+
+    @cached_property
+    def lower(self) -> Array:
+        """Lower limits, shape (nq,)."""
+        return _joined([j.lower for j in self.independent_joints])
+
+    @cached_property
+    def upper(self) -> Array:
+        """Upper limits, shape (nq,)."""
+        return _joined([j.upper for j in self.independent_joints])
+
+    def body(self, name: str) -> Body:
+        """Return the body of this name."""
+        expect_name("body", name)
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        raise UnknownNameError("body", name, [b.name for b in self.bodies])
+
+    def joint(self, name: str) -> Joint:
+        """Return the joint of this name."""
+        expect_name("joint", name)
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        raise UnknownNameError("joint", name, [j.name for j in self.joints])
+
+    def frame(self, name: str) -> Frame:
+        """Return the frame of this name.
+
+        A body's own frame has the body's name, and the ground's is ``"world"``. A
+        declared frame of a body's name goes before it.
+        """
+        expect_name("frame", name)
+        for frame in self.frames:
+            if frame.name == name:
+                return frame
+        if name == "world" or any(b.name == name for b in self.bodies):
+            return Frame(name, name, np.eye(3), np.zeros(3))
+        names = [f.name for f in self.frames] + [b.name for b in self.bodies]
+        raise UnknownNameError("frame", name, names)
+
+    def _substituted(self, replacement: Callable[[Parameter], Parameter | float]) -> Self:
+        """Return the description with another parameter, or a number, for each parameter; unchecked."""
+        bindings = [(b, b.expression.evaluate(replacement, float)) for b in self.bindings]
+
+        def filled(where: str, part: Any, name: str) -> Any:
+            return with_numbers(
+                part, [(b.field, b.index, x) for b, x in bindings if (b.where, b.part) == (where, name)]
+            )
+
+        kinds = ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed")
+        changes: dict[str, Any] = {kind: tuple(filled(kind, p, p.name) for p in getattr(self, kind)) for kind in kinds}
+        expressions = tuple(replace(b, expression=x) for b, x in bindings if isinstance(x, Expression))
+        out: Self = replace(filled("gravity", self, ""), **changes, bindings=expressions)
+        return out
+
+
+def expect_name(what: str, name: object) -> None:
+    """Raise `InputError` for a name that is no text."""
+    if not isinstance(name, str):
+        raise InputError(f"{what}: expected a name, got {shown(name)}")
+
+
+def _joined(parts: list[Array]) -> Array:
+    out = np.concatenate([np.empty(0), *parts])
+    out.setflags(write=False)
+    return out
+
+
+def _named(joint: str, suffix: str) -> str:
+    return f"{joint}.{suffix}" if suffix else joint
