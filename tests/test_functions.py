@@ -19,10 +19,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from mbkit.catalog import double_pendulum
-from mbkit.codegen import c_source, extended_precision, jit, simd_kernel, taylor
+from mbkit.codegen import extended_precision, jit, simd_kernel, taylor
 from mbkit.codegen import program as program_module
 from mbkit.codegen import step_loop as lanes_module
-from mbkit.codegen.c_source import c_body
+from mbkit.codegen.c_source import c_code
 from mbkit.codegen.compiled import aligned, compiled
 from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.interpreter import Machine
@@ -189,10 +189,7 @@ def test_113_bits_are_right_to_33_digits(f: Function, backend: Any) -> None:
 @needs_cc
 def test_c_gives_the_bits_of_machine_code(tmp_path: Any) -> None:
     made = everything()
-    body = "\n".join(c_body(program(made), ["x", "y"], ["out"]))
-    head = "void f(const double *x, const double *y, double *out)"
-    text = f"#include <math.h>\n{head};\n{head}\n{{\n{body}\n}}\n"
-    (tmp_path / "f.c").write_text(text)
+    (tmp_path / "f.c").write_text(c_code("test", {"f": made}))
     subprocess.run([*C99, "-shared", "-fPIC", str(tmp_path / "f.c"), "-o", str(tmp_path / "f.so"), "-lm"], check=True)
     call = ctypes.CDLL(str(tmp_path / "f.so")).f
     code, rng = built(made), np.random.default_rng(2)
@@ -512,5 +509,5 @@ def test_every_operation_has_a_place_in_every_backend() -> None:
     heyoka = pytest.importorskip("heyoka")
     names = {*program_module._UNARY.values(), *program_module._BINARY.values()}
     assert {o.name for o in program(everything()).operations} >= {*CALLS, *DECIDED} - {"if_else"}
-    for known in (c_source._FORMS, extended_precision._functions(arithmetic()), taylor._functions(heyoka)):
+    for known in (extended_precision._functions(arithmetic()), taylor._functions(heyoka)):
         assert known.keys() == names

@@ -1,17 +1,13 @@
-"""A program as the body of a C99 function.
+"""Equations of motion as C99 that needs neither mbkit nor CasADi at run time, with a header that documents them.
 
-CasADi can write C of its own, but with a dozen exported symbols a function, names
-that clash between two models, and work arrays that the caller has to bring. One
-straight run of assignments needs none of that.
+CasADi's `CodeGenerator` writes the functions; each gets a wrapper that takes plain arrays.
 """
 
 from __future__ import annotations
 
-import heapq
 import math
 import re
-import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -21,145 +17,12 @@ import casadi as ca
 from mbkit import _interrupt
 from mbkit._escape import c_comment
 from mbkit._version import __version__
-from mbkit.codegen.program import Program, program
+from mbkit.codegen.program import program
 from mbkit.derivation.equations import FUNCTIONS, equations_of
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 
-__all__ = [
-    "DEFAULT",
-    "CFunction",
-    "CSource",
-    "c_body",
-    "c_identifier",
-    "export_c",
-    "header",
-    "output_names",
-    "places",
-    "prototype",
-    "variables",
-]
-
-
-#: Functions of math.h.
-_OF_ONE: Final = (
-    *("fabs", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "exp", "expm1", "log", "log1p"),
-    *("sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
-)
-_OF_TWO: Final = ("atan2", "pow", "hypot")
-_FORMS: Final = {
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "{0} / {1}",
-    "neg": "-{0}",
-    "sq": "{0} * {0}",
-    "twice": "2.0 * {0}",
-    "inv": "1.0 / {0}",
-    **{name: f"{name}({{0}})" for name in _OF_ONE},
-    **{name: f"{name}({{0}}, {{1}})" for name in _OF_TWO},
-    "sign": "{0} > 0.0 ? 1.0 : {0} < 0.0 ? -1.0 : {0}",
-    # Not C's own, which pass over what is no number.
-    "fmin": "{0} < {1} || {0} != {0} ? {0} : {1}",
-    "fmax": "{0} > {1} || {0} != {0} ? {0} : {1}",
-    "lt": "(double)({0} < {1})",
-    "le": "(double)({0} <= {1})",
-    "eq": "(double)({0} == {1})",
-    "ne": "(double)({0} != {1})",
-    "not": "(double)({0} == 0.0)",
-    "and": "(double)({0} != 0.0 && {1} != 0.0)",
-    "or": "(double)({0} != 0.0 || {1} != 0.0)",
-    "if_else_zero": "{0} != 0.0 ? {1} : 0.0",
-}
-
-
-def places(program: Program) -> list[int | None]:
-    """Return in which local variable each operation's value is kept, None for those written in place.
-
-    A variable is taken again when its last reader has run, which keeps the stack small
-    even where a compiler does not optimise. Constants and entries of the arguments are
-    written where they are read. An entry that goes unchanged to the output is kept
-    all the same, so that the output may lie over an argument.
-    """
-    results = {int(index) for out in program.outputs for index in out.flat}
-    last = {}
-    for k, operation in enumerate(program.operations):
-        if operation.name != "input":
-            for argument in operation.arguments:
-                last[argument] = k
-    where: list[int | None] = []
-    free: list[int] = []
-    count = 0
-    for k, operation in enumerate(program.operations):
-        if operation.name == "const" or (operation.name == "input" and k not in results):
-            where.append(None)
-            continue
-        if operation.name != "input":
-            for argument in set(operation.arguments):
-                held = where[argument]
-                if last[argument] == k and argument not in results and held is not None:
-                    heapq.heappush(free, held)
-        if free:
-            where.append(heapq.heappop(free))
-        else:
-            where.append(count)
-            count += 1
-    return where
-
-
-def c_body(program: Program, inputs: Sequence[str], outputs: Sequence[str]) -> list[str]:
-    """Return the lines between a function's braces.
-
-    Parameters
-    ----------
-    program : Program
-    inputs, outputs : sequence of str
-        Name of each argument's array of doubles; outputs are filled column after column.
-    """
-    where = places(program)
-    texts: list[str] = []
-    lines: list[str] = []
-    for operation, place in zip(program.operations, where, strict=True):
-        if operation.name == "const":
-            text = _literal(operation.value)
-        elif operation.name == "input":
-            which, entry = operation.arguments
-            text = f"{inputs[which]}[{entry}]"
-        else:
-            text = _FORMS[operation.name].format(*(texts[i] for i in operation.arguments))
-        if place is not None:
-            lines.append(f"t{place} = {text};")
-            text = f"t{place}"
-        texts.append(text)
-    for name, out in zip(outputs, program.outputs, strict=True):
-        lines += [f"{name}[{k}] = {texts[int(index)]};" for k, index in enumerate(out.ravel(order="F"))]
-    read = {o.arguments[0] for o in program.operations if o.name == "input"}
-    unread = [f"(void){name};" for k, name in enumerate(inputs) if k not in read]
-    return [*_declaration(variables(where)), *unread, *lines]
-
-
-def variables(where: Sequence[int | None]) -> int:
-    """Return how many local variables `places` takes."""
-    return max((place for place in where if place is not None), default=-1) + 1
-
-
-def _declaration(count: int) -> list[str]:
-    if not count:
-        return []
-    names = ", ".join(f"t{k}" for k in range(count))
-    return textwrap.wrap(f"double {names};", width=96, subsequent_indent="    ")
-
-
-def _literal(value: float) -> str:
-    if math.isnan(value):
-        return "NAN"
-    if math.isinf(value):
-        return "INFINITY" if value > 0 else "(-INFINITY)"
-    # The shortest digits that give the same double back.
-    return repr(value) if math.copysign(1.0, value) > 0 else f"({value!r})"
-
-
-# The header of exported C code: all that its user has to know, where the compiler sees it.
+__all__ = ["DEFAULT", "CFunction", "CSource", "c_code", "c_identifier", "export_c"]
 
 #: Quantity -> (name in C of its one output, what it is).
 _ONE_OUTPUT: Final = {
@@ -175,7 +38,7 @@ _ONE_OUTPUT: Final = {
     "potential_energy": ("V", "potential energy of gravity and springs, J"),
     "energy_rate": ("dE_dt", "d(T + V)/dt at accelerations a, W"),
 }
-#: Output of the quantities that have several -> what it is.
+#: Output of a quantity that has several -> what it is.
 _SEVERAL_OUTPUTS: Final = {
     "by_q": "derivative by q along the configuration manifold: column k is that of q (+) t e_k",
     "by_v": "derivative by v",
@@ -227,7 +90,7 @@ class CFunction:
     operations : int
         Arithmetic operations of one call, a sine counted as one.
     stack : int
-        Bytes of local variables where the compiler does not optimise.
+        Bytes of local variables where the compiler does not optimise, copies of the inputs among them.
     """
 
     name: str
@@ -240,75 +103,80 @@ class CFunction:
     @property
     def signature(self) -> str:
         """The function on one line, such as ``pendulum_gravity(q[1]) -> g[1]``."""
-        taken = ", ".join(f"{name}[{n}]" for name, n in self.inputs)
-        given = ", ".join(f"{name}[{rows * columns}]" for name, (rows, columns) in self.outputs)
-        return f"{self.name}({taken}) -> {given}"
+        inputs = ", ".join(f"{name}[{n}]" for name, n in self.inputs)
+        outputs = ", ".join(f"{name}[{rows * columns}]" for name, (rows, columns) in self.outputs)
+        return f"{self.name}({inputs}) -> {outputs}"
+
+    def prototype(self, macro: str, nv: int) -> str:
+        """Return the declaration without its semicolon, with the header's macros as sizes."""
+        arguments = [f"const double {name}[{_extent(macro, name, n, nv)}]" for name, n in self.inputs]
+        for name, shape in self.outputs:
+            extent = " * ".join(_extent(macro, "", n, nv) for n in shape if n > 1) or "1"
+            arguments.append(f"double {name}[{extent}]")
+        one_line = f"void {self.name}({', '.join(arguments)})"
+        return one_line if len(one_line) < 110 else f"void {self.name}(\n    " + ",\n    ".join(arguments) + ")"
+
+    def documentation(self) -> list[str]:
+        """Return the lines of the comment above the declaration."""
+        rows = [(f"{name}[{n}]", _INPUTS.get(name, "")) for name, n in self.inputs]
+        for name, (n, columns) in self.outputs:
+            text = _ONE_OUTPUT[self.quantity][1] if self.quantity in _ONE_OUTPUT else _SEVERAL_OUTPUTS.get(name, "")
+            rows.append((f"{name}[{n}]", f"out: {text}"))
+            if columns > 1:
+                rows[-1] = (f"{name}[{n} * {columns}]", f"out, by columns: {text}")
+        width = max(len(shape) for shape, _ in rows)
+        return [
+            f"{self.quantity}: {self.operations} operations, {self.stack} bytes of local variables.",
+            *(f"    {shape.ljust(width)}  {text}".rstrip() for shape, text in rows),
+        ]
 
 
-def output_names(quantity: str, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names in C of a function's outputs, given those of its expressions."""
-    return (_ONE_OUTPUT[quantity][0],) if quantity in _ONE_OUTPUT else tuple(names)
+def _extent(macro: str, name: str, n: int, nv: int) -> str:
+    named = {"q": "NQ", "parameters": "NP"}.get(name, "NV" if n == nv else "")
+    return f"{macro}_{named}" if named else str(n)
 
 
-def prototype(prefix: str, function: CFunction, model: Model) -> str:
-    """Return a declaration without its semicolon, with the header's macros as sizes."""
+def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_line: str) -> str:
     macro = prefix.upper()
-    taken = [f"const double {name}[{_size(macro, name, n, model)}]" for name, n in function.inputs]
-    given = [
-        f"double {name}[{' * '.join(_size(macro, '', n, model) for n in shape if n > 1) or 1}]"
-        for name, shape in function.outputs
-    ]
-    arguments = taken + given
-    one_line = f"void {function.name}({', '.join(arguments)})"
-    if len(one_line) < 110:
-        return one_line
-    return f"void {function.name}(\n    " + ",\n    ".join(arguments) + ")"
-
-
-def header(prefix: str, model: Model, functions: Sequence[CFunction], written_by: str) -> str:
-    """Return the text of the header.
-
-    Parameters
-    ----------
-    prefix : str
-        Of every name in C.
-    model : Model
-    functions : sequence of CFunction
-        At least one.
-    written_by : str
-        The first line, by which mbkit knows its own files.
-    """
-    macro = prefix.upper()
-    told = [
-        written_by,
+    present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on]
+    q_units, v_units = _units(model)
+    lines = [
+        first_line,
         "",
-        *_facts(model, functions),
+        f"Model       {c_comment(model.name)}",
+        f"Digest      {model.digest}",
+        f"Holds       {', '.join(present) or ('energies T and V' if model.written else 'inertia alone')}",
+        f"Functions   {functions[0].name}",
+        *(f"            {f.name}" for f in functions[1:]),
         "",
-        *_example(prefix, model, functions[0]),
+        f"A program   cc -std=c99 -O2 main.c {prefix}.c -o main -lm",
+        "",
+        *(f"    {line}".rstrip() for line in _example(prefix, model, functions[0])),
         "",
         *_CONVENTIONS.format(macro=macro).splitlines(),
         "",
         f"Coordinates q[{model.nq}]",
-        *_table(zip(model.coordinate_names, _coordinate_units(model), strict=True)),
+        *_table(zip(model.coordinate_names, q_units, strict=True)),
         "",
         f"Velocities v[{model.nv}], and the unit of the force on each",
-        *_table((name, *units) for name, units in zip(model.velocity_names, _velocity_units(model), strict=True)),
+        *_table((name, *units) for name, units in zip(model.velocity_names, v_units, strict=True)),
     ]
     if model.parameters:
-        told += ["", f"Parameters parameters[{len(model.parameters)}], and the value that the model gives each"]
-        told += _table((name, "none" if x is None else repr(x)) for name, x in model.parameters.items())
+        lines += ["", f"Parameters parameters[{len(model.parameters)}], and the value that the model gives each"]
+        lines += _table((name, "none" if x is None else repr(x)) for name, x in model.parameters.items())
     followers = [(j.name, j.mimic) for j in model.joints if j.mimic]
     if followers:
-        told += ["", "Joints that follow another and have no coordinate of their own"]
-        rows = ((c_comment(name), c_comment(m.joint), m) for name, m in followers)
-        told += [f"    {name} = {_told(m.ratio)} * {other} + {_told(m.offset)}" for name, other, m in rows]
+        lines += ["", "Joints that follow another and have no coordinate of their own"]
+        for name, mimic in followers:
+            ratio, offset = ("(of the parameters)" if math.isnan(x) else repr(x) for x in (mimic.ratio, mimic.offset))
+            lines.append(f"    {c_comment(name)} = {ratio} * {c_comment(mimic.joint)} + {offset}")
     sizes = {"NQ": model.nq, "NV": model.nv} | ({"NP": len(model.parameters)} if model.parameters else {})
     blocks = [
-        _comment(told),
+        _comment(lines),
         f"#ifndef MBKIT_{macro}_H\n#define MBKIT_{macro}_H",
         "\n".join(f"#define {macro}_{name} {n}" for name, n in sizes.items()),
         '#ifdef __cplusplus\nextern "C" {\n#endif',
-        *(f"{_comment(_documented(f))}\n{prototype(prefix, f, model)};" for f in functions),
+        *(f"{_comment(f.documentation())}\n{f.prototype(macro, model.nv)};" for f in functions),
         "#ifdef __cplusplus\n}\n#endif",
         "#endif",
     ]
@@ -320,50 +188,29 @@ def _comment(lines: Sequence[str]) -> str:
     return "\n".join([f"/* {first}", *(f" * {line}".rstrip() for line in rest), " */"])
 
 
-def _facts(model: Model, functions: Sequence[CFunction]) -> list[str]:
-    present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on]
-    alone = "inertia alone" if model.written is None else "what was written as T and V"
-    return [
-        f"Model       {c_comment(model.name)}",
-        f"Digest      {model.digest}",
-        f"Holds       {', '.join(present) or alone}",
-        f"Functions   {functions[0].name}",
-        *(f"            {f.name}" for f in functions[1:]),
-    ]
-
-
 def _example(prefix: str, model: Model, function: CFunction) -> list[str]:
-    macro = prefix.upper()
-    # Whoever compiles this must see that a parameter without a value still has to get one.
+    # NAN marks a parameter without a value, for which the user has to put a number.
     numbers = ["NAN" if x is None else repr(x) for x in model.parameters.values()]
-    values = {"q": _initial(model), "parameters": ", ".join(numbers)}
-    lines = [
-        f"const double {name}[{_size(macro, name, n, model)}] = {{{values.get(name, '0.0')}}};"
-        for name, n in function.inputs
-    ]
-    lines += [f"double {name}[{rows * columns}];" for name, (rows, columns) in function.outputs]
-    call = ", ".join([name for name, _ in function.inputs] + [name for name, _ in function.outputs])
-    lines += [f"{function.name}({call});", f'printf("%.17g\\n", {function.outputs[0][0]}[0]);', "return 0;"]
+    ones = ", ".join(f"[{k}] = 1.0" for k, x in enumerate(model.neutral().tolist()) if x)
+    values = {"q": ones or "0.0", "parameters": ", ".join(numbers)}
+    call = ", ".join(name for name, _ in (*function.inputs, *function.outputs))
     return [
-        f"A program   cc -std=c99 -O2 main.c {prefix}.c -o main -lm",
+        *(["#include <math.h>"] if "NAN" in numbers else []),
+        "#include <stdio.h>",
+        f'#include "{prefix}.h"',
         "",
-        *(["    #include <math.h>"] if "NAN" in numbers else []),
-        "    #include <stdio.h>",
-        f'    #include "{prefix}.h"',
-        "",
-        "    int main(void)",
-        "    {",
-        *(f"        {line}" for line in lines),
-        "    }",
+        "int main(void)",
+        "{",
+        *(
+            f"    const double {name}[{_extent(prefix.upper(), name, n, model.nv)}] = {{{values.get(name, '0.0')}}};"
+            for name, n in function.inputs
+        ),
+        *(f"    double {name}[{rows * columns}];" for name, (rows, columns) in function.outputs),
+        f"    {function.name}({call});",
+        f'    printf("%.17g\\n", {function.outputs[0][0]}[0]);',
+        "    return 0;",
+        "}",
     ]
-
-
-def _initial(model: Model) -> str:
-    return ", ".join(f"[{k}] = 1.0" for k, x in enumerate(model.neutral().tolist()) if x) or "0.0"
-
-
-def _told(x: float) -> str:
-    return "(what the parameters make)" if math.isnan(x) else repr(x)
 
 
 def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
@@ -375,53 +222,69 @@ def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
     ]
 
 
-def _coordinate_units(model: Model) -> list[str]:
+def _units(model: Model) -> tuple[list[str], list[tuple[str, str]]]:
+    """Return the unit of each coordinate, and those of each velocity and force."""
     if model.written is not None:
-        return ["generalized"] * model.nq
-    return [
-        "m" if k in j.type.lengths else "rad" if k in j.type.angular else "1"
-        for j in model.independent_joints
-        for k in range(j.type.nq)
+        return ["generalized"] * model.nq, [("generalized", "generalized")] * model.nv
+    kinds = [joint.type for joint in model.independent_joints]
+    coordinates = [
+        "m" if k in kind.lengths else "rad" if k in kind.angular else "1" for kind in kinds for k in range(kind.nq)
     ]
+    # Lengths come first and have the same places in q and v.
+    velocities = [("m/s", "N") if k in kind.lengths else ("rad/s", "N m") for kind in kinds for k in range(kind.nv)]
+    return coordinates, velocities
 
 
-def _velocity_units(model: Model) -> list[tuple[str, str]]:
-    if model.written is not None:
-        return [("generalized", "generalized")] * model.nv
-    # Lengths come first and keep their places in v, whatever a quaternion takes.
-    return [
-        ("m/s", "N") if k in j.type.lengths else ("rad/s", "N m")
-        for j in model.independent_joints
-        for k in range(j.type.nv)
-    ]
+# C's fmin and fmax ignore NaN; the engine's pass it on.
+_FMIN_FMAX: Final = re.compile(r"return (fmin\(x, y\)|fmax\(x, y\)|x<y \? x : y|x>y \? x : y);")
+_LESS: Final = {"fmin(x, y)": "<", "x<y ? x : y": "<", "fmax(x, y)": ">", "x>y ? x : y": ">"}
+_PROLOGUE: Final = """\
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+"""
 
 
-def _documented(function: CFunction) -> list[str]:
-    rows = [(f"{name}[{n}]", _INPUTS.get(name, "")) for name, n in function.inputs]
-    for name, (n, columns) in function.outputs:
-        one = _ONE_OUTPUT.get(function.quantity)
-        told = one[1] if one else _SEVERAL_OUTPUTS.get(name, "")
-        shape, layout = (f"{n}", "") if columns == 1 else (f"{n} * {columns}", ", by columns")
-        rows.append((f"{name}[{shape}]", f"out{layout}: {told}"))
-    width = max(len(shape) for shape, _ in rows)
-    lines = [f"    {shape.ljust(width)}  {text}".rstrip() for shape, text in rows]
-    return [
-        f"{function.quantity}: {function.operations} operations, {function.stack} bytes of local variables.",
-        *lines,
-    ]
+def c_code(prefix: str, functions: Mapping[str, ca.Function]) -> str:
+    """Return C99 definitions of functions of CasADi that take plain arrays: the inputs, then the outputs.
+
+    Parameters
+    ----------
+    prefix : str
+        Of CasADi's internal names.
+    functions : mapping of str to casadi.Function
+        Dense functions of SX, by their names in C.
+    """
+    generator = ca.CodeGenerator(prefix, {"with_export": False})
+    wrappers = []
+    for name, function in functions.items():
+        # CasADi refuses two underscores in a row.
+        inner = re.sub("_+", "_", f"{name}_casadi")
+        symbols = function.sx_in()
+        generator.add(ca.Function(inner, symbols, function.call(symbols)))
+        inputs = [(f"x{k}", function.nnz_in(k)) for k in range(function.n_in())]
+        outputs = [(f"y{k}", function.nnz_out(k)) for k in range(function.n_out())]
+        arguments = [f"const double {x}[{n}]" for x, n in inputs] + [f"double {y}[{n}]" for y, n in outputs]
+        lines = [
+            "/* The inputs are copied because an output may lie on one. */",
+            f"void {name}({', '.join(arguments)})",
+            "{",
+            *(f"    double own_{x}[{n}];" for x, n in inputs),
+            f"    const double *inputs[] = {{{', '.join(f'own_{x}' for x, _ in inputs)}}};",
+            f"    double *outputs[] = {{{', '.join(y for y, _ in outputs)}}};",
+            "    int k;",
+            *(f"    for (k = 0; k < {n}; k++) own_{x}[k] = {x}[k];" for x, n in inputs),
+            f"    {inner}(inputs, outputs, 0, 0, 0);",
+            "}",
+        ]
+        wrappers.append("\n".join(lines))
+    text = _FMIN_FMAX.sub(lambda m: f"return x {_LESS[m[1]]} y || x != x ? x : y;", generator.dump())
+    return "\n".join([_PROLOGUE, text, *wrappers]) + "\n"
 
 
-def _size(macro: str, name: str, n: int, model: Model) -> str:
-    named = {"q": "NQ", "parameters": "NP"}.get(name, "NV" if n == model.nv else "")
-    return f"{macro}_{named}" if named else str(n)
-
-
-# Equations of motion as plain C99 that needs neither mbkit nor CasADi.
-
-_MARK: Final = "Written by mbkit"
-
-#: What is exported where no quantity is named.
+#: The quantities that are exported unless others are named.
 DEFAULT: Final = ("inverse_dynamics", "forward_dynamics")
+_MARK: Final = "Written by mbkit"
 _IDENTIFIER: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -472,7 +335,7 @@ class CSource:
         texts = {folder / f"{self.name}.h": self.header, folder / f"{self.name}.c": self.source}
         header, source = texts
         try:
-            # Both are looked at before either is written.
+            # Both are checked before either is written.
             for path in texts:
                 if not force and path.exists() and not _ours(path):
                     raise OutputError(
@@ -491,9 +354,9 @@ class CSource:
 def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | None = None) -> CSource:
     """Return C99 code that computes quantities of a model.
 
-    Each becomes one function without loops, heap or state, such as
+    Each becomes one function without heap or state, such as
     ``void panda_forward_dynamics(const double q[], const double v[], const double tau[],
-    double a[])``; named parameters of the model are a last input. The header tells
+    double a[])``; named parameters of the model are a last input. The header states
     units, layouts, conventions and the order of the joints. Compilers take long for
     long functions: with ``gcc -O2`` about a second for Panda's forward dynamics (4,000
     operations), four for Talos' (18,000), over a minute for the two-armed Tiago's
@@ -516,7 +379,7 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     Raises
     ------
     UnknownNameError
-        A quantity that there is not.
+        An unknown quantity.
     InputError
         No quantity, or a `name` that is no identifier in C.
     UnsupportedError
@@ -525,16 +388,16 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     Examples
     --------
     >>> import mbkit as mb
-    >>> made = mb.lagrangian.export_c(mb.catalog.pendulum(), ["forward_dynamics"])
-    >>> made.functions[0].name
+    >>> source = mb.lagrangian.export_c(mb.catalog.pendulum(), ["forward_dynamics"])
+    >>> source.functions[0].name
     'pendulum_forward_dynamics'
     """
     wanted = _checked(quantities)
-    for needed, told in (("loops", model.needs.loops), ("prescribed", model.needs.time)):
-        if told:
+    for feature, present in (("loops", model.needs.loops), ("prescribed", model.needs.time)):
+        if present:
             raise UnsupportedError(
-                f"{model.name} has {needed!r}, which C code of its tree leaves out; mbkit.lagrangian.from_model(model)"
-                f".model can be exported with them, and model.without({needed!r}) without them"
+                f"{model.name} has {feature!r}, which C code of its tree leaves out; export "
+                f"mbkit.lagrangian.from_model(model).model with them, or model.without({feature!r})"
             )
     if not model.nv:
         raise UnsupportedError(f"{model.name} cannot be exported: no joint of it moves, and C has no empty arrays")
@@ -542,36 +405,27 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     if not _IDENTIFIER.fullmatch(prefix):
         raise InputError(f"name: expected letters, digits and _, a letter first, got {name!r}")
     equations = equations_of(model)
-    made = [_function(prefix, model, quantity, equations.function(quantity)) for quantity in wanted]
-    functions = tuple(function for function, _ in made)
+    code = {f"{prefix}_{quantity}": equations.function(quantity) for quantity in wanted}
+    functions = tuple(_described(*item, quantity) for item, quantity in zip(code.items(), wanted, strict=True))
     versions = {"mbkit": __version__, "casadi": str(ca.CasadiMeta.version())}
     written_by = f"{_MARK} {versions['mbkit']} with casadi {versions['casadi']}"
-    bodies = [f"/* {written_by}; {prefix}.h tells the rest. */", f'#include "{prefix}.h"', "#include <math.h>"]
     return CSource(
         name=prefix,
         digest=model.digest,
         functions=functions,
-        header=header(prefix, model, functions, f"{written_by}; made anew rather than edited."),
-        source="\n\n".join([*bodies, *(body for _, body in made)]) + "\n",
+        header=_header(prefix, model, functions, f"{written_by}; do not edit, export again."),
+        source=f'/* {written_by}; see {prefix}.h. */\n#include "{prefix}.h"\n{c_code(prefix, code)}',
         versions=versions,
     )
 
 
-def _function(prefix: str, model: Model, quantity: str, function: ca.Function) -> tuple[CFunction, str]:
-    written = program(function)
-    inputs = tuple(zip(function.name_in(), written.inputs, strict=True))
-    outputs = tuple(zip(output_names(quantity, function.name_out()), written.shapes, strict=True))
-    described = CFunction(
-        name=f"{prefix}_{quantity}",
-        quantity=quantity,
-        inputs=inputs,
-        outputs=outputs,
-        operations=written.arithmetic,
-        stack=8 * variables(places(written)),
-    )
-    lines = c_body(written, [n for n, _ in inputs], [n for n, _ in outputs])
-    body = "\n".join(f"    {line}" for line in lines)
-    return described, f"{prototype(prefix, described, model)}\n{{\n{body}\n}}"
+def _described(name: str, function: ca.Function, quantity: str) -> CFunction:
+    operations = program(function)
+    inputs = tuple(zip(function.name_in(), operations.inputs, strict=True))
+    names = (_ONE_OUTPUT[quantity][0],) if quantity in _ONE_OUTPUT else function.name_out()
+    outputs = tuple(zip(names, operations.shapes, strict=True))
+    stack = 8 * (function.sz_w() + sum(operations.inputs))
+    return CFunction(name, quantity, inputs, outputs, operations.arithmetic, stack)
 
 
 def _checked(quantities: Iterable[str]) -> list[str]:
