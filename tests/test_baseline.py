@@ -21,7 +21,7 @@ from mbkit.engines import ENGINES
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import BaselineError, InputError, NonPhysicalWarning, OutputError, UnknownNameError, UnsupportedError
-from mbkit.studies import _results
+from mbkit.studies import results
 from mbkit.studies.baseline.file import store, text_of
 
 RECORDED = Path(__file__).parent / "baselines"
@@ -81,8 +81,8 @@ def recorded(arm: Path, content: bytes) -> Path:
 
 
 def moved_version(monkeypatch, package: str = "pin", version: str = "99.0") -> None:
-    now = _results.versions()
-    monkeypatch.setattr(_results, "versions", lambda: now | {package: version})
+    now = results.versions()
+    monkeypatch.setattr(results, "versions", lambda: now | {package: version})
 
 
 def absent(monkeypatch, engine: str) -> None:

@@ -23,9 +23,9 @@ from mbkit.report.formatting import count_text, error_text, time_text
 from mbkit.report.output_folder import check_writable, file_stem, write
 from mbkit.report.page import bench_page, check_page, sweep_page
 from mbkit.report.progress import Bar
-from mbkit.studies._results import Refusal
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
+from mbkit.studies.results import Refusal
 from mbkit.studies.work_precision.figure import figure
 from mbkit.studies.work_precision.result import Curve, PrecisionPoint, WorkPrecision
 

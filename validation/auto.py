@@ -25,8 +25,8 @@ import numpy as np
 import mbkit as mb
 from mbkit.methods.registry import METHODS
 from mbkit.simulate.solvers.auto import EXPLICIT, IMPLICIT
-from mbkit.studies._results import processor, versions
 from mbkit.studies.compare.rollouts import start_state
+from mbkit.studies.results import processor, versions
 from mbkit.studies.stress.cases import mass_ratio, stiffness
 
 GOAL, RTOL = 1e-6, 1e-8

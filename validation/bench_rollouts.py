@@ -20,7 +20,7 @@ import mujoco.rollout
 import numpy as np
 
 import mbkit as mb
-from mbkit.studies._results import processor, versions
+from mbkit.studies.results import processor, versions
 
 ROUNDS, STEPS, DT = 7, 200, 1e-3
 SIZES = (1024, 4096, 16384)

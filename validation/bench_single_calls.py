@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
-from mbkit.studies._results import processor, versions
+from mbkit.studies.results import processor, versions
 
 ROUNDS, CALLS = 41, 2000
 

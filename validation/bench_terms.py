@@ -43,7 +43,7 @@ from mbkit.codegen.compiled import cores
 from mbkit.codegen.program import program
 from mbkit.engines.mujoco import model as mujoco_model
 from mbkit.engines.pinocchio import model as pinocchio_model
-from mbkit.studies._results import processor, versions
+from mbkit.studies.results import processor, versions
 from tests.random_trees import random_tree
 
 HERE = Path(__file__).parent

@@ -26,7 +26,7 @@ import numpy as np
 import mbkit as mb
 from mbkit import catalog
 from mbkit.errors import MbkitWarning
-from mbkit.studies._results import processor, versions
+from mbkit.studies.results import processor, versions
 
 HERE = Path(__file__).parent
 STEPS, WINDOWS = 1_000_000, 10

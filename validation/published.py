@@ -32,7 +32,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitWarning
 from mbkit.model import Model
 from mbkit.simulate import Event, Trajectory, at_section
-from mbkit.studies._results import processor, versions
+from mbkit.studies.results import processor, versions
 from validation import elliptic
 from validation.closed_forms import published
 from validation.scenes import SCENES, Scene

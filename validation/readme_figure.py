@@ -16,8 +16,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 import mbkit as mb
-from mbkit.studies._results import processor, versions
 from mbkit.studies.compare.all_robots import all_robots
+from mbkit.studies.results import processor, versions
 
 HERE = Path(__file__).parent
 COLOURS = {"pinocchio": "#0072b2", "lagrangian": "#d55e00", "mujoco": "#009e73"}

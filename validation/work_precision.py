@@ -20,7 +20,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 import mbkit as mb
-from mbkit.studies._results import processor, versions
+from mbkit.studies.results import processor, versions
 from validation.scenes import SCENES
 
 HERE = Path(__file__).parent

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from mbkit.report.formatting import time_text
-from mbkit.studies._results import Refusal
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
+from mbkit.studies.results import Refusal
 
 __all__ = [
     "Failure",

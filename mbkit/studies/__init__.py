@@ -1,9 +1,9 @@
 """Questions asked of several engines at once."""
 
 from mbkit.studies import stress
-from mbkit.studies._results import Refusal
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 from mbkit.studies.compare.study import compare
+from mbkit.studies.results import Refusal
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.result import Curve, InterruptedSweepError, PrecisionPoint, WorkPrecision

@@ -13,8 +13,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import BaselineError
 from mbkit.model import Model
-from mbkit.studies import _results
-from mbkit.studies._results import Refusal
+from mbkit.studies import results
 from mbkit.studies._targets import checked_target
 from mbkit.studies.baseline import record as engines_
 from mbkit.studies.baseline import tolerance
@@ -25,6 +24,7 @@ from mbkit.studies.baseline.file import path_of, read
 from mbkit.studies.baseline.record import evaluated
 from mbkit.studies.baseline.result import BaselineResult, Status
 from mbkit.studies.baseline.tolerance import FINE, OWN, ROUNDING, Moved, VersionChange, Yardstick, allowed
+from mbkit.studies.results import Refusal
 
 __all__ = ["check", "diff"]
 
@@ -90,7 +90,7 @@ def check(
     tell = progress or _silent
     now = tolerance.relevant(recorded.engines)
     moved_versions = tolerance.moved(recorded.versions, now)
-    processor = _results.processor()
+    processor = results.processor()
     result = BaselineResult(
         question="check",
         model=model.name,

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from mbkit._check import Array
-from mbkit.studies._results import Refusal
 from mbkit.studies.baseline.description import Description
 from mbkit.studies.compare.terms import States
+from mbkit.studies.results import Refusal
 
 __all__ = ["ROLLOUT", "Baseline", "Rollout"]
 

@@ -18,11 +18,11 @@ from mbkit import _interrupt
 from mbkit._check import Array
 from mbkit._escape import json_text
 from mbkit.errors import BaselineError, InputError, OutputError
-from mbkit.studies._results import Refusal
 from mbkit.studies.baseline import file as toml
 from mbkit.studies.baseline.content import ROLLOUT, Baseline, Rollout
 from mbkit.studies.baseline.description import FLAT, SECTIONS, Description, moving_mass
 from mbkit.studies.compare.terms import States
+from mbkit.studies.results import Refusal
 
 __all__ = [
     "FORMAT",

@@ -16,8 +16,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
-from mbkit.studies import _results
-from mbkit.studies._results import Refusal
+from mbkit.studies import results
 from mbkit.studies._targets import checked_target
 from mbkit.studies.baseline import record as engines_
 from mbkit.studies.baseline.content import ROLLOUT, Baseline, Rollout
@@ -27,6 +26,7 @@ from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Yardstick, relevant
 from mbkit.studies.compare.rollouts import quiet_simulate
 from mbkit.studies.compare.study import COMPARABLE
 from mbkit.studies.compare.terms import TERMS, States, states
+from mbkit.studies.results import Refusal
 
 __all__ = ["LONG", "checked_model", "checked_names", "evaluated", "made", "record", "states_of", "with_values"]
 
@@ -212,7 +212,7 @@ def _recorded(
         target="",
         options={},
         seed=seed,
-        processor=_results.processor(),
+        processor=results.processor(),
         versions=relevant(errors),
         description=description,
         coordinates=tuple(model.coordinate_names),

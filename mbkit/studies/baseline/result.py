@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from mbkit._escape import html, json_text, markdown, one_line
-from mbkit.errors import OutputError
-from mbkit.studies._results import Refusal
+from mbkit._escape import one_line
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.tolerance import Moved, VersionChange
+from mbkit.studies.results import Block, Items, Refusal, ResultTable, Title, columns_of
 
 __all__ = ["BaselineResult", "Status"]
 
@@ -24,7 +20,7 @@ _MOST_CHANGES: Final = 20
 
 
 @dataclass(frozen=True)
-class BaselineResult:
+class BaselineResult(ResultTable):
     """A model held against a baseline, or one baseline against another.
 
     Attributes
@@ -149,26 +145,16 @@ class BaselineResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        return asdict(self) | {"passed": self.passed, "verdict": self.verdict}
+        return super().to_dict() | {"passed": self.passed, "verdict": self.verdict}
 
-    def to_json(self, path: str | Path | None = None) -> str:
-        """Return the result as JSON, and write it to `path` if given. What is not finite becomes null."""
-        text = json_text(json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False, ensure_ascii=False))
-        if path is not None:
-            try:
-                Path(path).write_text(text, encoding="utf-8")
-            except OSError as error:
-                raise OutputError(f"cannot write {path}: {error.strerror}; the result itself is kept") from error
-        return text
+    _csv_columns = columns_of(Moved)
 
-    def to_markdown(self) -> str:
-        """Return it as a list in Markdown."""
-        found = [f"- {markdown(what)}: {markdown(told)}" for what, told in self.lines(everything=True)]
-        return "\n".join([f"**{markdown(self.model)}**: {markdown(self.verdict)}", "", *found]).rstrip() + "\n"
+    def _csv_rows(self) -> tuple[Moved, ...]:
+        return self.moved
 
-    def _repr_html_(self) -> str:
-        found = "".join(f"<li>{html(what)}: {html(told)}</li>" for what, told in self.lines(everything=True))
-        return f"<p><b>{html(self.model)}</b>: {html(self.verdict)}</p>" + (f"<ul>{found}</ul>" if found else "")
+    def _blocks(self) -> Iterator[Block]:
+        yield Title(self.model, f": {self.verdict}")
+        yield Items(f"{what}: {text}" for what, text in self.lines(everything=True))
 
     def __repr__(self) -> str:
         return f"<BaselineResult of {self.model!r}: {one_line(self.verdict)}>"
@@ -180,11 +166,3 @@ def _one(found: Sequence[object]) -> bool:
 
 def _count(found: Sequence[object], noun: str) -> str:
     return f"{len(found)} {noun}{'' if _one(found) else 's'}"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

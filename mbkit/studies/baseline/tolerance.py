@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.studies import _results
+from mbkit.studies import results
 from mbkit.studies.baseline.content import ROLLOUT, Baseline
 from mbkit.studies.baseline.description import Description, moving_mass
 from mbkit.studies.compare.errors import Errors, Scales
@@ -194,7 +194,7 @@ _ABSENT: Final = "not installed"
 def relevant(engines: Iterable[str]) -> dict[str, str]:
     """Return the versions that can move numbers of these engines."""
     packages = dict.fromkeys([*_SHARED, *(_PACKAGES[e] for e in engines if e in _PACKAGES)])
-    now = _results.versions()
+    now = results.versions()
     return {p: now[p] for p in packages}
 
 

@@ -15,7 +15,7 @@ from typing import Any, Final, Literal
 from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError
 from mbkit.load import load, robots
 from mbkit.load.robot_data import find
-from mbkit.studies import _results
+from mbkit.studies import results
 from mbkit.studies._processes import run
 from mbkit.studies.compare.result import Comparison
 from mbkit.studies.compare.study import compare
@@ -72,8 +72,8 @@ class Sweep:
     samples: int
     seed: int
     seconds: float
-    versions: dict[str, str] = field(default_factory=_results.versions)
-    processor: str = field(default_factory=_results.processor)
+    versions: dict[str, str] = field(default_factory=results.versions)
+    processor: str = field(default_factory=results.processor)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from operator import attrgetter
+from typing import Any, Final
 
-import numpy as np
-
-from mbkit._check import Array
-from mbkit._escape import html, markdown, one_line
-from mbkit.errors import OutputError
-from mbkit.studies._results import Refusal
-
-if TYPE_CHECKING:
-    from mbkit.studies.work_precision.result import WorkPrecision
+from mbkit._escape import one_line
+from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
+from mbkit.studies.work_precision.result import WorkPrecision
 
 __all__ = ["Comparison", "Omission", "RolloutRow", "Row"]
 
@@ -174,8 +168,24 @@ class Omission:
         return abs(self.saved_ns) > 2 * self.saved_spread
 
 
+def _outcome(row: Row) -> str:
+    return row.reason if not row.passed else "zero in all states" if row.zero else "agree"
+
+
+_COLUMNS: Final = (
+    Column("term", attrgetter("term")),
+    Column("engine", attrgetter("engine")),
+    Column("worst", attrgetter("relative"), ".1e"),
+    Column("median", attrgetter("median"), ".1e"),
+    Column("per joint", attrgetter("per_joint"), ".1e"),
+    Column("joint", attrgetter("joint")),
+    Column("ns", attrgetter("ns"), ".0f"),
+    Column("", _outcome),
+)
+
+
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(ResultTable):
     """Several engines on one description: do they agree, to how many digits, at what cost.
 
     Attributes
@@ -305,67 +315,24 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        precision = self.precision.to_dict() if self.precision is not None else None
-        judged = {"passed": self.passed, "verdict": self.verdict, "digits": self.digits}
-        judged["shortened"] = list(self.shortened)
-        omissions = [asdict(o) | {"measurable": o.measurable} for o in self.omissions]
-        return asdict(self) | {"precision": precision, "omissions": omissions} | judged
+        return super().to_dict() | {
+            "precision": self.precision.to_dict() if self.precision is not None else None,
+            "omissions": [asdict(o) | {"measurable": o.measurable} for o in self.omissions],
+            "passed": self.passed,
+            "verdict": self.verdict,
+            "digits": self.digits,
+            "shortened": list(self.shortened),
+        }
 
-    def to_json(self, path: str | Path | None = None) -> str:
-        """Return the result as JSON, and write it to `path` if given. NaN becomes null."""
-        text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False)
-        if path is not None:
-            try:
-                Path(path).write_text(text, encoding="utf-8")
-            except OSError as error:
-                raise OutputError(f"cannot write {path}: {error.strerror}; the result itself is kept") from error
-        return text
+    _csv_columns = columns_of(Row)
 
-    def to_markdown(self) -> str:
-        """Return the table of terms in Markdown."""
-        head = "| term | engine | worst | median | per joint | joint | ns | |\n|---|---|---|---|---|---|---|---|"
-        lines = [
-            f"| {markdown(r.term)} | {markdown(r.engine)} | {r.relative:.1e} | {r.median:.1e} | {r.per_joint:.1e} "
-            f"| {markdown(r.joint)} | {r.ns:.0f} | {markdown(_outcome(r))} |"
-            for r in self.rows
-        ]
-        told = [
-            f"- {markdown(r.engine + (' ' + r.term if r.term else ''))}: {markdown(r.reason)}" for r in self.refusals
-        ]
-        first = f"**{markdown(self.model)}**: {markdown(self.verdict)}"
-        return "\n".join([first, "", head, *lines, "", *told]).rstrip() + "\n"
+    def _csv_rows(self) -> tuple[Row, ...]:
+        return self.rows
 
-    def _repr_html_(self) -> str:
-        cells = "".join(
-            f"<tr><td>{html(r.term)}</td><td>{html(r.engine)}</td><td>{r.relative:.1e}</td><td>{r.median:.1e}</td>"
-            f"<td>{html(r.joint)}</td><td>{r.ns:.0f}</td>"
-            f"<td>{html(_outcome(r))}</td></tr>"
-            for r in self.rows
-        )
-        head = "".join(f"<th>{h}</th>" for h in ("term", "engine", "worst", "median", "joint", "ns", ""))
-        refusals = "".join(f"<li>{html(r.engine)}: {html(r.reason)}</li>" for r in self.refusals)
-        return f"<p><b>{html(self.model)}</b>: {html(self.verdict)}</p><table><tr>{head}</tr>{cells}</table>" + (
-            f"<ul>{refusals}</ul>" if refusals else ""
-        )
+    def _blocks(self) -> Iterator[Block]:
+        yield Title(self.model, f": {self.verdict}")
+        yield Table(_COLUMNS, self.rows)
+        yield Items(f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in self.refusals)
 
     def __repr__(self) -> str:
         return f"<Comparison of {self.model!r}: {one_line(self.verdict)}>"
-
-
-def _outcome(row: Row) -> str:
-    return row.reason if not row.passed else "zero in all states" if row.zero else "agree"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value
-
-
-def tupled(x: Array) -> tuple[float, ...]:
-    """Return a vector as plain floats."""
-    return tuple(float(a) for a in x)

@@ -16,13 +16,13 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
-from mbkit.studies import _results
-from mbkit.studies._results import Refusal, facts_of
+from mbkit.studies import results
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.omissions import omissions
-from mbkit.studies.compare.result import Comparison, Row, tupled
+from mbkit.studies.compare.result import Comparison, Row
 from mbkit.studies.compare.rollouts import free_of_mimic, rollouts
 from mbkit.studies.compare.terms import TERMS, States, Term, power_rows, states
+from mbkit.studies.results import Refusal, model_info
 from mbkit.studies.work_precision.study import work_precision
 
 __all__ = ["COMPARABLE", "Judge", "announced", "compare"]
@@ -197,8 +197,8 @@ class Judge:
             median=float(np.median(errors.relative)),
             samples=len(errors.relative),
             worst_kind=self.at.kinds[worst],
-            worst_q=tupled(self.at.q[worst]),
-            worst_v=tupled(self.at.v[worst]),
+            worst_q=tuple(self.at.q[worst].tolist()),
+            worst_v=tuple(self.at.v[worst].tolist()),
             ns=ns[0],
             ns_spread=ns[1],
             passed=passed,
@@ -290,7 +290,7 @@ def compare(
     tell(1.0, "done")
     return Comparison(
         model=model.name,
-        facts=facts_of(model),
+        facts=model_info(model),
         engines=tuple(made),
         reference=reference,
         samples=samples,
@@ -299,8 +299,8 @@ def compare(
         rows=tuple(rows),
         refusals=tuple(refusals),
         setup=setup,
-        versions=_results.versions(),
-        processor=_results.processor(),
+        versions=results.versions(),
+        processor=results.processor(),
         seconds=time.perf_counter() - begun,
         **result,
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from operator import itemgetter
 from typing import Any, Final
 
-from mbkit._escape import html, markdown, one_line
-from mbkit.studies.explain.result import Explanation, grouped, saved
+from mbkit._escape import one_line
+from mbkit.studies.explain.result import Explanation, grouped
+from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title
 
 __all__ = ["DECIDING", "MISSING", "TERMS", "Parsed", "ParserComparison", "Stage"]
 
@@ -76,7 +78,7 @@ class Parsed:
 
 
 @dataclass(frozen=True)
-class ParserComparison:
+class ParserComparison(ResultTable):
     """A file through several importers.
 
     Attributes
@@ -149,60 +151,50 @@ class ParserComparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        told = asdict(self)
-        for data, p in zip(told["importers"], self.importers, strict=True):
-            data["agrees"] = p.agrees
-            data["explanation"] = p.explanation.to_dict() if p.explanation else None
-        return told | {"agree": self.agree, "verdict": self.verdict}
+        importers = [
+            asdict(p) | {"agrees": p.agrees, "explanation": p.explanation.to_dict() if p.explanation else None}
+            for p in self.importers
+        ]
+        return super().to_dict() | {"importers": importers, "agree": self.agree, "verdict": self.verdict}
 
-    def to_json(self, path: str | Path | None = None) -> str:
-        """Return the result as JSON, and write it to `path` if given. Infinity and NaN become null."""
-        return saved(self.to_dict(), path)
+    _csv_columns = (
+        Column("engine", lambda row: row[0].engine),
+        Column("version", lambda row: row[0].version),
+        Column("stage", lambda row: row[1].name),
+        Column("same", lambda row: row[1].same),
+        Column("worst", lambda row: row[1].worst),
+        Column("where", lambda row: row[1].where),
+        Column("says", lambda row: row[1].says),
+    )
 
-    def to_markdown(self) -> str:
-        """Return the stages as a table, and the causes, in Markdown."""
+    def _csv_rows(self) -> list[tuple[Parsed, Stage]]:
+        return [(p, stage) for p in self.importers for stage in p.stages]
+
+    def _blocks(self) -> Iterator[Block]:
+        yield Title(self.source, f": {self.verdict}")
         read = [p for p in self.importers if p.stages]
-        lines = [f"**{markdown(self.source)}**: {markdown(self.verdict)}", ""]
         if read:
-            lines += [f"| stage | {' | '.join(p.engine for p in read)} |", "|---" * (len(read) + 1) + "|"]
-            for k, stage in enumerate(read[0].stages):
-                lines.append(f"| {stage.name} | {' | '.join(markdown(cell(p.stages[k])) for p in read)} |")
-            lines.append("")
+            rows = [(stages[0].name, *map(_cell, stages)) for stages in zip(*(p.stages for p in read), strict=True)]
+            heads = ("stage", *(p.engine for p in read))
+            yield Table([Column(head, itemgetter(k)) for k, head in enumerate(heads)], rows)
+        yield Items(self._notes())
+
+    def _notes(self) -> Iterator[str]:
         for p in self.importers:
             if p.refused:
-                lines.append(f"- {p.engine}: {markdown(p.refused)}")
-            if not p.refused and not p.stages:
-                lines.append(f"- {p.engine} reads it{', and is the reference' if p.engine == self.reference else ''}")
+                yield f"{p.engine}: {p.refused}"
+            elif not p.stages:
+                yield f"{p.engine} reads it{', and is the reference' if p.engine == self.reference else ''}"
             for kind, says, what in grouped(p.explanation.causes) if p.explanation else ():
-                lines.append(f"- {markdown(f'{kind}: {says} ({what})')}")
-            lines += [f"- {p.engine}: {markdown(note)}" for note in p.notes]
-        lines += [f"- {markdown(note)}" for note in (*self.notes, *([self.faults] if self.faults else []))]
-        return "\n".join(lines).rstrip() + "\n"
-
-    def _repr_html_(self) -> str:
-        read = [p for p in self.importers if p.stages]
-        head = "".join(f"<th>{h}</th>" for h in ("stage", *(p.engine for p in read)))
-        rows = "".join(
-            f"<tr><td>{stage.name}</td>{''.join(f'<td>{html(cell(p.stages[k]))}</td>' for p in read)}</tr>"
-            for k, stage in enumerate(read[0].stages if read else ())
-        )
-        told = [f"{p.engine}: {p.refused}" for p in self.importers if p.refused]
-        told += [
-            f"{kind}: {says} ({what})"
-            for p in read
-            if p.explanation
-            for kind, says, what in grouped(p.explanation.causes)
-        ]
-        items = "".join(f"<li>{html(x)}</li>" for x in told)
-        return f"<p><b>{html(self.source)}</b>: {html(self.verdict)}</p><table><tr>{head}</tr>{rows}</table>" + (
-            f"<ul>{items}</ul>" if items else ""
-        )
+                yield f"{kind}: {says} ({what})"
+            yield from (f"{p.engine}: {note}" for note in p.notes)
+        yield from (*self.notes, *([self.faults] if self.faults else []))
 
     def __repr__(self) -> str:
         return f"<ParserComparison of {self.source!r}: {one_line(self.verdict)}>"
 
 
-def cell(stage: Stage) -> str:
+def _cell(stage: Stage) -> str:
     """Return a stage as a cell of a table."""
     return stage.says if stage.same is False and stage.says else _MARK[stage.same]
 

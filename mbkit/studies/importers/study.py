@@ -22,7 +22,7 @@ from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_links import urdf_links
 from mbkit.model import Joint, Model
-from mbkit.studies import _results
+from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import HINGES, angle_of, told
 from mbkit.studies.explain.joint_matching import Matching, aligned, renamed, settled
 from mbkit.studies.explain.merged_links import Compact
@@ -417,8 +417,8 @@ def compare_parsers(
         samples=samples,
         seed=seed,
         tolerance=tolerance,
-        versions=_results.versions(),
-        processor=_results.processor(),
+        versions=results.versions(),
+        processor=results.processor(),
         seconds=time.perf_counter() - begun,
     )
 

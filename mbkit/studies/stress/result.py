@@ -19,8 +19,9 @@ from mbkit._check import real
 from mbkit._escape import csv_text, html, markdown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies._figure_style import engine_index
-from mbkit.studies._results import cell as number
-from mbkit.studies._results import plain, remade, write
+from mbkit.studies.results import csv_number as number
+from mbkit.studies.results import remade, write
+from mbkit.studies.results import to_plain as plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,7 +13,7 @@ from typing import Any, Final
 from mbkit._check import count, real
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
-from mbkit.studies import _results
+from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Keeper, Progress
 from mbkit.studies._processes import processors
 from mbkit.studies.stress.case import Case
@@ -192,8 +192,8 @@ def stress(
         return StressResult(
             cases=tuple(sweep.result() for sweep in sweeps),
             complete=complete,
-            versions=_results.versions(),
-            processor=_results.processor(),
+            versions=results.versions(),
+            processor=results.processor(),
             seconds=time.perf_counter() - begun,
             settings=settings,
         )

@@ -25,8 +25,8 @@ from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
 from mbkit.studies._processes import run
-from mbkit.studies._results import Refusal
 from mbkit.studies.compare.rollouts import TooLongError, patience, quiet_simulate
+from mbkit.studies.results import Refusal
 from mbkit.studies.work_precision.result import Curve, PrecisionPoint
 from mbkit.studies.work_precision.settings import Plan
 

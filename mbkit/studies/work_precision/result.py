@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mbkit._escape import csv_text, html, markdown
 from mbkit.errors import InputError
-from mbkit.studies._results import Refusal, cell, plain, remade, write
+from mbkit.studies.results import Refusal, remade, write
+from mbkit.studies.results import csv_number as cell
+from mbkit.studies.results import to_plain as plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

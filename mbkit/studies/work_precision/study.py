@@ -18,11 +18,10 @@ from mbkit.methods.registry import METHODS
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.simulate.torque import TorqueFunction
-from mbkit.studies import _results
+from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Keeper, Progress
-from mbkit.studies._results import facts_of
-from mbkit.studies.compare.result import tupled
 from mbkit.studies.compare.rollouts import free_of_mimic, start_state
+from mbkit.studies.results import model_info
 from mbkit.studies.work_precision.curve import Allowance, Alone, Scene, Shared, Sweeping
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as known_motion
@@ -316,7 +315,7 @@ def work_precision(
         sweeping = Alone(scene, wanted, repeats, seed, allowance)
     else:
         sweeping = Shared(executor, scene, wanted, repeats, seed, allowance)
-    facts = facts_of(moving)
+    facts = model_info(moving)
     if moving is not model and model.layout.reduced:
         facts["notes"] = [*facts["notes"], "mimic joints free"]
     settings = {
@@ -341,13 +340,13 @@ def work_precision(
             asked=asked,
             reference=how,
             floor=scene.floor,
-            q0=tupled(scene.q0),
-            v0=tupled(scene.v0),
+            q0=tuple(scene.q0.tolist()),
+            v0=tuple(scene.v0.tolist()),
             curves=tuple(curve for curve, _ in found if curve is not None),
             refusals=tuple(refusal for _, refusal in found if refusal is not None),
             complete=complete,
-            versions=_results.versions(),
-            processor=_results.processor(),
+            versions=results.versions(),
+            processor=results.processor(),
             seconds=time.perf_counter() - begun,
             settings=settings,
         )

@@ -1,0 +1,327 @@
+"""What every study's result shares: plain data, JSON, CSV, Markdown and HTML, from one description of its tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+import platform
+import types
+import typing
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import cache
+from importlib import metadata
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, ClassVar, Final, Self
+
+import numpy as np
+
+from mbkit._escape import csv_text, html, markdown
+from mbkit._version import __version__
+from mbkit.errors import InputError, OutputError
+from mbkit.model import Model
+
+__all__ = [
+    "NO_LIMIT",
+    "Block",
+    "Column",
+    "Items",
+    "Refusal",
+    "ResultTable",
+    "Table",
+    "Title",
+    "columns_of",
+    "csv_number",
+    "from_plain",
+    "model_info",
+    "processor",
+    "remade",
+    "to_plain",
+    "versions",
+    "write",
+]
+
+#: What JSON has for an infinite limit, where null stands for an unknown one.
+NO_LIMIT: Final = "no limit"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Something that an engine could not do, with its reason; `term` is empty for all of it."""
+
+    engine: str
+    term: str
+    reason: str
+
+
+# Plain data, and back.
+
+
+def to_plain(value: Any) -> Any:
+    """Return data as JSON can hold it: tuples and arrays as lists, and None for a number that is not finite."""
+    if isinstance(value, dict):
+        return {k: to_plain(x) for k, x in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(x) for x in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return to_plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def from_plain(kind: Any, value: Any) -> Any:
+    """Return plain data as a type has it: dataclasses, tuples, and NaN for null where it is a number.
+
+    Entries that a dataclass does not have are left out.
+    """
+    if is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        names = [f.name for f in fields(kind) if f.name in value]
+        return typing.cast(Any, kind)(**{name: from_plain(hints[name], value[name]) for name in names})
+    if kind is float:
+        return math.nan if value is None else math.inf if value == NO_LIMIT else value
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple:
+        kinds = itertools.repeat(args[0]) if args[-1] is Ellipsis else args
+        return tuple(from_plain(k, x) for k, x in zip(kinds, value, strict=False))
+    if origin is dict:
+        return {k: from_plain(args[1], x) for k, x in value.items()}
+    if origin in (types.UnionType, typing.Union) and value is not None:
+        return from_plain(args[0], value)
+    return value
+
+
+def remade(kind: type[Any], told: dict[str, Any]) -> Any:
+    """Return a dataclass from plain data; null is NaN, and what it does not have is left out."""
+    names = [f.name for f in fields(kind) if f.name in told]
+    return kind(**{n: math.nan if told[n] is None else told[n] for n in names})
+
+
+def csv_number(x: float) -> str:
+    """Return a number with all its digits for CSV, empty for NaN."""
+    return "" if math.isnan(x) else repr(x)
+
+
+# Tables, as Markdown and HTML.
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its head, its value in a row, how a number is written, and whether it is set to the right."""
+
+    head: str
+    value: Callable[[Any], Any]
+    form: str = ""
+    right: bool = False
+
+    def text(self, row: Any, escape: Callable[[str], str]) -> str:
+        """Return the cell of a row."""
+        value = self.value(row)
+        return escape(value) if isinstance(value, str) else format(value, self.form)
+
+
+def columns_of(kind: type) -> tuple[Column, ...]:
+    """Return a column for each field of a dataclass that is a text, a number or a truth value."""
+    plain = ("str", "int", "float", "bool")
+    return tuple(Column(f.name, attrgetter(f.name)) for f in fields(kind) if f.type in plain)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of any kind, and what is read of each."""
+
+    columns: Sequence[Column]
+    rows: Iterable[Any]
+
+    def markdown(self) -> str:
+        """Return it in Markdown."""
+        head = "".join(f"| {markdown(c.head)} ".replace("  ", " ") for c in self.columns)
+        rule = "".join("|---:" if c.right else "|---" for c in self.columns)
+        rows = ("".join(f"| {c.text(row, markdown)} " for c in self.columns) for row in self.rows)
+        return "\n".join(f"{line}|" for line in (head, rule, *rows))
+
+    def html(self) -> str:
+        """Return it in HTML."""
+        head = "".join(f"<th>{html(c.head)}</th>" for c in self.columns)
+        rows = ("".join(f"<td>{c.text(row, html)}</td>" for c in self.columns) for row in self.rows)
+        return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+
+
+@dataclass(frozen=True)
+class Title:
+    """A name in bold, and what follows it."""
+
+    name: str
+    text: str
+
+    def markdown(self) -> str:
+        """Return it in Markdown."""
+        return f"**{markdown(self.name)}**{markdown(self.text)}"
+
+    def html(self) -> str:
+        """Return it in HTML."""
+        return f"<p><b>{html(self.name)}</b>{html(self.text)}</p>"
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list of texts."""
+
+    texts: Iterable[str]
+
+    def markdown(self) -> str:
+        """Return it in Markdown."""
+        return "\n".join(f"- {markdown(text)}" for text in self.texts)
+
+    def html(self) -> str:
+        """Return it in HTML."""
+        items = "".join(f"<li>{html(text)}</li>" for text in self.texts)
+        return f"<ul>{items}</ul>" if items else ""
+
+
+Block = Title | Table | Items
+
+
+class ResultTable:
+    """Base of the frozen dataclasses that studies return.
+
+    A result says what it holds once, as `_blocks` for people and as `_csv_columns` of `_csv_rows` for programs.
+    """
+
+    _csv_columns: ClassVar[Sequence[Column]] = ()
+
+    def _blocks(self) -> Iterator[Block]:
+        """Yield titles, tables and lists, in order."""
+        raise NotImplementedError
+
+    def _csv_rows(self) -> Iterable[Any]:
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return asdict(typing.cast(Any, self))
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """Return the result as JSON, and write it to `path` if given. Infinity and NaN become null."""
+        text = json.dumps(to_plain(self.to_dict()), indent=1, allow_nan=False)
+        if path is not None:
+            write(path, text + "\n")
+        return text
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Return the result that `to_json` wrote; null is NaN.
+
+        Raises
+        ------
+        InputError
+            The text is no such result.
+        """
+        try:
+            result: Self = from_plain(cls, json.loads(text))
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+            raise InputError(
+                f"text: expected the JSON of a {cls.__name__}, such as Path(...).read_text() of a file "
+                f"that to_json wrote; it has no such content ({type(error).__name__}: {error})"
+            ) from None
+        return result
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """Return one line a row, with all digits, and write it to `path` if given."""
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(c.head for c in self._csv_columns)
+        for row in self._csv_rows():
+            writer.writerow(_csv_cell(c.value(row)) for c in self._csv_columns)
+        if path is not None:
+            write(path, stream.getvalue())
+        return stream.getvalue()
+
+    def to_markdown(self) -> str:
+        """Return the result for people, in Markdown."""
+        return "\n\n".join(text for block in self._blocks() if (text := block.markdown())) + "\n"
+
+    def _repr_html_(self) -> str:
+        return "".join(block.html() for block in self._blocks())
+
+
+def _csv_cell(value: Any) -> Any:
+    """Return a number with all its digits, empty for NaN and None, and text that is no formula."""
+    if isinstance(value, str):
+        return csv_text(value)
+    if isinstance(value, float):
+        return "" if math.isnan(value) else repr(value)
+    return int(value) if isinstance(value, bool) else value
+
+
+def write(path: str | Path, text: str) -> None:
+    """Write a text to a file.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written there.
+    """
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"cannot write {path}: {error.strerror or error}; choose a folder that exists (the result itself is kept)"
+        ) from error
+
+
+# The model, versions and processor, for every report.
+
+
+def model_info(model: Model) -> dict[str, Any]:
+    """Return size, mass, digest, needs, joints, notes and inconsistent inertias of a model, as plain data."""
+    return {
+        "nq": model.nq,
+        "nv": model.nv,
+        # Energies do not tell it.
+        **({} if model.written is not None else {"mass": model.mass}),
+        "digest": model.digest,
+        "needs": model.needs.as_dict(),
+        "joints": list(model.joint_names),
+        "notes": list(model.notes),
+        "nonphysical": [f"{name}: {why}" for name, why in model.nonphysical],
+    }
+
+
+_PACKAGES: Final = (
+    *("pin", "mujoco", "drake", "casadi", "numpy", "scipy"),
+    *("llvmlite", "heyoka", "mpmath", "example-robot-data"),
+)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of everything that computes."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    # Searching the installed packages takes some 10 ms.
+    out = {"mbkit": __version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            out[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            out[package] = "not installed"
+    return out
+
+
+def processor() -> str:
+    """Return the processor's model name and the system."""
+    name = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                name = line.split(":", 1)[1].strip()
+                break
+    except OSError:
+        pass
+    return f"{name}, {platform.system()} {platform.machine()}"

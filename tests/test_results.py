@@ -1,0 +1,105 @@
+"""What all results of studies share: JSON and back, CSV, Markdown and HTML."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+
+import pytest
+
+from mbkit.errors import InputError, OutputError
+from mbkit.studies.baseline.description import Change
+from mbkit.studies.baseline.result import BaselineResult
+from mbkit.studies.baseline.tolerance import Moved, VersionChange
+from mbkit.studies.importers.result import Parsed, ParserComparison, Stage
+from mbkit.studies.results import Column, Refusal, Table, from_plain, to_plain
+from tests.test_report import AGREEING, DIFFERING, EMPTY
+
+IMPORTED = ParserComparison(
+    source="arm.urdf",
+    format="urdf",
+    floating_base=False,
+    reference="file",
+    faults="",
+    importers=(
+        Parsed("pinocchio", "4.1.0", stages=(Stage("masses", True, 0.0, "", ""), Stage("M", False, 0.5, "a", "M|"))),
+        Parsed("mujoco", "4.0.0", refused="no <mesh>"),
+    ),
+    notes=("meshes left out",),
+    samples=3,
+    seed=0,
+    tolerance=1e-9,
+    versions={"mbkit": "1"},
+    processor="x",
+    seconds=math.nan,
+)
+CHECKED = BaselineResult(
+    question="check",
+    model="arm",
+    path="arm.toml",
+    status="numbers",
+    engines=("pinocchio",),
+    changes=(Change("bodies", "a", "mass", 1.0, 2.0, "mass of a: 1 → 2"),),
+    moved=(Moved("M", "pinocchio", "a", "neutral", 1.0, 2.0, 0.5, 1e-15),),
+    versions=(VersionChange("pin", "4.0.0", "4.1.0"),),
+    processors=("x", "y"),
+    skipped=(Refusal("drake", "", "not installed"),),
+)
+RESULTS = {"agreeing": AGREEING, "differing": DIFFERING, "empty": EMPTY, "importers": IMPORTED, "baseline": CHECKED}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_json_holds_all_of_a_result(name, tmp_path):
+    result = RESULTS[name]
+    text = result.to_json(tmp_path / "r.json")
+    again = type(result).from_json((tmp_path / "r.json").read_text())
+    assert again.to_json() == text
+    assert repr(again) == repr(result)
+    assert again.to_markdown() == result.to_markdown()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"model": 1}', "[" * 100_000])
+def test_json_of_something_else_is_refused(text):
+    with pytest.raises(InputError, match="Comparison"):
+        type(AGREEING).from_json(text)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_csv_has_a_line_for_each_row_and_all_digits(name, tmp_path):
+    result = RESULTS[name]
+    text = result.to_csv(tmp_path / "r.csv")
+    assert (tmp_path / "r.csv").read_text() == text
+    rows = list(csv.DictReader(io.StringIO(text)))
+    table = {"importers": IMPORTED.importers[0].stages, "baseline": CHECKED.moved}.get(name)
+    wanted = list(getattr(result, "rows", table))
+    assert len(rows) == len(wanted)
+    for row, of in zip(rows, wanted, strict=True):
+        for field in ("relative", "worst", "error"):
+            if field in row:
+                x = getattr(of, field)
+                assert float(row[field]) == x if not math.isnan(x) else row[field] == ""
+
+
+def test_nothing_is_lost_where_a_file_cannot_be_written(tmp_path):
+    for write in (AGREEING.to_json, AGREEING.to_csv):
+        with pytest.raises(OutputError, match="missing"):
+            write(tmp_path / "missing" / "r")
+
+
+def test_markdown_and_html_escape_texts_and_write_numbers_as_asked():
+    table = Table((Column("a|b", lambda r: r[0]), Column("x", lambda r: r[1], ".1e", right=True)), [("<b>|", 0.5)])
+    assert table.markdown() == "| a\\|b | x |\n|---|---:|\n| &lt;b&gt;\\| | 5.0e-01 |"
+    assert table.html() == "<table><tr><th>a|b</th><th>x</th></tr><tr><td>&lt;b&gt;|</td><td>5.0e-01</td></tr></table>"
+    for result in RESULTS.values():
+        assert "<mesh>" not in result._repr_html_() + result.to_markdown()
+
+
+def test_plain_data_has_no_number_that_json_has_not():
+    assert json.dumps(to_plain({"a": (math.nan, 1.0), "b": [math.inf]}), allow_nan=False) == (
+        '{"a": [null, 1.0], "b": [null]}'
+    )
+    assert from_plain(tuple[float, ...], [1.0, "no limit"]) == (1.0, math.inf)
+    assert math.isnan(from_plain(float, None))
+    assert from_plain(float | None, None) is None
