@@ -40,8 +40,6 @@ _NEARER: Final = 0.3
 #: Poses of a whole turn, and along one velocity in each round.
 _STEPS: Final = 24
 _ALONG: Final = 9
-#: Kinds whose own velocities become dependent at some angle, whatever the masses are: gimbal lock.
-_LOCKING: Final = ("spherical_zyx",)
 
 
 @lru_cache(maxsize=64)
@@ -64,7 +62,7 @@ def cancellation(model: Model, enough: float = np.inf) -> float:
 
     Infinite where a joint can lock; 1 where M is singular at every pose. Nothing is looked for beyond `enough`.
     """
-    if any(joint.kind in _LOCKING for joint in model.joints):
+    if any(joint.type.gimbal is not None for joint in model.joints):
         return np.inf
     rng = np.random.default_rng(0)
     q = model.random_state(rng, _STATES)[0]
@@ -147,7 +145,7 @@ def _bound(model: Model, q: Array) -> float:
     holder: dict[str, str] = {"world": ""}
     own: dict[str, list[Array]] = {}
     for joint in model.tree:
-        holder[joint.child] = holder[joint.parent] if joint.kind == "fixed" else joint.name
+        holder[joint.child] = joint.name if joint.type.nv else holder[joint.parent]
         own.setdefault(holder[joint.child], []).append(rows[joint.name])
     worst = 1.0
     for joint in model.independent_joints:

@@ -186,8 +186,8 @@ class Equations:
     def coriolis_matrix(self) -> Any:
         """Christoffel's C = ½ ∂(C v)/∂v + ½ M A(v).
 
-        A holds the quasi-velocities' structure: [[ω̂, v̂], [0, ω̂]] for a free joint
-        and ω̂ for a ball joint, zero otherwise. A(v) v = 0 leaves C v as it is, and
+        A holds the quasi-velocities' structure, -Aᵀ p = hamel(v, p): [[ω̂, v̂], [0, ω̂]] for a free joint
+        and ω̂ for a ball joint, zero where v = q̇. A(v) v = 0 leaves C v as it is, and
         the second term makes Ṁ - 2C skew.
         """
         half = 0.5 * ca.jacobian(self.coriolis_force, self.v)
@@ -195,14 +195,11 @@ class Equations:
             return half
         A: Any = ca.SX(self.model.nv, self.model.nv)
         for joint in self.model.independent_joints:
-            start = self.model.layout.v[joint.name].start
-            if joint.kind == "ball":
-                A[start : start + 3, start : start + 3] = ca.skew(self.v[start : start + 3])
-            elif joint.kind == "free":
-                linear, angular = self.v[start : start + 3], self.v[start + 3 : start + 6]
-                A[start : start + 3, start : start + 3] = ca.skew(angular)
-                A[start : start + 3, start + 3 : start + 6] = ca.skew(linear)
-                A[start + 3 : start + 6, start + 3 : start + 6] = ca.skew(angular)
+            if joint.type.quaternion is not None:
+                own = self.model.layout.v[joint.name]
+                v = ca.vertsplit(self.v[own])
+                rows = [joint.type.hamel(v, e) for e in np.eye(joint.type.nv).tolist()]
+                A[own, own] = -ca.sparsify(ca.vertcat(*(ca.horzcat(*row) for row in rows)))
         return half + 0.5 * ca.mtimes(self.mass_matrix, A)
 
     @cached_property

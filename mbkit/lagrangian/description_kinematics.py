@@ -138,7 +138,7 @@ class SymbolicKinematics:
 
     def _placement(self, joint: Joint) -> tuple[Any, Vector]:
         q = self._arguments(joint)
-        return joint.type.placement(self.space, self.values["joints", joint.name], q)  # type: ignore[arg-type]
+        return joint.type.placement(self.space, self.values["joints", joint.name], q)
 
     def _columns(self) -> dict[str, dict[int, Column]]:
         """Return each body's velocity in its own axes per unit of each velocity that moves it."""
@@ -162,7 +162,7 @@ class SymbolicKinematics:
         for k in range(joint.type.nv):
             unit = [self.space.number(int(i == k)) for i in range(joint.type.nv)]
             values = self.values["joints", joint.name]
-            linear, angular = joint.type.twist(self.space, values, q, unit)  # type: ignore[arg-type]
+            linear, angular = joint.type.twist(self.space, values, q, unit)
             i, ratio = self._velocity(joint, k)
             yield i, ([ratio * x for x in linear], [ratio * x for x in angular])
 
@@ -347,7 +347,7 @@ def _is_polynomial(x: sp.Expr) -> bool:
 
 def _advances(joint: Joint, i: int) -> bool:
     """Return whether a coordinate moves something by its own length; others only turn."""
-    return i in joint.type.lengths or joint.kind == "helical"
+    return i in joint.type.lengths or i in joint.type.screws
 
 
 def _turn(angle: sp.Expr) -> sp.Expr:
@@ -511,8 +511,7 @@ def _axes(way: _Way) -> list[Array]:
     """Return what a way's joints turn about, each in the axes of the body at its end while no other has moved."""
     out = []
     for k, joint in enumerate(way):
-        own = joint.axes if joint.type.n_axes else np.eye(3)[3 - len(joint.type.angular) :]
-        out += [_at_rest(way[k:]) @ x for x in own if joint.type.angular]
+        out += [_at_rest(way[k:]) @ x for x in joint.type.hinge_axes(joint)]
     return out
 
 

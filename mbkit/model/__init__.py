@@ -2,7 +2,7 @@
 
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.description import Needs
-from mbkit.model.joint_types import KINDS, JointKind, kind_of
+from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
 from mbkit.model.model import Model
 from mbkit.model.parameters import Expression, Number, Parameter, known, nominal
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
@@ -15,6 +15,7 @@ __all__ = [
     "Joint",
     "JointCoupling",
     "JointKind",
+    "JointType",
     "Loop",
     "Mimic",
     "Model",
@@ -27,4 +28,5 @@ __all__ = [
     "kind_of",
     "known",
     "nominal",
+    "register_joint_type",
 ]

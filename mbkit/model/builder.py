@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from mbkit import spatial
 from mbkit._check import Array, _as_float, finite_array, real, shown
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
-from mbkit.model.joint_types import KINDS, kind_of
+from mbkit.model.joint_types import FIXED, KINDS, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
@@ -356,7 +356,7 @@ class ModelBuilder:
             near = near or list(KINDS)
             self._read.faults.append(f"{who}: unknown kind {shown(kind)}; use one of {', '.join(near)}")
             # The other faults of this call would only be echoes of this one.
-            kind, axis, axis2, pitch, mimic = "fixed", None, None, 0.0, None
+            kind, axis, axis2, pitch, mimic = FIXED.name, None, None, 0.0, None
             lower = upper = velocity_limit = effort_limit = None
             armature = damping = friction = stiffness = rest = 0.0
         type_ = kind_of(kind)

@@ -18,6 +18,7 @@ import numpy as np
 
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, UnknownNameError
+from mbkit.model.joint_types import KINDS
 from mbkit.model.layout import Layout
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
@@ -259,6 +260,7 @@ class Description:
             self.prescribed,
             *self.couplings,
             *self.bindings,
+            *(KINDS[kind].digest for kind in sorted({j.kind for j in self.joints}) if not KINDS[kind].built_in),
         )
 
     @cached_property

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from mbkit.model import quaternions as rotation
-from mbkit.model.joint_types import acceleration_in_parent, velocity_in_body, velocity_in_parent
 from mbkit.model.model import Model
 
 __all__ = ["Space"]
@@ -45,7 +44,7 @@ class Space:
             if start is not None:
                 turn = slice(q.start + start, q.stop), slice(v.start + start, v.stop)
                 self._turns.append(turn)
-                if start:
+                if joint.type.floating:
                     self._free.append((turn[0], slice(v.start, v.start + start), turn[1]))
 
     def _add(self, q: slice, v: slice) -> None:
@@ -91,13 +90,13 @@ class Space:
         """Return w of mbkit's v."""
         if self._rates is not None:
             return self._rates.enter(q, v)
-        return self._changed(q, v, velocity_in_parent)
+        return self._changed(q, v, rotation.rotate)
 
     def leave(self, q: Any, w: Any) -> Any:
         """Return mbkit's v of w."""
         if self._rates is not None:
             return self._rates.leave(q, w)
-        return self._changed(q, w, velocity_in_body)
+        return self._changed(q, w, rotation.rotate_back)
 
     def enter_force(self, q: Any, f: Any) -> Any:
         """Return the momentum or force on w of one on mbkit's v; on free joints they turn as velocities do."""
@@ -127,13 +126,10 @@ class Space:
             return a
         out = self.copied(a)
         for turn, linear, angular in self._free:
-            turned = acceleration_in_parent(
-                self.components(q, turn),
-                self.components(v, linear),
-                self.components(v, angular),
-                self.components(a, linear),
-            )
-            self.put(out, linear, turned)
+            # a_J = R (a + w × v)
+            turned = rotation.cross(self.components(v, angular), self.components(v, linear))
+            rate = [x + y for x, y in zip(self.components(a, linear), turned, strict=True)]
+            self.put(out, linear, rotation.rotate(self.components(q, turn), rate))
         return out
 
     @staticmethod

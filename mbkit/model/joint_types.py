@@ -1,35 +1,37 @@
-"""What each kind of joint is, once: its sizes, placement, twist and velocities.
+"""Joint types: sizes, placement, twist and velocities of each, and the registry for types of one's own.
 
-The formulas use only ``+ - * /`` and the functions `sin` and `cos` of the module
-passed as `m`, so the same lines serve NumPy batches, CasADi graphs, SymPy and
-mpmath. Coordinates are sequences of scalars; a rotation is a list of three rows.
+Formulas use only ``+ - * /`` and ``m.sin`` and ``m.cos`` of single coordinates, where `m` is NumPy, CasADi, SymPy's
+trigonometric ring or mpmath. Coordinates are sequences of scalars; a rotation is a list of three rows.
 
-Conventions (Featherstone 2008, ch. 4.4, with the choices below)
-    The child frame moves relative to the joint frame J, which is fixed in the
-    parent. ``placement`` gives (R_JC, p_JC_J). ``twist`` gives the velocity of C
-    relative to J as (linear, angular) of C's origin, both in C's axes.
-    ``qdot`` is D(q) v, ``pullback`` is D(q)ᵀ x, and ``hamel`` is the term that the
-    Boltzmann–Hamel equation adds to d/dt ∂T/∂v for quasi-velocities
-    (Greenwood 2003, Advanced Dynamics, eq. 4.77; zero where v = q̇).
+Conventions (Featherstone 2008, ch. 4.4, with the choices below): the child frame C moves relative to the joint frame J,
+which is fixed in the parent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from types import ModuleType
+import hashlib
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, Final
 
-from mbkit.model.quaternions import Components, cross, rotate, rotate_back
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.errors import InputError, UnsupportedError
 
 __all__ = [
+    "FIXED",
+    "FREE",
     "KINDS",
+    "PRISMATIC",
     "JointKind",
+    "JointType",
     "Scalars",
-    "acceleration_in_parent",
     "cross3",
     "kind_of",
-    "velocity_in_body",
-    "velocity_in_parent",
+    "register_joint_type",
 ]
 
 
@@ -43,7 +45,7 @@ def cross3(a: Scalars, b: Scalars) -> list[Any]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-def _about(m: ModuleType, axis: Scalars, angle: Any) -> Rows:
+def _about(m: Any, axis: Scalars, angle: Any) -> Rows:
     # Rodrigues with the diagonal as a² + (1 - a²) c: exact zeros and ones of an
     # axis along x, y or z stay exact and vanish from a symbolic graph.
     c, s = m.cos(angle), m.sin(angle)
@@ -98,8 +100,8 @@ def _quaternion_pullback(q: Scalars, g: Scalars) -> list[Any]:
     ]
 
 
-class JointKind:
-    """A kind of joint; the subclasses below are all there are.
+class JointType:
+    """A type of joint. A subclass gives the attributes and formulas, `register_joint_type` makes an instance known.
 
     Attributes
     ----------
@@ -107,13 +109,25 @@ class JointKind:
     nq, nv : int
         Coordinates and velocities.
     n_axes : int
-        How many unit axes a joint of this kind is given.
+        Unit axes that a joint of this type takes from its description, ``joint.axes``.
     quaternion : int or None
-        Where the quaternion starts among the coordinates.
+        Index of the first coordinate of a quaternion (x, y, z, w), which comes last.
     suffixes, velocity_suffixes : tuple of str
         Names of the coordinates and velocities, behind the joint's own.
     angular, lengths : tuple of int
-        Which coordinates are angles and which are lengths.
+        Coordinates that are angles, and that are lengths.
+    pitched : bool
+        Whether it takes an advance per radian from its description, ``joint.pitch``.
+    screws : tuple of int
+        Angles that the formulas also use outside of sine and cosine.
+    gimbal : int or None
+        Angle at whose odd quarter turns the velocities become dependent.
+    floating : bool
+        Whether q is position and quaternion, and v linear and angular velocity in the child's axes.
+    axial : bool
+        Whether the joint's frame may turn about its axis and slide along it without a change of the motion.
+    like : str
+        Name of a joint type of the same motion, which differs in its limits alone.
     """
 
     name: str
@@ -125,100 +139,174 @@ class JointKind:
     velocity_suffixes: tuple[str, ...] = ("",)
     angular: tuple[int, ...] = ()
     lengths: tuple[int, ...] = ()
+    pitched: bool = False
+    screws: tuple[int, ...] = ()
+    gimbal: int | None = None
+    floating: bool = False
+    axial: bool = False
+    like: str = ""
+
+    def __repr__(self) -> str:
+        return f"<joint type {self.name!r}: nq={self.nq}, nv={self.nv}>"
 
     @property
     def coordinate_velocities(self) -> bool:
-        """Whether v = q̇, so that D = 1."""
+        """Whether v = q̇, so that D = 1; then the joint can have springs."""
         return self.quaternion is None
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    @property
+    def rotates(self) -> bool:
+        """Whether the child can turn."""
+        return bool(self.angular) or self.quaternion is not None
+
+    @property
+    def motion(self) -> str:
+        """The same text for types of the same motion."""
+        return self.like or self.name
+
+    @property
+    def built_in(self) -> bool:
+        """Whether mbkit defines this type."""
+        return type(self).__module__ == __name__
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the attributes and of what the formulas compute at fixed random states."""
+        total = hashlib.sha256(repr([getattr(self, name) for name in _ATTRIBUTES]).encode())
+        for seed in range(3):
+            joint, q, v = _sample(self, seed)
+            R, p = self.placement(_REAL, joint, q)
+            values = [
+                *R,
+                p,
+                *self.twist(_REAL, joint, q, v),
+                self.qdot(q, v),
+                self.pullback(q, q),
+                self.hamel(v, v[::-1]),
+            ]
+            for x in values:
+                total.update(np.array(x, dtype=np.float64).tobytes())
+        return total.hexdigest()
+
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         """Return R_JC and p_JC_J."""
         raise NotImplementedError
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        """Return the linear and angular velocity of C in J, in C's axes."""
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+        """Return the linear and angular velocity of C's origin relative to J, in C's axes."""
         raise NotImplementedError
 
     def qdot(self, q: Scalars, v: Scalars) -> list[Any]:
         """Return D(q) v."""
-        return list(v)
+        k = self.quaternion
+        return list(v) if k is None else [*v[:k], *_quaternion_rate(q[k:], v[k:])]
 
     def pullback(self, q: Scalars, g: Scalars) -> list[Any]:
         """Return D(q)ᵀ g."""
-        return list(g)
+        k = self.quaternion
+        return list(g) if k is None else [*g[:k], *_quaternion_pullback(q[k:], g[k:])]
 
     def hamel(self, v: Scalars, p: Scalars) -> list[Any]:
-        """Return what is added to d/dt p, for momenta p = ∂T/∂v."""
-        return [0.0] * self.nv
+        """Return what the Boltzmann–Hamel equation adds to d/dt p, for momenta p = ∂T/∂v.
+
+        Zero where v = q̇ (Greenwood 2003, Advanced Dynamics, eq. 4.77).
+        """
+        k = self.quaternion
+        return [0.0] * self.nv if k is None else [0.0] * k + cross3(v[k:], p[k:])
+
+    def integrate(self, q: Array, dq: Array) -> Array:
+        """Return q ⊕ dq, (..., nq), of coordinates (..., nq) and tangents (..., nv)."""
+        k = self.quaternion
+        if k is None:
+            return np.asarray(q + dq)
+        turned = spatial.multiply(q[..., k:], spatial.exp_quaternion(dq[..., k:]))
+        return np.concatenate([q[..., :k] + dq[..., :k], spatial.normalized(turned)], axis=-1)
+
+    def difference(self, q0: Array, q1: Array) -> Array:
+        """Return the dq with integrate(q0, dq) = q1, (..., nv)."""
+        k = self.quaternion
+        if k is None:
+            return np.asarray(q1 - q0)
+        turn = spatial.log_quaternion(spatial.multiply(spatial.conjugate(q0[..., k:]), q1[..., k:]))
+        return np.concatenate([q1[..., :k] - q0[..., :k], turn], axis=-1)
+
+    def hinge_axes(self, joint: Any) -> list[Array]:
+        """Return the axes that the angles turn about at q = 0, in the child's frame."""
+        q, unit = [0.0] * self.nq, np.eye(self.nv).tolist()
+        return [np.array(self.twist(_REAL, joint, q, unit[i])[1], dtype=np.float64) for i in self.angular]
 
 
-class _Fixed(JointKind):
+#: The name of `JointType` in earlier versions.
+JointKind = JointType
+
+
+class _Fixed(JointType):
     name, nq, nv, suffixes, velocity_suffixes = "fixed", 0, 0, (), ()
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _IDENTITY, [0.0, 0.0, 0.0]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         return [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
 
 
-class _Revolute(JointKind):
-    name, nq, nv, n_axes, angular = "revolute", 1, 1, 1, (0,)
+class _Revolute(JointType):
+    name, nq, nv, n_axes, angular, axial = "revolute", 1, 1, 1, (0,), True
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _about(m, joint.axes[0], q[0]), [0.0, 0.0, 0.0]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         return [0.0, 0.0, 0.0], [a * v[0] for a in joint.axes[0]]
 
 
 class _Continuous(_Revolute):
-    name = "continuous"
+    name, like = "continuous", "revolute"
 
 
-class _Prismatic(JointKind):
-    name, nq, nv, n_axes, lengths = "prismatic", 1, 1, 1, (0,)
+class _Prismatic(JointType):
+    name, nq, nv, n_axes, lengths, axial = "prismatic", 1, 1, 1, (0,), True
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _IDENTITY, [a * q[0] for a in joint.axes[0]]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         return [a * v[0] for a in joint.axes[0]], [0.0, 0.0, 0.0]
 
 
 class _Helical(_Revolute):
     # The axis is an eigenvector of the rotation, so the advance has the same
     # components in J and in C.
-    name = "helical"
+    name, pitched, screws = "helical", True, (0,)
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _about(m, joint.axes[0], q[0]), [joint.pitch * a * q[0] for a in joint.axes[0]]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         return [joint.pitch * a * v[0] for a in joint.axes[0]], [a * v[0] for a in joint.axes[0]]
 
 
-class _Universal(JointKind):
+class _Universal(JointType):
     name, nq, nv, n_axes, angular = "universal", 2, 2, 2, (0, 1)
     suffixes = velocity_suffixes = ("1", "2")
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _matmul(_about(m, joint.axes[0], q[0]), _about(m, joint.axes[1], q[1])), [0.0, 0.0, 0.0]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         first = _times_transposed(_about(m, joint.axes[1], q[1]), joint.axes[0])
         return [0.0, 0.0, 0.0], [first[i] * v[0] + joint.axes[1][i] * v[1] for i in range(3)]
 
 
-class _SphericalZYX(JointKind):
-    name, nq, nv, angular = "spherical_zyx", 3, 3, (0, 1, 2)
+class _SphericalZYX(JointType):
+    name, nq, nv, angular, gimbal = "spherical_zyx", 3, 3, (0, 1, 2), 1
     suffixes = velocity_suffixes = ("z", "y", "x")
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         zy = _matmul(_about(m, (0, 0, 1), q[0]), _about(m, (0, 1, 0), q[1]))
         return _matmul(zy, _about(m, (1, 0, 0), q[2])), [0.0, 0.0, 0.0]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         s1, c1, s2, c2 = m.sin(q[1]), m.cos(q[1]), m.sin(q[2]), m.cos(q[2])
         return [0.0, 0.0, 0.0], [
             v[2] - s1 * v[0],
@@ -227,47 +315,38 @@ class _SphericalZYX(JointKind):
         ]
 
 
-class _Ball(JointKind):
+class _Ball(JointType):
     name, nq, nv, quaternion = "ball", 4, 3, 0
     suffixes, velocity_suffixes = ("qx", "qy", "qz", "qw"), ("wx", "wy", "wz")
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _from_quaternion(q), [0.0, 0.0, 0.0]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         return [0.0, 0.0, 0.0], list(v)
 
-    def qdot(self, q: Scalars, v: Scalars) -> list[Any]:
-        return _quaternion_rate(q, v)
 
-    def pullback(self, q: Scalars, g: Scalars) -> list[Any]:
-        return _quaternion_pullback(q, g)
-
-    def hamel(self, v: Scalars, p: Scalars) -> list[Any]:
-        return cross3(v, p)
-
-
-class _Planar(JointKind):
+class _Planar(JointType):
     name, nq, nv, lengths, angular = "planar", 3, 3, (0, 1), (2,)
     suffixes = velocity_suffixes = ("x", "y", "theta")
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _about(m, (0, 0, 1), q[2]), [q[0], q[1], 0.0]
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         c, s = m.cos(q[2]), m.sin(q[2])
         return [c * v[0] + s * v[1], c * v[1] - s * v[0], 0.0], [0.0, 0.0, v[2]]
 
 
-class _Free(JointKind):
-    name, nq, nv, quaternion, lengths = "free", 7, 6, 3, (0, 1, 2)
+class _Free(JointType):
+    name, nq, nv, quaternion, lengths, floating = "free", 7, 6, 3, (0, 1, 2), True
     suffixes = ("x", "y", "z", "qx", "qy", "qz", "qw")
     velocity_suffixes = ("vx", "vy", "vz", "wx", "wy", "wz")
 
-    def placement(self, m: ModuleType, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
         return _from_quaternion(q[3:]), list(q[:3])
 
-    def twist(self, m: ModuleType, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
         return list(v[:3]), list(v[3:])
 
     def qdot(self, q: Scalars, v: Scalars) -> list[Any]:
@@ -282,57 +361,245 @@ class _Free(JointKind):
         slip = cross3(v[:3], p[:3])
         return cross3(v[3:], p[:3]) + [spin[i] + slip[i] for i in range(3)]
 
+    def integrate(self, q: Array, dq: Array) -> Array:
+        p, turn = spatial.exp_se3(dq)
+        there = spatial.normalized(spatial.multiply(q[..., 3:], turn))
+        return np.concatenate([q[..., :3] + spatial.rotate(q[..., 3:], p), there], axis=-1)
 
-KINDS: Final[dict[str, JointKind]] = {
-    kind.name: kind
-    for kind in (
-        _Fixed(),
+    def difference(self, q0: Array, q1: Array) -> Array:
+        back = spatial.conjugate(q0[..., 3:])
+        w = spatial.log_quaternion(spatial.multiply(back, q1[..., 3:]))
+        p = spatial.rotate(back, q1[..., :3] - q0[..., :3])
+        return np.concatenate([np.einsum("...ij,...j->...i", spatial.left_jacobian_inverse(w), p), w], axis=-1)
+
+
+FIXED: Final = _Fixed()
+PRISMATIC: Final = _Prismatic()
+FREE: Final = _Free()
+
+#: Joint type by name: the built-in ones, then those of `register_joint_type`.
+KINDS: Final[dict[str, JointType]] = {
+    joint_type.name: joint_type
+    for joint_type in (
+        FIXED,
         _Revolute(),
         _Continuous(),
-        _Prismatic(),
+        PRISMATIC,
         _Helical(),
         _Universal(),
         _SphericalZYX(),
         _Ball(),
         _Planar(),
-        _Free(),
+        FREE,
     )
 }
 
 
-def kind_of(name: str) -> JointKind:
-    """Return the kind of this name."""
-    return KINDS[name]
+def kind_of(name: str) -> JointType:
+    """Return the joint type of this name.
+
+    Raises
+    ------
+    UnsupportedError
+        No such type is registered in this process.
+    """
+    try:
+        return KINDS[name]
+    except KeyError:
+        raise UnsupportedError(
+            f"joint type {name!r} is not registered in this process; call mbkit.model.register_joint_type first"
+        ) from None
 
 
-# A free joint's velocity in the axes that the integrators use.
-#
-# mbkit's is linear then angular, both in body axes. Inside the integrators the
-# linear part is in the axes of the joint's fixed frame J (world axes for a
-# floating base), as in MuJoCo: ṗ is then the velocity itself, positions add up,
-# and a body that spins without forces keeps its linear velocity to the bit.
-#
-# With R = R_JB and body-axes velocity (v, w)::
-#
-#     v_J = R v                 a_J = R (a + w × v)
-#
-# Quaternion, linear and angular parts are sequences of components, as in
-# `mbkit.model.quaternions`.
+# Joint types of one's own
+
+_ATTRIBUTES: Final = tuple(JointType.__annotations__)
+_REAL: Final = SimpleNamespace(sin=np.sin, cos=np.cos)
+#: Complex step: derivatives to rounding.
+_STEP: Final = 1e-30
+_ROUNDING: Final = 1e-11
 
 
-def velocity_in_parent(quaternion: Components, linear: Components) -> list[Any]:
-    """Return R v."""
-    return rotate(quaternion, linear)
+def register_joint_type(joint_type: JointType) -> JointType:
+    """Make a joint type known, so that `ModelBuilder.add_joint` and the description's readers take its name.
+
+    The lagrangian engine, the oracle, `mbkit.lagrangian.from_model` (where v = q̇), simulation and studies take it;
+    other engines and file formats refuse it by name. A process that unpickles a model with such joints imports the
+    class, so the class has to stand in an importable module.
+
+    Parameters
+    ----------
+    joint_type : JointType
+        An instance of a subclass. Its class is not to change after registration.
+
+    Returns
+    -------
+    JointType
+        The same.
+
+    Raises
+    ------
+    InputError
+        Attributes that do not fit together; formulas that are no rigid motion, contradict each other, or cannot be
+        evaluated with ``+ - * /``, sine and cosine alone; or a name that another type has.
+
+    Examples
+    --------
+    >>> from mbkit.model import JointType, register_joint_type
+    >>> class Cylindrical(JointType):
+    ...     name, nq, nv, n_axes, lengths, angular = "doc_cylindrical", 2, 2, 1, (0,), (1,)
+    ...     suffixes = velocity_suffixes = ("d", "angle")
+    ...
+    ...     def placement(self, m, joint, q):
+    ...         R, _ = KINDS["revolute"].placement(m, joint, q[1:])
+    ...         return R, [a * q[0] for a in joint.axes[0]]
+    ...
+    ...     def twist(self, m, joint, q, v):
+    ...         return [a * v[0] for a in joint.axes[0]], [a * v[1] for a in joint.axes[0]]
+    >>> register_joint_type(Cylindrical())
+    <joint type 'doc_cylindrical': nq=2, nv=2>
+    """
+    if not isinstance(joint_type, JointType):
+        raise InputError(f"joint_type: expected an instance of a subclass of JointType, got {joint_type!r}")
+    faults = list(_attribute_faults(joint_type)) or list(_formula_faults(joint_type))
+    if faults:
+        raise InputError(f"joint type {getattr(joint_type, 'name', '')!r}: {'; '.join(faults)}")
+    known = KINDS.get(joint_type.name)
+    if known is not None and (known.built_in or known.digest != joint_type.digest):
+        raise InputError(
+            f"joint type {joint_type.name!r}: the name is registered with other formulas; use another name"
+        )
+    return KINDS.setdefault(joint_type.name, joint_type)
 
 
-def velocity_in_body(quaternion: Components, linear: Components) -> list[Any]:
-    """Return Rᵀ v_J."""
-    return rotate_back(quaternion, linear)
+def _attribute_faults(joint_type: JointType) -> Iterator[str]:
+    missing = [name for name in _ATTRIBUTES if not hasattr(joint_type, name)]
+    if missing:
+        yield f"no {', '.join(missing)}; set them in the class"
+        return
+    name, nq, nv, k = joint_type.name, joint_type.nq, joint_type.nv, joint_type.quaternion
+    if not isinstance(name, str) or not name.isidentifier():
+        yield f"name: expected a word of letters, digits and underscores, got {name!r}"
+    sizes = (("nq", nq, 1, 7), ("nv", nv, 1, 6), ("n_axes", joint_type.n_axes, 0, 2))
+    wrong = [
+        f"{n}: expected an integer of {a} to {b}, got {x!r}"
+        for n, x, a, b in sizes
+        if type(x) is not int or not a <= x <= b
+    ]
+    yield from wrong
+    if wrong:
+        return
+    if nq != nv + (k is not None) or (k is not None and k != nq - 4):
+        yield (
+            f"nq {nq}, nv {nv}, quaternion {k}: expected nq = nv, or nq = nv + 1 and a quaternion that starts at nq - 4"
+        )
+    for n, size in (("suffixes", nq), ("velocity_suffixes", nv)):
+        texts = getattr(joint_type, n)
+        if not isinstance(texts, tuple) or len(texts) != size or len({x for x in texts if isinstance(x, str)}) != size:
+            yield f"{n}: expected {size} different texts, got {texts!r}"
+    plain = nq if k is None else k
+    for n in ("angular", "lengths", "screws"):
+        if not isinstance(getattr(joint_type, n), tuple) or not {*getattr(joint_type, n)} <= {*range(plain)}:
+            yield f"{n}: expected a tuple of indices below {plain}, got {getattr(joint_type, n)!r}"
+    if {*joint_type.angular} | {*joint_type.lengths} != {*range(plain)} or {*joint_type.angular} & {
+        *joint_type.lengths
+    }:
+        yield "angular and lengths: expected each coordinate outside a quaternion in one of them"
+    if joint_type.gimbal is not None and joint_type.gimbal not in joint_type.angular:
+        yield f"gimbal: expected one of the angles {joint_type.angular}, got {joint_type.gimbal!r}"
+    if joint_type.floating and not isinstance(joint_type, _Free):
+        yield "floating: only for subclasses of the type 'free'"
+    if joint_type.like and joint_type.like not in KINDS:
+        yield f"like: expected the name of a joint type, got {joint_type.like!r}"
 
 
-def acceleration_in_parent(
-    quaternion: Components, linear: Components, angular: Components, rate: Components
-) -> list[Any]:
-    """Return R (a + w × v), from the body-axes velocity and its rate a."""
-    turn = cross(angular, linear)
-    return rotate(quaternion, [rate[i] + turn[i] for i in range(3)])
+def _sample(joint_type: JointType, seed: int) -> tuple[SimpleNamespace, list[float], list[float]]:
+    rng = np.random.default_rng(seed)
+    axes = spatial.normalized(rng.standard_normal((joint_type.n_axes, 3))) if joint_type.n_axes else np.zeros((0, 3))
+    joint = SimpleNamespace(axes=axes.tolist(), pitch=0.3 if joint_type.pitched else 0.0)
+    q, v = rng.standard_normal(joint_type.nq), rng.standard_normal(joint_type.nv)
+    if (k := joint_type.quaternion) is not None:
+        q[k:] = spatial.normalized(q[k:])
+    return joint, q.tolist(), v.tolist()
+
+
+class _Angle:
+    """A coordinate of which only sine and cosine can be taken."""
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+
+_OF_ANGLES: Final = SimpleNamespace(
+    sin=lambda x: np.sin(x.value if isinstance(x, _Angle) else x),
+    cos=lambda x: np.cos(x.value if isinstance(x, _Angle) else x),
+)
+
+
+def _formula_faults(joint_type: JointType) -> Iterator[str]:
+    """Yield what is wrong with the formulas, measured at one random state."""
+    joint, q, v = _sample(joint_type, 7)
+    nq, nv, k = joint_type.nq, joint_type.nv, joint_type.quaternion
+    try:
+        D = np.array([joint_type.qdot(q, e) for e in np.eye(nv).tolist()], dtype=float).T
+        moved = [x + 1j * _STEP * r for x, r in zip(q, joint_type.qdot(q, v), strict=True)]
+        R, p = (np.array(x, dtype=complex) for x in joint_type.placement(_REAL, joint, moved))
+        linear, angular = (np.array(x, dtype=float) for x in joint_type.twist(_REAL, joint, q, v))
+        g, momentum = np.arange(1.0, nq + 1), np.arange(1.0, nv + 1)
+        pulled = np.array(joint_type.pullback(q, g.tolist()), dtype=float)
+        hamel = np.array(joint_type.hamel(v, momentum.tolist()), dtype=float)
+        shapes = D.shape, R.shape, p.shape, linear.shape, angular.shape, pulled.shape, hamel.shape
+    except Exception as error:  # a user's code may raise anything
+        yield f"a formula fails: {type(error).__name__}: {error}; use + - * / and m.sin and m.cos alone"
+        return
+    if shapes != ((nq, nv), (3, 3), (3,), (3,), (3,), (nv,), (nv,)):
+        yield (
+            "a formula returns another size: expected qdot, R, p, linear, angular, pullback and hamel of "
+            f"nq = {nq} and nv = {nv}, got shapes {shapes}"
+        )
+        return
+    off = np.abs(R.real @ R.real.T - np.eye(3)).max()
+    if not off < _ROUNDING or not np.linalg.det(R.real) > 0:
+        yield "placement: R is not a rotation matrix"
+    rate, spin = R.real.T @ p.imag / _STEP, R.real.T @ R.imag / _STEP
+    turning = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
+    if not np.abs([linear - rate, angular - turning]).max() < _ROUNDING:
+        yield (
+            f"twist: expected the rate of the placement, linear {rate.round(6).tolist()} and angular "
+            f"{turning.round(6).tolist()} at q = {np.round(q, 6).tolist()}, got {linear.round(6).tolist()} and "
+            f"{angular.round(6).tolist()}"
+        )
+    if k is None and not np.array_equal(D, np.eye(nv)):
+        yield "qdot: expected v, for a type without a quaternion"
+    if not np.abs(pulled - D.T @ g).max() < _ROUNDING * nq:
+        yield "pullback: expected D(q)ᵀ g, with D of qdot"
+    expected = np.einsum("ijk,j,k->i", _structure(joint_type, q, D), v, momentum)
+    if not np.abs(hamel - expected).max() < _ROUNDING * nq:
+        yield (
+            f"hamel: expected {expected.round(6).tolist()}, by the brackets of D's columns, "
+            f"got {hamel.round(6).tolist()}"
+        )
+    opaque = {i for i in joint_type.angular if i not in joint_type.screws}
+    angles = [_Angle(x) if i in opaque else x for i, x in enumerate(q)]
+    try:
+        joint_type.placement(_OF_ANGLES, joint, angles)
+        joint_type.twist(_OF_ANGLES, joint, angles, v)
+    except (TypeError, AttributeError) as error:
+        yield f"an angle enters other than by m.sin(q[i]) and m.cos(q[i]) ({error}); list it in screws"
+
+
+def _structure(joint_type: JointType, q: list[float], D: Array) -> Array:
+    """Return c of [D_i, D_j] = Σ c_ijk D_k."""
+    nv, units = joint_type.nv, np.eye(joint_type.nv).tolist()
+    # slopes[i, j]: the derivative of column j along column i
+    slopes = np.array(
+        [
+            [
+                np.imag(joint_type.qdot([x + 1j * _STEP * r for x, r in zip(q, D[:, i], strict=True)], e)) / _STEP
+                for e in units
+            ]
+            for i in range(nv)
+        ]
+    )
+    brackets = slopes - slopes.transpose(1, 0, 2)
+    return np.asarray((brackets.reshape(nv * nv, -1) @ np.linalg.pinv(D).T).reshape(nv, nv, nv))

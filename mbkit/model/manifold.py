@@ -99,20 +99,7 @@ def integrate(model: Description, q: Array, dq: Array) -> Array:
     out = np.empty(q.shape)
     for joint in model.independent_joints:
         a, b = model.layout.q[joint.name], model.layout.v[joint.name]
-        x, u = q[..., a], dq[..., b]
-        if joint.kind == "free":
-            p, turn = spatial.exp_se3(u)
-            out[..., a] = np.concatenate(
-                [
-                    x[..., :3] + spatial.rotate(x[..., 3:], p),
-                    spatial.normalized(spatial.multiply(x[..., 3:], turn)),
-                ],
-                axis=-1,
-            )
-        elif joint.kind == "ball":
-            out[..., a] = spatial.normalized(spatial.multiply(x, spatial.exp_quaternion(u)))
-        else:
-            out[..., a] = x + u
+        out[..., a] = joint.type.integrate(q[..., a], dq[..., b])
     return out
 
 
@@ -124,14 +111,5 @@ def difference(model: Description, q0: Array, q1: Array) -> Array:
     out = np.empty((*q0.shape[:-1], model.nv))
     for joint in model.independent_joints:
         a, b = model.layout.q[joint.name], model.layout.v[joint.name]
-        x, y = q0[..., a], q1[..., a]
-        if joint.kind == "free":
-            back = spatial.conjugate(x[..., 3:])
-            w = spatial.log_quaternion(spatial.multiply(back, y[..., 3:]))
-            p = spatial.rotate(back, y[..., :3] - x[..., :3])
-            out[..., b] = np.concatenate([np.einsum("...ij,...j->...i", spatial.left_jacobian_inverse(w), p), w], -1)
-        elif joint.kind == "ball":
-            out[..., b] = spatial.log_quaternion(spatial.multiply(spatial.conjugate(x), y))
-        else:
-            out[..., b] = y - x
+        out[..., b] = joint.type.difference(q0[..., a], q1[..., a])
     return out

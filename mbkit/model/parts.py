@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.joint_types import JointKind, kind_of
+from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 
 __all__ = ["Body", "Frame", "Joint", "JointCoupling", "Loop", "Mimic", "PointSpring", "Prescribed"]
 
@@ -86,8 +86,8 @@ class Joint(_Frozen):
     Attributes
     ----------
     kind : str
-        One of fixed, revolute, continuous, prismatic, helical, universal,
-        spherical_zyx, ball, planar, free.
+        Name of a joint type: fixed, revolute, continuous, prismatic, helical, universal,
+        spherical_zyx, ball, planar, free, or one of `register_joint_type`.
     rotation, translation : (3, 3) and (3,) arrays
         R_PJ and p_PJ_P, the joint's fixed frame in the parent's.
     axes : (k, 3) array
@@ -128,9 +128,18 @@ class Joint(_Frozen):
         return f"<Joint {self.name!r}: {self.kind}, {self.parent!r} to {self.child!r}{follows}>"
 
     @property
-    def type(self) -> JointKind:
-        """The formulas of this joint's kind."""
+    def type(self) -> JointType:
+        """The formulas of this joint's type."""
         return kind_of(self.kind)
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        # Another process may not have registered the type.
+        return (type(self), self._values()) if self.type.built_in else (_of_type, (self.type, self._values()))
+
+
+def _of_type(joint_type: JointType, values: tuple[Any, ...]) -> Joint:
+    register_joint_type(joint_type)
+    return Joint(*values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,7 +125,7 @@ def _joint_faults(joint: Joint) -> list[str]:
         )
     if np.any(joint.stiffness) and not joint.type.coordinate_velocities:
         out.append(f"{who}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring")
-    if joint.pitch and joint.kind != "helical":
+    if joint.pitch and not joint.type.pitched:
         out.append(f"{who}: pitch {joint.pitch} on a {joint.kind} joint; only helical joints have one")
     return out
 
@@ -252,7 +252,7 @@ def static_bodies(joints: Iterable[Joint]) -> set[str]:
     """Return the bodies that are fixed to the world, whose inertia cannot act."""
     below: dict[str, list[str]] = {}
     for joint in joints:
-        if joint.kind == "fixed":
+        if not joint.type.nv:
             below.setdefault(joint.parent, []).append(joint.child)
     found: set[str] = set()
     waiting = ["world"]
@@ -408,7 +408,7 @@ def scale_doubts(model: Description) -> list[str]:
         least = float(diagonal[model.layout.v[joint.name]].min())
         if least < _LEAST:
             small.append(f"{joint.name!r} ({least:.1e})")
-        elif joint.kind != "prismatic" and carried[joint.child] * extent**2 > _APART * least:
+        elif joint.type.rotates and carried[joint.child] * extent**2 > _APART * least:
             far.append(f"{joint.name!r} ({least:.1e} kg m² of {carried[joint.child]:.1e} kg over {extent:.1e} m)")
     root = np.sqrt(diagonal)
     values = np.linalg.eigvalsh(M / root[:, None] / root)

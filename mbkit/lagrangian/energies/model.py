@@ -21,6 +21,7 @@ from mbkit.lagrangian.constraints.redundancy import is_judged, refuse_unreachabl
 from mbkit.lagrangian.energies.casadi_equations import WrittenEquations
 from mbkit.model import Model
 from mbkit.model.description import Needs
+from mbkit.model.joint_types import PRISMATIC
 from mbkit.model.parts import Body, Frame, Joint
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def _coordinate(name: str, before: str) -> Joint:
     zero, endless = np.zeros(1), np.full(1, np.inf)
     return Joint(
         name=name,
-        kind="prismatic",
+        kind=PRISMATIC.name,
         parent=before,
         child=name,
         rotation=np.eye(3),

@@ -228,8 +228,8 @@ def _pole(dyn: Dynamics, q: Array) -> Iterator[str]:
     if dyn.model.written is not None:
         return
     for joint in dyn.model.independent_joints:
-        if joint.kind == "spherical_zyx":
-            side = np.sign(np.cos(q[..., dyn.model.layout.q[joint.name].start + 1]))
+        if joint.type.gimbal is not None:
+            side = np.sign(np.cos(q[..., dyn.model.layout.q[joint.name].start + joint.type.gimbal]))
             if (side != side[..., :1])[np.isfinite(side)].any():
                 yield (
                     f"joint {joint.name!r} was stepped over gimbal lock: its pose holds, and its first and last angle "

@@ -19,7 +19,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
-from mbkit.model.joint_types import JointKind
+from mbkit.model.joint_types import JointType
 from mbkit.simulate.solvers.vector_field import unit_quaternions
 from mbkit.simulate.torque import Force
 
@@ -112,7 +112,7 @@ class Linearization:
         return rate, D, tangent
 
 
-def _of_rotation(kind: JointKind, q: Array, v: Array, length: float) -> tuple[Array, Array, Array]:
+def _of_rotation(kind: JointType, q: Array, v: Array, length: float) -> tuple[Array, Array, Array]:
     start = kind.quaternion
     assert start is not None
     x = q.tolist()
@@ -123,7 +123,7 @@ def _of_rotation(kind: JointKind, q: Array, v: Array, length: float) -> tuple[Ar
     # The quaternion's own rate is linear in it.
     for i, e in enumerate(np.eye(kind.nq)[start:].tolist()):
         rate[start:, start + i] = kind.qdot(e, v.tolist())[start:]
-    if start:
+    if kind.floating:
         # d(R v) = -R (v × dθ)
         linear = v[:start]
         moved = np.cross(linear, tangent[start:, start:], axisb=0, axisc=0)

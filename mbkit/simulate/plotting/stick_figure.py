@@ -104,20 +104,20 @@ class _Drawn:
         self._depth = {"world": 0}
         self._members: dict[str, list[str]] = {"world": []}
         for joint in model.tree:
-            fixed = joint.kind == "fixed"
+            fixed = not joint.type.nv
             root = self._root[joint.parent] if fixed else joint.child
             self._root[joint.child] = root
             self._members.setdefault(root, []).append(joint.child)
             if not fixed:
                 self._depth[root] = self._depth[self._root[joint.parent]] + 1
-        self._moving = [j for j in model.tree if j.kind != "fixed"]
+        self._moving = [j for j in model.tree if j.type.nv]
 
     def whole(self, n: int) -> Skeleton:
         links, slides, joints, carts, masses, anchors, boxes = ([] for _ in range(7))
         path, deepest = np.zeros((n, 3)), 0
         for joint in self._moving:
             root, base, place = self._root[joint.parent], self._bases[joint.name].p, self._poses[joint.child].p
-            flies = joint.kind == "free"
+            flies = joint.type.floating
             slides_along = bool(joint.type.lengths) and not flies
             if root == "world":
                 foot = base if joint.parent == "world" else self._foot(joint)
@@ -144,7 +144,7 @@ class _Drawn:
             if depth > deepest and root not in carrying:
                 path, deepest = here if tip is None else tip, depth
         first = self._moving[0] if self._moving else None
-        if first is not None and first.kind == "free":
+        if first is not None and first.type.floating:
             path = self._poses[first.child].of(self._model.body(first.child).com)
 
         def stacked(parts: Sequence[object], *shape: int) -> Array:
@@ -170,7 +170,7 @@ class _Drawn:
         return self._poses[body].p
 
     def _slides(self, root: str) -> bool:
-        return any(j.child == root and j.type.lengths and j.kind != "free" for j in self._moving)
+        return any(j.child == root and j.type.lengths and not j.type.floating for j in self._moving)
 
     def _tip(self, root: str) -> tuple[Array | None, bool]:
         """Return the end of a last link, and whether it is a centre of mass."""

@@ -373,7 +373,7 @@ def _merged(whole: Model) -> Description:
     """Return the links that share a body with others, and the places of the joints upon these."""
     host: dict[str, str] = {}
     for joint in whole.tree:
-        fixed = joint.kind == "fixed" and joint.parent != "world"
+        fixed = not joint.type.nv and joint.parent != "world"
         host[joint.child] = host[joint.parent] if fixed else joint.child
     size = Counter(host.values())
     shared = [link for link, body in host.items() if size[body] > 1]

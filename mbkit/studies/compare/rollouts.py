@@ -111,7 +111,7 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size[:-1].shape)
     disturbance = _DISTURBANCE * size[:-1] * signs
     for joint in model.independent_joints:
-        if joint.kind == "free":
+        if joint.type.floating:
             # MuJoCo holds such a force in other axes; the torques disturb enough.
             start = model.layout.v[joint.name].start
             disturbance[:, start : start + 3] = 0.0

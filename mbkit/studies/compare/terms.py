@@ -108,7 +108,7 @@ def _near_singular(model: Model, rng: np.random.Generator, n: int) -> Array:
         start = model.layout.q[joint.name].start
         for i in joint.type.angular:
             turns = rng.integers(-1, 3, n)
-            if joint.kind == "spherical_zyx" and i == 1:
+            if i == joint.type.gimbal:
                 turns = 2 * rng.integers(0, 2, n) - 1
             q[:, start + i] = turns * np.pi / 2 + rng.choice([-_NEAR, _NEAR], n)
     return q

@@ -69,7 +69,7 @@ class Convention:
 
 def conventions(model: Model) -> Iterator[Convention]:
     """Yield the misunderstandings that this model's joints allow, the likely ones first."""
-    if any(j.kind == "free" for j in model.independent_joints):
+    if any(j.type.floating for j in model.independent_joints):
         yield from _velocity_frames(model)
     if model.quaternions:
         for back, says in (
@@ -118,7 +118,7 @@ def _shuffled(model: Model, places: int) -> Callable[[States], States]:
 
 def _velocity_frames(model: Model) -> Iterator[Convention]:
     """Yield velocities of free joints in other axes or in the other order."""
-    free = [(model.layout.q[j.name], model.layout.v[j.name]) for j in model.independent_joints if j.kind == "free"]
+    free = [(model.layout.q[j.name], model.layout.v[j.name]) for j in model.independent_joints if j.type.floating]
 
     def turns(at: States, *, linear: bool, angular: bool) -> Array:
         T = np.tile(np.eye(model.nv), (len(at.q), 1, 1))

@@ -18,7 +18,6 @@ from mbkit.studies.explain.tolerance import Near
 
 __all__ = [
     "CONSTRAINTS",
-    "HINGES",
     "Guess",
     "Hypothesis",
     "angle_of",
@@ -416,8 +415,6 @@ _DEGREE: Final = np.pi / 180
 #: Numbers per velocity, by the name of what they are; those without a say in the smooth motion below.
 _NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "friction", "stiffness": "spring"}
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
-#: What differs in its limits alone.
-HINGES: Final = frozenset({"revolute", "continuous"})
 
 
 def blind_joints(joint: Joint) -> Iterator[Guess]:
@@ -430,7 +427,7 @@ def blind_joints(joint: Joint) -> Iterator[Guess]:
         if joint.mimic.offset:
             mimic = Mimic(joint.mimic.joint, joint.mimic.ratio)
             yield Guess("mimic", "leaves out the offset at which it follows", {"mimic": mimic})
-    if joint.kind == "helical":
+    if joint.type.pitched:
         yield from _pitches(joint)
     yield from _axes(joint)
     yield from _places_joints(joint)
@@ -479,7 +476,7 @@ def named_joints(a: Joint, b: Joint, near: Near) -> list[Guess]:
     out: list[Guess] = []
     if a.parent != b.parent:
         out.append(Guess("parent", f"hangs it on {b.parent!r} and not on {a.parent!r}", {"parent": b.parent}))
-    if a.kind != b.kind and {a.kind, b.kind} != HINGES:
+    if a.type.motion != b.type.motion:
         # Nothing of one kind's numbers means anything to the other.
         whole = {f.name: getattr(b, f.name) for f in fields(b) if f.name not in ("name", "child", "parent")}
         return [*out, Guess("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)]
@@ -547,7 +544,7 @@ def _turned(a: Joint, b: Joint) -> Guess:
     value = {"rotation": b.rotation}
     angle = angle_of(R)
     about = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    if a.kind in ("revolute", "continuous", "helical") and np.allclose(R @ a.axes[0], a.axes[0], atol=1e-9):
+    if a.type.axial and a.type.rotates and np.allclose(R @ a.axes[0], a.axes[0], atol=1e-9):
         angle = float(np.copysign(angle, about @ a.axes[0]))
         return Guess("zero position", f"counts from {told(angle)} rad ({told(angle / _DEGREE)}°) further on", value)
     return Guess("joint rotation", f"has it turned by {told(angle)} rad ({told(angle / _DEGREE)}°)", value)
@@ -556,7 +553,7 @@ def _turned(a: Joint, b: Joint) -> Guess:
 def _shifted(a: Joint, b: Joint, near: Near) -> Guess:
     value = {"translation": b.translation}
     d = a.rotation.T @ (b.translation - a.translation)
-    if a.kind == "prismatic" and near.point(np.cross(d, a.axes[0]), np.zeros(3)):
+    if a.type.axial and not a.type.rotates and near.point(np.cross(d, a.axes[0]), np.zeros(3)):
         return Guess("zero position", f"counts from {told(float(d @ a.axes[0]))} m further on", value)
     return Guess("joint origin", f"has the joint at {told(b.translation)} m, not at {told(a.translation)}", value)
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model import Body, Joint, JointCoupling, Mimic, Model
-from mbkit.studies.explain.hypotheses import HINGES, Hypothesis
+from mbkit.model.joint_types import FIXED
+from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.merged_links import Compact, Member, compact
 from mbkit.studies.explain.tolerance import Near
 
@@ -149,7 +150,7 @@ class _Overlay:
         body_a, body_b, near = self.bodies[0][a.child], self.bodies[1][b.child], self.near
         cost = 0.0 if a.name == b.name else _NAME
         if a.kind != b.kind:
-            cost += _FRAME if {a.kind, b.kind} == HINGES else _KIND
+            cost += _FRAME if a.type.motion == b.type.motion else _KIND
         far = np.linalg.norm(a.translation), np.linalg.norm(b.translation)
         cost += 0.0 if near.point(np.array([far[0]]), np.array([far[1]])) else _NUMBER
         cost += 0.0 if near.number(body_a.mass, body_b.mass) else _NUMBER
@@ -187,9 +188,6 @@ def _sizes(model: Model) -> dict[str, int]:
 # is moved to where the other description has it, if nothing of its joint and body differs then, or at least
 # two parts less. One part less is no evidence: of two different robots, a frame can always be slid to where the
 # other's stands, and its centre of mass and the next joint then have numbers that are in neither file.
-
-#: Kinds whose frames mean nothing beyond their axis. The others' coordinates are measured in theirs.
-_LOOSE: Final = ("revolute", "continuous", "helical", "prismatic")
 
 
 @dataclass(frozen=True)
@@ -267,14 +265,14 @@ def aligned(b: Compact, a: Model, near: Near) -> Aligned:
         moved[joint.child] = np.eye(3), np.zeros(3)
         made[joint.name] = there, body
         like = joints.get(joint.name)
-        if like is None or joint.kind not in _LOOSE or (like.kind != joint.kind and {like.kind, joint.kind} != HINGES):
+        if like is None or not joint.type.axial or like.type.motion != joint.type.motion:
             continue
         turn, shift = there.rotation.T @ like.rotation, there.rotation.T @ (like.translation - there.translation)
         # Exact ones and zeros stay what they are.
         turn = np.eye(3) if near.vector(turn, np.eye(3)) else turn
         shift = np.zeros(3) if near.point(shift, np.zeros(3)) else shift
         axis = joint.axes[0]
-        if joint.kind != "prismatic":
+        if joint.type.rotates:
             shift = axis * (axis @ shift)
         if not shift.any() and np.array_equal(turn, np.eye(3)):
             continue
@@ -415,7 +413,7 @@ def _fixed(joint: Joint) -> Joint:
     none = joint.axes[:0].ravel()
     numbers = ("lower", "upper", "velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness")
     empty: dict[str, Any] = dict.fromkeys((*numbers, "rest"), none)
-    return replace(joint, kind="fixed", axes=joint.axes[:0], pitch=0.0, mimic=None, **empty)
+    return replace(joint, kind=FIXED.name, axes=joint.axes[:0], pitch=0.0, mimic=None, **empty)
 
 
 def _below(model: Model, name: str) -> set[str]:

@@ -356,4 +356,4 @@ def _lump(model: Model, name: str) -> Lump:
 
 
 def _base(joint: Joint) -> bool:
-    return joint.kind == "free" and joint.parent == "world"
+    return joint.type.floating and joint.parent == "world"

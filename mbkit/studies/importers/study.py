@@ -23,7 +23,7 @@ from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_links import urdf_links
 from mbkit.model import Joint, Model
 from mbkit.studies import results
-from mbkit.studies.explain.hypotheses import HINGES, angle_of, told
+from mbkit.studies.explain.hypotheses import angle_of, told
 from mbkit.studies.explain.joint_matching import Matching, aligned, renamed, settled
 from mbkit.studies.explain.merged_links import Compact
 from mbkit.studies.explain.result import Cause, Explanation
@@ -111,7 +111,7 @@ def _stage(name: str, found: Iterable[_Difference]) -> Stage:
 
 def _tree(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
     def kinds(a: Joint, b: Joint) -> _Difference | None:
-        same = a.kind == b.kind or {a.kind, b.kind} == HINGES
+        same = a.type.motion == b.type.motion
         return None if same else _Difference(a.name, 1.0, f"{b.kind} for {a.kind}")
 
     def parents(a: Joint, b: Joint) -> _Difference | None:
