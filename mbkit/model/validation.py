@@ -126,9 +126,7 @@ def _joint_faults(joint: Joint) -> list[str]:
     if np.any(joint.stiffness) and not joint.type.coordinate_velocities:
         out.append(f"{who}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring")
     if joint.pitch and not joint.type.pitched:
-        out.append(
-            f"{who}: pitch {joint.pitch} on a {joint.kind} joint; only pitched types, such as helical, have one"
-        )
+        out.append(f"{who}: pitch {joint.pitch} on a {joint.kind} joint; only pitched types, such as helical, have one")
     return out
 
 
