@@ -26,8 +26,8 @@ from mbkit.report.progress import Bar
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 from mbkit.studies.results import Refusal
-from mbkit.studies.work_precision.figure import figure
-from mbkit.studies.work_precision.result import Curve, PrecisionPoint, WorkPrecision
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
+from mbkit.studies.work_precision.result import WorkPrecision
 
 NAN = math.nan
 HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'
@@ -473,8 +473,8 @@ def test_without_energies_there_is_no_panel_of_energies():
 
 
 def test_a_colour_and_marker_belong_to_an_engine_whichever_others_there_are():
-    alone = figure(replace(STUDY, curves=STUDY.curves[2:]))
-    among = figure(STUDY)
+    alone = replace(STUDY, curves=STUDY.curves[2:]).plot()
+    among = STUDY.plot()
     for fig in (alone, among):
         handle = next(h for h in fig.legends[0].legend_handles if "mujoco" in str(h.get_label()))
         assert (handle.get_color(), handle.get_marker()) == ("#00805e", "D")
@@ -538,7 +538,7 @@ def test_nothing_of_the_figure_is_cut_where_it_is_saved(names):
     # From 1 ms to 1 s: a tick, with its label, at either end.
     points = tuple(point(1e-3, 10.0**-k, 10.0 ** (k / 4 - 3)) for k in range(1, 13))
     curves = tuple(replace(STUDY.curves[0], engine=f"{name}{k or ''}", points=points) for k, name in enumerate(names))
-    drawn = figure(replace(STUDY, curves=curves))
+    drawn = replace(STUDY, curves=curves).plot()
     box, (width, height) = drawn.get_tightbbox(), drawn.get_size_inches()
     assert box.x0 >= 0
     assert box.y0 >= 0

@@ -28,9 +28,10 @@ from mbkit._escape import csv_text
 from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
-from mbkit.studies.work_precision.curve import _heyoka_anew, made_ready, observed_order, shares
-from mbkit.studies.work_precision.result import Curve, PrecisionPoint, WorkPrecision
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
+from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.settings import plans
+from mbkit.studies.work_precision.sweep import _without_heyoka_cache, first_run, repetitions
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]
 STEPS = [0.1 / 2**k for k in range(6)]
@@ -167,7 +168,7 @@ def test_a_slow_machine_measures_the_same_points(monkeypatch):
         perf_counter=lambda: 40 * clocks["perf_counter"]() - 39 * starts["perf_counter"],
         process_time=lambda: 40 * clocks["process_time"]() - 39 * starts["process_time"],
     )
-    monkeypatch.setattr(sys.modules["mbkit.studies.work_precision.curve"], "time", slow)
+    monkeypatch.setattr(sys.modules["mbkit.studies.work_precision.sweep"], "time", slow)
     assert errors(few_runs()) == errors(quick)
     assert not quick.shortened
     # Work is counted, and a call from Python counts eight.
@@ -207,7 +208,7 @@ def test_nothing_that_is_kept_shortens_a_first_run(method, monkeypatch):
         made.append(dyn)
         mb.simulate(dyn, [0.1, 0.2], [0.0, 0.0], 1e-3, method, save=[1e-3])
 
-    told = [made_ready(model, "lagrangian", method, first)[1] for _ in range(3)]
+    told = [first_run(model, "lagrangian", method, first)[1] for _ in range(3)]
     # A compiler's time, not that of finding what it made: half a millisecond.
     assert min(told) > 5e-3
     begun = time.perf_counter()
@@ -361,7 +362,7 @@ def test_a_tolerance_that_no_run_takes_is_said():
         ({"engines": ()}, InputError, "engines: expected at least one"),
         ({"engines": "mujoco"}, InputError, "engines: expected several names"),
         ({"engines": ("mujocco",)}, UnknownNameError, "'mujoco'"),
-        ({"engines": ("oracle",)}, InputError, "oracle is what the others"),
+        ({"engines": ("oracle",)}, InputError, "engines: the oracle"),
         ({"engines": (1,)}, InputError, "expected names"),
         ({"methods": ()}, InputError, "methods: expected at least one"),
         ({"methods": "rk4"}, InputError, "methods: expected several names"),
@@ -541,7 +542,7 @@ def test_overlapping_first_runs_leave_heyokas_cache_as_it_was():
     if not hasattr(state, "set_diskcache_enabled"):
         pytest.skip("this heyoka has no cache on disk")
     before = state.get_diskcache_enabled()
-    first, second = _heyoka_anew(), _heyoka_anew()
+    first, second = _without_heyoka_cache(), _without_heyoka_cache()
     for step in (first.__enter__, second.__enter__, lambda: first.__exit__(None, None, None)):
         step()
         assert not state.get_diskcache_enabled()
@@ -606,7 +607,7 @@ def test_a_pure_power_shows_itself_whatever_is_missing(order, size, lost):
 @given(st.lists(st.integers(1, 10_000), min_size=0, max_size=20), st.integers(1, 9), st.floats(0, 1e4))
 def test_repetitions_fit_into_the_time_there_is(milliseconds, most, budget):
     seconds = [m / 1000 for m in milliseconds]
-    counts = shares(seconds, most, budget)
+    counts = repetitions(seconds, most, budget)
     assert all(0 <= c <= most for c in counts)
     assert sum(c * s for c, s in zip(counts, seconds, strict=True)) <= budget * (1 + 1e-6)
 
@@ -706,7 +707,7 @@ def test_a_result_reads_well(few, tmp_path):
 
 def test_steps_divide_the_saved_intervals_and_get_finer():
     (plan,) = plans({"pinocchio": ["rk4"]}, 0.1, [0.1, 0.05], None)
-    assert plan.asked
+    assert plan.required
     assert plan.values == pytest.approx((0.1, 0.05))
     (own,) = plans({"pinocchio": ["rk4"]}, 0.1, None, None)
     assert own.values[0] == 0.05

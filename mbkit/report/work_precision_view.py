@@ -10,8 +10,9 @@ from typing import Final
 
 from mbkit.report.figures import PAGE, page_style, svg
 from mbkit.report.formatting import count_text, time_text
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import USEFUL, figure
-from mbkit.studies.work_precision.result import Curve, PrecisionPoint, WorkPrecision
+from mbkit.studies.work_precision.result import WorkPrecision
 
 __all__ = [
     "CurveLine",
@@ -185,11 +186,14 @@ def headline(result: WorkPrecision) -> str:
 def error_against_time(result: WorkPrecision) -> str:
     """Draw the figure of error against run time, for the page."""
     with page_style("precision"):
-        return svg(figure(result, PAGE), "Error against run time, by engine and method")
+        return svg(
+            figure(result.curves, result.duration, result.floor, PAGE), "Error against run time, by engine and method"
+        )
 
 
 def picture(result: WorkPrecision) -> bytes:
     """Return the same figure as PNG on white."""
     stream = io.BytesIO()
-    figure(result).savefig(stream, format="png", dpi=_DOTS_PER_INCH, facecolor="white", metadata={"Software": "mbkit"})
+    fig = figure(result.curves, result.duration, result.floor)
+    fig.savefig(stream, format="png", dpi=_DOTS_PER_INCH, facecolor="white", metadata={"Software": "mbkit"})
     return stream.getvalue()

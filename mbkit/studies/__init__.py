@@ -5,8 +5,9 @@ from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 from mbkit.studies.compare.study import compare
 from mbkit.studies.results import Refusal
 from mbkit.studies.stress.result import StressResult
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.reference import Reference
-from mbkit.studies.work_precision.result import Curve, InterruptedSweepError, PrecisionPoint, WorkPrecision
+from mbkit.studies.work_precision.result import InterruptedSweepError, WorkPrecision
 from mbkit.studies.work_precision.study import work_precision
 
 __all__ = [

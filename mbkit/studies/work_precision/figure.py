@@ -1,9 +1,4 @@
-"""The work-precision figure: who is fastest at which error, and every curve by its method.
-
-Above, all curves faintly, the best of each engine in its colour, and the front, which
-nothing beats in both error and run time, as a band with its methods named; the same
-for energy at the right. Below, one small panel per method with the engines in it.
-"""
+"""The work-precision figure: error and energy drift against run time, and one panel for each method."""
 
 from __future__ import annotations
 
@@ -13,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from mbkit._escape import one_line
 from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, log_ticks, style
-from mbkit.studies.work_precision.result import Curve, PrecisionPoint, WorkPrecision
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,31 +19,37 @@ __all__ = ["USEFUL", "figure"]
 _Place = tuple[float, float]
 _Measure = Callable[[PrecisionPoint], float]
 
-#: MuJoCo's own integrators with the same formulas as ours stand beside them.
-_BESIDE: Final = {"mujoco_rk4": "rk4", "mujoco_euler": "semi_implicit_euler"}
+#: MuJoCo's own integrators stand in the panel of the same formula.
+_SAME_FORMULA: Final = {"mujoco_rk4": "rk4", "mujoco_euler": "semi_implicit_euler"}
 _COLUMNS: Final = 5
 _WIDTH: Final = 10.4
 _TOP: Final = 4.4
-#: Where axes end, so that half of a last tick's label has its place.
+#: Right end of the axes; leaves room for half of the last tick's label.
 _RIGHT: Final = 0.98
-_SMALLEST: Final = 5.0
+_MIN_LEGEND: Final = 5.0
 _ROW: Final = 1.5
-_NAME: Final = 9.0  # points, and the width of a letter in bold, in
+_NAME: Final = 9.0  # points, and the width of a bold letter, in
 _LETTER: Final = 0.077
-#: An error above this, rad or m, is no answer, so it is on no front; ten times as much is not drawn.
+#: A run with a larger error, rad or m, is not on the front; with ten times as much it is not drawn.
 USEFUL: Final = 0.1
-_MOST: Final = 1.0
-#: A double tells no less.
-_LEAST: Final = 1e-17
+_MAX_ERROR: Final = 1.0
+_MIN_ERROR: Final = 1e-17
 _EPS: Final = 2.0**-52
 
 
-def figure(result: WorkPrecision, palette: Palette = PLAIN) -> Figure:
-    """Draw a result.
+def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Palette = PLAIN) -> Figure:
+    """Draw curves of error against run time.
+
+    Above stand all curves, thin, the best of each engine, and the front; at the right the
+    same for energy. Below, one panel for each method.
 
     Parameters
     ----------
-    result : WorkPrecision
+    curves : sequence of Curve
+    duration : float
+        Horizon, s.
+    floor : float
+        How well the reference is known, rad or m.
     palette : Palette
         By default for white paper.
 
@@ -61,69 +62,53 @@ def figure(result: WorkPrecision, palette: Palette = PLAIN) -> Figure:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    methods = _methods(result.curves)
+    floor = floor if math.isfinite(floor) and floor > 0 else 0.0
+    methods = _methods(curves)
     rows = math.ceil(len(methods) / _COLUMNS)
+
+    def error(p: PrecisionPoint) -> float:
+        # Below the reference's floor nothing is known; a logarithm has no zero.
+        return max(p.error, floor / 10, _MIN_ERROR) if math.isfinite(p.error) else math.nan
+
     with rc_context(style(palette)):  # type: ignore[arg-type]
         height = _TOP + (0.75 + _ROW * rows if rows else 0.0)
         fig = Figure(figsize=(_WIDTH, height))
         above, below = 0.62 / height, 0.55 / height
         split = 1 - _TOP / height
-        floor = _floor(result)
         # With dampers the energy is not conserved, and there is no drift to show.
-        conserved = any(_drawable(p.seconds, p.energy) for _, p in result.rows())
+        conserved = any(_drawable(p.seconds, p.energy) for c in curves for p in c.points)
         margins = {"left": 0.07, "right": _RIGHT, "top": 1 - above, "bottom": split + below, "wspace": 0.2}
         ratios = (1.55, 1.0) if conserved else (1.0,)
         axes = fig.subplots(1, len(ratios), width_ratios=ratios, squeeze=False, gridspec_kw=margins)[0]
-        _overview(axes[0], result, lambda p: _shown(p, floor), floor, palette, known_to=floor > 0)
+        _overview(axes[0], curves, error, floor, palette, show_floor=floor > 0)
         axes[0].set_title("error: lower left is better", loc="left")
         axes[0].set_ylabel("largest error of q, rad or m")
         if conserved:
-            _overview(axes[1], result, lambda p: p.energy, _EPS, palette)
+            _overview(axes[1], curves, lambda p: p.energy, _EPS, palette)
             axes[1].set_title("energy over the same runs", loc="left")
             axes[1].set_ylabel("energy drift, relative")
         for ax in axes:
-            ax.set_xlabel(f"run time of {result.duration:g} s of motion, s")
-        _legend(fig, result, palette)
+            ax.set_xlabel(f"run time of {duration:g} s of motion, s")
+        _legend(fig, curves, floor, palette)
         if rows:
-            told = "Method by method, each engine in its colour, the front behind"
-            if any(c.method in _BESIDE for curves in methods.values() for c in curves):
-                told += "; dashed: MuJoCo's own integrator of the same formulas"
-            fig.text(0.025, split - 0.12 / height, told, va="top")
-            grid = fig.subplots(
-                rows,
-                _COLUMNS,
-                sharex=True,
-                sharey=True,
-                squeeze=False,
-                gridspec_kw={
-                    "left": 0.07,
-                    "right": _RIGHT,
-                    "top": split - 0.58 / height,
-                    "bottom": 0.42 / height,
-                    "wspace": 0.08,
-                    "hspace": 0.3,
-                },
-            )
-            _by_method(list(grid.flat), methods, result, palette)
+            caption = "Method by method, each engine in its colour, the front behind"
+            if any(c.method in _SAME_FORMULA for some in methods.values() for c in some):
+                caption += "; dashed: MuJoCo's own integrator of the same formulas"
+            fig.text(0.025, split - 0.12 / height, caption, va="top")
+            margins = {"left": 0.07, "right": _RIGHT, "top": split - 0.58 / height, "bottom": 0.42 / height}
+            margins |= {"wspace": 0.08, "hspace": 0.3}
+            grid = fig.subplots(rows, _COLUMNS, sharex=True, sharey=True, squeeze=False, gridspec_kw=margins)
+            _by_method(list(grid.flat), methods, curves, error, floor, palette)
     return fig
 
 
 def _methods(curves: Iterable[Curve]) -> dict[str, list[Curve]]:
-    """Return the panels: a method's name and its curves, those on the most engines first."""
-    found: dict[str, list[Curve]] = {}
+    """Return the curves of each panel, methods on most engines first."""
+    panels: dict[str, list[Curve]] = {}
     for curve in curves:
         if any(_drawable(p.seconds, p.error) for p in curve.points):
-            found.setdefault(_BESIDE.get(curve.method, curve.method), []).append(curve)
-    return dict(sorted(found.items(), key=lambda item: -len({c.engine for c in item[1]})))
-
-
-def _floor(result: WorkPrecision) -> float:
-    return result.floor if math.isfinite(result.floor) and result.floor > 0 else 0.0
-
-
-def _shown(point: PrecisionPoint, floor: float) -> float:
-    # What is below the reference's own floor is not known any better; a logarithm has no zero.
-    return max(point.error, floor / 10, _LEAST) if math.isfinite(point.error) else math.nan
+            panels.setdefault(_SAME_FORMULA.get(curve.method, curve.method), []).append(curve)
+    return dict(sorted(panels.items(), key=lambda item: -len({c.engine for c in item[1]})))
 
 
 def _drawable(seconds: float, y: float) -> bool:
@@ -131,12 +116,12 @@ def _drawable(seconds: float, y: float) -> bool:
 
 
 def _places(points: Iterable[PrecisionPoint], measure: _Measure) -> list[_Place]:
-    found = [(p.seconds, max(measure(p), _LEAST)) for p in points if _drawable(p.seconds, measure(p))]
-    return [(x, y) for x, y in found if y <= _MOST]
+    places = [(p.seconds, max(measure(p), _MIN_ERROR)) for p in points if _drawable(p.seconds, measure(p))]
+    return [(x, y) for x, y in places if y <= _MAX_ERROR]
 
 
-def _unbeaten(places: Iterable[tuple[Curve, _Place]], floor: float) -> list[tuple[Curve, _Place]]:
-    """Return what nothing beats in both, fastest first; below the floor nothing is better."""
+def _front(places: Iterable[tuple[Curve, _Place]], floor: float) -> list[tuple[Curve, _Place]]:
+    """Return the points that none beats in both error and run time, fastest first; below the floor all are equal."""
     out: list[tuple[Curve, _Place]] = []
     for curve, (x, y) in sorted(places, key=lambda item: item[1]):
         if not out or max(y, floor) < max(out[-1][1][1], floor):
@@ -149,20 +134,16 @@ def _useful(places: Iterable[tuple[Curve, _Place]]) -> list[tuple[Curve, _Place]
 
 
 def _overview(
-    ax: Axes, result: WorkPrecision, measure: _Measure, floor: float, palette: Palette, *, known_to: bool = False
+    ax: Axes, curves: Sequence[Curve], measure: _Measure, floor: float, palette: Palette, *, show_floor: bool = False
 ) -> None:
-    """Draw all curves faintly, the best of each engine, and the front with its names.
-
-    Below `floor` nothing is better; `known_to` says whether that is the reference's own.
-    """
-    known = [(c, place) for c in result.curves for place in _places(c.points, measure)]
-    for curve in result.curves:
-        places = _places(curve.points, measure)
-        ax.plot(*_columns(places), color=palette.engine(curve.engine), linewidth=0.7, alpha=0.4)
-    front = _unbeaten(_useful(known), floor)
+    """Draw all curves thin, the best of each engine, and the front with its names."""
+    known = [(c, place) for c in curves for place in _places(c.points, measure)]
+    for curve in curves:
+        ax.plot(*_columns(_places(curve.points, measure)), color=palette.engine(curve.engine), linewidth=0.7, alpha=0.4)
+    front = _front(_useful(known), floor)
     ax.plot(*_columns([p for _, p in front]), color=palette.ink, alpha=0.16, linewidth=11.0, solid_capstyle="round")
-    for engine in _engines(result):
-        best = _unbeaten([item for item in known if item[0].engine == engine], floor)
+    for engine in _engines(curves):
+        best = _front([item for item in known if item[0].engine == engine], floor)
         ax.plot(
             *_columns([p for _, p in best]),
             color=palette.engine(engine),
@@ -175,7 +156,7 @@ def _overview(
     names = _names(front)
     if known:
         _limits(ax, [p for _, p in known], floor, names)
-    if known_to:
+    if show_floor:
         ax.axhline(floor, color=palette.muted, linestyle=(0, (4, 3)), linewidth=1.0)
     ax.grid(which="major")
     log_ticks(ax)
@@ -237,26 +218,26 @@ def _short(curve: Curve) -> str:
     return one_line(curve.method, 30)
 
 
-def _engines(result: WorkPrecision) -> list[str]:
-    return list(dict.fromkeys(c.engine for c in result.curves))
+def _engines(curves: Sequence[Curve]) -> list[str]:
+    return list(dict.fromkeys(c.engine for c in curves))
 
 
-def _legend(fig: Figure, result: WorkPrecision, palette: Palette) -> None:
+def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
         Line2D(
             [], [], color=palette.engine(e), marker=engine_mark(e), linewidth=2.0, label=f"best of {one_line(e, 20)}"
         )
-        for e in _engines(result)
+        for e in _engines(curves)
     ]
     handles.append(Line2D([], [], color=palette.ink, alpha=0.16, linewidth=9.0, label="the front"))
     handles.append(Line2D([], [], color=palette.muted, linewidth=0.7, label="every curve"))
-    if _floor(result) > 0:
-        told = f"reference known to {result.floor:.0e}"
-        handles.append(Line2D([], [], color=palette.muted, linestyle=(0, (4, 3)), linewidth=1.0, label=told))
+    if floor > 0:
+        label = f"reference known to {floor:.0e}"
+        handles.append(Line2D([], [], color=palette.muted, linestyle=(0, (4, 3)), linewidth=1.0, label=label))
     # On one line, in letters as small as long names need.
-    for size in (10.0, 9.0, 8.0, 7.0, 6.0, _SMALLEST):
+    for size in (10.0, 9.0, 8.0, 7.0, 6.0, _MIN_LEGEND):
         legend = fig.legend(
             handles=handles,
             loc="upper left",
@@ -265,31 +246,31 @@ def _legend(fig: Figure, result: WorkPrecision, palette: Palette) -> None:
             columnspacing=1.6,
             prop={"size": size},
         )
-        if size == _SMALLEST or legend.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
+        if size == _MIN_LEGEND or legend.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
             return
         legend.remove()
 
 
 def _by_method(
-    panels: Sequence[Axes], methods: dict[str, list[Curve]], result: WorkPrecision, palette: Palette
+    panels: Sequence[Axes],
+    methods: dict[str, list[Curve]],
+    curves: Sequence[Curve],
+    measure: _Measure,
+    floor: float,
+    palette: Palette,
 ) -> None:
     """Draw one method a panel, each engine in its colour, with the front as a band behind."""
-    floor = _floor(result)
-
-    def measure(p: PrecisionPoint) -> float:
-        return _shown(p, floor)
-
-    known = [(c, place) for c in result.curves for place in _places(c.points, measure)]
-    front = _columns([p for _, p in _unbeaten(_useful(known), floor)])
-    for ax, (method, curves) in zip(panels, methods.items(), strict=False):
+    known = [(c, place) for c in curves for place in _places(c.points, measure)]
+    front = _columns([p for _, p in _front(_useful(known), floor)])
+    for ax, (method, some) in zip(panels, methods.items(), strict=False):
         ax.plot(*front, color=palette.ink, alpha=0.16, linewidth=6.0, solid_capstyle="round")
-        for curve in curves:
-            beside = curve.method in _BESIDE
+        for curve in some:
+            own = curve.method in _SAME_FORMULA
             ax.plot(
                 *_columns(_places(curve.points, measure)),
                 color=palette.engine(curve.engine),
-                marker="" if beside else engine_mark(curve.engine),
-                linestyle=(0, (2, 1)) if beside else "-",
+                marker="" if own else engine_mark(curve.engine),
+                linestyle=(0, (2, 1)) if own else "-",
                 markersize=3.0,
                 linewidth=1.3,
             )

@@ -1,4 +1,4 @@
-"""What a sweep runs: which method on which engine, and with which steps or tolerances."""
+"""The settings of a sweep: which method on which engine, and with which steps or tolerances."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.methods.registry import METHODS, Method, method_of
 
-__all__ = ["INTERVALS", "MEASURED", "Plan", "names_of", "pairs", "plans", "save_grid"]
-
+__all__ = ["INTERVALS", "MEASURED", "Settings", "names_of", "pairs", "plans", "save_grid"]
 
 #: Errors are measured at the ends of this many equal parts of the horizon.
 INTERVALS: Final = 10
+#: Engines that can be measured.
+MEASURED: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
 #: The coarsest step, s, and the finest, as a part of the horizon.
 _COARSEST: Final = 0.05
 _FINEST: Final = 1e-7
 #: Ratio of neighbouring steps, by the method's order: an error falls by 4 to 16 at each.
 _RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
-#: Methods that call the dynamics from Python on every engine, and what such a call costs beside a compiled one.
+#: Methods that call the dynamics from Python on every engine, and the cost of such a call in compiled ones.
 _FROM_PYTHON: Final = frozenset({"dop853", "radau", "bdf", "lsoda", "gauss4", "gauss6"})
-_CALL: Final = 8
+_PYTHON_CALL: Final = 8
 
 
 @dataclass(frozen=True)
-class Plan:
+class Settings:
     """The settings of one method on one engine, coarse to fine.
 
     Attributes
@@ -38,27 +39,27 @@ class Plan:
     setting : {"dt", "rtol"}
     values : tuple of float
         Steps, s, or tolerances.
-    asked : bool
-        Whether somebody asked for these values, so that each has to be accounted for;
-        else the sweep ends where finer ones bring nothing or take too much work.
+    required : bool
+        Whether the caller chose the values, so that each is reported. Otherwise the sweep
+        ends where finer values improve nothing or take too much work.
     """
 
     engine: str
     method: str
     setting: Literal["dt", "rtol"]
     values: tuple[float, ...]
-    asked: bool
+    required: bool
 
     @property
-    def kind(self) -> Method:
+    def info(self) -> Method:
         """The method as data."""
         return METHODS[self.method]
 
     def work(self, steps: int, evaluations: int) -> int:
-        """Return what a run costs, in compiled evaluations of the forward dynamics; the same on every machine."""
-        compiled = self.kind.kind == "native" or self.method.startswith("drake_") or self.engine == "lagrangian"
-        each = 1 if compiled and self.method not in _FROM_PYTHON else _CALL
-        return each * (evaluations or steps * max(self.kind.stages, 1))
+        """Return the cost of a run in compiled evaluations of the forward dynamics, equal on every machine."""
+        compiled = self.info.kind == "native" or self.method.startswith("drake_") or self.engine == "lagrangian"
+        each = 1 if compiled and self.method not in _FROM_PYTHON else _PYTHON_CALL
+        return each * (evaluations or steps * max(self.info.stages, 1))
 
 
 def save_grid(duration: float) -> np.ndarray:
@@ -71,8 +72,8 @@ def plans(
     interval: float,
     steps: Sequence[float] | None,
     tolerances: Sequence[float] | None,
-) -> tuple[Plan, ...]:
-    """Return a plan for every engine's methods.
+) -> tuple[Settings, ...]:
+    """Return the settings for every engine's methods.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def plans(
     interval : float
         Time between two saved states, s, on which steps must end.
     steps, tolerances : sequences of float, optional
-        Asked for. A step is shortened so that a whole number of them is an interval; a
+        The caller's values. A step is shortened so that a whole number of them is an interval; a
         tolerance below a method's least is left out.
     """
     out = []
@@ -89,20 +90,19 @@ def plans(
         for name in names:
             method = METHODS[name]
             if method.kind == "adaptive":
-                given, asked = (tolerances, True) if tolerances is not None else (_tolerances(method), False)
-                values = tuple(sorted({float(x) for x in given if x >= method.least}, reverse=True))
-                out.append(Plan(engine, name, "rtol", values, asked))
+                wanted = _tolerances(method) if tolerances is None else tolerances
+                values = tuple(sorted({float(x) for x in wanted if x >= method.least}, reverse=True))
+                out.append(Settings(engine, name, "rtol", values, tolerances is not None))
             else:
-                given, asked = (steps, True) if steps is not None else (_steps(method, interval), False)
-                counts = sorted({max(1, int(np.ceil(interval / h * (1 - 1e-9)))) for h in given})
-                out.append(Plan(engine, name, "dt", tuple(interval / n for n in counts), asked))
+                wanted = _steps(method, interval) if steps is None else steps
+                counts = sorted({max(1, int(np.ceil(interval / h * (1 - 1e-9)))) for h in wanted})
+                out.append(Settings(engine, name, "dt", tuple(interval / n for n in counts), steps is not None))
     return tuple(out)
 
 
 def _tolerances(method: Method) -> tuple[float, ...]:
-    # A Taylor series is compiled anew for each order that a tolerance asks for.
-    decades = range(3, 16, 4 if method.name == "taylor" else 1)
-    return tuple(x for x in (float(f"1e-{k}") for k in decades) if x >= method.least)
+    # A Taylor series is compiled for each order that a tolerance needs.
+    return tuple(float(f"1e-{k}") for k in range(3, 16, 4 if method.name == "taylor" else 1))
 
 
 def _steps(method: Method, interval: float) -> tuple[float, ...]:
@@ -110,12 +110,6 @@ def _steps(method: Method, interval: float) -> tuple[float, ...]:
     coarsest = min(interval, _COARSEST)
     count = int(np.log(coarsest / (interval * INTERVALS * _FINEST)) / np.log(ratio)) + 1
     return tuple(coarsest / ratio**k for k in range(count))
-
-
-# Which methods are asked of which engines.
-
-#: Engines that can be measured.
-MEASURED: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
 
 
 def pairs(
@@ -132,42 +126,41 @@ def pairs(
     Raises
     ------
     InputError, UnknownNameError
-        What no engine is, or no method of it.
+        An unknown engine or method, or a method that the engine does not have.
     """
     names = names_of("engines", engines)
     for name in names:
         if name == OracleDynamics.engine:
-            raise InputError("engines: the oracle is what the others are measured by; leave it out")
+            raise InputError("engines: the oracle is the reference for the others and is not measured; leave it out")
         if name not in MEASURED:
             raise UnknownNameError("engine", name, MEASURED)
     if isinstance(methods, Mapping):
         for engine in methods:
             if engine not in names:
                 raise InputError(f"methods: {engine!r} is not among the engines {list(names)}")
-        asked = {engine: names_of(f"methods[{engine!r}]", methods[engine]) for engine in names if engine in methods}
-        if not asked:
+        wanted = {engine: names_of(f"methods[{engine!r}]", methods[engine]) for engine in names if engine in methods}
+        if not wanted:
             raise InputError("methods: expected the methods of at least one engine, got none")
-        for engine, own in asked.items():
+        for engine, own in wanted.items():
             for method in map(method_of, own):
                 if method.engines and engine not in method.engines:
                     raise InputError(
                         f"methods[{engine!r}]: {method.name} is not on {engine}; it is on {', '.join(method.engines)}"
                     )
     else:
-        given = tuple(METHODS) if methods is None else names_of("methods", methods)
-        asked = dict.fromkeys(names, given)
-    out = {e: tuple(m for m in ms if not method_of(m).engines or e in METHODS[m].engines) for e, ms in asked.items()}
-    # A method that none of the engines has was asked for in error.
-    for name in dict.fromkeys(m for ms in asked.values() for m in ms):
-        if methods is not None and not any(name in ms for ms in out.values()):
+        wanted = dict.fromkeys(names, tuple(METHODS) if methods is None else names_of("methods", methods))
+    out = {e: tuple(m for m in ms if not method_of(m).engines or e in METHODS[m].engines) for e, ms in wanted.items()}
+    available = {name for ms in out.values() for name in ms}
+    for name in dict.fromkeys(m for ms in wanted.values() for m in ms):
+        if methods is not None and name not in available:
             raise InputError(
-                f"methods: {name} is not on {' or '.join(asked)}; it is on {', '.join(METHODS[name].engines)}"
+                f"methods: {name} is not on {' or '.join(wanted)}; it is on {', '.join(METHODS[name].engines)}"
             )
     return out
 
 
 def names_of(what: str, given: object) -> tuple[str, ...]:
-    """Return names as a tuple, each once; `what` they are is for the message."""
+    """Return names as a tuple, each once; `what` begins the message of an error."""
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise InputError(f"{what}: expected several names, got {given!r}; write ({given!r},)")
     names = tuple(dict.fromkeys(given))

@@ -21,148 +21,30 @@ from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Keeper, Progress
 from mbkit.studies.compare.rollouts import free_of_mimic, start_state
-from mbkit.studies.results import model_info
-from mbkit.studies.work_precision.curve import Allowance, Alone, Scene, Shared, Sweeping
 from mbkit.studies.work_precision.reference import Reference
-from mbkit.studies.work_precision.reference import reference as known_motion
+from mbkit.studies.work_precision.reference import reference as compute_reference
 from mbkit.studies.work_precision.result import InterruptedSweepError, WorkPrecision
 from mbkit.studies.work_precision.settings import INTERVALS, pairs, plans, save_grid
+from mbkit.studies.work_precision.sweep import Problem, Sweep, TimeBudget
 
-__all__ = ["Exact", "scene_of", "work_precision"]
+__all__ = ["Exact", "work_precision"]
 
-
-# The motion that a study of run time is about, and what its errors are measured by.
-
-#: From a time to q and v there.
+#: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 
-#: A reference that starts farther than this from q0 and v0 is of another motion.
+#: A reference that starts farther than this from q0 and v0 belongs to another motion.
 _SAME_START: Final = 1e-9
 _EPS: Final = float(np.finfo(float).eps)
-
-
-def scene_of(
-    model: Model,
-    duration: float,
-    start: tuple[ArrayLike | None, ArrayLike | None],
-    torque: Any,
-    seed: int,
-    reference: Reference | Exact | None,
-    tell: Callable[[float], object],
-    seconds: float,
-) -> tuple[Scene, str]:
-    """Return what is integrated with its reference, and how the reference was made.
-
-    Parameters
-    ----------
-    model : Model
-    duration : float
-        Asked for, s.
-    start : (q0, v0)
-        None for the reference's own start, or one by `seed`.
-    torque : (nv,) array, callable or None
-    seed : int
-    reference : Reference, callable or None
-        None to search for one.
-    tell : callable
-        Gets the fraction of the search that is done.
-    seconds : float
-        What the search may take.
-
-    Raises
-    ------
-    InputError
-        A start or a reference of another model or motion.
-    NumericalError
-        No reference holds for even a hundredth of the duration.
-    """
-    tell(0.0)
-    q0, v0 = _start(model, start, seed, reference)
-    if reference is None:
-        made = _searched(model, q0, v0, duration, torque, seconds, tell)
-        times, q, floor, how = made.t, made.q, float(made.floor.max()), made.how
-    elif isinstance(reference, Reference):
-        made = reference
-        keep = made.t <= duration * (1 + 1e-12)
-        times, q, how = _multiples(made.t[keep]), made.q[keep], made.how
-        floor = float(made.floor[keep].max())
-    else:
-        times = save_grid(duration)
-        q = np.stack([_state(model, reference, t)[0] for t in times])
-        floor, how = 8 * _EPS * float(np.abs(q).max()), "an exact function, to rounding"
-    if q.shape != (len(times), model.nq):
-        raise InputError(f"reference: expected states of {model.nq} coordinates, got {q.shape}; it is of another model")
-    if float(np.abs(model.difference(q0, q[0])).max()) > _SAME_START:
-        raise InputError(
-            "reference: does not start at q0 (and v0); leave them out, or take the reference of this start"
-        )
-    return Scene(model, q0, v0, torque, times, q, floor), how
-
-
-def _start(
-    model: Model, start: tuple[ArrayLike | None, ArrayLike | None], seed: int, reference: Reference | Exact | None
-) -> tuple[Array, Array]:
-    own = start_state(model, seed)
-    known: tuple[Array, Array] | None = None
-    if isinstance(reference, Reference):
-        known = np.asarray(reference.q[0]), np.asarray(reference.v[0])
-    elif callable(reference):
-        known = _state(model, reference, 0.0)
-    elif reference is not None:
-        raise InputError(
-            f"reference: expected a Reference or a function from t to (q, v), got {type(reference).__name__}"
-        )
-    own = own if known is None else known
-    q, v = (mine if given is None else given for given, mine in zip(start, own, strict=True))
-    q0, v0 = model.check_q(q, "q0"), model.check_v(v, "v0")
-    if q0.ndim != 1 or v0.ndim != 1:
-        raise InputError(f"q0, v0: expected one state, got shapes {q0.shape} and {v0.shape}")
-    if known is not None and float(np.abs(v0 - known[1]).max()) > _SAME_START:
-        raise InputError("reference: does not start with v0; leave it out, or take the reference of this start")
-    return q0, v0
-
-
-def _state(model: Model, exact: Exact, t: float) -> tuple[Array, Array]:
-    try:
-        told = exact(float(t))
-    except Exception as error:
-        raise InputError(f"reference: the function raised {type(error).__name__} at t = {t:g} s: {error}") from error
-    if not isinstance(told, Sequence) or len(told) != 2:
-        raise InputError(f"reference: expected the function to return (q, v), got {told!r} at t = {t:g} s")
-    q = finite_array("reference's q", told[0], (model.nq,))
-    return q, finite_array("reference's v", told[1], (model.nv,))
-
-
-def _searched(
-    model: Model, q0: Array, v0: Array, duration: float, torque: Any, seconds: float, tell: Callable[[float], object]
-) -> Reference:
-    """Return a reference up to where it holds, or of a tenth of the time where it does not hold for that."""
-    for part in (duration, duration / INTERVALS):
-        made = known_motion(model, q0, v0, part, save_grid(part), torque, seconds=seconds, progress=tell)
-        if len(made.t) > 1:
-            return made
-    raise NumericalError(f"{model.name}: no reference holds for even {part / INTERVALS:g} s; {made.how}")
-
-
-def _multiples(times: Array) -> Array:
-    """Return a reference's times, if steps of equal length can end on all of them."""
-    if len(times) < 2 or np.abs(times / times[1] - np.rint(times / times[1])).max() > 1e-9:
-        raise InputError(
-            "reference: expected times that are 0 and multiples of the first after it, within the duration"
-        )
-    return times
-
-
-#: Seconds that a study usually takes, and what each velocity adds, up to the most.
+#: Seconds that a study usually takes: base, for each velocity, and at the most.
 _USUAL: Final = 60.0
-_EACH: Final = 10.0
-_MOST: Final = 120.0
-#: Times as long, a study that was given no time ends all the same.
-_AT_THE_LATEST: Final = 5.0
-#: Counted work of a run, for so many velocities; of more it is less, as each evaluation takes longer.
+_PER_VELOCITY: Final = 10.0
+_MAX_USUAL: Final = 120.0
+#: A study without `seconds` ends after this many times the usual time.
+_LATEST: Final = 5.0
+#: Counted work of a run up to so many velocities; it is less beyond, where an evaluation takes longer.
 _WORK: Final = 200_000
 _VELOCITIES: Final = 8
-#: The part of it that a reference may take.
+#: Part of the usual time for the search of a reference.
 _FOR_REFERENCE: Final = 0.25
 _ALONE: Final = "interleaved in one process"
 _TOGETHER: Final = "by workers that share the cores: errors are the same, run times are not those of a quiet machine"
@@ -193,51 +75,51 @@ def work_precision(
     Parameters
     ----------
     model : Model
-        With mimic joints, and MuJoCo's own integrators among the methods, these joints
-        are free: MuJoCo would make them soft.
+        Its mimic joints are free where MuJoCo's own integrators are among the methods: MuJoCo
+        would make them soft.
     engines : sequence of str
     methods : sequence of str, or mapping of str to sequence of str, optional
         Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by
         default every method on every engine that has it.
     duration : float
-        Horizon, s; cut where the reference stops holding, or the one given ends.
+        Horizon, s; cut where the reference ends.
     q0 : (nq,) array_like, optional
     v0 : (nv,) array_like, optional
-        Where the motion starts; by default near the middle of the joints' ranges,
-        moving gently, by `seed`, or where `reference` does.
+        Start; by default that of `reference`, or a slow motion near the middle of the joints'
+        ranges, chosen by `seed`.
     torque : (nv,) array_like or callable, optional
-        Generalized force, held all the time, or a function of (t, q, v).
+        Generalized force, constant, or a function of (t, q, v).
     seed : int
     steps : sequence of float, optional
         Of fixed-step methods, s, each shortened so that a whole number of them is a tenth of
-        the horizon. By default from 0.05 s downwards, as far as it pays.
+        the horizon. By default from 0.05 s downwards until the error no longer falls.
     tolerances : sequence of float, optional
         rtol = atol of adaptive methods; by default from 1e-3 downwards. Those below a
         method's least are left out.
     repeats : int
-        Timings of each setting, in rounds over all of them; fewer of long ones where
+        Timings of each setting, in rounds over all of them; fewer of long runs where
         time is short.
     seconds : float, optional
-        What the study may take of the processor's time at the most, the reference and all compiling included.
-        What is left out for that is told first, in the repr and the reports. Nothing that is being compiled is
-        broken off, and a part is always left to the runs. When not given, `work` alone decides on the settings,
-        and five times the usual 60 to 120 s end the study of a model that takes too long to derive.
+        Limit of processor time, with the reference and all compilation. What is left out for it is
+        named first in the repr and the reports. A compilation is never broken off, and a part is always
+        left to the runs. By default `work` alone decides on the settings, and the study ends after five times
+        the usual 60 to 120 s.
     work : int, optional
-        Evaluations of the forward dynamics that a run of the study's own steps and tolerances may take; one
-        that is called from Python counts eight. So the curves do not depend on the machine's speed. By default
-        200,000, and less beyond 8 velocities.
+        Limit of evaluations of the forward dynamics in a run with the study's own steps and tolerances; an
+        evaluation called from Python counts eight. So the curves do not depend on the machine's speed. By
+        default 200,000, and less beyond 8 velocities.
     executor : concurrent.futures.Executor, optional
-        Who measures, a curve each: a pool of processes, Dask's or MPI's. Errors do not
-        depend on it. Run times do: workers share the cores, and each has the time
-        allowed for one curve, so leave it out for run times to rely on.
+        Measures one curve a call: a pool of processes, Dask's or MPI's. Errors do not
+        depend on it. Run times do, because workers share the cores: leave it out for reliable run
+        times.
     reference : Reference or callable, optional
-        The motion itself: of `mbkit.studies.work_precision.reference`, whose times are then the saved
-        ones, or an exact function from t to (q, v). By default made here.
+        The motion: from `mbkit.studies.work_precision.reference`, whose times are then the saved
+        ones, or an exact function from t to (q, v). By default it is computed.
     progress : callable, optional
-        Called as ``progress(fraction, text)``. What it raises ends the study, after
-        `checkpoint` has got what was finished.
+        Called as ``progress(fraction, text)``. Its exception ends the study, after
+        `checkpoint` has got the finished part.
     checkpoint : path or callable, optional
-        Where the result so far goes every few seconds and at the end: a JSON file, which is
+        Receives the result so far every few seconds and at the end: a JSON file, which is
         whole at any time, or a function.
 
     Returns
@@ -247,26 +129,25 @@ def work_precision(
     Raises
     ------
     InputError, UnknownNameError
-        For unusable arguments. What an engine or method cannot do is in `refusals`.
+        Unusable arguments. The limits of an engine or method are in `refusals`.
     UnsupportedError
-        A reference is searched, and the model has loops or prescribed motions, which engines do not take.
+        Without `reference`, the model has loops or prescribed motions, which engines do not support.
     NumericalError
-        No two ways to compute this motion agree even at its beginning.
+        No two computations of this motion agree even at its beginning.
     InterruptedSweepError
-        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is what was finished, which
-        `checkpoint` has got before. It is a plain one while there is no reference yet.
+        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is the finished part, which
+        `checkpoint` has got before. While the reference is computed, a plain `KeyboardInterrupt`.
 
     Notes
     -----
     An error is the largest difference of q to the reference, on the manifold, over
-    eleven times and all coordinates. What is timed is `mbkit.simulate` on the same run,
-    as a user would call it, saving these eleven states (SciPy's methods end a step on
-    each, so they take ten at the least). Everything that belongs to the model is
-    first derived, compiled and built from nothing, whatever the caches hold, and that
-    is timed apart. Then all settings are run once, the cheapest next run of all curves
-    first, until finer settings bring nothing or would take too much work, and then timed
-    in rounds over all of them, each round in another order. The observed order is
-    taken as `mbkit.studies.work_precision.curve` says.
+    eleven times and all coordinates. Timed is `mbkit.simulate` on the same run, as a user
+    would call it, saving these eleven states (SciPy's methods end a step on
+    each, so they take ten at the least). First everything that belongs to the model is
+    derived, compiled and built with empty caches, timed apart. Then all settings are run
+    once, the cheapest next run of all curves first, until finer settings bring no smaller
+    error or would take too much work. Then they are timed in rounds, each round in another
+    order. For the observed order see `mbkit.studies.work_precision.curve.observed_order`.
 
     A script that hands over a pool of processes needs ``if __name__ == "__main__":``,
     and the pool a context that does not fork, such as
@@ -283,76 +164,74 @@ def work_precision(
     """
     begun = time.perf_counter()
     _check_model(model)
-    usual = min(_USUAL + _EACH * model.nv, _MOST)
-    limit = _AT_THE_LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
+    usual = min(_USUAL + _PER_VELOCITY * model.nv, _MAX_USUAL)
+    limit = _LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
     most = _WORK * min(1.0, _VELOCITIES / model.nv) if work is None else count("work", work, least=1)
-    allowance = Allowance(limit, min(usual, limit), most)
+    budget = TimeBudget(limit, min(usual, limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     _check_executor(executor, torque)
     keeper = Keeper(progress, checkpoint)
-    wanted_pairs = pairs(engines, methods)
-    moving = _moving(model, wanted_pairs)
+    methods_of = pairs(engines, methods)
+    integrated = _integrated_model(model, methods_of)
     asked = real("duration", duration, positive=True)
-    grids = _grid("steps", steps), _grid("tolerances", tolerances)
-    scene, how = scene_of(
-        moving,
-        asked,
-        (q0, v0),
-        _torque(torque, moving),
-        seed,
-        reference,
-        lambda done: keeper.tell(0.1 * done, "reference"),
-        _FOR_REFERENCE * allowance.usual,
-    )
-    if scene.motion == 0.0:
+    steps, tolerances = _positive_numbers("steps", steps), _positive_numbers("tolerances", tolerances)
+    force = _constant_torque(torque, integrated)
+    keeper.tell(0.0, "reference")
+    start = _start(integrated, (q0, v0), seed, reference)
+    if reference is None:
+        reference = _computed_reference(
+            integrated,
+            *start,
+            asked,
+            force,
+            _FOR_REFERENCE * budget.usual,
+            lambda done: keeper.tell(0.1 * done, "reference"),
+        )
+    problem, how = _problem(integrated, start, force, asked, reference)
+    if problem.motion == 0.0:
         raise InputError(
             "q0, v0: expected a start from which something moves, got one at rest in equilibrium, where every method "
             "is exact; choose another start"
         )
-    wanted = plans(wanted_pairs, float(scene.times[1]), *grids)
-    sweeping: Sweeping
-    if executor is None:
-        sweeping = Alone(scene, wanted, repeats, seed, allowance)
-    else:
-        sweeping = Shared(executor, scene, wanted, repeats, seed, allowance)
-    facts = model_info(moving)
-    if moving is not model and model.layout.reduced:
+    settings = plans(methods_of, float(problem.times[1]), steps, tolerances)
+    sweep = Sweep(problem, settings, repeats, seed, budget, executor)
+    facts = results.model_info(integrated)
+    if integrated is not model and model.layout.reduced:
         facts["notes"] = [*facts["notes"], "mimic joints free"]
-    settings = {
-        "seed": seed,
-        "repeats": repeats,
-        "allowed": allowance.seconds,
-        "work": allowance.work,
-        "steps": grids[0],
-        "tolerances": grids[1],
-        "torque": "function" if callable(scene.torque) else None if scene.torque is None else scene.torque.tolist(),
-        "saved": scene.times.tolist(),
-        "executor": None if executor is None else type(executor).__name__,
-        "timing": _ALONE if executor is None else _TOGETHER,
-    }
 
     def result(*, complete: bool) -> WorkPrecision:
-        found = sweeping.found()
+        outcomes = sweep.outcomes()
         return WorkPrecision(
             model=model.name,
             facts=facts,
-            duration=scene.duration,
+            duration=problem.duration,
             asked=asked,
             reference=how,
-            floor=scene.floor,
-            q0=tuple(scene.q0.tolist()),
-            v0=tuple(scene.v0.tolist()),
-            curves=tuple(curve for curve, _ in found if curve is not None),
-            refusals=tuple(refusal for _, refusal in found if refusal is not None),
+            floor=problem.floor,
+            q0=tuple(problem.q0.tolist()),
+            v0=tuple(problem.v0.tolist()),
+            curves=tuple(curve for curve, _ in outcomes if curve is not None),
+            refusals=tuple(refusal for _, refusal in outcomes if refusal is not None),
             complete=complete,
             versions=results.versions(),
             processor=results.processor(),
             seconds=time.perf_counter() - begun,
-            settings=settings,
+            settings={
+                "seed": seed,
+                "repeats": repeats,
+                "allowed": budget.seconds,
+                "work": budget.work,
+                "steps": steps,
+                "tolerances": tolerances,
+                "torque": "function" if callable(force) else None if force is None else force.tolist(),
+                "saved": problem.times.tolist(),
+                "executor": None if executor is None else type(executor).__name__,
+                "timing": _ALONE if executor is None else _TOGETHER,
+            },
         )
 
     try:
-        for fraction, text in sweeping.steps():
+        for fraction, text in sweep.steps():
             keeper.tell(0.1 + 0.9 * fraction, text)
             keeper.now_and_then(partial(result, complete=False))
         whole = result(complete=True)
@@ -361,12 +240,79 @@ def work_precision(
         keeper.keep(part)
         raise InterruptedSweepError(part) from None
     except Exception:
-        # A progress function's, or a fault: what was finished is not lost with it.
+        # An error of a progress function, or a fault: the finished part is not lost.
         keeper.keep(result(complete=False))
         raise
     keeper.keep(whole)
     keeper.tell(1.0, "done")
     return whole
+
+
+def _start(
+    model: Model, start: tuple[ArrayLike | None, ArrayLike | None], seed: int, reference: Reference | Exact | None
+) -> tuple[Array, Array]:
+    known: tuple[Array, Array] | None = None
+    if isinstance(reference, Reference):
+        known = np.asarray(reference.q[0]), np.asarray(reference.v[0])
+    elif callable(reference):
+        known = _exact_state(model, reference, 0.0)
+    elif reference is not None:
+        raise InputError(
+            f"reference: expected a Reference or a function from t to (q, v), got {type(reference).__name__}"
+        )
+    default = start_state(model, seed) if known is None else known
+    q, v = (usual if own is None else own for own, usual in zip(start, default, strict=True))
+    q0, v0 = model.check_q(q, "q0"), model.check_v(v, "v0")
+    if q0.ndim != 1 or v0.ndim != 1:
+        raise InputError(f"q0, v0: expected one state, got shapes {q0.shape} and {v0.shape}")
+    if known is not None and float(np.abs(v0 - known[1]).max()) > _SAME_START:
+        raise InputError("reference: does not start with v0; leave v0 out, or use the reference of this start")
+    return q0, v0
+
+
+def _exact_state(model: Model, exact: Exact, t: float) -> tuple[Array, Array]:
+    try:
+        state = exact(float(t))
+    except Exception as error:
+        raise InputError(f"reference: the function raised {type(error).__name__} at t = {t:g} s: {error}") from error
+    if not isinstance(state, Sequence) or len(state) != 2:
+        raise InputError(f"reference: expected the function to return (q, v), got {state!r} at t = {t:g} s")
+    q = finite_array("reference's q", state[0], (model.nq,))
+    return q, finite_array("reference's v", state[1], (model.nv,))
+
+
+def _computed_reference(
+    model: Model, q0: Array, v0: Array, duration: float, torque: Any, seconds: float, progress: Callable[[float], None]
+) -> Reference:
+    """Return a reference as far as it holds; search again over a tenth of the time if it holds nowhere."""
+    for part in (duration, duration / INTERVALS):
+        out = compute_reference(model, q0, v0, part, save_grid(part), torque, seconds=seconds, progress=progress)
+        if len(out.t) > 1:
+            return out
+    raise NumericalError(f"{model.name}: no reference holds for even {part / INTERVALS:g} s; {out.how}")
+
+
+def _problem(
+    model: Model, start: tuple[Array, Array], torque: Any, duration: float, reference: Reference | Exact
+) -> tuple[Problem, str]:
+    """Return the problem up to where its reference holds, and how the reference was computed."""
+    if isinstance(reference, Reference):
+        keep = reference.t <= duration * (1 + 1e-12)
+        times, q, how = reference.t[keep], reference.q[keep], reference.how
+        floor = float(reference.floor[keep].max())
+        if len(times) < 2 or np.abs(times / times[1] - np.rint(times / times[1])).max() > 1e-9:
+            raise InputError(
+                "reference: expected times that are 0 and multiples of the first after it, within the duration"
+            )
+    else:
+        times = save_grid(duration)
+        q = np.stack([_exact_state(model, reference, t)[0] for t in times])
+        floor, how = 8 * _EPS * float(np.abs(q).max()), "an exact function, to rounding"
+    if q.shape != (len(times), model.nq):
+        raise InputError(f"reference: expected states of {model.nq} coordinates, got {q.shape}; it is of another model")
+    if float(np.abs(model.difference(start[0], q[0])).max()) > _SAME_START:
+        raise InputError("reference: does not start at q0 (and v0); leave them out, or use the reference of this start")
+    return Problem(model, *start, torque, times, q, floor), how
 
 
 def _check_executor(executor: Executor | None, torque: object) -> None:
@@ -375,7 +321,7 @@ def _check_executor(executor: Executor | None, torque: object) -> None:
     if not isinstance(executor, Executor):
         raise InputError(
             f"executor: expected a concurrent.futures.Executor, got {type(executor).__name__}; "
-            "a ProcessPoolExecutor is one, and so is what Dask's client.get_executor() returns"
+            "use a ProcessPoolExecutor, or the result of Dask's client.get_executor()"
         )
     if isinstance(executor, ProcessPoolExecutor):
         try:
@@ -393,15 +339,15 @@ def _check_model(model: Model) -> None:
     model.require_values("a study of run time")
 
 
-def _moving(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
-    """Return the model that all integrate."""
+def _integrated_model(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
+    """Return the model with parameters as numbers, and mimic joints free where MuJoCo's own integrators run."""
     if model.parameters:
         model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
     native = any(METHODS[m].kind == "native" for ms in pairs.values() for m in ms)
     return free_of_mimic(model) if model.layout.reduced and native else model
 
 
-def _torque(torque: ArrayLike | TorqueFunction | None, model: Model) -> Any:
+def _constant_torque(torque: ArrayLike | TorqueFunction | None, model: Model) -> Any:
     if torque is None or callable(torque):
         return torque
     try:
@@ -417,7 +363,7 @@ def _torque(torque: ArrayLike | TorqueFunction | None, model: Model) -> Any:
     return finite_array("torque", torque, (model.nv,))
 
 
-def _grid(name: str, values: Sequence[float] | None) -> tuple[float, ...] | None:
+def _positive_numbers(name: str, values: Sequence[float] | None) -> tuple[float, ...] | None:
     if values is None:
         return None
     if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):

@@ -1,0 +1,582 @@
+"""The measurement of work-precision curves: coarse settings first, then finer ones, then timings in rounds."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit._fork import fork_safe
+from mbkit.catalog import pendulum
+from mbkit.codegen.disk_cache import anew
+from mbkit.engines import Dynamics, dynamics
+from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.model import Model
+from mbkit.simulate import Trajectory
+from mbkit.studies._processes import run
+from mbkit.studies.compare.rollouts import TooLongError, patience, quiet_simulate
+from mbkit.studies.results import Refusal
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
+from mbkit.studies.work_precision.settings import Settings
+
+__all__ = ["CurveMeasurement", "Problem", "Sweep", "TimeBudget", "first_run", "repetitions"]
+
+OUT_OF_TIME: Final = "not run: the time allowed was used up"
+#: A run shorter than this is repeated within a round, s.
+_SHORT: Final = 2e-3
+_MAX_IN_A_ROUND: Final = 100
+#: Settings in a row that bring no smaller error, after which a sweep over the study's own grid ends.
+_MAX_WITHOUT_GAIN: Final = 2
+#: A setting is finer if it takes so many times the steps: a decade of a tolerance is 1.33 at order 8.
+_FINER: Final = 1.2
+#: Larger errors may still fall again, as those of steps that are too large do.
+_CONVERGED: Final = 1e-6
+#: Parts of the time allowed until which compilation may begin, and until which every setting has run once.
+_COMPILED: Final = 0.5
+_EXPLORED: Final = 0.65
+#: Part of the time that each phase has at the least, however long the phases before took.
+_MIN_PART: Final = 0.2
+
+
+# The first run: derivation, compilation and construction.
+
+#: The state of heyoka's switch at each entry of the block: it is one switch for all threads.
+_HEYOKA_BEFORE: Final[list[bool]] = []
+_HEYOKA_LOCK: Final = fork_safe(threading.RLock())
+
+
+def first_run(model: Model, engine: str, method: str, start: Callable[[Dynamics], Any]) -> tuple[Dynamics, float]:
+    """Return an engine that has run a method once, and the seconds of that beyond the run itself.
+
+    Everything that belongs to the model is derived, compiled and built, whatever the caches in memory and on disk
+    hold. Imports, and what is the same for every model, are done before the clock starts.
+
+    Parameters
+    ----------
+    model : Model
+    engine, method : str
+    start : callable
+        Runs the method briefly on the engine.
+    """
+    _import_for(engine, method)
+    with _empty_caches():
+        begun = time.perf_counter()
+        dyn = dynamics(model, engine)
+        start(dyn)
+        cold = time.perf_counter() - begun
+    begun = time.perf_counter()
+    start(dyn)
+    return dyn, max(0.0, cold - (time.perf_counter() - begun))
+
+
+@cache
+def _import_for(engine: str, method: str) -> None:
+    with contextlib.suppress(MbkitError):
+        quiet_simulate(dynamics(pendulum(), engine), [0.1], [0.0], 1e-3, method, save=[1e-3])
+
+
+@contextlib.contextmanager
+def _empty_caches() -> Iterator[None]:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(anew())
+        if "heyoka" in sys.modules:
+            stack.enter_context(_without_heyoka_cache())
+        yield
+
+
+@contextlib.contextmanager
+def _without_heyoka_cache() -> Iterator[None]:
+    from heyoka import llvm_state
+
+    # Older versions have no cache on disk.
+    if not hasattr(llvm_state, "set_diskcache_enabled"):
+        llvm_state.clear_memcache()
+        yield
+        return
+    with _HEYOKA_LOCK:
+        _HEYOKA_BEFORE.append(llvm_state.get_diskcache_enabled())
+        llvm_state.set_diskcache_enabled(False)
+    llvm_state.clear_memcache()
+    try:
+        yield
+    finally:
+        with _HEYOKA_LOCK:
+            before = _HEYOKA_BEFORE.pop()
+            # The last thread to leave restores what the first one saw.
+            if not _HEYOKA_BEFORE:
+                llvm_state.set_diskcache_enabled(before)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The initial value problem that every method solves, and its reference.
+
+    Attributes
+    ----------
+    model : Model
+    q0, v0 : (nq,), (nv,) arrays
+    torque : (nv,) array, callable or None
+    times : (K,) array
+        From 0 to the horizon, s.
+    q : (K, nq) array
+        The reference there.
+    floor : float
+        How well it is known.
+    """
+
+    model: Model
+    q0: Array
+    v0: Array
+    torque: Any
+    times: Array
+    q: Array
+    floor: float
+
+    @property
+    def duration(self) -> float:
+        """The horizon, s."""
+        return float(self.times[-1])
+
+    @property
+    def motion(self) -> float:
+        """The farthest that any coordinate gets from the start."""
+        return float(np.abs(self.model.difference(np.broadcast_to(self.q[0], self.q.shape), self.q)).max())
+
+    def solve(self, dyn: Dynamics, settings: Settings, value: float, limit: float | None = None) -> Trajectory:
+        """Integrate to the horizon; give up after `limit` seconds."""
+        return self._simulate(dyn, settings, value, self.duration, self.times, limit)
+
+    def start(self, dyn: Dynamics, settings: Settings, value: float) -> Trajectory:
+        """Integrate one step, or a thousandth of an interval."""
+        duration = value if settings.setting == "dt" else 1e-3 * float(self.times[1])
+        return self._simulate(dyn, settings, value, duration, np.array([duration]), None)
+
+    def _simulate(
+        self, dyn: Dynamics, settings: Settings, value: float, duration: float, save: Array, limit: float | None
+    ) -> Trajectory:
+        setting: dict[str, Any] = {settings.setting: value, "torque": self.torque, "save": save}
+        progress = None if limit is None else patience(limit)
+        return quiet_simulate(dyn, self.q0, self.v0, duration, settings.method, progress=progress, **setting)
+
+    def error(self, run: Trajectory) -> float:
+        """Return the largest difference to the reference over times and coordinates."""
+        return float(np.abs(self.model.difference(self.q, run.q)).max())
+
+    def energy_drift(self, dyn: Dynamics, run: Trajectory) -> float:
+        """Return the drift of the energy, relative to the larger of T and of the change of V.
+
+        NaN with dampers, applied forces or explicit time: the saved states are too few to know their work as
+        well as the methods are good.
+        """
+        if self.torque is not None or self.model.needs.damping or self.model.clock is not None:
+            return math.nan
+        kinetic = 0.5 * np.einsum("ni,nij,nj->n", run.v, dyn.mass_matrix(run.q), run.v)
+        potential = dyn.potential_energy(run.q)
+        if self.model.written is not None:
+            # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
+            potential = potential - dyn.kinetic_energy(run.q, 0 * run.v)
+        drift = np.abs((kinetic - kinetic[0]) + (potential - potential[0])).max()
+        size = max(float(kinetic.max()), float(np.ptp(potential)))
+        return float(drift) / size if size > 0 else math.nan
+
+
+@dataclass
+class _Run:
+    """One setting: its result, the seconds of the first run and of preparing it, and the timings."""
+
+    value: float
+    first: float = math.nan
+    preparation: float = 0.0
+    error: float = math.nan
+    energy: float = math.nan
+    steps: int = 0
+    evaluations: int = 0
+    note: str = ""
+    times: list[float] = field(default_factory=list)
+
+
+class CurveMeasurement:
+    """The measurement of one curve.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : Settings
+
+    Attributes
+    ----------
+    refusal : Refusal or None
+        Why the engine and method have no further points.
+    """
+
+    def __init__(self, problem: Problem, settings: Settings) -> None:
+        self.problem, self.settings = problem, settings
+        self.refusal: Refusal | None = None
+        self._left = list(settings.values)
+        self._runs: list[_Run] = []
+        self._dyn: Dynamics | None = None
+        self._compile = math.nan
+        #: The last run, which is not among `_runs` if it took the same steps as the one before.
+        self._last: _Run | None = None
+        self._ended = ""
+        if not self._left:
+            self._refuse(f"takes no tolerance below {settings.info.least:.3g}, and every tolerance given is smaller")
+
+    @property
+    def over(self) -> bool:
+        """Whether no setting is left to run."""
+        return not self._left
+
+    @property
+    def expected(self) -> float:
+        """Estimated seconds of the next run; 0 before the first."""
+        return 0.0 if self._last is None else self._last.first * self._growth(self._last)
+
+    @property
+    def expected_with_preparation(self) -> float:
+        """Estimated seconds of the next run with what is compiled for it."""
+        return self.expected + (self._last.preparation if self._last else 0.0)
+
+    @property
+    def work(self) -> float:
+        """Estimated counted work of the next run; 0 before the first."""
+        last = self._last
+        return 0.0 if last is None else self.settings.work(last.steps, last.evaluations) * self._growth(last)
+
+    def _growth(self, last: _Run) -> float:
+        finer = last.value / self._left[0]
+        # A method of order p takes finer**(1/p) times the steps; 2 per decade is p = 3.
+        return finer if self.settings.setting == "dt" else float(finer**0.3)
+
+    def compile(self) -> None:
+        """Derive, compile and build, timed."""
+        # Where the code depends on the tolerance, the middle one stands for all.
+        value = self._left[len(self._left) // 2]
+        with self._refusing():
+            self._dyn, self._compile = first_run(
+                self.problem.model,
+                self.settings.engine,
+                self.settings.method,
+                lambda dyn: self.problem.start(dyn, self.settings, value),
+            )
+
+    def run_next(self, limit: float) -> None:
+        """Run the next setting; give up after `limit` seconds."""
+        one = _Run(self._left.pop(0))
+        with self._refusing():
+            self._run(one, limit)
+            before, self._last = self._last, one
+            # Coarse tolerances that lead to the same steps are one point.
+            if before is None or self.settings.required or not _same_steps(before, one):
+                self._runs.append(one)
+            if not self.settings.required and self._no_gain():
+                self._left = []
+
+    def _run(self, one: _Run, limit: float) -> None:
+        assert self._dyn is not None
+        begun = time.perf_counter()
+        try:
+            self.problem.start(self._dyn, self.settings, one.value)
+            one.preparation, begun = time.perf_counter() - begun, time.perf_counter()
+            run = self.problem.solve(self._dyn, self.settings, one.value, limit)
+        except UnsupportedError:
+            raise
+        except MbkitError as error:
+            one.first, one.note = time.perf_counter() - begun, str(error)
+            if isinstance(error, TooLongError) and not self.settings.required:
+                self.end(one.note)
+            return
+        one.first = time.perf_counter() - begun
+        one.steps, one.evaluations = run.stats.steps, run.stats.evaluations
+        if not run.stats.finished or len(run.t) != len(self.problem.times):
+            one.note = run.stats.message or f"ended at t = {run.t[-1]:g} s"
+            return
+        one.error = self.problem.error(run)
+        try:
+            one.energy = self.problem.energy_drift(self._dyn, run)
+        except MbkitError as error:
+            one.note = f"no energy: {error}"
+
+    def _no_gain(self) -> bool:
+        """Return whether the last settings brought no smaller error: at the reference's floor, or at rounding."""
+        # Steps that end on the saved times can be shorter than a coarse tolerance needs: of settings that hardly
+        # add a step, only the first shows whether finer ones help.
+        counted = self._runs[:1]
+        for one in self._runs[1:]:
+            if not one.error > self.problem.floor or one.steps >= _FINER * counted[-1].steps:
+                counted.append(one)
+        errors = [one.error for one in counted]
+        before, last = errors[:-_MAX_WITHOUT_GAIN], errors[-_MAX_WITHOUT_GAIN:]
+        finite = [e for e in before if math.isfinite(e)]
+        if not finite or min(finite) > _CONVERGED:
+            return False
+        floor = self.problem.floor
+        return all(not e < max(0.5 * min(finite), floor) or e <= floor for e in last)
+
+    def give_up(self, reason: str) -> None:
+        """End here; settings that the caller chose are reported with the reason why they were not run."""
+        if self.settings.required:
+            self._runs += [_Run(value, note=reason) for value in self._left]
+        elif not self._runs and self.refusal is None:
+            self._refuse(reason)
+        self.end(reason)
+
+    def end(self, reason: str) -> None:
+        """Run no finer setting, for this reason."""
+        self._left, self._ended = [], reason
+
+    @contextlib.contextmanager
+    def _refusing(self) -> Iterator[None]:
+        """Turn any error into the refusal of this curve, so that no other curve is lost."""
+        try:
+            yield
+        except Exception as error:  # engines raise errors of many kinds
+            self._refuse(str(error) if isinstance(error, MbkitError) else f"{type(error).__name__}: {error}")
+
+    def _refuse(self, reason: str) -> None:
+        name = self.settings.engine
+        self.refusal = Refusal(name, self.settings.method, reason.removeprefix(f"{name}: "))
+        self._left = []
+
+    def repeatable(self) -> list[tuple[float, Callable[[], None]]]:
+        """Return the runs that are worth timing again: seconds of each, and how to repeat it."""
+        return [(one.first, partial(self._repeat, one)) for one in self._runs if math.isfinite(one.error)]
+
+    def _repeat(self, one: _Run) -> None:
+        assert self._dyn is not None
+        count = int(np.clip(_SHORT / max(one.first, 1e-9), 1, _MAX_IN_A_ROUND))
+        begun = time.perf_counter()
+        for _ in range(count):
+            self.problem.solve(self._dyn, self.settings, one.value)
+        one.times.append((time.perf_counter() - begun) / count)
+
+    def curve(self) -> Curve | None:
+        """Return the curve so far, None without any point."""
+        if not self._runs:
+            return None
+        settings, problem = self.settings, self.problem
+        fixed = settings.setting == "dt"
+        order = observed_order(
+            [one.value for one in self._runs] if fixed else [],
+            [one.error for one in self._runs] if fixed else [],
+            floor=problem.floor,
+            motion=problem.motion,
+        )
+        return Curve(
+            settings.engine,
+            settings.method,
+            tuple(self._point(one) for one in self._runs),
+            order.order,
+            order.points,
+            float(settings.info.order) if fixed and settings.info.order is not None else math.nan,
+            compile=self._compile,
+            ended=self._ended,
+        )
+
+    def _point(self, one: _Run) -> PrecisionPoint:
+        # The first run counts only if it was not repeated.
+        times = one.times or [one.first]
+        low, median, high = np.percentile(times, [25, 50, 75])
+        return PrecisionPoint(
+            setting=self.settings.setting,
+            value=one.value,
+            error=one.error,
+            energy=one.energy,
+            seconds=float(median),
+            spread=float(high - low) / 2 if len(times) > 1 else math.nan,
+            steps=one.steps,
+            evaluations=one.evaluations,
+            repeats=len(times) if math.isfinite(times[0]) else 0,
+            note=one.note,
+        )
+
+
+def _same_steps(a: _Run, b: _Run) -> bool:
+    both = math.isfinite(a.error) and math.isfinite(b.error)
+    return both and 0 < a.evaluations == b.evaluations and a.steps == b.steps
+
+
+def repetitions(seconds: Sequence[float], most: int, budget: float) -> list[int]:
+    """Return how many times to repeat runs of these lengths within a budget, at most `most` each.
+
+    Examples
+    --------
+    >>> repetitions([0.1, 0.1, 5.0], most=5, budget=4.0)
+    [5, 5, 0]
+    >>> repetitions([0.1, 1.0, 1.0], most=5, budget=4.5)
+    [5, 2, 2]
+    """
+    counts, left = [0] * len(seconds), max(budget, 0.0)
+    by_length = sorted(range(len(seconds)), key=lambda i: seconds[i])
+    for k, i in enumerate(by_length):
+        counts[i] = min(most, int(left / (len(by_length) - k) / seconds[i] * (1 + 1e-9)))
+        left -= counts[i] * seconds[i]
+    return counts
+
+
+@dataclass(frozen=True)
+class TimeBudget:
+    """What a sweep may take, in seconds of the processor: other load on the machine ends no sweep.
+
+    Attributes
+    ----------
+    seconds : float
+        After which nothing is begun, counted from `begun`.
+    usual : float
+        After which runs are not timed again.
+    work : float
+        Counted work of a run with the study's own settings; see `Settings.work`.
+    clock : callable
+        Seconds, by default of the processor.
+    """
+
+    seconds: float
+    usual: float
+    work: float
+    clock: Callable[[], float] = field(default_factory=lambda: time.process_time)
+    begun: float = math.nan
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.begun):
+            object.__setattr__(self, "begun", self.clock())
+
+    def until(self, part: float, least: float = 0.0) -> float:
+        """Return when a part of `seconds` is over, leaving at least the part `least` from now on."""
+        return max(self.begun + part * self.seconds, self.clock() + least * self.seconds)
+
+    def timed_until(self) -> float:
+        """Return when timing ends, leaving a least part of the usual time from now on."""
+        return max(self.begun + self.usual, self.clock() + _MIN_PART * self.usual)
+
+
+#: A curve, and why it has no further points.
+Outcome = tuple[Curve | None, Refusal | None]
+
+
+class Sweep:
+    """The measurement of all curves: interleaved in this process, or one curve a call of an executor.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : sequence of Settings
+        One for each curve.
+    repeats, seed : int
+    budget : TimeBudget
+    executor : concurrent.futures.Executor, optional
+        Then each curve has its part of the time, however many run side by side.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        settings: Sequence[Settings],
+        repeats: int,
+        seed: int,
+        budget: TimeBudget,
+        executor: Executor | None = None,
+    ) -> None:
+        self._problem, self._settings, self._executor = problem, settings, executor
+        self._repeats, self._seed, self._budget = repeats, seed, budget
+        self._curves = [] if executor else [CurveMeasurement(problem, one) for one in settings]
+        self._answers: dict[int, Outcome] = {}
+
+    def outcomes(self) -> list[Outcome]:
+        """Return the curves and refusals so far."""
+        if self._executor:
+            return [self._answers.get(i, (None, None)) for i in range(len(self._settings))]
+        return [(one.curve(), one.refusal) for one in self._curves]
+
+    def steps(self) -> Iterator[tuple[float, str]]:
+        """Measure; after each small step yield the fraction done and a text."""
+        return self._in_executor(self._executor) if self._executor else self._here()
+
+    def _here(self) -> Iterator[tuple[float, str]]:
+        clock, until = self._budget.clock, self._budget.until(_COMPILED, _MIN_PART)
+        # Jacobians and series take longest to derive; they come last, so that the others have their time.
+        for k, one in enumerate(sorted(self._curves, key=_derivation_cost)):
+            yield 0.2 * k / len(self._curves), f"compiling {one.settings.method} on {one.settings.engine}"
+            if k and clock() > until:
+                one.give_up(OUT_OF_TIME)
+            elif not one.over:
+                one.compile()
+        begun = clock()
+        for one in self._coarse_to_fine(self._budget.until(_EXPLORED, _MIN_PART)):
+            # Costs grow geometrically, so the root of the time shows the progress.
+            done = ((clock() - begun) / (_EXPLORED * self._budget.usual)) ** 0.5
+            yield 0.2 + 0.4 * min(done, 1.0), f"{one.settings.method} on {one.settings.engine}"
+        yield 0.6, "timing"
+        for k in self._repeat(self._budget.timed_until()):
+            yield 0.6 + 0.4 * (k + 1) / self._repeats, f"timing, round {k + 1} of {self._repeats}"
+
+    def _coarse_to_fine(self, until: float) -> Iterator[CurveMeasurement]:
+        """Run each setting once, the cheapest next run of all curves first; begin none that would not end in time."""
+        while going := [one for one in self._curves if not one.over]:
+            one = min(going, key=lambda x: x.expected)
+            left = until - self._budget.clock()
+            if one.expected_with_preparation > left:
+                for other in going:
+                    other.give_up(OUT_OF_TIME)
+                return
+            if one.work > self._budget.work and not one.settings.required:
+                one.end("")
+                continue
+            # The estimate may be wrong: one run must not take all that is left.
+            one.run_next(limit=float(f"{max(left / 4, 2 * one.expected, 0.1):.2g}"))
+            yield one
+
+    def _repeat(self, until: float) -> Iterator[int]:
+        """Time every setting in rounds, each in another order, so that drifts of the machine meet all runs alike.
+
+        Where time is short, the longest runs are repeated less.
+        """
+        clock = self._budget.clock
+        runs = [x for one in self._curves for x in one.repeatable()]
+        counts = repetitions([max(first, _SHORT) for first, _ in runs], self._repeats, until - clock())
+        rng = np.random.default_rng(self._seed)
+        for k in range(self._repeats):
+            for i in rng.permutation(len(runs)):
+                if k < counts[i] and clock() + runs[i][0] < until:
+                    runs[i][1]()
+            yield k
+
+    def _in_executor(self, executor: Executor) -> Iterator[tuple[float, str]]:
+        yield 0.0, f"{len(self._settings)} curves by {type(executor).__name__}"
+        left = self._budget.until(1.0, 2 * _MIN_PART) - self._budget.clock()
+        each = 1 / max(len(self._settings), 1)
+        part = replace(self._budget, seconds=left * each, usual=min(self._budget.usual, left) * each)
+        calls = {
+            str(i): partial(_measure, self._problem, one, self._repeats, self._seed, part)
+            for i, one in enumerate(self._settings)
+        }
+        # Threads that suppress warnings side by side restore each other's filters.
+        with warnings.catch_warnings():
+            for name, answer in run(calls, executor=executor):
+                one = self._settings[int(name)]
+                if isinstance(answer, Exception):
+                    answer = None, Refusal(one.engine, one.method, f"{type(answer).__name__}: {answer}")
+                self._answers[int(name)] = answer
+                yield len(self._answers) / len(self._settings), f"{one.method} on {one.engine}"
+
+
+def _measure(problem: Problem, settings: Settings, repeats: int, seed: int, budget: TimeBudget) -> Outcome:
+    """Measure one curve in a worker."""
+    sweep = Sweep(problem, [settings], repeats, seed, replace(budget, begun=math.nan))
+    for _ in sweep.steps():
+        pass
+    return sweep.outcomes()[0]
+
+
+def _derivation_cost(one: CurveMeasurement) -> tuple[bool, bool]:
+    return one.settings.info.stages == 0, one.settings.engine == "lagrangian"
