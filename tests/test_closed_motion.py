@@ -16,8 +16,8 @@ from scipy.special import mathieu_a
 
 import mbkit as mb
 from mbkit.lagrangian import Lagrangian, systems
-from mbkit.lagrangian.reduction.quasi_velocities import QuasiLagrangian
 from mbkit.lagrangian.statics.virtual_work import generalized_force
+from mbkit.lagrangian.system import QuasiLagrangian
 from tests import twins
 from tests.twins import TWINS, paper
 from validation import closed_forms, elliptic, motions, quadrature, textbook

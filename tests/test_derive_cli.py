@@ -14,9 +14,9 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.lagrangian import systems
+from mbkit.lagrangian.printer import Blackboard, folded, written
 from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
 from mbkit.lagrangian.printing.numpy_module import python_code
-from mbkit.lagrangian.printing.printer import Blackboard, folded, written
 from mbkit.lagrangian.printing.summary import Account
 from mbkit.load.robot_data import find
 

@@ -65,17 +65,17 @@ def derive(
     if form == "c":
         _write_c(target, system, out or Path("mbkit-export"), force)
         return
-    from mbkit.lagrangian.energies.model import WrittenModel
+    from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
     from mbkit.lagrangian.printing.catalog_symbols import letters, with_plain_turns
     from mbkit.report.progress import Bar
 
-    if form != "python" and not isinstance(target, WrittenModel):
+    if form != "python" and not isinstance(target, EnergyModel):
         target, note = with_plain_turns(target, snap)
         if note:
             say("note", f"{note}. The equations to read differ from the model by that; --snap 0 leaves it as it is")
     with Bar(f"derive {target.name}") as bar:
-        names = None if isinstance(target, WrittenModel) else letters(target)
+        names = None if isinstance(target, EnergyModel) else letters(target)
         lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.1 * x, text))
         # What is prescribed is no coordinate of the equation.
         told = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
@@ -134,11 +134,11 @@ def _described(system: Callable[..., Lagrangian]) -> str:
 
 def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     from mbkit.codegen.c_source import c_identifier, export_c
-    from mbkit.lagrangian.energies.model import WrittenModel
+    from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.printing.catalog_symbols import in_symbols
     from mbkit.load.robot_data import canonical
 
-    if not isinstance(model, WrittenModel):
+    if not isinstance(model, EnergyModel):
         model = in_symbols(model) or model
     robot = canonical(name)
     made = export_c(model, name=None if robot is None else c_identifier(robot))

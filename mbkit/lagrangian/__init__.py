@@ -13,30 +13,30 @@ from mbkit.derivation import FUNCTIONS, Equations, ForwardDynamicsDerivatives, I
 
 if TYPE_CHECKING:
     from mbkit.lagrangian import systems as systems
-    from mbkit.lagrangian.constraints.independent_coordinates import Embedded as Embedded
     from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion as EquationsOfMotion
     from mbkit.lagrangian.from_description import from_model as from_model
+    from mbkit.lagrangian.independent_coordinates import Embedded as Embedded
     from mbkit.lagrangian.reduction.conserved import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
-    from mbkit.lagrangian.reduction.quasi_velocities import QuasiEquationsOfMotion as QuasiEquationsOfMotion
-    from mbkit.lagrangian.reduction.quasi_velocities import QuasiLagrangian as QuasiLagrangian
+    from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.reduction.routh import Routhian as Routhian
     from mbkit.lagrangian.statics.equilibrium import Equilibrium as Equilibrium
     from mbkit.lagrangian.statics.virtual_work import from_particles as from_particles
     from mbkit.lagrangian.statics.virtual_work import generalized_force as generalized_force
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
+    from mbkit.lagrangian.system import QuasiLagrangian as QuasiLagrangian
 
 _HOME = {
     "CanonicalEquations": "mbkit.lagrangian.reduction.hamilton",
     "ConservedQuantity": "mbkit.lagrangian.reduction.conserved",
-    "Embedded": "mbkit.lagrangian.constraints.independent_coordinates",
+    "Embedded": "mbkit.lagrangian.independent_coordinates",
     "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
     "Equilibrium": "mbkit.lagrangian.statics.equilibrium",
     "Hamiltonian": "mbkit.lagrangian.reduction.hamilton",
     "Lagrangian": "mbkit.lagrangian.system",
-    "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_velocities",
-    "QuasiLagrangian": "mbkit.lagrangian.reduction.quasi_velocities",
+    "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_equations",
+    "QuasiLagrangian": "mbkit.lagrangian.system",
     "Routhian": "mbkit.lagrangian.reduction.routh",
     "from_model": "mbkit.lagrangian.from_description",
     "from_particles": "mbkit.lagrangian.statics.virtual_work",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, count
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import sympy as sp
 
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, instead_of_writing, motion
-from mbkit.lagrangian.energies.model import WrittenModel
 from mbkit.lagrangian.energies.symbols import velocity_of
+from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.model import Model
@@ -100,8 +100,8 @@ def from_model(
     """
     if not isinstance(model, Model):
         raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) gives one")
-    if isinstance(model, WrittenModel):
-        return model.system
+    if isinstance(model, EnergyModel):
+        return cast("Lagrangian", model.form)
     _check(model)
     q = _coordinates(model, coordinates)
     named = None

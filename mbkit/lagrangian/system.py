@@ -2,184 +2,38 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, real
+from mbkit._check import Array, real, rows
 from mbkit._escape import one_line
+from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.lagrangian.constraints.manifold import Manifold, manifold_of
+from mbkit.lagrangian.constraints.redundancy import refuse_unreachable, require_independent
+from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
-from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split
-from mbkit.lagrangian.energies.symbols import declared, name_of, plain
-from mbkit.lagrangian.printing.printer import Blackboard
+from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities
+from mbkit.lagrangian.energies.symbols import name_of
+from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
+from mbkit.lagrangian.energy_model import EnergyModel, energies_latex
+from mbkit.lagrangian.independent_coordinates import Embedded
 from mbkit.lagrangian.reduction import conserved
 from mbkit.lagrangian.reduction.conserved import ConservedQuantity
-from mbkit.lagrangian.trig.simplify import tidy_matrix
+from mbkit.lagrangian.reduction.hamilton import Hamiltonian, hamiltonian
+from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
+from mbkit.lagrangian.reduction.routh import Routhian, routhian
+from mbkit.lagrangian.trig.simplify import tidy
 
-if TYPE_CHECKING:
-    from mbkit.engines import Dynamics
-    from mbkit.lagrangian.constraints.independent_coordinates import Embedded
-    from mbkit.lagrangian.constraints.manifold import Manifold
-    from mbkit.lagrangian.energies.model import WrittenModel
-    from mbkit.lagrangian.reduction.hamilton import Hamiltonian
-    from mbkit.lagrangian.reduction.quasi_velocities import QuasiLagrangian
-    from mbkit.lagrangian.reduction.routh import Routhian
-
-__all__ = ["Constrained", "Lagrangian"]
+__all__ = ["Lagrangian", "QuasiLagrangian"]
 
 
-# What a `Lagrangian` with constraints answers by number.
-
-
-class Constrained:
-    """Constraints, their Jacobian and multipliers, consistent states and the embedded form."""
-
-    name: str
-    coordinates: tuple[sp.Symbol, ...]
-    constraints: tuple[sp.Expr, ...]
-
-    @property
-    @abstractmethod
-    def model(self) -> WrittenModel:
-        """The system as engines take it."""
-
-    @abstractmethod
-    def dynamics(
-        self, engine: str = "lagrangian", *, options: Mapping[str, Any] | None = None, **values: float
-    ) -> Dynamics:
-        """Return the compiled dynamics."""
-
-    def constraint(self, q: ArrayLike, t: float = 0.0, **values: float) -> Array:
-        """Return f(q, t), (m,) or (N, m); zero where the constraints hold.
-
-        Parameters
-        ----------
-        q : (n,) or (N, n) array_like
-        t : float
-            s.
-        **values
-            Of parameters, by name.
-        """
-        manifold = self._manifold(t, values)
-        return manifold.value(self.model.check_q(q))
-
-    def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, **values: float) -> Array:
-        """Return J = ∂f/∂q, (m, n) or (N, m, n); arguments are those of `constraint`."""
-        manifold = self._manifold(t, values)
-        return manifold.jacobian(self.model.check_q(q))
-
-    def multipliers(
-        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike | None = None, t: float = 0.0, **values: float
-    ) -> Array:
-        """Return λ, (m,) or (N, m): the forces Jᵀ λ that hold the constraints.
-
-        Parameters
-        ----------
-        q, v : (n,) or (N, n) array_like
-            A consistent state; `project` makes one.
-        tau : (n,) or (N, n) array_like, optional
-            Zero when not given.
-        t : float
-            s.
-        **values
-            Of parameters, by name.
-        """
-        from mbkit.lagrangian.constraints.redundancy import require_independent
-
-        q, v = self.model.check_q(q), self.model.check_v(v)
-        tau = self.model.check_v(np.zeros_like(v) if tau is None else tau, "tau")
-        manifold, (q, v, tau) = self._manifold(t, values), np.broadcast_arrays(q, v, tau)
-        for one in np.atleast_2d(q):
-            require_independent(manifold.dyn, one)
-        out = manifold.multipliers(q, v, tau)
-        if not np.isfinite(out).all():
-            raise NumericalError(
-                f"{self.name}: the multipliers are not finite at q = {q.tolist()}; perhaps the constraints depend on "
-                "each other in this pose, or the mass matrix is singular"
-            )
-        return out
-
-    def project(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, **values: float) -> tuple[Array, Array]:
-        """Return the nearest state that the constraints allow, by the mass matrix's measure.
-
-        Parameters
-        ----------
-        q, v : (n,) or (N, n) array_like
-        t : float
-            s.
-        **values
-            Of parameters, by name.
-
-        Returns
-        -------
-        q, v : (n,) or (N, n) arrays
-            With f(q, t) = 0 and J v + ∂f/∂t = 0 to rounding.
-
-        Raises
-        ------
-        InputError
-            Constraints that contradict or follow from each other, or too far a way.
-        """
-        manifold = self._manifold(t, values)
-        q, v = np.broadcast_arrays(self.model.check_q(q), self.model.check_v(v))
-        if q.ndim == 1:
-            return self._projected(manifold, q, v)
-        found = [self._projected(manifold, *pair) for pair in zip(q, v, strict=True)]
-        return np.array([pair[0] for pair in found]), np.array([pair[1] for pair in found])
-
-    def _projected(self, manifold: Manifold, q: Array, v: Array) -> tuple[Array, Array]:
-        from mbkit.lagrangian.constraints.redundancy import refuse_unreachable, require_independent
-
-        try:
-            found = manifold.project(q, v)
-        except InputError:
-            refuse_unreachable(manifold.dyn, q)
-            raise
-        require_independent(manifold.dyn, found[0], everywhere=True)
-        return found
-
-    def embedded(self, independent: Sequence[Any] | None = None, **values: float) -> Embedded:
-        """Return the system on independent coordinates alone, for `mbkit.simulate`.
-
-        Parameters
-        ----------
-        independent : sequence of coordinates or their names, optional
-            As many as there are coordinates less constraints. When not given, those on
-            which the others depend best, chosen anew where that changes.
-        **values
-            Of parameters, by name.
-        """
-        from mbkit.lagrangian.constraints.independent_coordinates import Embedded
-
-        dyn = self.dynamics().at(**values)
-        if isinstance(independent, (str, sp.Basic)):
-            independent = [independent]
-        names = None if independent is None else tuple(name_of(x) for x in independent)
-        return Embedded(self._consistent(dyn), names)
-
-    def _manifold(self, t: float, values: Mapping[str, float]) -> Manifold:
-        return self._consistent(self._interpreted.at(**values) if values else self._interpreted).at(real("t", t))
-
-    def _consistent(self, dyn: Dynamics) -> Manifold:
-        # It loads CasADi.
-        from mbkit.lagrangian.constraints.manifold import manifold_of
-
-        if not self.constraints:
-            raise UnsupportedError(f"{self.name}: has no constraints; give them as constraints=[...]")
-        return manifold_of(dyn)
-
-    @cached_property
-    def _interpreted(self) -> Dynamics:
-        return self.dynamics(options={"compile": False})
-
-
-class Lagrangian(Constrained):
+class Lagrangian(EnergyForm):
     """A system as its energies in generalized coordinates, to read and to run.
 
     Parameters
@@ -245,52 +99,12 @@ class Lagrangian(Constrained):
     l**2*m*omegadot + g*l*m*sin(theta) = tau
     """
 
-    def __init__(
-        self,
-        T: Any,
-        V: Any = 0,
-        coordinates: Sequence[Any] = (),
-        velocities: Sequence[Any] | None = None,
-        *,
-        time: sp.Symbol | None = None,
-        forces: Mapping[Any, Any] | None = None,
-        dissipation: Any = 0,
-        parameters: Mapping[sp.Symbol, float | None] | Iterable[sp.Symbol] | None = None,
-        constraints: Sequence[Any] = (),
-        name: str = "system on paper",
-    ) -> None:
-        d = declared(T, V, coordinates, velocities, time, forces, dissipation, parameters, constraints)
-        if not isinstance(name, str) or not name.strip():
-            raise InputError(f"name: expected a text, got {name!r}")
-        self.name = name
-        self.coordinates, self.velocities, self.time = d.coordinates, d.velocities, d.time
-        self.accelerations, self.multiplier_symbols = d.accelerations, d.multipliers
-        self.parameters, self.inputs = d.parameters, d.inputs
-        self.T, self.V, self.dissipation, self.constraints = d.T, d.V, d.dissipation, d.constraints
-        self.forces = sp.ImmutableMatrix([x if q not in self.inputs else 0 for q, x in d.given.items()])
-        require_inertia(self.kinetic.M, self.coordinates, self.velocities, self.constraints)
-
     # The parts
-
-    @cached_property
-    def kinetic(self) -> KineticSplit:
-        """T = T2 + T1 + T0, with M and b."""
-        return split(self.T, self.velocities)
 
     def kinetic_split(self) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
         """Return T2, T1 and T0: T's parts of second, first and zeroth degree in the velocities."""
         k = self.kinetic
         return k.T2, k.T1, k.T0
-
-    @cached_property
-    def momenta(self) -> sp.ImmutableMatrix:
-        """p = ∂T/∂v, (n, 1)."""
-        return tidy_matrix(self.kinetic.M * sp.Matrix(self.velocities) + self.kinetic.b)
-
-    @property
-    def L(self) -> sp.Expr:
-        """T - V."""
-        return self.T - self.V
 
     @cached_property
     def _equations(self) -> EquationsOfMotion:
@@ -302,32 +116,20 @@ class Lagrangian(Constrained):
 
     # What it keeps, and other forms of it
 
-    def cyclic_coordinates(self) -> tuple[sp.Symbol, ...]:
-        """Return the coordinates that L does not hold and along which nothing acts: their momenta are constant."""
-        return self._cyclic[1]
-
-    @cached_property
-    def _cyclic(self) -> tuple[dict[sp.Symbol, sp.Expr], tuple[sp.Symbol, ...]]:
-        return conserved.cyclic_coordinates(self)
-
-    def forced_cyclic_coordinates(self) -> dict[sp.Symbol, sp.Expr]:
-        """Return the other coordinates that L does not hold, each with the force that acts along it."""
-        return {q: force for q, force in self._cyclic[0].items() if force != 0}
-
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return p = ∂L/∂v of each cyclic coordinate, by coordinate."""
         return conserved.conserved_momenta(self)
 
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
         """Return what is constant along every motion: those momenta, and the energy or Jacobi's integral."""
-        return conserved.conserved_quantities(self)
+        return conserved.conserved_quantities(self, self.conserved_momenta(), self.energy_function, self.velocities)
 
     @property
     def energy_function(self) -> sp.Expr:
         """h = vᵀ ∂L/∂v - L = T2 - T0 + V: Jacobi's integral, the energy T + V where T = T2."""
         return conserved.energy_function(self)
 
-    def routhian(self, cyclic: sp.Symbol | Sequence[sp.Symbol] | None = None) -> Routhian:
+    def routhian(self, cyclic: sp.Symbol | Sequence[sp.Symbol] | None = None) -> Routhian[Lagrangian]:
         """Return Routh's reduction: the same system less its cyclic coordinates, or those given.
 
         Raises
@@ -335,8 +137,6 @@ class Lagrangian(Constrained):
         InputError
             One is not cyclic or a force acts along it; none is, or none would remain.
         """
-        from mbkit.lagrangian.reduction.routh import routhian
-
         return routhian(self, cyclic)
 
     def hamiltonian(self) -> Hamiltonian:
@@ -351,8 +151,6 @@ class Lagrangian(Constrained):
 
     @cached_property
     def _hamiltonian(self) -> Hamiltonian:
-        from mbkit.lagrangian.reduction.hamilton import hamiltonian
-
         return hamiltonian(self)
 
     def quasi_velocities(self, D: sp.Matrix, names: str | Sequence[str | sp.Symbol] | None = None) -> QuasiLagrangian:
@@ -372,63 +170,14 @@ class Lagrangian(Constrained):
         UnsupportedError
             Constraints act on the system.
         """
-        from mbkit.lagrangian.reduction.quasi_velocities import QuasiLagrangian
-
         return QuasiLagrangian(self, D, names)
-
-    # Variants
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return partial(Lagrangian, **self._given()), ()
-
-    def _given(self) -> dict[str, Any]:
-        return {
-            "T": self.T,
-            "V": self.V,
-            "coordinates": self.coordinates,
-            "velocities": self.velocities,
-            "time": self.time,
-            "forces": {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)},
-            "dissipation": self.dissipation,
-            "parameters": dict(self.parameters),
-            "constraints": self.constraints,
-            "name": self.name,
-        }
-
-    def _like(self, **changes: Any) -> Lagrangian:
-        return Lagrangian(**{**self._given(), **changes})
-
-    def substituted(self, values: Mapping[sp.Symbol, Any]) -> Lagrangian:
-        """Return the same system with numbers for some parameters."""
-        own = {s.name: s for s in self.parameters}
-        put = {}
-        for given, x in values.items():
-            symbol = own.get(str(given))
-            if symbol is None:
-                raise InputError(f"values: {given} is no parameter; they are {plain(self.parameters) or 'none'}")
-            put[symbol] = sp.sympify(x)
-        forces = {q: self.inputs.get(q, x.subs(put)) for q, x in zip(self.coordinates, self.forces, strict=True)}
-        return self._like(
-            T=self.T.subs(put),
-            V=self.V.subs(put),
-            dissipation=self.dissipation.subs(put),
-            forces=forces,
-            constraints=[c.subs(put) for c in self.constraints],
-            parameters={s: x for s, x in self.parameters.items() if s not in put},
-        )
-
-    def conservative(self) -> Lagrangian:
-        """Return the same system without dissipation and forces; inputs stay."""
-        return self._like(dissipation=0, forces=dict(self.inputs))
 
     # Running it
 
     @cached_property
-    def model(self) -> WrittenModel:
+    def model(self) -> EnergyModel:
         """The system as engines take it: ``mb.dynamics(lag.model, "lagrangian")``."""
-        from mbkit.lagrangian.energies.model import WrittenModel
-
-        return WrittenModel(self)
+        return EnergyModel(self)
 
     def dynamics(
         self, engine: str = "lagrangian", *, options: Mapping[str, Any] | None = None, **values: float
@@ -444,10 +193,124 @@ class Lagrangian(Constrained):
         **values
             Of parameters, by name; the others keep theirs.
         """
-        from mbkit.engines import dynamics
+        dyn = dynamics(self.model, engine, **(options or {}))
+        return dyn.at(**values) if values else dyn
 
-        made = dynamics(self.model, engine, **(options or {}))
-        return made.at(**values) if values else made
+    # Constraints
+
+    def constraint(self, q: ArrayLike, t: float = 0.0, **values: float) -> Array:
+        """Return f(q, t), (m,) or (N, m); zero where the constraints hold.
+
+        Parameters
+        ----------
+        q : (n,) or (N, n) array_like
+        t : float
+            s.
+        **values
+            Of parameters, by name.
+        """
+        manifold = self._manifold(t, values)
+        return manifold.value(self.model.check_q(q))
+
+    def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, **values: float) -> Array:
+        """Return J = ∂f/∂q, (m, n) or (N, m, n); arguments are those of `constraint`."""
+        manifold = self._manifold(t, values)
+        return manifold.jacobian(self.model.check_q(q))
+
+    def multipliers(
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike | None = None, t: float = 0.0, **values: float
+    ) -> Array:
+        """Return λ, (m,) or (N, m): the forces Jᵀ λ that hold the constraints.
+
+        Parameters
+        ----------
+        q, v : (n,) or (N, n) array_like
+            A consistent state; `project` makes one.
+        tau : (n,) or (N, n) array_like, optional
+            Zero when not given.
+        t : float
+            s.
+        **values
+            Of parameters, by name.
+        """
+        q, v = self.model.check_q(q), self.model.check_v(v)
+        tau = self.model.check_v(np.zeros_like(v) if tau is None else tau, "tau")
+        manifold, (q, v, tau) = self._manifold(t, values), np.broadcast_arrays(q, v, tau)
+        for one in np.atleast_2d(q):
+            require_independent(manifold.dyn, one)
+        out = manifold.multipliers(q, v, tau)
+        if not np.isfinite(out).all():
+            raise NumericalError(
+                f"{self.name}: the multipliers are not finite at q = {q.tolist()}; perhaps the constraints depend on "
+                "each other in this pose, or the mass matrix is singular"
+            )
+        return out
+
+    def project(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, **values: float) -> tuple[Array, Array]:
+        """Return the nearest state that the constraints allow, by the mass matrix's measure.
+
+        Parameters
+        ----------
+        q, v : (n,) or (N, n) array_like
+        t : float
+            s.
+        **values
+            Of parameters, by name.
+
+        Returns
+        -------
+        q, v : (n,) or (N, n) arrays
+            With f(q, t) = 0 and J v + ∂f/∂t = 0 to rounding.
+
+        Raises
+        ------
+        InputError
+            Constraints that contradict or follow from each other, or too far a way.
+        """
+        manifold = self._manifold(t, values)
+        q, v = np.broadcast_arrays(self.model.check_q(q), self.model.check_v(v))
+        if q.ndim == 1:
+            return self._projected(manifold, q, v)
+        found = [self._projected(manifold, *pair) for pair in zip(q, v, strict=True)]
+        return np.array([pair[0] for pair in found]), np.array([pair[1] for pair in found])
+
+    def _projected(self, manifold: Manifold, q: Array, v: Array) -> tuple[Array, Array]:
+        try:
+            found = manifold.project(q, v)
+        except InputError:
+            refuse_unreachable(manifold.dyn, q)
+            raise
+        require_independent(manifold.dyn, found[0], everywhere=True)
+        return found
+
+    def embedded(self, independent: Sequence[Any] | None = None, **values: float) -> Embedded:
+        """Return the system on independent coordinates alone, for `mbkit.simulate`.
+
+        Parameters
+        ----------
+        independent : sequence of coordinates or their names, optional
+            As many as there are coordinates less constraints. When not given, those on
+            which the others depend best, chosen anew where that changes.
+        **values
+            Of parameters, by name.
+        """
+        dyn = self.dynamics().at(**values)
+        if isinstance(independent, (str, sp.Basic)):
+            independent = [independent]
+        names = None if independent is None else tuple(name_of(x) for x in independent)
+        return Embedded(self._consistent(dyn), names)
+
+    def _manifold(self, t: float, values: Mapping[str, float]) -> Manifold:
+        return self._consistent(self._interpreted.at(**values) if values else self._interpreted).at(real("t", t))
+
+    def _consistent(self, dyn: Dynamics) -> Manifold:
+        if not self.constraints:
+            raise UnsupportedError(f"{self.name}: has no constraints; give them as constraints=[...]")
+        return manifold_of(dyn)
+
+    @cached_property
+    def _interpreted(self) -> Dynamics:
+        return self.dynamics(options={"compile": False})
 
     # Reading
 
@@ -455,5 +318,129 @@ class Lagrangian(Constrained):
         return one_line(f"<Lagrangian {self.name!r}: coordinates {', '.join(map(str, self.coordinates))}>")
 
     def _repr_latex_(self) -> str:
-        board = Blackboard(self.coordinates, self.velocities, time=self.time)
-        return f"$T = {board.latex(self.T)},\\quad V = {board.latex(self.V)}$"
+        return energies_latex(self)
+
+
+class QuasiLagrangian(Lagrangian):
+    """A system in quasi-velocities; made by `Lagrangian.quasi_velocities`.
+
+    It reads and runs as a `Lagrangian` does, with the velocities w: states are (q, w), and
+    ``tau`` is the force on each w, Dᵀ times that on each coordinate (`to_force`). What only
+    coordinates' rates have, momenta of cyclic coordinates, Routh's and Hamilton's functions,
+    are those of `system`.
+
+    Attributes
+    ----------
+    system : Lagrangian
+        The same in its coordinates' rates.
+    D, W : (n, n) sympy.Matrix
+        q̇ = D w and w = W q̇.
+    """
+
+    def __init__(self, system: Lagrangian, D: Any, names: Any = None) -> None:
+        self.system = system
+        # The parts of T are known, and need not be separated again.
+        arguments, self.__dict__["kinetic"], self.quasi = in_quasi_velocities(system, D, names)
+        self.D, self.W = self.quasi.D, self.quasi.W
+        super().__init__(**arguments)
+
+    quasi: QuasiVelocities
+
+    @property
+    def hamel_coefficients(self) -> sp.ImmutableDenseNDimArray:
+        """γ, (n, n, n), of `mbkit.lagrangian.reduction.quasi_equations`; ``hamel_coefficients[k, i, j]`` = γ^k_ij."""
+        return self.quasi.hamel_coefficients
+
+    @property
+    def input_forces(self) -> sp.ImmutableMatrix:
+        """Dᵀ u of the coordinates' inputs u, (n, 1)."""
+        return self.quasi.input_forces
+
+    @cached_property
+    def _equations(self) -> EquationsOfMotion:
+        return quasi_equations(self, self.quasi)
+
+    # Variants
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return QuasiLagrangian, (self.system, self.D, self.velocities)
+
+    def _of(self, system: Lagrangian, D: Any) -> QuasiLagrangian:
+        return QuasiLagrangian(system, D, self.velocities)
+
+    def substituted(self, values: Mapping[sp.Symbol, Any]) -> QuasiLagrangian:
+        """Return the same system with numbers for some parameters."""
+        system = self.system.substituted(values)
+        return self._of(system, self.D.subs({s: sp.sympify(x) for s, x in values.items()}))
+
+    def conservative(self) -> QuasiLagrangian:
+        """Return the same system without dissipation and forces; inputs stay."""
+        return self._of(self.system.conservative(), self.D)
+
+    def quasi_velocities(self, D: Any, names: Any = None) -> QuasiLagrangian:
+        """Return the system in other quasi-velocities u, with q̇ = D u again."""
+        return QuasiLagrangian(self.system, D, names)
+
+    # What coordinates' rates alone have
+
+    def cyclic_coordinates(self) -> tuple[sp.Symbol, ...]:
+        """Return those of `system`."""
+        return self.system.cyclic_coordinates()
+
+    def forced_cyclic_coordinates(self) -> dict[sp.Symbol, sp.Expr]:
+        """Return those of `system`."""
+        return self.system.forced_cyclic_coordinates()
+
+    def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
+        """Return the momentum Wᵀ p of each cyclic coordinate, in quasi-velocities."""
+        p, kept = self.W.T * self.momenta, self.system.cyclic_coordinates()
+        return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
+
+    def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
+        """Return what is constant along every motion, in quasi-velocities."""
+        return conserved.conserved_quantities(
+            self.system, self.conserved_momenta(), self.energy_function, self.velocities
+        )
+
+    def routhian(self, cyclic: Any = None) -> Routhian[Lagrangian]:
+        """Return Routh's reduction of `system`."""
+        return self.system.routhian(cyclic)
+
+    def hamiltonian(self) -> Hamiltonian:
+        """Return Hamilton's function of `system`."""
+        return self.system.hamiltonian()
+
+    # Numbers
+
+    @cached_property
+    def _maps(self) -> Numeric:
+        return Numeric(sp.Matrix.vstack(self.D, self.W), self.coordinates, tuple(self.parameters))
+
+    def _map(self, name: str, q: ArrayLike, x: ArrayLike, values: dict[str, float]) -> tuple[Array, Array, Array]:
+        n = len(self.coordinates)
+        q, x = rows("q", q, n, self.name, "nq"), rows(name, x, n, self.name, "nv")
+        told = (
+            parameter_values(self, values, name)
+            if self.D.free_symbols & set(self.parameters)
+            else np.zeros(len(self.parameters))
+        )
+        both = self._maps(q, told)
+        return both[..., :n, :], both[..., n:, :], x
+
+    def to_velocity(self, q: ArrayLike, w: ArrayLike, **values: float) -> Array:
+        """Return the coordinates' rates D w in numbers, (n,) or (N, n)."""
+        D, _, w = self._map("w", q, w, values)
+        return np.asarray(np.einsum("...ij,...j->...i", D, w))
+
+    def to_quasi_velocity(self, q: ArrayLike, v: ArrayLike, **values: float) -> Array:
+        """Return w = D⁻¹ v of the coordinates' rates in numbers, (n,) or (N, n)."""
+        _, W, v = self._map("v", q, v, values)
+        return np.asarray(np.einsum("...ij,...j->...i", W, v))
+
+    def to_force(self, q: ArrayLike, tau: ArrayLike, **values: float) -> Array:
+        """Return the forces Dᵀ τ on w of those on the coordinates in numbers, (n,) or (N, n)."""
+        D, _, tau = self._map("tau", q, tau, values)
+        return np.asarray(np.einsum("...ij,...i->...j", D, tau))
+
+    def __repr__(self) -> str:
+        return one_line(f"<QuasiLagrangian {self.name!r}: quasi-velocities {', '.join(map(str, self.velocities))}>")

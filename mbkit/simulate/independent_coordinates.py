@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, finite_array
 from mbkit.engines import Dynamics
 from mbkit.errors import DoubtfulRunWarning, FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
-from mbkit.lagrangian.constraints.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
+from mbkit.lagrangian.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
 from mbkit.methods.registry import Method
 from mbkit.simulate.constraint_projection import SingularPoses, from_consistent
 from mbkit.simulate.events import Event, Hit

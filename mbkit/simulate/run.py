@@ -29,7 +29,7 @@ from mbkit.simulate.torque import Applied, Torque, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.constraints.independent_coordinates import Embedded
+    from mbkit.lagrangian.independent_coordinates import Embedded
 
 __all__ = ["adaptive_runner", "fixed_runner", "simulate"]
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final, cast
 
+import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.engines.base import Dynamics, at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.constraints.terms import FUNCTIONS
-
-if TYPE_CHECKING:
-    from mbkit.lagrangian.energies.casadi_equations import WrittenEquations
+from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
 
 __all__ = ["Manifold", "least_change", "manifold_of"]
 
@@ -25,6 +24,67 @@ _CONSISTENT: Final = 1e-8
 _NEAR: Final = 1e-8
 _MOST: Final = 60
 _TWIN: Final = "_constrained_twin"
+
+
+# The functions that are compiled.
+
+
+def _function(eq: EnergyEquations, name: str, given: dict[str, Any], made: dict[str, Any]) -> ca.Function:
+    given = {**given, **eq.trailing}
+    dense = [ca.densify(x) for x in made.values()]
+    return ca.Function(name, list(given.values()), dense, list(given), list(made), {"cse": True})
+
+
+def _rows(eq: EnergyEquations) -> ca.Function:
+    c = eq.constraints
+    return _function(eq, "constraint_rows", {"q": eq.q}, {"f": c.value, "J": c.jacobian})
+
+
+def _terms(eq: EnergyEquations) -> ca.Function:
+    c, M = eq.constraints, eq.mass_matrix
+    made = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": c.weight(M), "M": M}
+    return _function(eq, "constraint", {"q": eq.q, "v": eq.v}, made)
+
+
+def _step(eq: EnergyEquations) -> ca.Function:
+    """(q, v) -> q after a step of Newton's, v made consistent there, f before it and its scale."""
+    c, m = eq.constraints, eq.constraints.value.shape[0]
+    W = c.weight(eq.mass_matrix)
+    Y = solve(W, c.jacobian.T, eq.elimination_order)
+    S = ca.mtimes(c.jacobian, Y)
+    q1 = eq.q - ca.mtimes(Y, solve(S, c.value, range(m)))
+    Y1, S1, rate1 = (ca.substitute(x, eq.q, q1) for x in (Y, S, c.rate))
+    v1 = eq.v - ca.mtimes(Y1, solve(S1, rate1, range(m)))
+    scale = ca.sqrt(ca.sum2(c.jacobian**2))
+    return _function(eq, "constraint_step", {"q": eq.q, "v": eq.v}, {"q1": q1, "v1": v1, "f": c.value, "scale": scale})
+
+
+def _multipliers(eq: EnergyEquations) -> ca.Function:
+    return _function(eq, "multipliers", {"q": eq.q, "v": eq.v, "tau": eq.tau}, {"lambda": eq.multipliers})
+
+
+def _embedded(eq: EnergyEquations) -> ca.Function:
+    c = eq.constraints
+    made = {"J": c.jacobian, "by_time": c.by_time, "gamma": c.gamma, "M": eq.mass_matrix, "force": eq.applied}
+    return _function(eq, "embedded", {"q": eq.q, "v": eq.v}, made)
+
+
+def _curvature(eq: EnergyEquations) -> ca.Function:
+    """(q, λ) -> ∂(Jᵀ λ)/∂q; λ takes the place of v's first entries."""
+    c = eq.constraints
+    pull = ca.mtimes(c.jacobian.T, eq.v[: c.value.shape[0]])
+    return _function(eq, "curvature", {"q": eq.q, "v": eq.v}, {"H": ca.jacobian(pull, eq.q)})
+
+
+#: Name -> what derives it.
+_FUNCTIONS: Final = {
+    "constraint_rows": _rows,
+    "constraint": _terms,
+    "constraint_step": _step,
+    "multipliers": _multipliers,
+    "embedded": _embedded,
+    "curvature": _curvature,
+}
 
 
 @dataclass(frozen=True)
@@ -64,12 +124,13 @@ class Manifold:
     # What is compiled
 
     @property
-    def _equations(self) -> WrittenEquations:
-        return self.dyn.equations  # type: ignore[return-value]  # of a written model
+    def equations(self) -> EnergyEquations:
+        """The equations of the energies."""
+        return cast("EnergyEquations", self.dyn.equations)
 
     def call(self, name: str, *arguments: Array) -> list[Array]:
-        """Return what a function of `FUNCTIONS` gives, with its parameters behind."""
-        code = self.dyn.code(name, make=lambda: FUNCTIONS[name](self._equations))
+        """Return the outputs of a compiled function, with its parameters behind."""
+        code = self.dyn.code(name, make=lambda: _FUNCTIONS[name](self.equations))
         if self.dyn.model.parameters:
             p, lead = self.dyn.parameter_values, arguments[0].shape[:-1]
             if p.ndim > 1 and not lead:

@@ -17,6 +17,7 @@ from mbkit._check import Array
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError, NumericalError
 from mbkit.lagrangian.constraints.manifold import Manifold, least_change, manifold_of
+from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.model import Model
 
 __all__ = ["is_judged", "refuse_unreachable", "require_few", "require_independent"]
@@ -39,21 +40,19 @@ _MOST: Final = 100
 _TOLD: Final = 100
 
 #: Values of the parameters with which a system was independent at some pose.
-_JUDGED: Final[WeakKeyDictionary[object, set[tuple[float, ...]]]] = WeakKeyDictionary()
+_JUDGED: Final[WeakKeyDictionary[EnergyForm, set[tuple[float, ...]]]] = WeakKeyDictionary()
 
 
-def is_judged(model: Model) -> bool:
-    """Return whether the constraints were independent at some pose, with these values of the parameters."""
-    return _values(model) in _JUDGED.get(model.system, ())  # type: ignore[attr-defined]  # of a written model
+def is_judged(form: EnergyForm, model: Model) -> bool:
+    """Return whether the constraints were independent at some pose, with the model's values of the parameters."""
+    return _values(model) in _JUDGED.get(form, ())
 
 
-def require_few(model: Model) -> None:
+def require_few(form: EnergyForm) -> None:
     """Refuse more constraints than coordinates."""
-    rows = len(model.system.constraints)  # type: ignore[attr-defined]  # of a written model
-    if rows > model.nv:
-        raise InputError(
-            f"constraints: {rows} of them for {model.nv} coordinates; at most {model.nv} can be independent"
-        )
+    rows, n = len(form.constraints), len(form.coordinates)
+    if rows > n:
+        raise InputError(f"constraints: {rows} of them for {n} coordinates; at most {n} can be independent")
 
 
 def _values(model: Model) -> tuple[float, ...]:
@@ -78,11 +77,11 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     NumericalError
         They depend on each other at `q` alone, a singular pose.
     """
-    model = dyn.model
-    known = _JUDGED.setdefault(model.system, set())  # type: ignore[attr-defined]  # of a written model
-    written = [str(c) for c in model.system.constraints]  # type: ignore[attr-defined]
-    require_few(model)
-    manifold = manifold_of(dyn)
+    model, manifold = dyn.model, manifold_of(dyn)
+    form = manifold.equations.form
+    known = _JUDGED.setdefault(form, set())
+    written = [str(c) for c in form.constraints]
+    require_few(form)
     rng = np.random.default_rng(0)
     beside = [q + _ASIDE * rng.standard_normal(q.shape) for _ in range(_BESIDE)]
     sizes = np.max([np.linalg.norm(manifold.jacobian(x), axis=1) for x in (q, *beside)], axis=0)
@@ -118,7 +117,7 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
         None was found, with the rows that are left over.
     """
     manifold, model = manifold_of(dyn), dyn.model
-    written = [str(c) for c in model.system.constraints]  # type: ignore[attr-defined]  # of a written model
+    written = [str(c) for c in manifold.equations.form.constraints]
     rng = np.random.default_rng(0)
     best = (np.inf, np.zeros(len(written)))
     starts = [rng.choice([1.0, 3.0]) * Model.random_state(model, rng)[0] for _ in range(_STARTS)]

@@ -1,57 +1,67 @@
-"""The equations of a system that was written as energies, as CasADi expressions."""
+"""The equations of a system of energies as CasADi expressions: Lagrange's, and in quasi-velocities Hamel's."""
 
 from __future__ import annotations
 
 from functools import cached_property
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.model_values import Constants, Values
 from mbkit.errors import UnsupportedError
-from mbkit.lagrangian.constraints.terms import ConstraintTerms, constrained, derivatives
+from mbkit.lagrangian.energies.constraint_terms import ConstraintTerms, constrained
+from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.sympy_to_casadi import Conversion
+from mbkit.model import Model
 
-if TYPE_CHECKING:
-    from mbkit.lagrangian.energies.model import WrittenModel
-
-__all__ = ["WrittenEquations"]
+__all__ = ["EnergyEquations"]
 
 
-class WrittenEquations(Equations):
-    """The equations of a `WrittenModel`, derived from its T and V as those of a robot are."""
+class EnergyEquations(Equations):
+    """The equations derived from T and V.
 
-    model: WrittenModel
+    Parameters
+    ----------
+    model : Model
+        Of the coordinates and parameters of the energies.
+    form : EnergyForm
+    constants : {"literal", "symbol"}
+        How numbers stand in the expressions.
+    """
 
-    def __init__(self, model: WrittenModel, constants: Constants = "literal") -> None:
+    def __init__(self, model: Model, form: EnergyForm, constants: Constants = "literal") -> None:
         values = Values(model, constants)
-        self.model = model
+        self.model, self.form = model, form
         self.q, self.v = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
         self.a, self.tau = ca.SX.sym("a", model.nv), ca.SX.sym("tau", model.nv)
-        s = model.system
-        names = {**{p: values.named[p.name] for p in s.parameters}}
-        names |= {c: self.q[i] for i, c in enumerate(s.coordinates)}
-        names |= {w: self.v[i] for i, w in enumerate(s.velocities)}
-        self.time = values.named[model.clock] if model.clock else None
-        if s.time is not None:
-            names[s.time] = values.named[s.time.name]
+        names = {**{p: values.named[p.name] for p in form.parameters}}
+        names |= {c: self.q[i] for i, c in enumerate(form.coordinates)}
+        names |= {w: self.v[i] for i, w in enumerate(form.velocities)}
+        self.time = None
+        if form.time is not None:
+            self.time = names[form.time] = values.named[form.time.name]
         read = Conversion(names, values.number)
-        self._T, self._V, self._R = ca.SX(read(s.T)), ca.SX(read(s.V)), ca.SX(read(s.dissipation))
-        self._Q = read.matrix(s.forces)
-        self.constraints = ConstraintTerms(read.matrix(s.constraints), self.q, self.v, self.time)
-        self._kinematics(read)
+        self._T, self._V, self._R = ca.SX(read(form.T)), ca.SX(read(form.V)), ca.SX(read(form.dissipation))
+        self._Q = read.matrix(form.forces)
+        self.constraints = ConstraintTerms(read.matrix(form.constraints), self.q, self.v, self.time)
+        #: Of each momentum k, (γ^k v)_i = Σ_j γ^k_ij v_j; none where velocities are rates.
+        self._turns: list[Any] = []
+        qdot, pullback = self.v, lambda x: x
+        if form.quasi is not None:
+            n, gamma = model.nv, form.quasi.hamel_coefficients
+            D = ca.reshape(read.matrix(list(form.quasi.D.T)), n, n)
+            qdot, pullback = ca.mtimes(D, self.v), lambda x: ca.mtimes(D.T, x)
+            turns = (read.matrix([gamma[k, i, j] for j in range(n) for i in range(n)]) for k in range(n))
+            self._turns = [ca.mtimes(ca.reshape(turn, n, n), self.v) for turn in turns]
+        self.kin = SimpleNamespace(qdot=qdot, pullback=pullback)  # type: ignore[assignment]
         self.parameters = values.parameters
         self.constants, self.constant_values = values.constants, values.constant_values
 
-    def _kinematics(self, read: Conversion) -> None:  # noqa: ARG002  # quasi-velocities have something to read
-        """Set what velocities are to coordinates: their rates."""
-        self.kin = SimpleNamespace(qdot=self.v, pullback=lambda x: x)  # type: ignore[assignment]
-
-    def _turned(self, p: Any) -> Any:  # noqa: ARG002
-        """Return what quasi-velocities add to the rate of a momentum."""
-        return 0
+    def _turned(self, p: Any) -> Any:
+        """Return Σ_jk γ^k_ij v_j p_k, which quasi-velocities add to the rate of a momentum."""
+        return sum((turn * p[k] for k, turn in enumerate(self._turns)), ca.SX(self.model.nv, 1))
 
     @property
     def kinetic_energy(self) -> Any:
@@ -65,7 +75,7 @@ class WrittenEquations(Equations):
 
     @cached_property
     def gravity(self) -> Any:
-        """∂V/∂q, whatever it comes from."""
+        """∂V/∂q, springs included; Dᵀ ∂V/∂q in quasi-velocities."""
         return self.kin.pullback(ca.gradient(self._V, self.q))
 
     @cached_property
@@ -101,13 +111,21 @@ class WrittenEquations(Equations):
         return rate - self.kin.pullback(ca.gradient(T2, self.q))
 
     @cached_property
+    def coriolis_matrix(self) -> Any:
+        """Christoffel's C = ½ ∂(C v)/∂v + ½ M A, with A_kj = -(γ^k v)_j; A v = 0, and M A makes Ṁ - 2C skew."""
+        if not self._turns:
+            return super().coriolis_matrix
+        A = -ca.horzcat(*self._turns).T
+        return 0.5 * (ca.jacobian(self.coriolis_force, self.v) + ca.mtimes(self.mass_matrix, A))
+
+    @cached_property
     def nle(self) -> Any:
         """C v + d + ∂V/∂q."""
         return self._inertial(ca.SX(self.model.nv, 1)) + self.gravity
 
     @cached_property
     def _constrained(self) -> tuple[Any, Any]:
-        return constrained(self)
+        return constrained(self.constraints, self.mass_matrix, self.tau + self.applied, self.elimination_order)
 
     @property
     def multipliers(self) -> Any:
@@ -117,22 +135,25 @@ class WrittenEquations(Equations):
     @cached_property
     def forward_dynamics(self) -> Any:
         """M⁻¹ (τ + τ_passive - nle + Jᵀ λ); every other term of the equation is the one without constraints."""
-        if not self.model.constrained:
+        if not self.form.constraints:
             return super().forward_dynamics
         return self._constrained[0]
 
     @cached_property
     def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
-        """∂FD/∂q, ∂FD/∂v and ∂FD/∂τ, under the constraints."""
-        return derivatives(self) if self.model.constrained else super().forward_dynamics_derivatives
+        """∂FD/∂q, ∂FD/∂v and ∂FD/∂τ; under constraints the last is M⁻¹ on what they leave free."""
+        if not self.form.constraints:
+            return super().forward_dynamics_derivatives
+        q, v, tau = (ca.jacobian(self.forward_dynamics, x) for x in (self.q, self.v, self.tau))
+        return q, v, tau
 
     @property
     def least_constraint(self) -> None:
-        """Nothing: energies as written are no sum of squares of rates."""
+        """None: energies are not given as a sum of squares of rates."""
 
     @property
     def elimination_order(self) -> tuple[int, ...]:
-        """The coordinates as they stand."""
+        """The coordinates in their order."""
         return tuple(range(self.model.nv))
 
     def _frame(self, name: str) -> tuple[str, Any]:

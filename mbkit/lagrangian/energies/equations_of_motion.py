@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from itertools import combinations_with_replacement
+from typing import Any
 
 import sympy as sp
 from sympy.matrices.exceptions import NonInvertibleMatrixError
 
 from mbkit._escape import one_line, terminal
 from mbkit.errors import UnsupportedError
+from mbkit.lagrangian.energies.energy_form import EnergyForm
+from mbkit.lagrangian.printer import Abbreviations, Blackboard, spread
+from mbkit.lagrangian.trig.shortest_form import cost
 from mbkit.lagrangian.trig.simplify import gradient, slope, tidy, tidy_matrix
 
-if TYPE_CHECKING:
-    from mbkit.lagrangian.system import Lagrangian
-
-__all__ = ["EquationsOfMotion", "christoffel", "equations_of_motion"]
+__all__ = ["EquationsOfMotion", "christoffel", "equations_of_motion", "printed_equations"]
 
 
 @dataclass(frozen=True)
@@ -118,12 +119,13 @@ class EquationsOfMotion:
 
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block, in the order of a blackboard."""
-        from mbkit.lagrangian.printing.equation_text import board_of, letters_for, lines
-
-        board, short = board_of(self), letters_for(self)
-        told = lines(self, board, short, latex=True)
-        told += [(board.latex(letter), board.latex(root)) for letter, root in short.roots.items()]
-        rows = (f"{left} &= {right}" for left, right in told)
+        board = Blackboard(self.coordinates, self.velocities, self.accelerations, self.multipliers)
+        shown = (*self.mass_matrix, *self.coriolis_force, *self.drift, *self.potential_gradient, *self.forces)
+        shown = (*shown, *self.constraints)
+        short = Abbreviations(shown, set().union(*(x.free_symbols for x in shown)))
+        pairs = printed_equations(self, board, short, latex=True)
+        pairs += [(board.latex(letter), board.latex(root)) for letter, root in short.roots.items()]
+        rows = (f"{left} &= {right}" for left, right in pairs)
         return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
 
     def _repr_latex_(self) -> str:
@@ -149,8 +151,44 @@ def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
     return out or "0"
 
 
-def equations_of_motion(system: Lagrangian, *, coriolis: bool = True) -> EquationsOfMotion:
-    """Return Lagrange's equations of a system: d/dt ∂L/∂v - ∂L/∂q = Q + Jᵀ λ; C is zero where nobody asks for it."""
+def printed_equations(
+    e: EquationsOfMotion,
+    board: Blackboard,
+    short: Abbreviations,
+    *,
+    latex: bool = False,
+    progress: Callable[[float, str], object] = lambda fraction, what: None,  # noqa: ARG005
+) -> list[tuple[str, str]]:
+    """Return the two sides of each equation and of each constraint; `progress` gets the fraction done."""
+    right = e.forces
+    if e.multipliers:
+        right = right + e.constraint_jacobian.T * sp.Matrix(e.multipliers)
+    join = board.latex_of if latex else board.text_of
+    out = []
+    for i, force in enumerate(right):
+        progress(i / len(right), f"equation {i + 1} of {len(right)}")
+        parts = [m * a for m, a in zip(e.mass_matrix[i, :], e.accelerations, strict=True)]
+        parts += [_by_speeds(e.coriolis_force[i], e.velocities), e.drift[i], spread(e.potential_gradient[i])]
+        out.append((join(short(part) for part in parts), join([short(force)])))
+    write = board.latex if latex else board.text
+    return out + [(write(short(f)), "0") for f in e.constraints]
+
+
+def _by_speeds(x: sp.Expr, velocities: tuple[sp.Symbol, ...]) -> sp.Expr:
+    """Return what is quadratic in the velocities term by term, where that is shorter or frees cosines from brackets."""
+    moving = [v for v in velocities if x.has(v)]
+    if len(moving) < 2 or not x.has(sp.sin, sp.cos):
+        return x
+    pairs = combinations_with_replacement(moving, 2)
+    # Of a square the second derivative is twice its factor.
+    terms = ((tidy(sp.diff(x, v, w) / (2 if v == w else 1)), v * w) for v, w in pairs)
+    grouped = sp.Add(*(factor * pair for factor, pair in terms))
+    brackets = (a for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add)
+    return grouped if cost(grouped) < cost(x) or any(a.has(sp.sin, sp.cos) for a in brackets) else x
+
+
+def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> EquationsOfMotion:
+    """Return Lagrange's equations of a system: d/dt ∂L/∂v - ∂L/∂q = Q + Jᵀ λ; C is zero without `coriolis`."""
     q, v, k, t = system.coordinates, sp.Matrix(system.velocities), system.kinetic, system.time
     n, m = len(q), len(system.constraints)
     drift = sp.zeros(n, 1)

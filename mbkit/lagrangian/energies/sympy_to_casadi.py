@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import casadi as ca
 import numpy as np
 import sympy as sp
 
-from mbkit._check import Array, real
+from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import UnsupportedError
 
-if TYPE_CHECKING:
-    from mbkit.lagrangian.system import Lagrangian
-
-__all__ = ["Conversion", "Numeric", "values_of"]
+__all__ = ["Conversion", "Numeric"]
 
 
 _UNARY: Final[dict[Any, Callable[[Any], Any]]] = {
@@ -187,23 +184,3 @@ class Numeric:
         lead = np.broadcast_shapes(*(x.shape[:-1] for x in arguments))
         rows = [np.ascontiguousarray(np.broadcast_to(x, (*lead, x.shape[-1])), dtype=np.float64) for x in arguments]
         return self._machine(*rows)[0].reshape(*lead, *self._shape)
-
-
-def values_of(system: Lagrangian, values: Mapping[str, float], what: str) -> Array:
-    """Return the numbers of a system's parameters in their order, with some replaced.
-
-    Raises
-    ------
-    InputError, UnknownNameError
-        A parameter without a value; no such parameter.
-    """
-    names = {s.name: x for s, x in system.parameters.items()}
-    for name in values:
-        if name not in names:
-            raise UnknownNameError("parameter", name, names)
-    told = {**names, **{n: real(f"parameter {n!r}", x) for n, x in values.items()}}
-    missing = [n for n, x in told.items() if x is None]
-    if missing:
-        given = ", ".join(f"{n}=..." for n in missing)
-        raise InputError(f"{what}: no value for parameter {', '.join(map(repr, missing))}; give it as {given}")
-    return np.array(list(told.values()), dtype=np.float64)

@@ -11,9 +11,8 @@ import sympy as sp
 
 from mbkit._escape import identifier, one_line
 from mbkit._version import __version__
-from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
-from mbkit.lagrangian.printing.equation_text import lines
-from mbkit.lagrangian.printing.printer import Abbreviations, Blackboard, folded, matrix, spread, written
+from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion, printed_equations
+from mbkit.lagrangian.printer import Abbreviations, Blackboard, folded, matrix, spread, written
 from mbkit.lagrangian.system import Lagrangian
 
 __all__ = ["Account"]
@@ -51,7 +50,7 @@ class Account:
     @cached_property
     def equations(self) -> EquationsOfMotion:
         """The equations of motion; where they are too long for a page, without C."""
-        if self.long and type(self.system) is Lagrangian:
+        if self.long and self.system.quasi is None:
             return equations_of_motion(self.system, coriolis=False)
         return self.system.equations()
 
@@ -73,7 +72,7 @@ class Account:
 
     def _lines(self, short: Abbreviations, *, latex: bool) -> list[tuple[str, str]]:
         # The matrices are there before; they take about a third of the time.
-        return lines(
+        return printed_equations(
             *(self.equations, self._board, short),
             latex=latex,
             progress=lambda x, what: self._progress(0.3 + 0.7 * x, what),

@@ -9,30 +9,28 @@ the energy T + V where T has neither T1 nor T0 (ch. 2.7).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Final
 
 import sympy as sp
 
 from mbkit._escape import one_line, terminal
-from mbkit.lagrangian.printing.printer import Blackboard
-from mbkit.lagrangian.trig.simplify import tidy
-from mbkit.lagrangian.trig.zero_test import vanishes
-
-if TYPE_CHECKING:
-    from mbkit.lagrangian.system import Lagrangian
+from mbkit.lagrangian.energies.energy_form import EnergyForm, acting_forces, vanish
+from mbkit.lagrangian.printer import Blackboard
 
 __all__ = [
+    "JACOBI",
     "ConservedQuantity",
-    "acting",
     "conserved_momenta",
     "conserved_quantities",
-    "cyclic_coordinates",
     "energy_function",
     "is_energy",
     "keeps_energy",
 ]
+
+#: Meaning of h where it is not the energy.
+JACOBI: Final = "Jacobi's integral T2 - T0 + V, not the energy T + V"
 
 
 @dataclass(frozen=True)
@@ -71,47 +69,13 @@ class ConservedQuantity:
         return f"${self.latex()}$"
 
 
-def _vanish(parts: Iterable[sp.Expr]) -> bool:
-    # Decimals that cancel do so in their own digits only.
-    return all(vanishes(x) or (x.has(sp.Float) and tidy(x) == 0) for x in parts)
-
-
-def _in_no_energy(system: Lagrangian, q: sp.Symbol) -> bool:
-    """Return whether ∂L/∂q = 0: term by term in the velocities, so that each is short."""
-    k = system.kinetic
-    return _vanish(sp.diff(x, q) for x in (*k.M, *k.b, k.T0, system.V))
-
-
-def acting(system: Lagrangian) -> list[sp.Expr]:
-    """Return the generalized forces beside V's: forces, inputs and dissipation, one a coordinate."""
-    named = zip(system.coordinates, system.velocities, system.forces, strict=True)
-    # Not from the equations of motion, whose Christoffel symbols nobody asks for here.
-    return [tidy(x + system.inputs.get(q, sp.Integer(0)) - sp.diff(system.dissipation, w)) for q, w, x in named]
-
-
-def _along(system: Lagrangian) -> dict[sp.Symbol, sp.Expr]:
-    """Return what acts along each coordinate beside V, the constraints with their λ among it."""
-    multipliers = list(zip(system.multiplier_symbols, system.constraints, strict=True))
-    return {
-        q: tidy(x + sum((sp.diff(f, q) * symbol for symbol, f in multipliers), sp.Integer(0)))
-        for q, x in zip(system.coordinates, acting(system), strict=True)
-    }
-
-
-def cyclic_coordinates(system: Lagrangian) -> tuple[dict[sp.Symbol, sp.Expr], tuple[sp.Symbol, ...]]:
-    """Return the force along each coordinate that L does not hold, and those of them along which there is none."""
-    forces = _along(system)
-    cyclic = {q: forces[q] for q in system.coordinates if _in_no_energy(system, q)}
-    return cyclic, tuple(q for q, force in cyclic.items() if force == 0)
-
-
-def conserved_momenta(system: Lagrangian) -> dict[sp.Symbol, sp.Expr]:
+def conserved_momenta(system: EnergyForm) -> dict[sp.Symbol, sp.Expr]:
     """Return ∂L/∂v of each cyclic coordinate along which nothing acts."""
     free = system.cyclic_coordinates()
     return {q: p for q, p in zip(system.coordinates, system.momenta, strict=True) if q in free}
 
 
-def energy_function(system: Lagrangian) -> sp.Expr:
+def energy_function(system: EnergyForm) -> sp.Expr:
     """Return h = vᵀ ∂L/∂v - L = T2 - T0 + V."""
     if is_energy(system):
         # As its author wrote it.
@@ -120,42 +84,44 @@ def energy_function(system: Lagrangian) -> sp.Expr:
     return k.T2 - k.T0 + system.V
 
 
-def is_energy(system: Lagrangian) -> bool:
+def is_energy(system: EnergyForm) -> bool:
     """Return whether h, and with it H, is the energy T + V: where T1 = T0 = 0."""
     k = system.kinetic
     return not any(k.b) and k.T0 == 0
 
 
-def keeps_energy(system: Lagrangian) -> bool:
+def keeps_energy(system: EnergyForm) -> bool:
     """Return whether h is constant: dh/dt = Qᵀ v - ∂L/∂t, and moving constraints do work too."""
     if system.time is not None:
         k, t = system.kinetic, system.time
-        if not _vanish(sp.diff(x, t) for x in (*k.M, *k.b, k.T0, system.V, *system.constraints)):
+        if not vanish(sp.diff(x, t) for x in (*k.M, *k.b, k.T0, system.V, *system.constraints)):
             return False
-    power = sum((x * w for x, w in zip(acting(system), system.velocities, strict=True)), sp.Integer(0))
-    return _vanish([power])
+    power = sum((x * w for x, w in zip(acting_forces(system), system.velocities, strict=True)), sp.Integer(0))
+    return vanish([power])
 
 
-def conserved_quantities(system: Lagrangian, form: Lagrangian | None = None) -> tuple[ConservedQuantity, ...]:
+def conserved_quantities(
+    system: EnergyForm, momenta: Mapping[sp.Symbol, sp.Expr], energy: sp.Expr, moving: tuple[sp.Symbol, ...]
+) -> tuple[ConservedQuantity, ...]:
     """Return the conserved momenta, and the energy or Jacobi's integral if that is constant.
 
     Parameters
     ----------
-    system : Lagrangian
+    system : EnergyForm
         In its coordinates' rates.
-    form : Lagrangian, optional
-        The same in other velocities, to write them in.
+    momenta : mapping of sympy.Symbol to sympy.Expr
+        Cyclic coordinate -> its momentum, in `moving`.
+    energy : sympy.Expr
+        The energy function h, in `moving`.
+    moving : tuple of sympy.Symbol
+        The velocities (or quasi-velocities) in which both are written.
     """
-    form = form or system
-    moving = (form.coordinates, form.velocities)
+    symbols = (system.coordinates, moving)
     out = [
-        ConservedQuantity(f"p_{q.name}", p, f"momentum of {q.name}, which is cyclic", moving)
-        for q, p in form.conserved_momenta().items()
+        ConservedQuantity(f"p_{q.name}", p, f"momentum of {q.name}, which is cyclic", symbols)
+        for q, p in momenta.items()
     ]
     if keeps_energy(system):
-        if is_energy(system):
-            out.append(ConservedQuantity("E", form.energy_function, "energy T + V", moving))
-        else:
-            told = "Jacobi's integral T2 - T0 + V, not the energy T + V"
-            out.append(ConservedQuantity("h", form.energy_function, told, moving))
+        name, meaning = ("E", "energy T + V") if is_energy(system) else ("h", JACOBI)
+        out.append(ConservedQuantity(name, energy, meaning, symbols))
     return tuple(out)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import sympy as sp
@@ -22,17 +22,22 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real, rows
 from mbkit._escape import one_line, terminal
 from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.lagrangian.energies.energy_form import (
+    EnergyForm,
+    acting_forces,
+    parameter_values,
+    read_expression,
+    symbols_of,
+    timed_parameters,
+)
 from mbkit.lagrangian.energies.kinetic_energy import Squares
-from mbkit.lagrangian.energies.symbols import free_name, in_symbols_of, velocity_of
-from mbkit.lagrangian.energies.sympy_to_casadi import Numeric, values_of
-from mbkit.lagrangian.printing.printer import Blackboard
+from mbkit.lagrangian.energies.symbols import free_name, velocity_of
+from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
+from mbkit.lagrangian.printer import Blackboard
 from mbkit.lagrangian.reduction import conserved
 from mbkit.lagrangian.reduction.conserved import ConservedQuantity
 from mbkit.lagrangian.trig.simplify import slope, tidy
 from mbkit.lagrangian.trig.zero_test import vanishes
-
-if TYPE_CHECKING:
-    from mbkit.lagrangian.system import Lagrangian
 
 __all__ = ["CanonicalEquations", "Hamiltonian", "bracket", "hamiltonian", "momentum_symbols", "shorter"]
 
@@ -43,10 +48,9 @@ __all__ = ["CanonicalEquations", "Hamiltonian", "bracket", "hamiltonian", "momen
 _SHORT: Final = 100
 
 
-def momentum_symbols(system: Lagrangian, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
+def momentum_symbols(system: EnergyForm, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
     """Return a symbol for each coordinate's momentum: theta -> p_theta, or P_theta where that is taken already."""
-    own = (*system.parameters, *system.coordinates, *system.velocities, *system.inputs.values())
-    taken = {s.name for s in (*own, *([system.time] if system.time is not None else []))}
+    taken = {s.name for s in symbols_of(system)}
     out = []
     for q in coordinates:
         out.append(sp.Symbol(free_name(f"p_{q.name}", taken)))
@@ -131,7 +135,7 @@ class Hamiltonian:
         v in momenta: M⁻¹ (p - b).
     """
 
-    system: Lagrangian = field(repr=False)
+    system: EnergyForm = field(repr=False)
     H: sp.Expr
     momenta: tuple[sp.Symbol, ...]
     definitions: sp.ImmutableMatrix
@@ -158,7 +162,7 @@ class Hamiltonian:
     @cached_property
     def _equations(self) -> CanonicalEquations:
         s = self.system
-        forces = [self.canonical(x) for x in conserved.acting(s)]
+        forces = [self.canonical(x) for x in acting_forces(s)]
         return CanonicalEquations(
             coordinates=s.coordinates,
             momenta=self.momenta,
@@ -183,7 +187,7 @@ class Hamiltonian:
         InputError
             Symbols that the system does not know.
         """
-        out = in_symbols_of(self.system, "f", f, self.momenta)
+        out = read_expression(self.system, "f", f, self.momenta)
         return sp.sympify(out.subs(dict(zip(self.system.velocities, self.velocities, strict=True)), simultaneous=True))
 
     def poisson(self, f: Any, g: Any) -> sp.Expr:
@@ -199,7 +203,7 @@ class Hamiltonian:
         out = bracket(f, self.H, self.coordinates, self.momenta)
         if self.system.time is not None:
             out += sp.diff(f, self.system.time)
-        forces = (self.canonical(x) for x in conserved.acting(self.system))
+        forces = (self.canonical(x) for x in acting_forces(self.system))
         pushed = sum((sp.diff(f, p) * x for p, x in zip(self.momenta, forces, strict=True)), sp.Integer(0))
         return shorter(out + pushed)
 
@@ -212,8 +216,7 @@ class Hamiltonian:
             for q in conserved.conserved_momenta(self.system)
         ]
         if self.is_conserved:
-            told = "energy T + V" if self.is_energy else "Jacobi's integral T2 - T0 + V, not the energy T + V"
-            out.append(ConservedQuantity("H", self.H, told, moving))
+            out.append(ConservedQuantity("H", self.H, "energy T + V" if self.is_energy else conserved.JACOBI, moving))
         return tuple(out)
 
     # Numbers
@@ -221,18 +224,16 @@ class Hamiltonian:
     @cached_property
     def _linear(self) -> Numeric:
         k, s = self.system.kinetic, self.system
-        time = (s.time,) if s.time is not None else ()
-        return Numeric(sp.Matrix.hstack(k.M, k.b), s.coordinates, (*time, *s.parameters))
+        return Numeric(sp.Matrix.hstack(k.M, k.b), s.coordinates, timed_parameters(s))
 
     @cached_property
     def _rates(self) -> Numeric:
         s, eq = self.system, self.equations()
-        time = (s.time,) if s.time is not None else ()
-        names = (s.coordinates, self.momenta, (*s.inputs.values(), *time, *s.parameters))
+        names = (s.coordinates, self.momenta, (*s.inputs.values(), *timed_parameters(s)))
         return Numeric(sp.Matrix.vstack(eq.qdot, eq.pdot), *names)
 
     def _behind(self, t: float, values: dict[str, float], what: str) -> Array:
-        told = values_of(self.system, values, what)
+        told = parameter_values(self.system, values, what)
         return told if self.system.time is None else np.array([real("t", t), *told])
 
     def _mass(self, q: ArrayLike, other: ArrayLike, name: str, t: float, values: dict[str, float]) -> Any:
@@ -290,7 +291,7 @@ class Hamiltonian:
         idle = [q.name for q, x in zip(s.coordinates, force, strict=True) if q not in s.inputs and x]
         if idle:
             raise InputError(f"tau: {s.name} has no input along {', '.join(idle)}; add forces={{{idle[0]}: tau}} to it")
-        told, timed = values_of(s, values, "field"), s.time is not None
+        told, timed = parameter_values(s, values, "field"), s.time is not None
 
         def f(t: float, y: ArrayLike) -> Array:
             y = rows("y", y, 2 * n, s.name, "nq + nv")
@@ -315,7 +316,7 @@ class Hamiltonian:
         return terminal(f"H = {self.H}")
 
 
-def hamiltonian(system: Lagrangian) -> Hamiltonian:
+def hamiltonian(system: EnergyForm) -> Hamiltonian:
     """Return H of a system.
 
     Raises

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -28,18 +28,18 @@ from mbkit._check import Array, finite_array, real, require_finite, rows
 from mbkit._escape import one_line, terminal
 from mbkit.codegen.interpreter import Machine
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian.energies.casadi_equations import WrittenEquations
+from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values, require_values, timed_parameters
 from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain
-from mbkit.lagrangian.energies.sympy_to_casadi import Numeric, values_of
-from mbkit.lagrangian.printing.printer import Blackboard
+from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
+from mbkit.lagrangian.energy_model import EnergyModel
+from mbkit.lagrangian.printer import Blackboard
 from mbkit.lagrangian.reduction.hamilton import momentum_symbols
 from mbkit.lagrangian.trig.simplify import tidy
 
-if TYPE_CHECKING:
-    from mbkit.lagrangian.system import Lagrangian
-
 __all__ = ["Motion", "ReducedState", "Routhian", "reconstructed", "routhian"]
+
+FormT = TypeVar("FormT", bound=EnergyForm)
 
 
 class ReducedState(NamedTuple):
@@ -58,7 +58,7 @@ class ReducedState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Routhian:
+class Routhian(Generic[FormT]):
     """A system less its cyclic coordinates; made by `Lagrangian.routhian`.
 
     Attributes
@@ -75,8 +75,8 @@ class Routhian:
         Ignored coordinate -> its velocity, in what remains.
     """
 
-    system: Lagrangian = field(repr=False)
-    lagrangian: Lagrangian
+    system: FormT = field(repr=False)
+    lagrangian: FormT
     cyclic: tuple[sp.Symbol, ...]
     momenta: Mapping[sp.Symbol, sp.Expr]
     rates: Mapping[sp.Symbol, sp.Expr]
@@ -103,8 +103,11 @@ class Routhian:
     @cached_property
     def _momenta(self) -> Numeric:
         s = self.system
-        time = (s.time,) if s.time is not None else ()
-        return Numeric(sp.Matrix(list(self.momenta.values())), s.coordinates, s.velocities, (*time, *s.parameters))
+        return Numeric(sp.Matrix(list(self.momenta.values())), s.coordinates, s.velocities, timed_parameters(s))
+
+    @cached_property
+    def _model(self) -> EnergyModel:
+        return EnergyModel(self.lagrangian)
 
     def reduce(self, q: ArrayLike, v: ArrayLike, *, t: float = 0.0, **values: float) -> ReducedState:
         """Return the reduced system's state and the values of the constant momenta.
@@ -120,7 +123,7 @@ class Routhian:
         """
         s, n = self.system, len(self.system.coordinates)
         q, v = rows("q", q, n, s.name, "nq"), rows("v", v, n, s.name, "nv")
-        told = values_of(s, values, "reduce")
+        told = parameter_values(s, values, "reduce")
         behind = told if s.time is None else np.array([real("t", t), *told])
         p = self._momenta(q, v, behind)[..., 0]
         kept, _ = self._places
@@ -179,7 +182,7 @@ class Routhian:
         return terminal("\n".join(lines + [f"{named[q]} = {x}" for q, x in self.rates.items()]))
 
 
-def routhian(system: Lagrangian, cyclic: Any = None) -> Routhian:
+def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
     """Return the reduction of a system by some or all of its cyclic coordinates.
 
     Parameters
@@ -208,9 +211,7 @@ def routhian(system: Lagrangian, cyclic: Any = None) -> Routhian:
     moved = [x - sum(y * w for y, w in zip(k.M[i, r], v, strict=True)) for x, i in zip(excess, c, strict=True)]
     rates = squares.solve(moved)
     put = {system.velocities[i]: x for i, x in zip(c, rates, strict=True)}
-    from mbkit.lagrangian.system import Lagrangian
-
-    reduced = Lagrangian(
+    reduced = type(system)(
         T=_quadratic(M, v) / 2 + sum(x * w for x, w in zip(b, v, strict=True)) + k.T0,
         V=system.V + squares.form(excess, excess) / 2,
         coordinates=kept,
@@ -231,7 +232,7 @@ def _quadratic(M: Any, v: list[sp.Symbol]) -> sp.Expr:
     return sum(terms, sp.Integer(0))
 
 
-def _chosen(system: Lagrangian, cyclic: Any) -> list[sp.Symbol]:
+def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
     free = system.cyclic_coordinates()
     found = system.forced_cyclic_coordinates() | dict.fromkeys(free, sp.Integer(0))
     if cyclic is None:
@@ -262,7 +263,7 @@ def _chosen(system: Lagrangian, cyclic: Any) -> list[sp.Symbol]:
 
 
 def _forces(
-    system: Lagrangian, kept: list[sp.Symbol], ignored: list[sp.Symbol], put: Mapping[sp.Symbol, sp.Expr]
+    system: EnergyForm, kept: list[sp.Symbol], ignored: list[sp.Symbol], put: Mapping[sp.Symbol, sp.Expr]
 ) -> dict[sp.Symbol, sp.Expr]:
     """Return the forces along the remaining coordinates, without the ignored velocities."""
     out = {}
@@ -275,7 +276,7 @@ def _forces(
     return out
 
 
-def _dissipation(system: Lagrangian, ignored: list[sp.Symbol], put: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+def _dissipation(system: EnergyForm, ignored: list[sp.Symbol], put: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
     # Nothing acts along the ignored coordinates: R holds their velocities in form only.
     out = tidy(system.dissipation)
     _need_not([*ignored, *put], out, f"the dissipation {out}")
@@ -315,7 +316,7 @@ class Motion(NamedTuple):
     v: Array
 
 
-def reconstructed(routhian: Routhian, run: Any, q0: ArrayLike, values: Mapping[str, float]) -> Motion:
+def reconstructed(routhian: Routhian[Any], run: Any, q0: ArrayLike, values: Mapping[str, float]) -> Motion:
     """Return the motion of the whole system; see `Routhian.reconstruct`."""
     t, q, v, parameters = _read(routhian, run, values)
     kept, ignored = routhian._places
@@ -330,9 +331,9 @@ def reconstructed(routhian: Routhian, run: Any, q0: ArrayLike, values: Mapping[s
     return Motion(t, whole, speeds)
 
 
-def _read(routhian: Routhian, run: Any, values: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
+def _read(routhian: Routhian[Any], run: Any, values: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
     """Return t, q, v and a row of the reduced model's parameters for each state, the time among them."""
-    model, held = routhian.lagrangian.model, {}
+    model, held = routhian._model, {}
     if hasattr(run, "tau") and hasattr(run, "model"):
         if np.any(run.tau()):
             raise UnsupportedError(
@@ -358,17 +359,14 @@ def _read(routhian: Routhian, run: Any, values: Mapping[str, float]) -> tuple[Ar
         if name not in told:
             raise UnknownNameError("parameter", name, told)
         told[name] = real(f"parameter {name!r}", x)
-    missing = [n for n, x in told.items() if x is None]
-    if missing:
-        given = ", ".join(f"{n}=..." for n in missing)
-        raise InputError(f"reconstruct: no value for parameter {', '.join(map(repr, missing))}; give it as {given}")
+    require_values(told, "reconstruct")
     parameters = np.tile(np.array(list(told.values()), dtype=np.float64), (len(t), 1))
     if model.clock is not None:
         parameters[:, list(told).index(model.clock)] = t
     return t, q, v, parameters
 
 
-def _start(routhian: Routhian, q0: ArrayLike, q: Array) -> Array:
+def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
     kept, ignored = routhian._places
     whole = len(kept) + len(ignored)
     given = np.asarray(q0, dtype=np.float64)
@@ -388,20 +386,20 @@ def _start(routhian: Routhian, q0: ArrayLike, q: Array) -> Array:
     return given[ignored]
 
 
-def _rates(routhian: Routhian) -> Numeric:
+def _rates(routhian: Routhian[Any]) -> Numeric:
     s = routhian.lagrangian
-    names = {p.name: p for p in (*s.parameters, *((s.time,) if s.time is not None else ()))}
-    behind = [names[n] for n in s.model.parameters]
+    names = {p.name: p for p in timed_parameters(s)}
+    behind = [names[n] for n in routhian._model.parameters]
     return Numeric(sp.Matrix(list(routhian.rates.values())), s.coordinates, s.velocities, behind)
 
 
-def _increments(routhian: Routhian, t: Array, q: Array, v: Array, parameters: Array, rates: Numeric) -> Array:
+def _increments(routhian: Routhian[Any], t: Array, q: Array, v: Array, parameters: Array, rates: Numeric) -> Array:
     """Return what each interval adds to the ignored coordinates, (K - 1, m)."""
     spans, m = np.diff(t), len(routhian.cyclic)
     if not len(spans):
         return np.empty((0, m))
-    model = routhian.lagrangian.model
-    equations = WrittenEquations(model)
+    model = routhian._model
+    equations = model.written("literal")
     forward = ca.substitute(equations.forward_dynamics, equations.tau, ca.SX.zeros(model.nv))
     given = [equations.q, equations.v, equations.parameters]
     machine = Machine(ca.Function("reduced", given, [ca.densify(forward)], {"cse": True}))

@@ -8,7 +8,7 @@ from typing import Any
 import sympy as sp
 
 from mbkit.errors import InputError
-from mbkit.lagrangian.energies.symbols import Plain, expression, listed, plain
+from mbkit.lagrangian.energies.symbols import PlainSymbols, expression, listed, plain
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.trig.simplify import tidy
 
@@ -35,7 +35,7 @@ def generalized_force(
     points : sequence of vectors
         R_i(q, t), where the forces act, along the same axes, m.
     coordinates : sequence of sympy symbols
-        Plain symbols or dynamicsymbols.
+        PlainSymbols symbols or dynamicsymbols.
     torques : sequence of vectors, optional
         n_k on bodies, N m.
     angular_velocities : sequence of vectors, optional
@@ -65,7 +65,7 @@ def generalized_force(
     >>> mb.lagrangian.generalized_force([[0, -m * g]], [tip], [th])
     {theta: -g*l*m*sin(theta)}
     """
-    into = Plain(coordinates, velocities, time)
+    into = PlainSymbols(coordinates, velocities, time)
     f, R = vectors("forces", forces, into), vectors("points", points, into)
     n, w = vectors("torques", torques, into), vectors("angular_velocities", angular_velocities, into)
     _pairs("forces", f, "points", R)
@@ -85,7 +85,7 @@ def generalized_force(
     return out
 
 
-def check_places(what: str, places: list[tuple[sp.Expr, ...]], into: Plain) -> None:
+def check_places(what: str, places: list[tuple[sp.Expr, ...]], into: PlainSymbols) -> None:
     """Refuse places that depend on a velocity, where nothing can be."""
     for k, place in enumerate(places):
         moving = {s for x in place for s in x.free_symbols} & set(into.velocities)
@@ -93,7 +93,7 @@ def check_places(what: str, places: list[tuple[sp.Expr, ...]], into: Plain) -> N
             raise InputError(f"{what}[{k}]: expected coordinates and time only, got the velocity {plain(moving)}")
 
 
-def vectors(what: str, given: Any, into: Plain) -> list[tuple[sp.Expr, ...]]:
+def vectors(what: str, given: Any, into: PlainSymbols) -> list[tuple[sp.Expr, ...]]:
     """Return vectors of expressions in plain symbols; a single vector is a list of one."""
     try:
         rows = [list(x) if _several(x) else x for x in given]
@@ -178,7 +178,7 @@ def from_particles(
     >>> print(lag.equations())
     l**2*m*thetaddot + g*l*m*sin(theta) = 0
     """
-    into = Plain(coordinates, velocities, time)
+    into = PlainSymbols(coordinates, velocities, time)
     R = vectors("positions", positions, into)
     check_places("positions", R, into)
     # A single vector stands for one particle, of which the mass may stand alone.
@@ -213,13 +213,13 @@ def from_particles(
     )
 
 
-def _rate(x: sp.Expr, into: Plain) -> sp.Expr:
+def _rate(x: sp.Expr, into: PlainSymbols) -> sp.Expr:
     """Return Ṙ's component: along the coordinates' velocities and with the time."""
     along = [sp.diff(x, q) * v for q, v in zip(into.coordinates, into.velocities, strict=True)]
     return sp.Add(*along, sp.diff(x, into.time) if into.time is not None else 0)
 
 
-def _work(forces: Sequence[Any], R: list[tuple[sp.Expr, ...]], into: Plain) -> dict[Any, sp.Expr]:
+def _work(forces: Sequence[Any], R: list[tuple[sp.Expr, ...]], into: PlainSymbols) -> dict[Any, sp.Expr]:
     if not len(forces):
         return {}
     if len(forces) != len(R):

@@ -65,7 +65,7 @@ _TRIANGLE: Final = np.triu_indices(3)
 def described(model: Model) -> Description:
     """Return every number and name of a model, in its own order."""
     if model.written is not None:
-        return _written(model, model.system)  # type: ignore[attr-defined]  # energies have their system
+        return _written(model, model.form)  # type: ignore[attr-defined]  # energies have their system
     out: Description = {
         "system": {"": {"name": model.name, "gravity": _plain(model.gravity)}},
         "parameters": {"": _parameters(model)},

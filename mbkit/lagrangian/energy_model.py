@@ -1,4 +1,4 @@
-"""A system written as energies, in the shape in which engines, simulation and studies take a model."""
+"""`EnergyModel`: a `Model` defined by T and V instead of bodies."""
 
 from __future__ import annotations
 
@@ -7,27 +7,35 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import sympy as sp
+from numpy.typing import ArrayLike
 
-from mbkit._check import Array, count, generator, real
+from mbkit._check import Array, batch_of, count, generator, real
 from mbkit._escape import html, one_line
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.constraints.manifold import Manifold, manifold_of
 from mbkit.lagrangian.constraints.redundancy import is_judged, refuse_unreachable, require_independent
-from mbkit.lagrangian.energies.casadi_equations import WrittenEquations
+from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
+from mbkit.lagrangian.energies.energy_form import EnergyForm
+from mbkit.lagrangian.energies.quasi_velocities import VelocityMap
+from mbkit.lagrangian.energies.symbols import plain
+from mbkit.lagrangian.printer import Blackboard
 from mbkit.model import Model
 from mbkit.model.description import Needs
 from mbkit.model.joint_types import PRISMATIC
 from mbkit.model.parts import Body, Frame, Joint
 
-if TYPE_CHECKING:
-    from mbkit.lagrangian.system import Lagrangian
+__all__ = ["EnergyModel", "abstract_parts", "energies_latex"]
 
-__all__ = ["WrittenModel", "abstract_parts"]
+
+def energies_latex(form: EnergyForm) -> str:
+    """Return T and V as inline LaTeX."""
+    board = Blackboard(form.coordinates, form.velocities, time=form.time)
+    return f"$T = {board.latex(form.T)},\\quad V = {board.latex(form.V)}$"
 
 
 # Bodies and joints for a model of which nothing but its coordinates is known.
@@ -71,44 +79,65 @@ def _massless(name: str) -> Body:
 _DRAWS = 50
 
 
-class WrittenModel(Model):
-    """A `Lagrangian` as a model: coordinates that add, named parameters, and no bodies.
+class EnergyModel(Model):
+    """A system of energies as a model: coordinates that add, named parameters, and no bodies.
 
     Parameters
     ----------
-    system : Lagrangian
+    form : EnergyForm
     values : mapping of str to float or None, optional
         Of its parameters, instead of their own.
+
+    Raises
+    ------
+    UnsupportedError
+        Quasi-velocities whose D holds parameters.
     """
 
-    def __init__(self, system: Lagrangian, values: Mapping[str, float | None] | None = None) -> None:
-        bodies, joints = abstract_parts([q.name for q in system.coordinates])
+    def __init__(self, form: EnergyForm, values: Mapping[str, float | None] | None = None) -> None:
+        held = form.quasi.D.free_symbols - set(form.coordinates) if form.quasi is not None else None
+        if held:
+            raise UnsupportedError(
+                f"D: to run, it must hold coordinates and numbers only, but it holds {plain(held)}; "
+                f"put numbers in first: substituted({{{min(held, key=str)}: ...}})"
+            )
+        bodies, joints = abstract_parts([q.name for q in form.coordinates])
         # The parts of a frozen class are set once, here.
         put = object.__setattr__
-        put(self, "system", system)
-        put(self, "_values", dict(values or {s.name: x for s, x in system.parameters.items()}))
-        super().__init__(system.name, np.zeros(3), bodies, joints)
+        put(self, "form", form)
+        put(self, "_values", dict(values or {s.name: x for s, x in form.parameters.items()}))
+        super().__init__(form.name, np.zeros(3), bodies, joints)
 
-    system: Lagrangian
+    form: EnergyForm
     _values: dict[str, float | None]
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
-        return type(self), (self.system, self._values)
+        return type(self), (self.form, self._values)
 
     @property
-    def written(self) -> Callable[..., WrittenEquations]:
+    def written(self) -> Callable[..., EnergyEquations]:
         """What makes the equations: a function of how numbers stand in them."""
-        return partial(WrittenEquations, self)
+        return partial(EnergyEquations, self, self.form)
 
     @property
     def clock(self) -> str | None:
         """Name of the time, a parameter that simulation moves."""
-        return self.system.time.name if self.system.time is not None else None
+        return self.form.time.name if self.form.time is not None else None
 
     @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other."""
-        return bool(self.system.constraints)
+        return bool(self.form.constraints)
+
+    @cached_property
+    def rates(self) -> VelocityMap | None:
+        """q̇ = D(q) v of quasi-velocities; None where v is q̇."""
+        return None if self.form.quasi is None else VelocityMap(self.form.quasi)
+
+    @cached_property
+    def velocity_names(self) -> tuple[str, ...]:
+        """Names of the quasi-velocities, or of the coordinates."""
+        return self.coordinate_names if self.form.quasi is None else tuple(w.name for w in self.form.velocities)
 
     @cached_property
     def parameters(self) -> Mapping[str, float | None]:
@@ -124,27 +153,28 @@ class WrittenModel(Model):
     @cached_property
     def needs(self) -> Needs:
         """Damping where a force or dissipation stands; energies tell nothing else apart."""
-        s = self.system
+        s = self.form
         flags = dict.fromkeys(Needs.__dataclass_fields__, False)
         return Needs(**{**flags, "damping": any(x != 0 for x in (s.dissipation, *s.forces))})
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 over the expressions and the values of the parameters."""
-        return _sha(self._form, *(f"{n}={x!r}" for n, x in self.parameters.items()))
+        return _sha(self._expressions, *(f"{n}={x!r}" for n, x in self.parameters.items()))
 
     @cached_property
     def form_digest(self) -> str:
         """The digest without the values."""
-        return _sha(self._form, *self.parameters)
+        return _sha(self._expressions, *self.parameters)
 
     @cached_property
-    def _form(self) -> str:
-        s = self.system
-        parts = (s.T, s.V, s.dissipation, s.forces, s.constraints, s.coordinates, s.velocities, s.time)
+    def _expressions(self) -> str:
+        s = self.form
+        parts = [s.T, s.V, s.dissipation, s.forces, s.constraints, s.coordinates, s.velocities, s.time]
+        parts += [] if s.quasi is None else [s.quasi.D]
         return "\n".join((s.name, *(sp.srepr(sp.sympify(x)) for x in parts)))
 
-    def with_nominal(self, values: Mapping[str, Any]) -> WrittenModel:
+    def with_nominal(self, values: Mapping[str, Any]) -> EnergyModel:
         """Return the same system at other values of its parameters."""
         for name in values:
             if name not in self.parameters:
@@ -156,20 +186,20 @@ class WrittenModel(Model):
         out.__dict__.update(kept, _values={**self._values, **moved})
         return out
 
-    def with_parameters(self, /, **values: float) -> WrittenModel:
+    def with_parameters(self, /, **values: float) -> EnergyModel:
         """Return the same system with plain numbers for some or all parameters."""
         return self.with_nominal(values).system_at(tuple(values))
 
-    def system_at(self, names: tuple[str, ...]) -> WrittenModel:
+    def system_at(self, names: tuple[str, ...]) -> EnergyModel:
         """Return the model in which these parameters are the numbers that they have now."""
-        own = {s.name: s for s in self.system.parameters}
+        own = {s.name: s for s in self.form.parameters}
         numbers = {own[n]: sp.Float(self.parameters[n], 17) for n in names if n in own}
-        return self.system.substituted(numbers).model
+        return EnergyModel(self.form.substituted(numbers))
 
     def without(self, *features: str) -> Model:
         """Return the same system less its damping; energies do not tell what else there is."""
         if set(features) == {"damping"}:
-            return self.system.conservative().model
+            return EnergyModel(self.form.conservative())
         raise UnsupportedError(
             f"without: {self.name} was written as energies, of which only 'damping' can be left out, got {features}"
         )
@@ -206,22 +236,38 @@ class WrittenModel(Model):
 
     def require_meaningful(self, q: Array) -> None:
         """Refuse constraints that depend on each other at the first configuration that is evaluated."""
-        if self.constrained and len(q) and None not in self.parameters.values() and not is_judged(self):
+        if self.constrained and len(q) and None not in self.parameters.values() and not is_judged(self.form, self):
             require_independent(self._states.dyn, np.atleast_2d(q)[0])
 
     @cached_property
     def _states(self) -> Manifold:
         return manifold_of(LagrangianDynamics(self, compile=False))
 
+    def integrate(self, q: ArrayLike, dq: ArrayLike) -> Array:
+        """Return q + D(q) dq: the configuration that a displacement dq in the space of v leads to."""
+        if self.rates is None:
+            return super().integrate(q, dq)
+        q, dq = self.check_q(q), self.check_v(dq, "dq")
+        batch_of(q=q, dq=dq)
+        return np.asarray(q + self.rates.enter(q, dq))
+
+    def difference(self, q0: ArrayLike, q1: ArrayLike) -> Array:
+        """Return the dq with ``integrate(q0, dq) = q1``."""
+        if self.rates is None:
+            return super().difference(q0, q1)
+        q0, q1 = self.check_q(q0, "q0"), self.check_q(q1, "q1")
+        batch_of(q0=q0, q1=q1)
+        return np.asarray(self.rates.leave(q0, q1 - q0))
+
     def frame(self, name: str) -> Frame:
         """Refuse: energies have no frames."""
         raise UnsupportedError(f"frame {name!r}: {self.name} was written as energies and has no frames")
 
     def __repr__(self) -> str:
-        return one_line(f"<WrittenModel {self.name!r}: coordinates {', '.join(self.coordinate_names)}>")
+        return one_line(f"<EnergyModel {self.name!r}: coordinates {', '.join(self.coordinate_names)}>")
 
     def _repr_html_(self) -> str:
-        return f"<p><b>{html(self.name)}</b>: {html(self.system._repr_latex_())}</p>"
+        return f"<p><b>{html(self.name)}</b>: {html(energies_latex(self.form))}</p>"
 
 
 def _sha(*parts: str) -> str:

@@ -26,13 +26,13 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.constraints.manifold import Manifold
 from mbkit.lagrangian.constraints.redundancy import require_few
-from mbkit.lagrangian.energies.model import abstract_parts
+from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
 
 __all__ = ["SINGULAR", "Chart", "Embedded", "EmbeddedDynamics", "ReducedModel"]
 
 
-# The equation on the independent coordinates of one chart; see `mbkit.lagrangian.constraints.independent_coordinates`.
+# The equation on the independent coordinates of one chart; see `mbkit.lagrangian.independent_coordinates`.
 
 _MOST: Final = 25
 #: Places from which the next one is sought: more than a step has stages.
@@ -286,8 +286,9 @@ class Embedded:
     def __init__(self, manifold: Manifold, independent: tuple[str, ...] | None = None) -> None:
         self.manifold, self.dynamics, self.independent = manifold, manifold.dyn, independent
         self.model = manifold.dyn.model
-        rows = len(self.model.system.constraints)  # type: ignore[attr-defined]  # of a written model
-        require_few(self.model)
+        form = manifold.equations.form
+        rows = len(form.constraints)
+        require_few(form)
         self.degrees = self.model.nv - rows
         if self.degrees < 1:
             raise InputError(f"{self.model.name}: {rows} constraints leave none of {self.model.nv} coordinates free")

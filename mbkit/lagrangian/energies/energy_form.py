@@ -1,0 +1,374 @@
+"""A system as its energies in generalized coordinates: the data that everything else in `mbkit.lagrangian` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property, partial
+from types import MappingProxyType
+from typing import Any, Self
+
+import numpy as np
+import sympy as sp
+from sympy.core.function import AppliedUndef
+
+from mbkit._check import Array, real
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split
+from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities
+from mbkit.lagrangian.energies.symbols import (
+    PlainSymbols,
+    acceleration_of,
+    by_name,
+    expression,
+    free_name,
+    listed,
+    name_of,
+    plain,
+    velocity_of,
+)
+from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
+from mbkit.lagrangian.trig.zero_test import vanishes
+
+__all__ = [
+    "EnergyForm",
+    "acting_forces",
+    "parameter_values",
+    "read_expression",
+    "require_values",
+    "symbols_of",
+    "timed_parameters",
+    "vanish",
+]
+
+
+class EnergyForm:
+    """T, V, forces and constraints in plain symbols, checked; arguments and attributes are those of `Lagrangian`.
+
+    Attributes
+    ----------
+    quasi : QuasiVelocities or None
+        Where the velocities are not the coordinates' rates.
+    """
+
+    quasi: QuasiVelocities | None = None
+
+    def __init__(
+        self,
+        T: Any,
+        V: Any = 0,
+        coordinates: Sequence[Any] = (),
+        velocities: Sequence[Any] | None = None,
+        *,
+        time: sp.Symbol | None = None,
+        forces: Mapping[Any, Any] | None = None,
+        dissipation: Any = 0,
+        parameters: Mapping[sp.Symbol, float | None] | Iterable[sp.Symbol] | None = None,
+        constraints: Sequence[Any] = (),
+        name: str = "system on paper",
+    ) -> None:
+        self.parameters = _parameters(parameters)
+        into = PlainSymbols(coordinates, velocities, time, among=getattr(T, "free_symbols", ()), named=self.parameters)
+        self.T, self.V, self.dissipation = into("T", T), into("V", V), into("dissipation", dissipation)
+        acting = _forces(into, forces or {})
+        self.constraints = tuple(_row(into, f"constraints[{k}]", c) for k, c in enumerate(_rows(constraints)))
+        self.coordinates, self.velocities = into.coordinates, into.velocities
+        others = (self.T, self.V, self.dissipation, *self.constraints)
+        # Dynamicsymbols bring a time that need not enter by itself.
+        self.time = into.time if any(into.time in x.free_symbols for x in (*others, *acting.values())) else None
+        moving = {*self.coordinates, *self.velocities, *([self.time] if self.time else [])}
+        self.inputs = _inputs(acting, moving | set(self.parameters), others)
+        self.forces = sp.ImmutableMatrix([x if q not in self.inputs else 0 for q, x in acting.items()])
+        # A velocity of a name of its own, such as omega, has its derivative named after it.
+        self.accelerations = tuple(
+            acceleration_of(q) if w.name == velocity_of(q).name else velocity_of(w)
+            for q, w in zip(self.coordinates, self.velocities, strict=True)
+        )
+        taken = {s.name for s in (*moving, *self.parameters, *self.inputs.values(), *self.accelerations)}
+        self.multiplier_symbols = tuple(
+            sp.Symbol(free_name(f"lambda{k + 1}", taken)) for k in range(len(self.constraints))
+        )
+        _check_names(self)
+        _check_declared(self)
+        _check_velocities(self)
+        if not isinstance(name, str) or not name.strip():
+            raise InputError(f"name: expected a text, got {name!r}")
+        self.name = name
+        require_inertia(self.kinetic.M, self.coordinates, self.velocities, self.constraints)
+
+    # Parts
+
+    @cached_property
+    def kinetic(self) -> KineticSplit:
+        """T = T2 + T1 + T0, with M and b."""
+        return split(self.T, self.velocities)
+
+    @cached_property
+    def momenta(self) -> sp.ImmutableMatrix:
+        """p = ∂T/∂v, (n, 1)."""
+        return tidy_matrix(self.kinetic.M * sp.Matrix(self.velocities) + self.kinetic.b)
+
+    @property
+    def L(self) -> sp.Expr:
+        """T - V."""
+        return self.T - self.V
+
+    # Cyclic coordinates
+
+    @cached_property
+    def _ignorable(self) -> dict[sp.Symbol, sp.Expr]:
+        """Each coordinate that L does not hold -> what acts along it beside V, constraints with their λ included."""
+        multipliers = list(zip(self.multiplier_symbols, self.constraints, strict=True))
+        forces = {
+            q: tidy(x + sum((sp.diff(f, q) * symbol for symbol, f in multipliers), sp.Integer(0)))
+            for q, x in zip(self.coordinates, acting_forces(self), strict=True)
+        }
+        # Term by term in the velocities, so that each is short.
+        parts = (*self.kinetic.M, *self.kinetic.b, self.kinetic.T0, self.V)
+        return {q: forces[q] for q in self.coordinates if vanish(sp.diff(x, q) for x in parts)}
+
+    def cyclic_coordinates(self) -> tuple[sp.Symbol, ...]:
+        """Return the coordinates that L does not hold and along which nothing acts: their momenta are constant."""
+        return tuple(q for q, force in self._ignorable.items() if force == 0)
+
+    def forced_cyclic_coordinates(self) -> dict[sp.Symbol, sp.Expr]:
+        """Return the other coordinates that L does not hold, each with the force that acts along it."""
+        return {q: force for q, force in self._ignorable.items() if force != 0}
+
+    # Variants
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(type(self), **self._arguments()), ()
+
+    def _arguments(self) -> dict[str, Any]:
+        return {
+            "T": self.T,
+            "V": self.V,
+            "coordinates": self.coordinates,
+            "velocities": self.velocities,
+            "time": self.time,
+            "forces": {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)},
+            "dissipation": self.dissipation,
+            "parameters": dict(self.parameters),
+            "constraints": self.constraints,
+            "name": self.name,
+        }
+
+    def _like(self, **changes: Any) -> Self:
+        """Return the same system with other arguments."""
+        return type(self)(**{**self._arguments(), **changes})
+
+    def substituted(self, values: Mapping[sp.Symbol, Any]) -> Self:
+        """Return the same system with numbers for some parameters."""
+        own = {s.name: s for s in self.parameters}
+        put = {}
+        for given, x in values.items():
+            symbol = own.get(str(given))
+            if symbol is None:
+                raise InputError(f"values: {given} is no parameter; they are {plain(self.parameters) or 'none'}")
+            put[symbol] = sp.sympify(x)
+        forces = {q: self.inputs.get(q, x.subs(put)) for q, x in zip(self.coordinates, self.forces, strict=True)}
+        return self._like(
+            T=self.T.subs(put),
+            V=self.V.subs(put),
+            dissipation=self.dissipation.subs(put),
+            forces=forces,
+            constraints=[c.subs(put) for c in self.constraints],
+            parameters={s: x for s, x in self.parameters.items() if s not in put},
+        )
+
+    def conservative(self) -> Self:
+        """Return the same system without dissipation and forces; inputs stay."""
+        return self._like(dissipation=0, forces=dict(self.inputs))
+
+
+def vanish(parts: Iterable[sp.Expr]) -> bool:
+    """Return whether all expressions are zero; decimals that cancel do so in their own digits only."""
+    return all(vanishes(x) or (x.has(sp.Float) and tidy(x) == 0) for x in parts)
+
+
+def acting_forces(form: EnergyForm) -> list[sp.Expr]:
+    """Return the generalized forces beside V's: forces, inputs and dissipation, one a coordinate."""
+    # Not from the equations of motion, whose Christoffel symbols are long.
+    named = zip(form.coordinates, form.velocities, form.forces, strict=True)
+    return [tidy(x + form.inputs.get(q, sp.Integer(0)) - sp.diff(form.dissipation, w)) for q, w, x in named]
+
+
+def timed_parameters(form: EnergyForm) -> tuple[sp.Symbol, ...]:
+    """Return the time, where it enters, and the parameters."""
+    return (*(() if form.time is None else (form.time,)), *form.parameters)
+
+
+def parameter_values(form: EnergyForm, values: Mapping[str, float], what: str) -> Array:
+    """Return the numbers of the parameters in their order, with some replaced.
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        A parameter without a value; no such parameter.
+    """
+    numbers = {s.name: x for s, x in form.parameters.items()}
+    for name in values:
+        if name not in numbers:
+            raise UnknownNameError("parameter", name, numbers)
+    numbers |= {n: real(f"parameter {n!r}", x) for n, x in values.items()}
+    require_values(numbers, what)
+    return np.array(list(numbers.values()), dtype=np.float64)
+
+
+def require_values(numbers: Mapping[str, float | None], what: str) -> None:
+    """Refuse parameters without a value, by name."""
+    missing = [n for n, x in numbers.items() if x is None]
+    if missing:
+        example = ", ".join(f"{n}=..." for n in missing)
+        raise InputError(f"{what}: no value for parameter {', '.join(map(repr, missing))}; give it as {example}")
+
+
+def symbols_of(form: EnergyForm) -> list[sp.Symbol]:
+    """Return parameters, inputs, time, velocities and coordinates."""
+    time = [] if form.time is None else [form.time]
+    return [*form.parameters, *form.inputs.values(), *time, *form.velocities, *form.coordinates]
+
+
+def read_expression(
+    form: EnergyForm, what: str, given: Any, also: Iterable[sp.Symbol] = (), *, others: bool = False
+) -> sp.Expr:
+    """Return an expression in a system's own symbols, from symbols of the same names or dynamicsymbols.
+
+    Raises
+    ------
+    InputError
+        It holds symbols that are neither the system's nor in `also`, unless `others` are allowed.
+    """
+    own = [*symbols_of(form), *also]
+    known = {s.name: s for s in own}
+    rates = {q.name: v for q, v in zip(form.coordinates, form.velocities, strict=True)}
+    out = expression(what, given, known)
+    for d in out.atoms(sp.Derivative):
+        name = name_of(d.expr)
+        if name in rates and d.derivative_count == 1:
+            out = out.subs(d, rates[name])
+    out = out.subs({f: known[name_of(f)] for f in out.atoms(AppliedUndef) if name_of(f) in rates})
+    out = by_name(out, known)
+    unknown = [str(x) for x in (*out.atoms(sp.Derivative), *out.atoms(AppliedUndef), *(out.free_symbols - set(own)))]
+    if unknown and not others:
+        raise InputError(f"{what}: {', '.join(sorted(unknown))} is no symbol of {form.name}: {', '.join(known)}")
+    return out
+
+
+# Arguments
+
+
+def _parameters(given: Any) -> Mapping[sp.Symbol, float | None]:
+    if isinstance(given, Mapping):
+        pairs: Iterable[tuple[Any, Any]] = given.items()
+    else:
+        none = given is None or (not isinstance(given, sp.Basic) and not given)
+        pairs = [] if none else ((s, None) for s in listed("parameters", given))
+    out: dict[sp.Symbol, float | None] = {}
+    for symbol, value in pairs:
+        if not isinstance(symbol, sp.Symbol):
+            raise InputError(f"parameters: expected SymPy symbols, got {symbol!r}")
+        if any(s.name == symbol.name for s in out):
+            raise InputError(f"parameters: {symbol.name!r} stands twice; a name stands for one number")
+        out[symbol] = None if value is None else real(f"parameter {symbol}", value)
+    return MappingProxyType(out)
+
+
+def _forces(into: PlainSymbols, given: Any) -> dict[sp.Symbol, sp.Expr]:
+    if not isinstance(given, Mapping):
+        raise InputError(f"forces: expected {{coordinate: force}}, got {given!r}")
+    out: dict[sp.Symbol, sp.Expr] = dict.fromkeys(into.coordinates, sp.Integer(0))
+    told = set()
+    for key, value in given.items():
+        coordinate = into("forces", key)
+        if coordinate not in out:
+            names = ", ".join(map(str, into.coordinates))
+            raise InputError(f"forces: {key} is no coordinate; the coordinates are {names}")
+        if coordinate in told:
+            raise InputError(f"forces: {coordinate} stands twice; add the forces along it")
+        told.add(coordinate)
+        out[coordinate] = into(f"forces[{key}]", value)
+    return out
+
+
+def _rows(given: Any) -> Sequence[Any]:
+    if isinstance(given, (sp.Basic, str)) and not isinstance(given, sp.Tuple):
+        given = [given]
+    try:
+        return list(given)
+    except TypeError:
+        raise InputError(f"constraints: expected a list of expressions, got {given!r}") from None
+
+
+def _row(into: PlainSymbols, what: str, given: Any) -> sp.Expr:
+    """Return what is zero; of an equation its left side less its right side."""
+    if isinstance(given, sp.Equality):
+        return into(what, given.lhs) - into(what, given.rhs)
+    return into(what, given)
+
+
+def _inputs(
+    given: Mapping[sp.Symbol, sp.Expr], known: set[sp.Symbol], others: Iterable[sp.Expr]
+) -> Mapping[sp.Symbol, sp.Symbol]:
+    """Return the symbols that stand alone as a force, and nowhere else."""
+    counts: dict[Any, int] = {}
+    for x in (*given.values(), *others):
+        for s in x.free_symbols:
+            counts[s] = counts.get(s, 0) + 1
+    alone = {q: x for q, x in given.items() if isinstance(x, sp.Symbol) and x not in known and counts[x] == 1}
+    return MappingProxyType(alone)
+
+
+def _parts(d: EnergyForm) -> dict[str, sp.Expr]:
+    """Return every expression by what it is called in a message."""
+    out = {"T": d.T, "V": d.V, "dissipation": d.dissipation}
+    out |= {f"forces[{q}]": x for q, x in zip(d.coordinates, d.forces, strict=True)}
+    return out | {f"constraints[{k}]": x for k, x in enumerate(d.constraints)}
+
+
+def _check_names(d: EnergyForm) -> None:
+    own = {s.name for s in (*d.coordinates, *d.velocities, *([d.time] if d.time else []))}
+    clash = [s for s in d.parameters if s.name in own]
+    if clash:
+        raise InputError(f"parameters: {plain(clash)} is a coordinate, a velocity or the time already")
+    rates = {a.name: v for a, v in zip(d.accelerations, d.velocities, strict=True)}
+    for what, symbols in (("parameters", d.parameters), ("forces", d.inputs.values()), ("coordinates", d.coordinates)):
+        for s in symbols:
+            if s.name in rates:
+                raise InputError(f"{what}: {s.name} is what the derivative of {rates[s.name]} is called; rename it")
+
+
+def _check_declared(d: EnergyForm) -> None:
+    known = {*d.coordinates, *d.velocities, *d.parameters, *([d.time] if d.time else [])}
+    parts = _parts(d)
+    unknown = {s for x in parts.values() for s in x.free_symbols} - known
+    if not unknown:
+        return
+    where = [name for name, x in parts.items() if x.free_symbols & unknown]
+    first = min(unknown, key=lambda s: s.name)
+    told = f"parameters: {plain(unknown)} stands in {', '.join(where)} and is not declared; "
+    told += f"add {first}=... to it as parameters={{{first}: 1.0}}, or with None for no value yet"
+    if all(name.startswith("forces") for name in where):
+        told += " (an input is a symbol that is all of one force, and stands nowhere else)"
+    elif "t" in {s.name for s in unknown} and d.time is None:
+        told += " (the time is given as time=t)"
+    else:
+        told += f" (the velocities are {', '.join(map(str, d.velocities))})"
+    raise InputError(told)
+
+
+def _check_velocities(d: EnergyForm) -> None:
+    """Refuse velocities where there can be none, and what says nothing without one."""
+    moving = set(d.velocities)
+    for name, x in _parts(d).items():
+        held = x.free_symbols & moving
+        if held and (name == "V" or name.startswith("constraints")):
+            raise InputError(f"{name}: expected coordinates, time and parameters only, got the velocity {plain(held)}")
+    if d.dissipation != 0 and not d.dissipation.free_symbols & moving:
+        raise InputError(
+            f"dissipation: {d.dissipation} holds none of the velocities {', '.join(map(str, d.velocities))}, and its "
+            "force is what it gains by them; a potential energy belongs in V"
+        )
+    for k, x in enumerate(d.constraints):
+        if not x.free_symbols & set(d.coordinates):
+            raise InputError(f"constraints[{k}]: {x} holds no coordinate, so that it binds none")

@@ -1,0 +1,200 @@
+"""Quasi-velocities: a system's equations in velocities w that are no coordinates' rates, q̇ = D(q) w.
+
+Boltzmann and Hamel's equations (Greenwood 2003, Advanced Dynamics, ch. 4.3), with T(q, w, t)
+and p_k = ∂T/∂w_k::
+
+    d/dt ∂T/∂w_i  -  Σ_r D_ri ∂T/∂q_r  +  Σ_jk γ^k_ij w_j p_k  =  Σ_r D_ri (Q_r - ∂V/∂q_r)
+
+    γ^k_ij = Σ_rs (∂W_kr/∂q_s - ∂W_ks/∂q_r) D_ri D_sj          W = D⁻¹
+
+The upper index k belongs to the momentum, i to the equation, j to the velocity; γ is
+skew in i and j. The columns of D are vector fields whose Lie brackets it holds:
+[D_i, D_j] = Σ_k γ^k_ij D_k. For a rotation and body-axes rates γ^k_ij = ε_ijk, and the term
+is ω × p, Euler's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import sympy as sp
+from sympy.core.function import AppliedUndef
+
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.lagrangian.energies.energy_form import EnergyForm, read_expression, symbols_of
+from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion
+from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, inverse
+from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities
+from mbkit.lagrangian.energies.symbols import fits
+from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
+
+__all__ = ["QuasiEquationsOfMotion", "in_quasi_velocities", "quasi_equations"]
+
+
+@dataclass(frozen=True)
+class QuasiEquationsOfMotion(EquationsOfMotion):
+    """M ẇ + C w + d + Dᵀ ∂V/∂q = Dᵀ Q, with q̇ = D w.
+
+    `velocities` are w, `potential_gradient` is Dᵀ ∂V/∂q and `forces` Dᵀ Q. C is Christoffel's
+    with the structure of D in it, so that Ṁ - 2C is skew.
+
+    Attributes
+    ----------
+    D : (n, n) sympy.Matrix
+    rates : tuple of sympy.Symbol
+        q̇.
+    hamel_coefficients : (n, n, n) sympy array
+        γ, with ``hamel_coefficients[k, i, j]`` = γ^k_ij.
+    """
+
+    D: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 0, []))
+    rates: tuple[sp.Symbol, ...] = ()
+    hamel_coefficients: sp.ImmutableDenseNDimArray = field(default_factory=lambda: sp.ImmutableDenseNDimArray([]))
+
+    def kinematics(self) -> tuple[sp.Eq, ...]:
+        """Return q̇ = D w, one equation per coordinate."""
+        right = self.D * sp.Matrix(self.velocities)
+        return tuple(sp.Eq(a, b, evaluate=False) for a, b in zip(self.rates, right, strict=True))
+
+
+def quasi_equations(system: EnergyForm, quasi: QuasiVelocities) -> QuasiEquationsOfMotion:
+    """Return Boltzmann's and Hamel's equations of a system, term by term."""
+    k, n, t = system.kinetic, len(system.coordinates), system.time
+    v, gamma, w = sp.Matrix(system.velocities), quasi.hamel_coefficients, system.velocities
+    drift = sp.zeros(n, 1)
+    if any(k.b) or k.T0 != 0:
+        slope = sp.Matrix.hstack(*_along(quasi, k.b))
+        turned = sp.Matrix(n, n, lambda i, j: sum(gamma[h, i, j] * k.b[h] for h in range(n)))
+        drift += (slope - slope.T + turned) * v - sp.Matrix(_along(quasi, k.T0))
+    if t is not None:
+        drift += sp.diff(k.M, t) * v + sp.diff(k.b, t)
+    friction = sp.Matrix([sp.diff(system.dissipation, x) for x in w])
+    return QuasiEquationsOfMotion(
+        coordinates=system.coordinates,
+        velocities=w,
+        accelerations=system.accelerations,
+        mass_matrix=k.M,
+        coriolis_matrix=_coriolis_matrix(system, quasi),
+        drift=tidy_matrix(drift),
+        potential_gradient=tidy_matrix(_along(quasi, system.V)),
+        forces=tidy_matrix(sp.Matrix(system.forces) + quasi.input_forces - friction),
+        D=quasi.D,
+        rates=quasi.rates,
+        hamel_coefficients=gamma,
+    )
+
+
+def _along(quasi: QuasiVelocities, x: Any) -> list[Any]:
+    """Return the derivative of x along each column of D."""
+    by = [sp.diff(x, q) for q in quasi.coordinates]
+    n = len(by)
+    return [sum((quasi.D[r, i] * by[r] for r in range(n)), 0 * x) for i in range(n)]
+
+
+def _coriolis_matrix(system: EnergyForm, quasi: QuasiVelocities) -> sp.ImmutableMatrix:
+    """Return C_ij = ½ Σ_k (D_k M_ij + D_j M_ik - D_i M_jk + c_ikj - c_jki - c_kji) w_k.
+
+    Koszul's formula for the connection of M in the frame of D's columns, with D_k the derivative
+    along a column and c_lij = Σ_h M_lh γ^h_ij.
+    """
+    M, n, gamma = system.kinetic.M, len(system.coordinates), quasi.hamel_coefficients
+    slopes = _along(quasi, sp.Matrix(M))
+    c = [[[sum(M[h, m] * gamma[m, i, j] for m in range(n)) for j in range(n)] for i in range(n)] for h in range(n)]
+
+    def entry(i: int, j: int) -> sp.Expr:
+        terms = (
+            (slopes[k][i, j] + slopes[j][i, k] - slopes[i][j, k] + c[i][k][j] - c[j][k][i] - c[k][j][i])
+            * system.velocities[k]
+            for k in range(n)
+        )
+        return tidy(sum(terms, sp.Integer(0)) / 2)
+
+    return sp.ImmutableMatrix(n, n, entry)
+
+
+def in_quasi_velocities(system: EnergyForm, D: Any, names: Any) -> tuple[dict[str, Any], KineticSplit, QuasiVelocities]:
+    """Return the arguments of the system in velocities w with q̇ = D w, the parts of its T, and D with its inverse.
+
+    Raises
+    ------
+    InputError
+        D of another shape, with other symbols, or singular everywhere; names that are taken.
+    UnsupportedError
+        Constraints act on the system.
+    """
+    if system.constraints:
+        raise UnsupportedError(
+            f"quasi_velocities: {system.name} has constraints, whose multipliers act on coordinates; embed them first"
+        )
+    D = tidy_matrix(_checked(system, D))
+    W, w, k = inverse(D, "D"), _named(system, names), system.kinetic
+    M, b = tidy_matrix(D.T * k.M * D), tidy_matrix(D.T * k.b)
+    v = sp.Matrix(w)
+    T2, T1 = (v.T * M * v)[0] / 2, (b.T * v)[0]
+    put = dict(zip(system.velocities, D * v, strict=True))
+    forces = tidy_matrix(D.T * system.forces.subs(put, simultaneous=True))
+    inputs = [system.inputs.get(q, sp.Integer(0)) for q in system.coordinates]
+    arguments = {
+        "T": tidy(T2) + T1 + k.T0,
+        "V": system.V,
+        "coordinates": system.coordinates,
+        "velocities": w,
+        "time": system.time,
+        "forces": dict(zip(system.coordinates, forces, strict=True)),
+        "dissipation": tidy(system.dissipation.subs(put, simultaneous=True)),
+        "parameters": system.parameters,
+        "name": system.name,
+    }
+    quasi = QuasiVelocities(D, W, system.coordinates, system.velocities, tidy_matrix(D.T * sp.Matrix(inputs)))
+    return arguments, KineticSplit(T2=tidy(T2), T1=T1, T0=k.T0, M=M, b=b), quasi
+
+
+def _checked(system: EnergyForm, given: Any) -> sp.ImmutableMatrix:
+    n = len(system.coordinates)
+    try:
+        D = sp.ImmutableMatrix(given)
+    except (TypeError, ValueError):
+        raise InputError(f"D: expected a SymPy matrix ({n}, {n}), got {type(given).__name__}") from None
+    if D.shape != (n, n):
+        raise InputError(
+            f"D: expected shape ({n}, {n}), one row for each of {', '.join(map(str, system.coordinates))}, "
+            f"got {D.shape}"
+        )
+    if D.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise InputError(f"D: expected finite entries, got {D.tolist()}")
+    D = D.applyfunc(lambda x: read_expression(system, "D", x, others=True))
+    if system.time is not None and system.time in D.free_symbols:
+        raise InputError(f"D: expected coordinates and parameters only, got the time {system.time}")
+    others = {str(x) for x in D.free_symbols - set(system.coordinates) - set(system.parameters)}
+    others |= {str(x) for x in D.atoms(AppliedUndef)}
+    if others:
+        raise InputError(
+            f"D: expected the coordinates {', '.join(map(str, system.coordinates))} and parameters only, "
+            f"got {', '.join(sorted(others))}; q̇ = D w with D of q alone"
+        )
+    return D
+
+
+def _named(system: EnergyForm, names: Any) -> list[sp.Symbol]:
+    n = len(system.coordinates)
+    if names is None:
+        names = [f"w{i + 1}" for i in range(n)]
+    if isinstance(names, str):
+        names = names.replace(",", " ").split()
+    given: Sequence[Any] = list(names)
+    if len(given) != n:
+        raise InputError(f"names: expected {n}, one for each column of D, got {len(given)}")
+    out = []
+    for x in given:
+        if not isinstance(x, (str, sp.Symbol)) or not str(x):
+            raise InputError(f"names: expected names or symbols, got {x!r}")
+        out.append(sp.Symbol(x) if isinstance(x, str) else x)
+        fits("velocities", out[-1])
+    taken = {s.name for s in symbols_of(system)}
+    for s in out:
+        if s.name in taken:
+            raise InputError(f"names: {s.name!r} stands for something else already")
+        taken.add(s.name)
+    return out
