@@ -139,11 +139,6 @@ def _end() -> None:
     """End this process and those that it started."""
     for action in list(_interrupts.at_end):
         action()
-    if "multiprocessing" in sys.modules:
-        import multiprocessing
-
-        for process in multiprocessing.active_children():
-            process.kill()
     os._exit(INTERRUPTED)
 
 

@@ -15,9 +15,9 @@ from click.testing import CliRunner, Result
 
 from mbkit.cli import cli
 from mbkit.errors import OutputError, UnknownNameError
-from mbkit.studies._processes import WorkerDiedError, run
 from mbkit.studies.compare import all_robots as sweeps
 from mbkit.studies.compare.all_robots import RobotOutcome, all_robots
+from mbkit.studies.worker import WorkerDiedError, run
 
 QUICK = ("--no-rollouts", "--samples", "4")
 
@@ -436,16 +436,19 @@ def test_an_executor_that_takes_no_more_leaves_a_reason():
     assert isinstance(found["a"], WorkerDiedError)
 
 
-def test_leaving_the_loop_ends_the_processes():
-    import multiprocessing
-    import time
-
-    begun = time.perf_counter()
-    for name, _ in run({"quick": partial(abs, 1), "slow": partial(time.sleep, 60)}, jobs=2):
+def test_leaving_the_loop_ends_the_processes(tmp_path):
+    noted = tmp_path / "pid"
+    slow = f"import os, time; open({str(noted)!r}, 'w').write(str(os.getpid()) + '.'); time.sleep(600)"
+    pids = []
+    for name, pid in run({"quick": os.getpid, "slow": partial(exec, slow)}, jobs=2):
         assert name == "quick"
+        while not noted.exists() or not noted.read_text().endswith("."):
+            pass
+        pids = [pid, int(noted.read_text()[:-1])]
         break
-    assert time.perf_counter() - begun < 30
-    assert not multiprocessing.active_children()
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
 
 
 # Files of others.

@@ -65,9 +65,9 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         return mb.compare_parsers(path, importers, samples=1, **options)
 
     yield run
-    kept = process._kept.pop(key, None)
-    if kept is not None:
-        kept.end()
+    worker = process._workers.pop(key, None)
+    if worker is not None:
+        worker.end()
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,7 @@ def test_one_that_hangs_is_stopped_and_the_next_file_read(told) -> None:
     assert first.agrees
     assert first.notes == second.notes != (str(os.getpid()),)
     # One that was interrupted owes an answer that nobody wants.
-    kept = process._kept[imported.IMPORTERS["drake"]]
-    kept.owes = True
+    process._workers[imported.IMPORTERS["drake"]].begin(os.getpid)
     assert told("sound").importers[0].notes != first.notes
     with pytest.raises(InputError, match="seconds"):
         told("sound", seconds=-1.0)
@@ -117,14 +116,17 @@ def test_in_a_script_without_a_guard_in_its_forks_and_after_its_end(tmp_path: Pa
 
             def pid():
                 assert mb.compare_parsers("r.urdf", ("mujoco",)).importers[0].agrees
-                return next(iter(process._kept.values())).child._process.pid
+                (worker,) = process._workers.values()
+                return worker.call(os.getpid)
 
             first = pid()
             forked = os.fork()
             if not forked:
-                # Let go of, with what was open of it.
-                assert not process._kept
-                raise SystemExit(0)
+                # A fork has no part in its parent's processes.
+                (worker,) = process._workers.values()
+                own = worker.call(os.getpid)
+                worker.end()
+                raise SystemExit(own == first)
             assert os.waitpid(forked, 0)[1] == 0
             assert pid() == first
             print(first)

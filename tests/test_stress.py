@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -28,10 +27,10 @@ from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies import InterruptedSweepError, StressResult
 from mbkit.studies.compare.rollouts import TooLongError
 from mbkit.studies.stress import Case, CaseResult, Cell, Row, stress
-from mbkit.studies.stress.messages import Condition, Failed, Prepare, Prepared
-from mbkit.studies.stress.reference import Search, condition, limited
-from mbkit.studies.stress.sweep import Bounds, CaseSweep
-from mbkit.studies.stress.worker import USED_UP, LostError
+from mbkit.studies.stress.measure import Prepared, condition_number, measure, prepare
+from mbkit.studies.stress.reference import ReferenceSearch, condition, cpu_limit
+from mbkit.studies.stress.sweep import OUT_OF_TIME, CaseSweep, Limits
+from mbkit.studies.worker import WorkerDiedError, WorkerTimeoutError
 from tests import stress_cases as own
 
 METHODS = ("rk4", *own.ENDS)
@@ -51,7 +50,7 @@ def study(told, tmp_path_factory) -> StressResult:
         [own.ENDING, own.FAULTY, own.MASSES, own.GLIDING],
         ["pinocchio"],
         METHODS,
-        seconds=0.3,
+        seconds=1.5,
         memory=2**30,
         budget=300,
         jobs=2,
@@ -215,25 +214,37 @@ def test_outcomes_by_error_floor_and_warning():
 # What is asked next
 
 
-def swept(answers, values=(1, 2, 3, 4), methods=("rk4", "rk853")) -> CaseResult:
-    """A case whose worker answers as told, by value and method."""
-    case = Case("fake", "None.", "step", "x", "", values, (), own.swing)
-    sweep = CaseSweep("0", case, values, [("pinocchio", m) for m in methods], 1e-6, Bounds(1.0, 1e-3, 1e-8), str)
-    asked = []
+class FakeWorker:
+    """Answers as told: by (stage "case" or method, value), a result, or the stage and the exception."""
 
-    def ask(request, _patience):
-        if isinstance(request, Prepare):
-            return answers.get(("case", request.value)) or Prepared("known")
-        if isinstance(request, Condition):
-            return 1.0
-        asked.append((request.value, request.method))
-        found = answers.get((request.method, request.value), Cell(request.value, "finished", 0.0))
-        if isinstance(found, Exception):
-            raise found
+    def __init__(self, answers=()):
+        self.answers, self.stage = dict(answers), ""
+
+    def call(self, function, _case, value, *args, **_limits):
+        key = {prepare: "case", condition_number: "condition"}.get(function) or args[0].method
+        default = {"case": Prepared("known"), "condition": 1.0}.get(key, Cell(value, "finished", 0.0))
+        found = self.answers.get((key, value), default)
+        self.stage = "run" if function is measure else ""
+        if isinstance(found, tuple):
+            self.stage, error = found
+            raise error
         return found
 
-    assert sweep.prepare(ask, time.perf_counter() + 10)
-    assert sweep.run("pinocchio", ask, time.perf_counter() + 10)
+
+def fake_sweep(values, methods, deadline=math.inf) -> tuple[CaseSweep, list[float]]:
+    """A sweep, and the time on its clock."""
+    now = [0.0]
+    case = Case("fake", "None.", "step", "x", "", values, (), own.swing)
+    rows = [("pinocchio", m) for m in methods]
+    return CaseSweep(case, values, rows, 1e-6, Limits(1.0, 1e-3, 1e-8), str, deadline, lambda: now[0]), now
+
+
+def swept(answers, values=(1, 2, 3, 4), methods=("rk4", "rk853")) -> CaseResult:
+    """A case whose worker answers as told."""
+    sweep, _ = fake_sweep(values, methods)
+    worker = FakeWorker(answers)
+    assert sweep.prepare(worker, 10.0)
+    assert sweep.run("pinocchio", worker, 10.0)
     assert sweep.done == sweep.size
     return sweep.result()
 
@@ -243,7 +254,7 @@ def ends(result: CaseResult) -> dict[str, list[str]]:
 
 
 def test_a_row_ends_where_more_would_only_cost():
-    found = ends(swept({("rk4", 2): LostError("slow", "stopped", "run"), ("rk853", 1): Cell(1, "diverged")}))
+    found = ends(swept({("rk4", 2): ("run", WorkerTimeoutError(1.0)), ("rk853", 1): Cell(1, "diverged")}))
     assert found["rk4"] == ["finished", "slow", "not run", "not run"]
     assert found["rk853"] == ["diverged", "finished", "finished", "finished"]
     twice = {("rk4", 1): Cell(1, "refused"), ("rk4", 2): Cell(2, "diverged")}
@@ -251,32 +262,45 @@ def test_a_row_ends_where_more_would_only_cost():
 
 
 def test_an_engine_that_cannot_be_made_is_asked_once():
-    found = swept({("rk4", 2): LostError("died", "crash", "engine")})
+    found = swept({("rk4", 2): ("engine", WorkerDiedError("crash"))})
     assert ends(found)["rk4"] == ends(found)["rk853"] == ["finished", "died", "not run", "not run"]
 
 
 def test_a_problem_that_takes_for_ever_is_asked_once():
-    found = swept({("case", 2): Failed("slow", "stopped", "case")})
+    found = swept({("case", 2): ("", WorkerTimeoutError(1.0))})
     assert ends(found)["rk4"] == ends(found)["rk853"] == ["finished", "slow", "finished", "finished"]
 
 
 def test_when_the_time_is_used_up_it_says_so_and_goes_on_with_more():
-    case = Case("fake", "None.", "step", "x", "", (1,), (), own.swing)
-    sweep = CaseSweep("0", case, (1,), [("pinocchio", "rk4")], 1e-6, Bounds(1.0, 1e-3, 1e-8), str)
-    later = time.perf_counter() + 10
+    sweep, now = fake_sweep((1,), ("rk4",), deadline=10.0)
     # Not before the truth is there.
-    assert not sweep.run("pinocchio", lambda *_: None, later)
-    assert sweep.prepare(lambda asked, _: Prepared("known") if isinstance(asked, Prepare) else 1.0, later)
-    assert not sweep.run("pinocchio", lambda *_: None, time.perf_counter())
-    assert sweep.result().rows[0].cells[0].note == USED_UP
-    assert sweep.run("pinocchio", lambda *_: Cell(1, "finished", 0.0), later)
+    assert not sweep.run("pinocchio", FakeWorker(), 10.0)
+    assert sweep.prepare(FakeWorker(), 10.0)
+    now[0] = 5.0
+    assert not sweep.run("pinocchio", FakeWorker(), 5.0)
+    assert sweep.result().rows[0].cells[0].note == OUT_OF_TIME
+    assert sweep.run("pinocchio", FakeWorker(), 10.0)
     assert sweep.result().rows[0].reach(1e-6) == 1
 
 
+def test_a_cell_that_is_stopped_by_the_end_of_the_study_is_not_slow():
+    sweep, now = fake_sweep((1,), ("rk4",), deadline=10.0)
+    assert sweep.prepare(FakeWorker(), 10.0)
+
+    class Late(FakeWorker):
+        def call(self, *args, **limits):
+            now[0] = 10.0
+            return super().call(*args, **limits)
+
+    assert sweep.run("pinocchio", Late({("rk4", 1): ("run", WorkerTimeoutError(1.0))}), 10.0)
+    cell = sweep.result().rows[0].cells[0]
+    assert (cell.end, cell.note) == ("not run", OUT_OF_TIME)
+
+
 def test_a_bound_of_time_ends_what_does_not_ask():
-    with pytest.raises(TooLongError, match=r"given up after 0\.05 s"), limited(0.05):
+    with pytest.raises(TooLongError, match=r"given up after 0\.05 s"), cpu_limit(0.05):
         any(False for _ in itertools.count())
-    with pytest.raises(KeyboardInterrupt), limited(10.0):
+    with pytest.raises(KeyboardInterrupt), cpu_limit(10.0):
         raise KeyboardInterrupt
     # And nothing is left of it.
     assert signal.getitimer(signal.ITIMER_PROF) == (0.0, 0.0)
@@ -287,14 +311,14 @@ def test_a_bound_of_time_ends_what_does_not_ask():
 
 def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none():
     problem, times = own.sprung(100.0), np.linspace(0, 0.5, 11)
-    truth, told = Search().truth(problem, times, 1e-7, 5.0)
+    truth, told = ReferenceSearch().truth(problem, times, 1e-7, 5.0)
     assert truth.floor < 1e-10
     assert "rk853 on lagrangian" in told
     # At 50 µs its own error is 1e-13.
     other = mb.simulate(mb.dynamics(problem.model, "mujoco"), problem.q, problem.v, 0.5, "mujoco_rk4", 5e-5, save=times)
     assert np.abs(truth.q - other.q).max() < 1e-12
     # 1e5 swings cannot be followed in the time.
-    truth, told = Search().truth(own.sprung(1e12), times, 1e-7, 0.5)
+    truth, told = ReferenceSearch().truth(own.sprung(1e12), times, 1e-7, 0.5)
     assert truth is None
     assert told.startswith("no truth: ")
 

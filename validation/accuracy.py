@@ -29,11 +29,11 @@ from rich.table import Table
 import mbkit as mb
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError, MbkitWarning, ModelError
-from mbkit.studies._processes import run
 from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS as ALL_TERMS
 from mbkit.studies.compare.terms import states
 from mbkit.studies.results import processor, versions
+from mbkit.studies.worker import run
 from tests.random_trees import random_tree
 
 HERE = Path(__file__).parent

@@ -132,12 +132,12 @@ def bench(
 
 @contextmanager
 def _workers(jobs: int | None) -> Iterator[Executor | None]:
-    from mbkit.studies._processes import Pool
+    from mbkit.studies.worker import WorkerPool
 
     if jobs is None:
         yield None
     else:
-        with Pool(jobs) as pool:
+        with WorkerPool(jobs) as pool:
             yield pool
 
 

@@ -16,9 +16,9 @@ from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError
 from mbkit.load import load, robots
 from mbkit.load.robot_data import find
 from mbkit.studies import results
-from mbkit.studies._processes import run
 from mbkit.studies.compare.result import Comparison
 from mbkit.studies.compare.study import compare
+from mbkit.studies.worker import run
 
 __all__ = ["RobotOutcome", "Sweep", "all_robots"]
 

@@ -435,16 +435,16 @@ def _read(
         try:
             check_installed(engine)
             begun[engine] = Reading(engine, stripped.text, stripped.format, floating_base, stripped.meshes, seconds)
-        except (UnsupportedError, ImporterError) as error:
+        except UnsupportedError as error:
             refused[engine] = str(error)
     for engine, reading in begun.items():
         try:
-            reading.send()
+            reading.begin()
         except ImporterError as error:
             refused[engine] = str(error)
     for engine in [e for e in begun if e not in refused]:
         try:
-            read[engine] = begun[engine].made()
+            read[engine] = begun[engine].result()
         except ImporterError as error:
             refused[engine] = str(error)
     return read, refused

@@ -1,138 +1,240 @@
-"""One engine and method at one value: the run, timed, and its error."""
+"""What a worker process of a stress study computes: the reference of one value, and one cell."""
 
 from __future__ import annotations
 
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines import Dynamics
+from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.methods.registry import METHODS
 from mbkit.simulate import Trajectory, simulate
 from mbkit.studies.compare.errors import interleaved
 from mbkit.studies.compare.rollouts import TooLongError, patience, quiet_simulate
-from mbkit.studies.stress.case import Measure, Problem, Truth, step_of
-from mbkit.studies.stress.messages import Doing, Run
-from mbkit.studies.stress.reference import TERMS, Terms, error_of, limited
+from mbkit.studies.stress.case import Case, Truth, problem_of, step_of, times_of
+from mbkit.studies.stress.reference import (
+    TERMS,
+    ReferenceSearch,
+    Terms,
+    condition,
+    cpu_limit,
+    error_of,
+    reference_terms,
+)
 from mbkit.studies.stress.result import Cell
+from mbkit.studies.worker import report_stage
 
-__all__ = ["evaluated", "heard_warnings", "integrated"]
+__all__ = ["Prepared", "Setting", "condition_number", "measure", "prepare"]
 
-#: Seconds of the processor: those of the wall are other processes' too. A run has one thread, and Linux tells
-#: those of the whole process to some milliseconds only while there is a timer on them.
+#: Processor time: the wall's is also other processes'. A run has one thread, and Linux gives the time of the whole
+#: process to some milliseconds only, unless there is a timer on it.
 _clock = time.thread_time
 
 #: A run shorter than this is timed so many times in all, s.
 _SHORT: Final = 5e-3
 _REPEATS: Final = 3
-#: What asks nobody whether to go on is stopped so much later than what does.
+#: Solvers that do not poll the deadline are interrupted so much later.
 _LATER: Final = 1.1
-#: What a method may turn to under way, and is compiled before.
-_TURNS_TO: Final = {"auto": ("rk853", "rodas5")}
-#: What a run may take that compiles on its way, beside one that does not.
-_FIRST: Final = 2.0
-#: Part of an interval in which nothing happens.
+#: Methods that another may switch to, which are compiled before it is timed.
+_SWITCHES_TO: Final = {"auto": ("rk853", "rodas5")}
+#: Times the run's seconds that an untimed run may take, which compiles what it needs on its way.
+_UNTIMED: Final = 2.0
+#: Part of an interval that is integrated to compile a method; however stiff the system, steps are few in it.
 _MOMENT: Final = 1e-15
-#: Steps of an engine's own integrator after which it is known how long all of them will take.
+#: Steps of an engine's own integrator from which the time of all steps is estimated.
 _TRIAL: Final = 2000
 _EPS: Final = float(np.finfo(float).eps)
 #: Roundings of a double energy, and the part of the motion's from which on they can hide its error.
 _ROUNDINGS: Final = 16.0
 _HIDDEN: Final = 1e-9
-#: Beyond which an error is no number for JSON.
-_LARGEST: Final = 1e300
+#: The largest error that a result holds, for JSON has no infinity.
+_MAX_ERROR: Final = 1e300
 
 
-def integrated(
-    asked: Run,
-    problem: Problem,
-    dyn: Dynamics,
-    times: Array,
-    truth: Truth | None,
-    energies: OracleDynamics | None,
-    measure: Measure,
-    tell: Callable[[Doing], None],
-) -> Cell:
-    """Return what comes of a run.
+@dataclass(frozen=True)
+class Prepared:
+    """The reference of one value.
 
-    Parameters
+    Attributes
     ----------
-    asked : Run
-    problem : Problem
-    dyn : Dynamics
-    times : (K,) array
-        Where the error is measured, s.
-    truth : Truth or None
-        None where the energy alone is known.
-    energies : OracleDynamics or None
-        Who says the energy; None for `dyn` itself.
-    measure : {"motion", "energy"}
-    tell : callable
-        Is told when the run begins, after all that only has to be made for it.
+    how : str
+        How the truth is known, or why it is not.
+    truth : Truth or Terms or None
+    facts : dict
+    dt : float or None
+        Step that the problem prescribes, s.
     """
-    setting = _setting(asked, problem, times)
-    duration = float(times[-1])
-    start = dyn, problem.q, problem.v
-    tell("method")
+
+    how: str
+    truth: Truth | Terms | None = None
+    facts: Mapping[str, float] = field(default_factory=dict)
+    dt: float | None = None
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a cell is computed.
+
+    Attributes
+    ----------
+    engine, method : str
+        For terms, the method is the term.
+    dt, rtol : float
+        Of fixed-step and of adaptive methods.
+    seconds, compile_seconds : float
+        Processor time of the run, and of deriving and compiling for it.
+    """
+
+    engine: str
+    method: str
+    dt: float
+    rtol: float
+    seconds: float
+    compile_seconds: float
+
+
+class _Held:
+    """What the calls about one value of a case share."""
+
+    def __init__(self, case: Case, value: float) -> None:
+        self.key = (case.name, value)
+        self.problem = problem_of(case, value)
+        #: Engine -> dynamics, and the warnings when it was made.
+        self.engines: dict[str, tuple[Dynamics, list[str]]] = {}
+
+    @cached_property
+    def oracle(self) -> OracleDynamics:
+        return OracleDynamics(self.problem.model)
+
+    def dynamics(self, engine: str) -> tuple[Dynamics, list[str]]:
+        if engine not in self.engines:
+            with heard_warnings() as heard:
+                dyn = dynamics(self.problem.model, engine)
+            self.engines[engine] = dyn, heard
+        return self.engines[engine]
+
+
+_held: _Held | None = None
+_searches: Final[dict[str, ReferenceSearch]] = {}
+
+
+@contextmanager
+def _value_of(case: Case, value: float) -> Iterator[_Held]:
+    """Give what is held of a value, and let go of the value before."""
+    global _held
     try:
-        with limited(asked.making):
-            _begin(asked, problem, dyn, times, setting)
-        if asked.method in _TURNS_TO:
-            # What it looks at on its way is compiled where it first looks.
-            with limited(_FIRST * asked.seconds):
-                quiet_simulate(*start, duration, asked.method, save=times, **setting)
-        tell("run")
-        if told := _too_many(asked, problem, dyn, times, setting):
-            return Cell(asked.value, "slow", note=told)
+        if _held is None or _held.key != (case.name, value):
+            _held = None
+            _held = _Held(case, value)
+        yield _held
+    except MemoryError:
+        _held = None
+        raise
+
+
+def prepare(case: Case, value: float, bar: float, seconds: float) -> Prepared:
+    """Return the reference of a value, searched for within so many seconds of processor time."""
+    with _value_of(case, value) as held:
+        problem = held.problem
+        facts = {name: float(x) for name, x in problem.facts.items()}
+        report_stage("truth")
+        if case.measure == "terms":
+            terms = reference_terms(problem, held.oracle)
+            return Prepared("the own derivation with 34 digits", terms, facts)
+        if case.measure == "energy":
+            return Prepared("the energy at the start, with 34 digits", None, facts, problem.dt)
+        search = _searches.setdefault(case.name, ReferenceSearch())
+        truth, how = search.truth(problem, times_of(problem, case.measure), 0.1 * bar * problem.scale, seconds)
+        return Prepared(how, truth, facts, problem.dt)
+
+
+def condition_number(case: Case, value: float) -> float:
+    """Return the condition number of the mass matrix at a value; see `reference.condition`."""
+    with _value_of(case, value) as held:
+        return condition(held.oracle, held.problem.q)
+
+
+def measure(case: Case, value: float, setting: Setting, truth: Truth | Terms | None) -> Cell:
+    """Return one cell: a run, or the evaluation of a term, timed, and its error."""
+    with _value_of(case, value) as held:
+        report_stage("engine")
+        dyn, heard = held.dynamics(setting.engine)
+        if case.measure != "terms":
+            assert not isinstance(truth, Terms)
+            cell = _integrate(case, value, setting, held, dyn, truth)
+        elif isinstance(truth, Terms):
+            cell = _evaluate(value, setting.method, dyn, truth)
+        else:
+            return Cell(value, "not run", note="not run: no truth")
+        # A warning when the engine was made holds for all that it does.
+        return replace(cell, warnings=(*heard, *cell.warnings)) if cell.end == "finished" else cell
+
+
+def _integrate(case: Case, value: float, setting: Setting, held: _Held, dyn: Dynamics, truth: Truth | None) -> Cell:
+    problem, method, times = held.problem, setting.method, times_of(held.problem, case.measure)
+    kind = METHODS[method]
+    adaptive = kind.kind == "adaptive"
+    dt = 0.0 if adaptive else step_of(problem, times, setting.dt)
+    step: dict[str, Any] = {"rtol": max(setting.rtol, kind.least)} if adaptive else {"dt": dt}
+    start, duration = (dyn, problem.q, problem.v), float(times[-1])
+    report_stage("method")
+    try:
+        with cpu_limit(setting.compile_seconds):
+            short = _MOMENT * float(times[1]) if adaptive else dt
+            for name in (*_SWITCHES_TO.get(method, ()), method):
+                quiet_simulate(*start, short, name, save=[short], **step)
+        if method in _SWITCHES_TO:
+            # The controller's own functions are compiled when it first uses them.
+            with cpu_limit(_UNTIMED * setting.seconds):
+                quiet_simulate(*start, duration, method, save=times, **step)
+        report_stage("run")
+        steps = round(duration / dt) if kind.kind == "native" else 0
+        if steps >= 2 * _TRIAL:
+            # An engine's own integrator does not stop when it is asked to.
+            begun = _clock()
+            quiet_simulate(*start, _TRIAL * dt, method, save=[_TRIAL * dt], **step)
+            expected = (_clock() - begun) * steps / _TRIAL
+            if expected > setting.seconds:
+                return Cell(value, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
         with heard_warnings() as heard:
             begun = _clock()
-            look = patience(asked.seconds, _clock)
-            with limited(_LATER * asked.seconds):
-                run = simulate(*start, duration, asked.method, save=times, progress=look, **setting)
+            look = patience(setting.seconds, _clock)
+            with cpu_limit(_LATER * setting.seconds):
+                run = simulate(*start, duration, method, save=times, progress=look, **step)
             seconds = [_clock() - begun]
     except TooLongError as error:
-        return Cell(asked.value, "slow", note=str(error))
+        return Cell(value, "slow", note=str(error))
     while seconds[0] < _SHORT and len(seconds) < _REPEATS:
         begun = _clock()
-        quiet_simulate(*start, duration, asked.method, save=times, doubt=False, **setting)
+        quiet_simulate(*start, duration, method, save=times, doubt=False, **step)
         seconds.append(_clock() - begun)
     stats = run.stats
     note = "; ".join(x for x in (stats.message, stats.chosen) if x)
-    out = Cell(asked.value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
+    cell = Cell(value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
     if not stats.finished or len(run.t) != len(times):
-        return replace(out, end="diverged", note=stats.message or f"ended at t = {run.t[-1]:g} s")
-    out = replace(out, warnings=tuple(dict.fromkeys(heard)))
+        return replace(cell, end="diverged", note=stats.message or f"ended at t = {run.t[-1]:g} s")
+    cell = replace(cell, warnings=tuple(dict.fromkeys(heard)))
     if not (np.isfinite(run.q).all() and np.isfinite(run.v).all()):
-        return replace(out, end="nan", note="states that are not finite, and nothing was said")
-    return _judged(out, problem, dyn, run, truth, energies, measure)
-
-
-def _judged(
-    out: Cell,
-    problem: Problem,
-    dyn: Dynamics,
-    run: Trajectory,
-    truth: Truth | None,
-    energies: OracleDynamics | None,
-    measure: Measure,
-) -> Cell:
+        return replace(cell, end="nan", note="states that are not finite, and nothing was said")
     try:
-        energy = _energy_error(energies or dyn, run)
+        # A run that is judged by its energy alone needs more digits of it than the run has.
+        energy = _energy_error(held.oracle if truth is None else dyn, run)
     except MbkitError:
         energy = math.nan
     if truth is None:
-        return replace(out, error=energy if measure == "energy" else math.nan, energy=energy)
-    error = float(np.abs(problem.model.difference(truth.q, run.q)).max()) / problem.scale
-    return replace(out, error=min(error, _LARGEST), energy=energy, floor=truth.floor / problem.scale)
+        return replace(cell, error=energy if case.measure == "energy" else math.nan, energy=energy)
+    apart = float(np.abs(problem.model.difference(truth.q, run.q)).max()) / problem.scale
+    return replace(cell, error=min(apart, _MAX_ERROR), energy=energy, floor=truth.floor / problem.scale)
 
 
 def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
@@ -143,19 +245,19 @@ def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
     model = dyn.model
     if model.needs.damping or model.clock is not None:
         return math.nan
-    T, V = _parts(dyn, "kinetic_energy", run.q, run.v), _parts(dyn, "potential_energy", run.q)
+    T, V = _energy(dyn, "kinetic_energy", run.q, run.v), _energy(dyn, "potential_energy", run.q)
     if model.written is not None:
         # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
-        none = _parts(dyn, "kinetic_energy", run.q, 0 * run.v)
-        T, V = (T[0] - none[0], T[1] - none[1]), (V[0] - none[0], V[1] - none[1])
-    (gained, kinetic), (change, _) = _since_the_start(T), _since_the_start(V)
-    drift, size = float(np.abs(gained + change).max()), max(float(kinetic.max()), float(np.ptp(change)))
+        T0 = _energy(dyn, "kinetic_energy", run.q, 0 * run.v)
+        T, V = (T[0] - T0[0], T[1] - T0[1]), (V[0] - T0[0], V[1] - T0[1])
+    gained, change = ((high - high[0]) + (low - low[0]) for high, low in (T, V))
+    drift, size = float(np.abs(gained + change).max()), max(float(T[0].max()), float(np.ptp(change)))
     rounding = 0.0 if dyn.engine == OracleDynamics.engine else _ROUNDINGS * _EPS * float(np.abs([T[0], V[0]]).max())
     hidden = rounding > _HIDDEN * size and drift <= rounding
-    return min(drift / size, _LARGEST) if size > 0 and not hidden else math.nan
+    return min(drift / size, _MAX_ERROR) if size > 0 and not hidden else math.nan
 
 
-def _parts(dyn: Dynamics, name: str, *state: Array) -> tuple[Array, Array]:
+def _energy(dyn: Dynamics, name: str, *state: Array) -> tuple[Array, Array]:
     """Return an energy as (high, low); a double has no low part."""
     if isinstance(dyn, OracleDynamics):
         return dyn.extended(name, *state)
@@ -167,75 +269,30 @@ def _parts(dyn: Dynamics, name: str, *state: Array) -> tuple[Array, Array]:
     return high, np.zeros_like(high)
 
 
-def _since_the_start(energy: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return how much an energy has changed, and itself."""
-    high, low = energy
-    return (high - high[0]) + (low - low[0]), high
-
-
-def _setting(asked: Run, problem: Problem, times: Array) -> dict[str, Any]:
-    method = METHODS[asked.method]
-    if method.kind == "adaptive":
-        return {"rtol": max(asked.rtol, method.least)}
-    return {"dt": step_of(problem, times, asked.dt)}
-
-
-def _begin(asked: Run, problem: Problem, dyn: Dynamics, times: Array, setting: dict[str, Any]) -> None:
-    """Integrate a step, or next to nothing of an interval, for all that is compiled."""
-    # However stiff the system, steps are not many in that.
-    short = setting.get("dt", _MOMENT * float(times[1]))
-    for method in (*_TURNS_TO.get(asked.method, ()), asked.method):
-        quiet_simulate(dyn, problem.q, problem.v, short, method, save=[short], **setting)
-
-
-def _too_many(asked: Run, problem: Problem, dyn: Dynamics, times: Array, setting: dict[str, Any]) -> str:
-    """Return why an engine's own integrator would take too long: it does not stop when it is asked to."""
-    if METHODS[asked.method].kind != "native":
-        return ""
-    dt = setting["dt"]
-    steps = round(float(times[-1]) / dt)
-    if steps < 2 * _TRIAL:
-        return ""
-    begun = _clock()
-    quiet_simulate(dyn, problem.q, problem.v, _TRIAL * dt, asked.method, save=[_TRIAL * dt], **setting)
-    expected = (_clock() - begun) * steps / _TRIAL
-    return f"not run: {steps} steps would take {expected:.2g} s" if expected > asked.seconds else ""
-
-
 @contextmanager
 def heard_warnings() -> Iterator[list[str]]:
-    """Collect what the library warns of."""
-    out: list[str] = []
+    """Collect the library's warnings."""
+    heard: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        yield out
-    out += [" ".join(str(w.message).split()) for w in caught if issubclass(w.category, MbkitWarning)]
+        yield heard
+    heard += [" ".join(str(w.message).split()) for w in caught if issubclass(w.category, MbkitWarning)]
 
 
-def evaluated(asked: Run, dyn: Dynamics, truth: Terms, tell: Callable[[Doing], None]) -> Cell:
-    """Return the error and the time of one evaluation of a term.
-
-    Parameters
-    ----------
-    asked : Run
-        Whose method is the term.
-    dyn : Dynamics
-    truth : Terms
-    tell : callable
-        As in `integrated`.
-    """
-    tell("method")
-    arguments = [getattr(truth.at, name) for name in TERMS[asked.method]]
-    term: Callable[..., Any] = getattr(dyn, asked.method)
+def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Cell:
+    """Return the error of a term over all states, and the time of one evaluation."""
+    report_stage("method")
+    arguments = [getattr(truth.at, name) for name in TERMS[term]]
+    function: Callable[..., Any] = getattr(dyn, term)
     with heard_warnings() as heard:
-        value = np.asarray(term(*arguments))
-    tell("run")
-    # Writeable ones, as users have: engines have a short way for them.
+        computed = np.asarray(function(*arguments))
+    report_stage("run")
+    # Writeable arrays, as users have them: engines have a fast path for those.
     one = [np.array(x[0]) for x in arguments]
-    ns, _ = interleaved({"": lambda: term(*one)}, rounds=3)[""]
-    out = Cell(asked.value, "finished", seconds=1e-9 * ns, warnings=tuple(dict.fromkeys(heard)))
-    if not np.isfinite(value).all():
-        return replace(out, end="nan", note="numbers that are not finite, and nothing was said")
-    if asked.method not in truth.values:
-        return replace(out, note=truth.missing[asked.method])
-    return replace(out, error=error_of(asked.method, value, truth))
+    ns, _ = interleaved({"": lambda: function(*one)}, rounds=3)[""]
+    cell = Cell(value, "finished", seconds=1e-9 * ns, warnings=tuple(dict.fromkeys(heard)))
+    if not np.isfinite(computed).all():
+        return replace(cell, end="nan", note="numbers that are not finite, and nothing was said")
+    if term not in truth.values:
+        return replace(cell, note=truth.missing[term])
+    return replace(cell, error=error_of(term, computed, truth))

@@ -1,9 +1,9 @@
-"""What the runs of one problem are measured by, searched for within a time.
+"""What the cells of one value are measured against: a reference motion, or terms with 34 digits.
 
-Where there is no closed form, two runs that share as little as possible tell by their difference how
-well either is known (Hairer, Nørsett, Wanner 1993, II.4, say why one run alone cannot). Three roads,
-until one is good enough: explicit methods of high order on two engines; implicit methods of different
-families, for what is stiff; Taylor series with 34 digits, for what loses digits in double.
+Where there is no closed form, the difference of two runs that share as little as possible bounds the error of either
+(Hairer, Nørsett, Wanner 1993, II.4, on why one run alone cannot). Three ways are tried until one is good enough:
+explicit methods of high order on two engines; implicit methods of different families, for stiff motion; Taylor series
+with 34 digits, for motion that loses digits in double.
 """
 
 from __future__ import annotations
@@ -32,27 +32,22 @@ from mbkit.studies.compare.terms import States
 from mbkit.studies.stress.case import Problem, Truth
 from mbkit.studies.work_precision.reference import gap, reference
 
-__all__ = ["TERMS", "Search", "Terms", "condition", "error_of", "limited", "terms_of"]
+__all__ = ["TERMS", "ReferenceSearch", "Terms", "condition", "cpu_limit", "error_of", "reference_terms"]
 
-
-# An end to calls that take too long and ask nobody whether to go on.
-
-#: A signal that code in C++ lost is sent again, s.
-_AGAIN: Final = 0.25
+#: Seconds after which the signal is sent again, for C++ code may lose it.
+_REPEAT: Final = 0.25
 
 
 @contextmanager
-def limited(seconds: float) -> Iterator[None]:
-    """Raise `TooLongError` after so many seconds of the processor's time.
+def cpu_limit(seconds: float) -> Iterator[None]:
+    """Raise `TooLongError` after so many seconds of processor time.
 
-    Python is interrupted wherever it is, and so is CasADi, which looks for signals while CVODES runs. What
-    does not look for them goes on: that takes an end to the process. Threads but the main one get no
-    signals, and no bound.
+    Interrupts Python anywhere, and CasADi, which looks for signals while CVODES runs. Other C++ code goes on until its
+    process is ended. Only the main thread gets signals; others have no limit.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-
     sent = threading.Event()
 
     def stop(_number: int, _frame: FrameType | None) -> None:
@@ -60,37 +55,38 @@ def limited(seconds: float) -> Iterator[None]:
         raise TooLongError(f"given up after {seconds:.2g} s")
 
     before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, seconds, _AGAIN)
+    signal.setitimer(signal.ITIMER_PROF, seconds, _REPEAT)
     try:
         yield
     except KeyboardInterrupt:
         if not sent.is_set():
             raise
-        # CasADi's answer to any signal.
+        # CasADi answers any signal with it.
         raise TooLongError(f"given up after {seconds:.2g} s") from None
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.signal(signal.SIGPROF, before)
 
 
+# Motions
+
 _EPS: Final = float(np.finfo(float).eps)
 #: The errors of two runs can partly cancel in their difference.
 _SAFETY: Final = 4.0
-#: A search shorter than this finds nothing, s.
-_LEAST: Final = 0.05
-#: Deriving and compiling series takes seconds that no search counts: with less time left they are not begun, s.
-_SERIES: Final = 5.0
-#: A truth no better than this part of the motion cannot tell even gross errors.
+#: A search is not begun with less time than this, s.
+_MIN_SEARCH: Final = 0.05
+#: Taylor series need seconds to derive and compile that the search does not count, s.
+_MIN_SERIES: Final = 5.0
+#: A truth no better than this part of the motion cannot show even gross errors.
 _WORTHLESS: Final = 1e-3
-#: Parts of the time left that the roads may take, in the order in which they are tried.
+#: Parts of the time left that the ways may take, in the order in which they are tried.
 _PARTS: Final = (0.35, 0.5, 1.0)
-#: Engine, method, and tolerance or number of steps: of high order, and the third where the second is not at hand.
+#: Engine, method, and tolerance or number of steps; the third stands in for the second where that is not installed.
 _EXPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
     ("lagrangian", "rk853", 1e-14),
     ("pinocchio", "dop853", 1e-13),
     ("mujoco", "dop853", 1e-13),
 )
-#: Those that can follow stiff motion.
 _IMPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
     ("lagrangian", "cvodes", 1e-12),
     ("lagrangian", "gauss6", 1000),
@@ -98,17 +94,17 @@ _IMPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
     ("lagrangian", "gauss6", 4000),
 )
 
-#: What a road finds: q at the times, how well it is known, and how it was made.
-_Found = tuple[Array, float, str]
-_Road = Callable[[Problem, Array, float, float], Iterator[_Found]]
+#: q at the times, how well it is known, and how it was computed.
+_Candidate = tuple[Array, float, str]
+_Way = Callable[[Problem, Array, float, float], Iterator[_Candidate]]
 
 
-class Search:
+class ReferenceSearch:
     """Searches for the truths of a case, one value after the other."""
 
     def __init__(self) -> None:
-        #: What led to the end for a milder value is tried first.
-        self._roads: list[_Road] = [partial(_double, _EXPLICIT), partial(_double, _IMPLICIT), _extended]
+        #: The way that was good enough for a milder value is tried first.
+        self._ways: list[_Way] = [partial(_two_runs, _EXPLICIT), partial(_two_runs, _IMPLICIT), _taylor_series]
 
     def truth(self, problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
         """Return the truth of a motion, or None, and how it is known or why it is not.
@@ -120,39 +116,38 @@ class Search:
         wanted : float
             How well it should be known, rad or m.
         seconds : float
-            What the search may take, of the processor's time.
+            Processor time of the search.
         """
         if problem.exact is not None:
-            return _closed(problem, times)
+            return _closed_form(problem, times)
         end = time.thread_time() + seconds
-        best: _Found | None = None
+        best: _Candidate | None = None
         reasons: list[str] = []
-        for road, part in zip(list(self._roads), _PARTS, strict=True):
+        for way, part in zip(list(self._ways), _PARTS, strict=True):
             left = end - time.thread_time()
-            if left < (_SERIES if road is _extended else _LEAST):
+            if left < (_MIN_SERIES if way is _taylor_series else _MIN_SEARCH):
                 reasons.append("the time was up")
                 break
             try:
-                for found in road(problem, times, wanted, part * left):
-                    best = found if best is None or found[1] < best[1] else best
+                for candidate in way(problem, times, wanted, part * left):
+                    best = candidate if best is None or candidate[1] < best[1] else best
             except MbkitError as error:
                 reasons.append(str(error))
             if best is not None and best[1] <= wanted:
-                self._roads.remove(road)
-                self._roads.insert(0, road)
+                self._ways.remove(way)
+                self._ways.insert(0, way)
                 break
         if best is None or best[1] > _WORTHLESS * problem.scale:
-            parted = f"{best[2]}, which part by {best[1] / _SAFETY:.1e}" if best else ""
-            return None, "no truth: " + "; ".join(x for x in (parted, *dict.fromkeys(reasons)) if x)
+            apart = f"{best[2]}, which part by {best[1] / _SAFETY:.1e}" if best else ""
+            return None, "no truth: " + "; ".join(x for x in (apart, *dict.fromkeys(reasons)) if x)
         q, floor, how = best
         return Truth(times, q, floor, how), f"{how}; known to {floor:.1e}"
 
 
-def _closed(problem: Problem, times: Array) -> tuple[Truth | None, str]:
-    """Return what a closed form says."""
+def _closed_form(problem: Problem, times: Array) -> tuple[Truth | None, str]:
     assert problem.exact is not None
-    told: Any = problem.exact(times)
-    q = np.asarray(told, dtype=np.float64)
+    exact: Any = problem.exact(times)
+    q = np.asarray(exact, dtype=np.float64)
     if q.shape != (len(times), problem.model.nq) or not np.isfinite(q).all():
         what = f"shape {q.shape}" if q.shape != (len(times), problem.model.nq) else "numbers that are not finite"
         return None, f"no truth: the closed form gave {what}, expected ({len(times)}, {problem.model.nq})"
@@ -164,42 +159,36 @@ def _closed(problem: Problem, times: Array) -> tuple[Truth | None, str]:
 
 
 def _rounding(q: Array) -> float:
-    """Return what rounding to double takes away from a motion."""
+    """Return the error of rounding a motion to double."""
     return 0.5 * _EPS * float(np.abs(q).max())
 
 
-def _double(
+def _two_runs(
     runs: Sequence[tuple[str, str, float]], problem: Problem, times: Array, wanted: float, seconds: float
-) -> Iterator[_Found]:
-    """Several runs in double, until two agree.
-
-    Raises
-    ------
-    NumericalError
-        There are no two that came to the end.
-    """
+) -> Iterator[_Candidate]:
+    """Make runs in double until two agree; `NumericalError` where fewer than two came to the end."""
     end = time.thread_time() + seconds
     done: list[tuple[Array, str]] = []
     best = np.inf
     for engine, method, setting in runs:
         left = end - time.thread_time()
-        if left < _LEAST:
+        if left < _MIN_SEARCH:
             break
         fixed = METHODS[method].kind == "fixed"
         # A whole number of steps to each saved time.
         each = max(1, round(setting / (len(times) - 1)))
-        given: dict[str, Any] = {"dt": float(times[1]) / each} if fixed else {"rtol": setting}
+        step: dict[str, Any] = {"dt": float(times[1]) / each} if fixed else {"rtol": setting}
         try:
             dyn = dynamics(problem.model, engine)
-            with limited(left):
-                run = quiet_simulate(dyn, problem.q, problem.v, float(times[-1]), method, save=times, **given)
+            with cpu_limit(left):
+                run = quiet_simulate(dyn, problem.q, problem.v, float(times[-1]), method, save=times, **step)
         except MbkitError:
-            # One that gives up, or is not there for this model, leaves the others.
+            # The other runs may do without it.
             continue
         if not run.stats.finished or len(run.q) < len(times):
             continue
-        told = f"{each * (len(times) - 1)} steps" if fixed else f"rtol {setting:.0e}"
-        how = f"{method} on {engine} ({told})"
+        size = f"{each * (len(times) - 1)} steps" if fixed else f"rtol {setting:.0e}"
+        how = f"{method} on {engine} ({size})"
         for other_q, other in done:
             apart = _SAFETY * float(gap(problem.model, other_q, run.q).max()) + _rounding(run.q)
             if apart < best:
@@ -214,19 +203,16 @@ def _double(
         raise NumericalError(f"of {tried}, {only} came to the end in {seconds:.2g} s")
 
 
-def _extended(problem: Problem, times: Array, wanted: float, seconds: float) -> Iterator[_Found]:  # noqa: ARG001  # as the others
-    """Taylor series with more digits than double has."""
-    made = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=seconds)
-    if len(made.t) < len(times):
-        raise NumericalError(made.how)
-    yield np.asarray(made.q), float(made.floor.max()), made.how
+def _taylor_series(problem: Problem, times: Array, _wanted: float, seconds: float) -> Iterator[_Candidate]:
+    found = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=seconds)
+    if len(found.t) < len(times):
+        raise NumericalError(found.how)
+    yield np.asarray(found.q), float(found.floor.max()), found.how
 
 
-# Terms at extreme states: values with 34 digits, and the errors of engines beside them.
-#
-# Errors are those of `mbkit.studies.compare.errors`, with one exception. There forward dynamics is divided by
-# cond(M), to judge engines; here it is not, for whoever uses an acceleration has to live with its
-# whole error, about eps cond(M) of what acts.
+# Terms. Errors are those of `mbkit.studies.compare.errors`, but for forward dynamics: there its error is divided by
+# cond(M), to judge engines; here it is not, because a user of an acceleration has its whole error, about
+# eps cond(M) of what acts.
 
 #: Method of `Dynamics` -> its arguments, fields of `States`.
 TERMS: Final = {
@@ -234,17 +220,17 @@ TERMS: Final = {
     "inverse_dynamics": ("q", "v", "a"),
     "forward_dynamics": ("q", "v", "tau"),
 }
-#: Beyond it doubles do not know the smallest eigenvalue of a matrix.
-_DOUBLE: Final = 1e15
-#: Columns of an inverse that are found side by side.
+#: Beyond this condition number doubles do not know the smallest eigenvalue of a matrix.
+_MAX_DOUBLE_CONDITION: Final = 1e15
+#: Columns of an inverse that are computed side by side.
 _BLOCK: Final = 16
-#: What an error is at the most, so that JSON can hold it.
-_LARGEST: Final = 1e300
+#: The largest error that a result holds, for JSON has no infinity.
+_MAX_ERROR: Final = 1e300
 
 
 @dataclass(frozen=True)
 class Terms:
-    """The states of a problem, and what the oracle says there.
+    """The states of a problem, and the oracle's values there.
 
     Attributes
     ----------
@@ -265,7 +251,7 @@ class Terms:
     exponent: int
 
 
-def terms_of(problem: Problem, oracle: OracleDynamics) -> Terms:
+def reference_terms(problem: Problem, oracle: OracleDynamics) -> Terms:
     """Return the oracle's values at a problem's states; accelerations are random, by a fixed seed."""
     model = problem.model
     q, v = (np.atleast_2d(x) for x in (model.check_q(problem.q), model.check_v(problem.v)))
@@ -281,7 +267,7 @@ def terms_of(problem: Problem, oracle: OracleDynamics) -> Terms:
         except NumericalError as error:
             missing[term] = f"no truth: {error}"
     M = oracle.mass_matrix(q)
-    exponent = -int(np.frexp(np.abs(M).max())[1])
+    exponent = _exponent(M)
     acting = np.abs(at.tau) + np.abs(oracle.nle(q, v)) + np.abs(oracle.passive(q, v))
     gravity = float(np.linalg.norm(model.gravity))
     weight = gravity * float(np.sqrt(np.ldexp(model.mass, exponent))) if gravity and model.written is None else 0.0
@@ -290,26 +276,29 @@ def terms_of(problem: Problem, oracle: OracleDynamics) -> Terms:
     return Terms(at, values, missing, scales, exponent)
 
 
+def _exponent(M: Array) -> int:
+    """Return the power of 2 that scales the largest number of a matrix to 1/2 ... 1."""
+    return -int(np.frexp(np.abs(M).max())[1])
+
+
 def error_of(term: str, value: Array, truth: Terms) -> float:
     """Return the worst error of a term over the states."""
     high, low = truth.values[term]
     with np.errstate(all="ignore"):
         error = (value - high) - low
         if term == "forward_dynamics":
-            worst = float(_acceleration(error, high, truth.scales).max())
-        else:
-            # Forces and inertias both are in kg.
-            error, high = np.ldexp(error, truth.exponent), np.ldexp(high, truth.exponent)
-            measured: Errors = (
-                matrix_errors(error, high, truth.scales)
-                if term == "mass_matrix"
-                else force_errors(error, high, truth.scales, heavy=True)
-            )
-            worst = float(measured.relative.max())
-    return min(worst, _LARGEST)
+            return min(float(_acceleration_errors(error, high, truth.scales).max()), _MAX_ERROR)
+        # Forces and inertias are both proportional to kg.
+        error, high = np.ldexp(error, truth.exponent), np.ldexp(high, truth.exponent)
+        errors: Errors = (
+            matrix_errors(error, high, truth.scales)
+            if term == "mass_matrix"
+            else force_errors(error, high, truth.scales, heavy=True)
+        )
+        return min(float(errors.relative.max()), _MAX_ERROR)
 
 
-def _acceleration(error: Array, reference: Array, scales: Scales) -> Array:
+def _acceleration_errors(error: Array, reference: Array, scales: Scales) -> Array:
     """Return errors in the norm √M_jj a_j, relative to the accelerations, or to what cancels in them."""
     root = np.sqrt(scales.diagonal)
     pushed = np.linalg.norm(scales.acting / np.where(root > 0, root, np.inf), axis=1)
@@ -324,14 +313,14 @@ def condition(oracle: OracleDynamics, q: Array) -> float:
     Beyond 1e15 it comes from M with 34 digits.
     """
     high, low = oracle.extended("mass_matrix", np.atleast_2d(q))
-    exponent = -int(np.frexp(np.abs(high).max())[1])
+    exponent = _exponent(high)
     high, low = np.ldexp(high, exponent), np.ldexp(low, exponent)
     with np.errstate(all="ignore"):
-        seen = np.linalg.cond(high)
-    if not (seen >= _DOUBLE).any():
-        return float(seen.max())
-    at = int(np.argmax(seen))
-    return float(np.linalg.norm(high[at], 2)) * _norm_of_inverse(high[at], low[at])
+        numbers = np.linalg.cond(high)
+    if not (numbers >= _MAX_DOUBLE_CONDITION).any():
+        return float(numbers.max())
+    k = int(np.argmax(numbers))
+    return float(np.linalg.norm(high[k], 2)) * _norm_of_inverse(high[k], low[k])
 
 
 def _norm_of_inverse(high: Array, low: Array) -> float:

@@ -6,7 +6,7 @@ import pickle
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from multiprocessing import spawn
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,15 +15,13 @@ from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Keeper, Progress
-from mbkit.studies._processes import processors
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.messages import Introduce
 from mbkit.studies.stress.reference import TERMS
 from mbkit.studies.stress.result import BAR, StressResult
-from mbkit.studies.stress.sweep import Bounds, CaseSweep, MisuseError, Slots
-from mbkit.studies.stress.worker_main import busy
+from mbkit.studies.stress.sweep import CaseSweep, Limits, run_sweeps
 from mbkit.studies.work_precision.result import InterruptedSweepError
 from mbkit.studies.work_precision.settings import pairs
+from mbkit.studies.worker import CallError, in_worker, processors
 
 __all__ = ["QUICK_METHODS", "stress"]
 
@@ -39,8 +37,8 @@ _SECONDS: Final = {True: 0.5, False: 2.0}
 _BUDGET: Final = {True: 100.0, False: 1700.0}
 _MEMORY: Final = 2 * 2**30
 #: Below it no worker starts, bytes.
-_LEAST_MEMORY: Final = 2**29
-_MOST_JOBS: Final = 16
+_MIN_MEMORY: Final = 2**29
+_MAX_JOBS: Final = 16
 #: Seconds between two looks at how far it is.
 _TICK: Final = 0.2
 
@@ -145,48 +143,48 @@ def stress(
     >>> result = mb.stress("joint_spring", engines=["pinocchio"], methods=["rk4"])  # doctest: +SKIP
     >>> print(result.to_markdown())  # doctest: +SKIP
     """
-    if busy():
+    if in_worker():
         raise InputError(
             "stress: called by one of its own workers, which imports the script that a case is defined in; "
             "put what the script does below: if __name__ == '__main__':"
         )
     begun = time.perf_counter()
     quick = _flag("quick", quick)
-    bounds = Bounds(
+    limits = Limits(
         _SECONDS[quick] if seconds is None else real("seconds", seconds, positive=True),
         real("dt", dt, positive=True),
         real("rtol", rtol, positive=True),
     )
     bar = real("bar", bar, positive=True)
-    room = _MEMORY if memory is None else count("memory", memory, least=_LEAST_MEMORY)
-    allowed = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
-    width = min(processors(), _MOST_JOBS) if jobs is None else count("jobs", jobs, least=1)
+    memory = _MEMORY if memory is None else count("memory", memory, least=_MIN_MEMORY)
+    budget = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
+    jobs = min(processors(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
     keeper = Keeper(progress, checkpoint)
     chosen = _cases(cases)
-    asked = pairs(engines, _quick_methods(engines) if quick and methods is None else methods)
-    introductions, sweeps = {}, []
+    _check_values(values, chosen)
+    methods_of = pairs(engines, _quick_methods(engines) if quick and methods is None else methods)
+    settings: dict[str, Any] = {
+        "engines": list(methods_of),
+        "methods": {engine: list(names) for engine, names in methods_of.items()},
+        "quick": quick,
+        "dt": limits.dt,
+        "rtol": limits.rtol,
+        "bar": bar,
+        "seconds": limits.seconds,
+        "memory": memory,
+        "budget": budget,
+        "jobs": jobs,
+    }
     doing = [""]
 
-    def told(text: str) -> None:
+    def report(text: str) -> None:
         doing[0] = text
 
-    for k, (case, own) in enumerate(chosen):
-        introductions[str(k)] = _introduction(str(k), case, own)
-        rows = _rows(case, asked)
-        sweeps.append(CaseSweep(str(k), case, _values(case, values, quick), rows, case.bar or bar, bounds, told))
-    _check_values(values, chosen)
-    settings: dict[str, Any] = {
-        "engines": list(asked),
-        "methods": {engine: list(names) for engine, names in asked.items()},
-        "quick": quick,
-        "dt": bounds.dt,
-        "rtol": bounds.rtol,
-        "bar": bar,
-        "seconds": bounds.seconds,
-        "memory": room,
-        "budget": allowed,
-        "jobs": width,
-    }
+    deadline = begun + budget
+    sweeps = []
+    for case in chosen:
+        rows = _rows(case, methods_of)
+        sweeps.append(CaseSweep(case, _values(case, values, quick), rows, case.bar or bar, limits, report, deadline))
 
     def result(*, complete: bool) -> StressResult:
         return StressResult(
@@ -199,17 +197,17 @@ def stress(
         )
 
     size = sum(sweep.size for sweep in sweeps)
-    width = min(width, max(1, sum(1 + len(sweep.engines) for sweep in sweeps)))
+    width = min(jobs, max(1, sum(1 + len(sweep.engines) for sweep in sweeps)))
     try:
         with (
             tempfile.TemporaryDirectory(prefix="mbkit-stress-", ignore_cleanup_errors=True) as home,
-            Slots(sweeps, introductions, Path(home), width, room, begun + allowed) as slots,
+            closing(run_sweeps(sweeps, Path(home), memory, width, deadline, _TICK)) as ticks,
         ):
-            for _ in slots.ticks(_TICK):
+            for _ in ticks:
                 keeper.tell(sum(sweep.done for sweep in sweeps) / size, doing[0])
                 keeper.now_and_then(lambda: result(complete=False))
         whole = result(complete=True)
-    except MisuseError as error:
+    except CallError as error:
         raise InputError(
             f"cases: a case of your own cannot be used in other processes: {error}; define its functions in a module"
         ) from None
@@ -218,7 +216,7 @@ def stress(
         keeper.keep(part)
         raise InterruptedSweepError(part) from None
     except Exception:
-        # A progress function's, or a fault: what was finished is not lost with it.
+        # Such as one of the progress function: the finished cells are not lost with it.
         keeper.keep(result(complete=False))
         raise
     keeper.keep(whole)
@@ -242,73 +240,61 @@ def _quick_methods(engines: object) -> dict[str, tuple[str, ...]] | None:
     return {engine: tuple(m for m in QUICK_METHODS[engine] if m in METHODS) for engine in engines}
 
 
-def _cases(given: object) -> list[tuple[Case, bool]]:
-    """Return the cases, and whether each is the user's own."""
-    if given is None:
-        from mbkit.studies.stress.cases import names
+def _cases(cases: object) -> list[Case]:
+    # With the named cases come all the models that they are made of.
+    from mbkit.studies.stress.cases import get, names
 
-        given = names()
-    if isinstance(given, (str, Case)):
-        given = (given,)
-    if not isinstance(given, Iterable):
-        raise InputError(f"cases: expected names or Case objects, got {given!r}")
-    out: list[tuple[Case, bool]] = []
-    for one in given:
-        if not isinstance(one, (str, Case)):
-            raise InputError(f"cases: expected names or Case objects, got {one!r}")
-        out.append((_named(one), False) if isinstance(one, str) else (one, True))
+    if cases is None:
+        cases = names()
+    if isinstance(cases, (str, Case)):
+        cases = (cases,)
+    if not isinstance(cases, Iterable):
+        raise InputError(f"cases: expected names or Case objects, got {cases!r}")
+    out: list[Case] = []
+    for case in cases:
+        if not isinstance(case, (str, Case)):
+            raise InputError(f"cases: expected names or Case objects, got {case!r}")
+        out.append(get(case) if isinstance(case, str) else _sendable(case))
     if not out:
         raise InputError("cases: expected at least one, got none; leave it out for all")
-    called = [case.name for case, _ in out]
-    for name in called:
-        if called.count(name) > 1:
+    names_ = [case.name for case in out]
+    for name in names_:
+        if names_.count(name) > 1:
             raise InputError(f"cases: {name!r} is there twice; a result finds a case by its name")
     return out
 
 
-def _named(name: str) -> Case:
-    # With the cases come all the models that they are made of.
-    from mbkit.studies.stress.cases import get
-
-    return get(name)
-
-
-def _introduction(key: str, case: Case, own: bool) -> Introduce:
-    if not own:
-        return Introduce(key, case.name)
+def _sendable(case: Case) -> Case:
     try:
-        pickled = pickle.dumps(case)
+        pickle.dumps(case)
     except Exception as error:  # pickle raises errors of several kinds
         raise InputError(
             f"cases: {case.name!r} cannot be sent to other processes ({error}); define its functions in a module"
         ) from None
-    # As multiprocessing has its children import the script that they were started from.
-    main = spawn.get_preparation_data("stress") if b"__main__" in pickled else {}
-    return Introduce(key, case.name, pickled, {k: x for k, x in main.items() if k.startswith("init_main")} or None)
+    return case
 
 
-def _rows(case: Case, asked: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
+def _rows(case: Case, methods_of: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
     if case.measure == "terms":
-        return [(engine, term) for engine in asked for term in TERMS]
-    return [(e, m) for e, names in asked.items() for m in names if not case.methods or m in case.methods]
+        return [(engine, term) for engine in methods_of for term in TERMS]
+    return [(e, m) for e, names in methods_of.items() for m in names if not case.methods or m in case.methods]
 
 
-def _values(case: Case, given: object, quick: bool) -> tuple[float, ...]:
-    own = case.quick if quick and case.quick else case.values
-    if isinstance(given, Mapping):
-        given = given.get(case.name)
-    if given is None:
-        given = own
-    if isinstance(given, (str, bytes)) or not isinstance(given, Iterable):
-        raise InputError(f"values: expected several numbers, or a mapping from cases to them, got {given!r}")
-    out = tuple(real(f"values[{i}] of {case.name}", x) for i, x in enumerate(given))
+def _values(case: Case, values: object, quick: bool) -> tuple[float, ...]:
+    if isinstance(values, Mapping):
+        values = values.get(case.name)
+    if values is None:
+        values = case.quick if quick and case.quick else case.values
+    if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
+        raise InputError(f"values: expected several numbers, or a mapping from cases to them, got {values!r}")
+    out = tuple(real(f"values[{i}] of {case.name}", x) for i, x in enumerate(values))
     if not out or len(set(out)) < len(out):
         raise InputError(f"values: expected different numbers for {case.name}, at least one, got {list(out)}")
     return out
 
 
-def _check_values(given: object, chosen: Sequence[tuple[Case, bool]]) -> None:
-    if isinstance(given, Mapping):
-        for name in given:
-            if name not in {case.name for case, _ in chosen}:
-                raise InputError(f"values: {name!r} is not among the cases: {', '.join(c.name for c, _ in chosen)}")
+def _check_values(values: object, chosen: Sequence[Case]) -> None:
+    if isinstance(values, Mapping):
+        for name in values:
+            if name not in {case.name for case in chosen}:
+                raise InputError(f"values: {name!r} is not among the cases: {', '.join(c.name for c in chosen)}")

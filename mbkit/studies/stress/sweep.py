@@ -1,53 +1,68 @@
-"""One case under way: what is known of each engine and method at each value, and what is worth asking next."""
+"""The order of a stress study: which cell of which case is computed next, and how long that may take."""
 
 from __future__ import annotations
 
 import math
-import queue
-import threading
+import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from mbkit.methods.registry import METHODS
+from mbkit.studies.compare.rollouts import TooLongError
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.messages import Answer, Condition, Doing, Failed, Introduce, Prepare, Prepared, Request, Run
-from mbkit.studies.stress.result import CaseResult, Cell, Row
-from mbkit.studies.stress.worker import USED_UP, LostError, Patience, Worker
+from mbkit.studies.stress.measure import Prepared, Setting, condition_number, measure, prepare
+from mbkit.studies.stress.result import CaseResult, Cell, End, Row
+from mbkit.studies.worker import (
+    OUT_OF_MEMORY,
+    CallError,
+    Worker,
+    WorkerClosedError,
+    WorkerDiedError,
+    WorkerStartError,
+    WorkerTimeoutError,
+    describe,
+)
 
-__all__ = ["Asks", "Bounds", "CaseSweep", "MisuseError", "Slots"]
+__all__ = ["OUT_OF_TIME", "CaseSweep", "Limits", "run_sweeps"]
 
-
-#: How much longer than a run the making of a problem and an engine, and deriving and compiling, may take, and at
-#: the least, s.
+#: The note of a cell that was left out when there was no time left.
+OUT_OF_TIME: Final = "not run: the time allowed was used up"
+#: Times a run's seconds that making the problem and the engine, and compiling, may take; and at the least, s.
 _MAKING: Final = 15.0
-_MAKING_LEAST: Final = 6.0
+_MIN_MAKING: Final = 6.0
 #: A run is not begun with less time than this, s.
-_LEAST: Final = 0.1
+_MIN_TIME: Final = 0.1
 #: Runs in a row that did not finish, after which a row is over.
-_IN_VAIN: Final = 2
-#: The part of a truth's time that its search gets, and what making engines for it may take besides, s.
+_MAX_FAILURES: Final = 2
+#: The part of a truth's time that its search gets, and the time for making its engines besides, s.
 _SEARCH: Final = 0.7
-_TRUTH_LEAST: Final = 2.0
-#: What terms with 34 digits may take at one value, for which there is no substitute, s.
+_MIN_TRUTH: Final = 2.0
+#: Terms with 34 digits at one value, for which there is no substitute, s.
 _TERMS: Final = 60.0
+#: Seconds, and the part of a limit, by which the worker may miss it before its process is ended.
+_GRACE: Final = (0.5, 0.25)
+#: Why no cell can be computed: these end the study.
+_FATAL: Final = (CallError, WorkerClosedError, WorkerStartError)
+#: Stage of a call -> what to add to the note of a process that ended there.
+_DURING: Final = {
+    "": ", making the problem",
+    "truth": ", searching for its truth",
+    "engine": ", making the engine",
+    "method": ", deriving and compiling",
+}
 
-#: Asks a worker, which may be lost.
-Asks = Callable[[Request, Patience], Answer]
+Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """What a run may take, and how it is set.
-
-    Attributes
-    ----------
-    seconds : float
-    dt, rtol : float
-    """
+class Limits:
+    """Seconds of a run, step and tolerance."""
 
     seconds: float
     dt: float
@@ -56,14 +71,9 @@ class Bounds:
 
 @dataclass
 class _Row:
-    """One engine and method.
+    """The cells of one engine and method by the index of their value.
 
-    Attributes
-    ----------
-    cells : dict
-        Index of a value -> what was found.
-    over : str
-        Why no more is asked of it; empty while more is.
+    `stopped` says why no more are computed; it is empty while more are.
     """
 
     engine: str
@@ -71,22 +81,22 @@ class _Row:
     setting: str
     theory: float | None
     cells: dict[int, Cell] = field(default_factory=dict)
-    over: str = ""
+    stopped: str = ""
 
     @property
     def expected(self) -> float:
-        """Seconds of the last run."""
+        """Seconds of the longest run."""
         return max((c.seconds for c in self.cells.values() if not math.isnan(c.seconds)), default=0.0)
 
-    def take(self, index: int, cell: Cell) -> None:
-        """Keep what was found, and decide whether more is worth it."""
+    def add(self, index: int, cell: Cell) -> None:
+        """Keep a cell, and decide whether more are worth it."""
         self.cells[index] = cell
-        last = [c.end for _, c in sorted(self.cells.items())][-_IN_VAIN:]
+        last = [c.end for _, c in sorted(self.cells.items())][-_MAX_FAILURES:]
         if cell.end in ("slow", "died"):
-            # What is more extreme costs as much again, and tells no more.
-            self.over = f"not run: {cell.end} at {cell.value:g} before"
-        elif len(last) == _IN_VAIN and not {"finished", "not run"} & set(last):
-            self.over = f"not run: {' and '.join(dict.fromkeys(last))} at milder values before"
+            # More extreme values cost as much again, and tell no more.
+            self.stopped = f"not run: {cell.end} at {cell.value:g} before"
+        elif len(last) == _MAX_FAILURES and not {"finished", "not run"} & set(last):
+            self.stopped = f"not run: {' and '.join(dict.fromkeys(last))} at milder values before"
 
 
 class CaseSweep:
@@ -94,343 +104,255 @@ class CaseSweep:
 
     Parameters
     ----------
-    key : str
-        What workers call it.
     case : Case
     values : sequence of float
         From mild to extreme.
     rows : sequence of (engine, method)
     bar : float
-    bounds : Bounds
-    told : callable
-        Is told of each little step, in words.
+    limits : Limits
+    report : callable
+        Takes a sentence about each step.
+    deadline : float
+        Of the study, on the clock.
+    clock : callable
+        Seconds.
     """
 
     def __init__(
         self,
-        key: str,
         case: Case,
         values: Sequence[float],
         rows: Sequence[tuple[str, str]],
         bar: float,
-        bounds: Bounds,
-        told: Callable[[str], None],
+        limits: Limits,
+        report: Callable[[str], object],
+        deadline: float = math.inf,
+        clock: Clock = time.perf_counter,
     ) -> None:
-        self.key, self.case, self.values, self.bar = key, case, tuple(values), bar
-        self._bounds = replace(bounds, seconds=bounds.seconds * case.patience)
-        self._told = told
+        self.case, self.values, self.bar = case, tuple(values), bar
+        self._limits = replace(limits, seconds=limits.seconds * case.patience)
+        self._making = max(_MIN_MAKING, _MAKING * self._limits.seconds)
+        self._report, self._deadline, self._clock = report, deadline, clock
+        #: By the index of the value; where the problem itself cannot be made, the cell of every row.
         self._prepared: dict[int, Prepared] = {}
         self._facts: dict[int, dict[str, float]] = {}
-        #: Values at which the problem itself could not be made.
         self._unmade: dict[int, Cell] = {}
         self._rows = [_Row(e, m, self._setting(m), case.theory(e, m) if case.theory else None) for e, m in rows]
 
     @property
     def engines(self) -> tuple[str, ...]:
-        """Those that have a row."""
+        """The engines that have a row."""
         return tuple(dict.fromkeys(row.engine for row in self._rows))
 
     @property
     def size(self) -> int:
-        """How many little steps there are: one for each truth and for each cell."""
+        """Number of steps: one for each truth and for each cell."""
         return len(self.values) * (1 + len(self._rows))
 
     @property
     def done(self) -> int:
-        """How many of them need no more work."""
-        rest = sum(len(self.values) if row.over else len(row.cells) for row in self._rows)
-        return len(self._facts) + rest
+        """Number of steps that need no more work."""
+        return len(self._facts) + sum(len(self.values) if row.stopped else len(row.cells) for row in self._rows)
 
     def _setting(self, method: str) -> str:
         if self.case.measure == "terms":
             return ""
         kind = METHODS[method]
         if kind.kind == "adaptive":
-            return f"rtol {max(self._bounds.rtol, kind.least):.0e}"
-        return f"dt {self._bounds.dt:g} s"
+            return f"rtol {max(self._limits.rtol, kind.least):.0e}"
+        return f"dt {self._limits.dt:g} s"
 
-    # Truths
-
-    def prepare(self, ask: Asks, until: float) -> bool:
-        """Have the problems made and their truths found; nothing is begun after some time on `time.perf_counter`.
-
-        Returns
-        -------
-        bool
-            Whether all is done.
-        """
+    def prepare(self, worker: Worker, until: float) -> bool:
+        """Have the truths computed in order, begin none after `until`, and return whether all are there."""
         for i, value in enumerate(self.values):
             if i in self._facts:
                 continue
-            left = until - time.perf_counter()
-            if left < _LEAST:
+            left = until - self._clock()
+            if left < _MIN_TIME:
                 return False
-            self._told(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
-            self._prepare(i, value, ask, left / (len(self.values) - i))
+            self._report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
+            self._prepare(i, value, worker, left / (len(self.values) - i))
         return True
 
-    def _prepare(self, i: int, value: float, ask: Asks, share: float) -> None:
-        def patience(doing: Doing) -> float:
-            if doing == "case":
-                return self._making
-            return _TERMS if self.case.measure == "terms" else share + _TRUTH_LEAST
-
+    def _prepare(self, i: int, value: float, worker: Worker, share: float) -> None:
         self._facts[i] = {}
+        seconds = _TERMS if self.case.measure == "terms" else share + _MIN_TRUTH
+        making, truth = _with_grace(self._making), {"truth": _with_grace(seconds)}
+        arguments = (self.case, value, self.bar, _SEARCH * share)
         try:
-            answer = ask(Prepare(self.key, i, value, self.bar, _SEARCH * share), patience)
-        except LostError as lost:
-            answer = Failed(lost.end, lost.note, lost.doing)
-        if isinstance(answer, Failed):
-            if answer.doing == "case":
-                self._unmade[i] = Cell(value, answer.end, note=answer.note)
+            prepared = worker.call(
+                prepare, *arguments, cpu_seconds=making, stage_seconds=truth, deadline=self._deadline
+            )
+        except _FATAL:
+            raise
+        except Exception as error:
+            end, note = self._failure(error, worker.stage)
+            if worker.stage:
+                self._prepared[i] = Prepared(f"no truth: {note}")
             else:
-                self._prepared[i] = Prepared(f"no truth: {answer.note}")
+                self._unmade[i] = Cell(value, end, note=note)
             return
-        assert isinstance(answer, Prepared)
-        self._prepared[i], self._facts[i] = answer, dict(answer.facts)
+        self._prepared[i], self._facts[i] = prepared, dict(prepared.facts)
         try:
-            condition = ask(Condition(self.key, i, value), patience)
-        except LostError:
+            number = worker.call(condition_number, self.case, value, cpu_seconds=making, deadline=self._deadline)
+        except _FATAL:
+            raise
+        except Exception:
+            # The fact is left out.
             return
-        if isinstance(condition, float) and math.isfinite(condition):
-            self._facts[i].setdefault("cond(M)", condition)
+        if math.isfinite(number):
+            self._facts[i].setdefault("cond(M)", number)
 
-    @property
-    def _making(self) -> float:
-        return max(_MAKING_LEAST, _MAKING * self._bounds.seconds)
+    def _failure(self, error: Exception, stage: str) -> tuple[End, str]:
+        """Return how a call ended that raised."""
+        if isinstance(error, WorkerTimeoutError):
+            over = self._clock() >= self._deadline
+            return ("not run", OUT_OF_TIME) if over else ("slow", f"{error}{_DURING.get(stage, '')}")
+        if isinstance(error, WorkerDiedError):
+            return "died", f"{error}{_DURING.get(stage, '')}"
+        if isinstance(error, MemoryError):
+            return "died", f"{OUT_OF_MEMORY} ({error})" if str(error) else OUT_OF_MEMORY
+        return ("slow" if isinstance(error, TooLongError) else "refused"), describe(error)
 
-    # Runs
-
-    def run(self, engine: str, ask: Asks, until: float) -> bool:
-        """Fill the rows of an engine, value by value; nothing is begun after some time on `time.perf_counter`.
-
-        Returns
-        -------
-        bool
-            Whether all is done.
-        """
-        mine = [row for row in self._rows if row.engine == engine]
+    def run(self, engine: str, worker: Worker, until: float) -> bool:
+        """Compute this engine's cells in order, begin none after `until`, and return whether all are there."""
+        rows = [row for row in self._rows if row.engine == engine]
         for i, value in enumerate(self.values):
             if i not in self._facts:
-                # Its truth is not searched for yet.
+                # Its truth is not there yet.
                 return False
-            # What was cheap before comes first, so that most of it is known when the time is over.
-            for row in sorted(mine, key=lambda row: row.expected):
+            # The cheapest first, so that most cells are known when the time is over.
+            for row in sorted(rows, key=lambda row: row.expected):
                 if i in row.cells:
                     continue
                 if i in self._unmade:
                     row.cells[i] = self._unmade[i]
-                elif row.over:
-                    row.cells[i] = Cell(value, "not run", note=row.over)
-                elif until - time.perf_counter() < _LEAST:
+                elif row.stopped:
+                    row.cells[i] = Cell(value, "not run", note=row.stopped)
+                elif until - self._clock() < _MIN_TIME:
                     return False
                 else:
-                    self._told(f"{self.case.name}: {row.method} on {engine}, {self.case.parameter} = {value:g}")
-                    self._cell(row, mine, i, ask)
+                    self._report(f"{self.case.name}: {row.method} on {engine}, {self.case.parameter} = {value:g}")
+                    self._run(row, rows, i, worker)
         return True
 
-    def _cell(self, row: _Row, mine: Sequence[_Row], i: int, ask: Asks) -> None:
-        value, bounds = self.values[i], self._bounds
-
-        def patience(doing: Doing) -> float:
-            return bounds.seconds if doing == "run" else self._making
-
-        asked = Run(self.key, i, value, row.engine, row.method, bounds.dt, bounds.rtol, bounds.seconds, self._making)
+    def _run(self, row: _Row, rows: Sequence[_Row], i: int, worker: Worker) -> None:
+        value, limits, truth = self.values[i], self._limits, self._prepared[i].truth
+        setting = Setting(row.engine, row.method, limits.dt, limits.rtol, limits.seconds, self._making)
+        making, run = _with_grace(self._making), {"run": _with_grace(limits.seconds)}
+        arguments = (self.case, value, setting, truth)
         try:
-            answer = ask(asked, patience)
-        except LostError as lost:
-            answer = Failed(lost.end, lost.note, lost.doing)
-        if isinstance(answer, Failed):
-            cell, doing = Cell(value, answer.end, note=answer.note), answer.doing
-        else:
-            assert isinstance(answer, Cell)
-            cell, doing = answer, "run"
-        row.take(i, cell)
-        if doing == "engine" and cell.end in ("slow", "died"):
-            # So it would go with every other method of this engine.
-            for other in mine:
-                if not other.over and i not in other.cells:
-                    other.take(i, cell)
-
-    # What is known
+            cell = worker.call(measure, *arguments, cpu_seconds=making, stage_seconds=run, deadline=self._deadline)
+        except _FATAL:
+            raise
+        except Exception as error:
+            end, note = self._failure(error, worker.stage)
+            cell = Cell(value, end, note=note)
+        row.add(i, cell)
+        if worker.stage == "engine" and cell.end in ("slow", "died"):
+            # Every other method of this engine would end like this.
+            for other in rows:
+                if not other.stopped and i not in other.cells:
+                    other.add(i, cell)
 
     def result(self) -> CaseResult:
         """Return what is known by now."""
-        case, count = self.case, len(self.values)
-        prepared = [self._prepared.get(i, Prepared(USED_UP)) for i in range(count)]
-        truths = tuple(self._unmade[i].note if i in self._unmade else prepared[i].told for i in range(count))
+        count = range(len(self.values))
+        truths = [self._unmade[i].note if i in self._unmade else self._truth(i) for i in count]
         return CaseResult(
-            **{k: x for k, x in case.facts().items() if k != "bar"},
+            **{k: x for k, x in self.case.facts().items() if k != "bar"},
             bar=self.bar,
             values=self.values,
-            truths=truths,
-            facts=tuple(dict(self._facts.get(i, {})) for i in range(count)),
-            rows=tuple(self._row(row) for row in self._rows),
+            truths=tuple(truths),
+            facts=tuple(dict(self._facts.get(i, {})) for i in count),
+            rows=tuple(self._result_row(row) for row in self._rows),
         )
 
-    def _row(self, row: _Row) -> Row:
-        unknown = [Cell(value, "not run", note=row.over or USED_UP) for value in self.values]
-        cells = tuple(row.cells.get(i, unknown[i]) for i in range(len(self.values)))
+    def _truth(self, i: int) -> str:
+        return self._prepared[i].how if i in self._prepared else OUT_OF_TIME
+
+    def _result_row(self, row: _Row) -> Row:
+        unknown = row.stopped or OUT_OF_TIME
+        cells = (row.cells.get(i, Cell(value, "not run", note=unknown)) for i, value in enumerate(self.values))
         setting = row.setting
         prescribed = {p.dt for p in tuple(self._prepared.values())} - {None}
         if prescribed and setting.startswith("dt"):
             setting = f"dt {prescribed.pop():g} s" if len(prescribed) == 1 else "dt of the case"
-        return Row(row.engine, row.method, cells, setting, row.theory)
+        return Row(row.engine, row.method, tuple(cells), setting, row.theory)
 
 
-# Who does what when: slots that work side by side, and the time of the study shared out among them.
+def _with_grace(seconds: float) -> float:
+    """Return the processor time after which a process is ended that should have stopped by itself."""
+    return seconds * (1 + _GRACE[1]) + _GRACE[0]
 
 
-class MisuseError(Exception):
-    """A worker cannot even be told what to do; never leaves `mbkit.studies`."""
-
-
-class _StoppedError(Exception):
-    """The study is over before its end."""
+# All cases side by side
 
 
 @dataclass(eq=False)
 class _Task:
-    """What one slot does in one go.
+    """The truths of a case, or one engine on it; `work` takes a worker and a time, and returns whether all is done.
 
-    Attributes
-    ----------
-    work : callable
-        Takes who is asked, and until when; returns whether all is done.
-    after : _Task or None
-        What has to be begun before, as many times and once more, unless it is done.
-    rounds : int
-        How many times it was begun.
+    `after` has to be begun before, once more than this one, unless it is done.
     """
 
-    work: Callable[[Asks, float], bool]
+    work: Callable[[Worker, float], bool]
     after: _Task | None = None
     rounds: int = 0
-    busy: bool = False
-    done: bool = False
+    state: Literal["waiting", "running", "done"] = "waiting"
+
+    @property
+    def ready(self) -> bool:
+        before = self.after
+        follows = (
+            before is None or before.state == "done" or (before.state == "waiting" and before.rounds > self.rounds)
+        )
+        return self.state == "waiting" and follows
 
 
-class Slots:
-    """Works through cases with so many processes side by side.
+def run_sweeps(
+    sweeps: Sequence[CaseSweep], home: Path, memory: int, jobs: int, deadline: float, tick: float
+) -> Generator[None]:
+    """Work through the cases with so many workers side by side; yield at least every `tick` seconds.
 
-    Parameters
-    ----------
-    sweeps : sequence of CaseSweep
-    introductions : mapping of str to Introduce
-    home : Path
-        Folder of the study.
-    jobs : int
-    memory : int
-        Bytes of each process; 0 for no bound.
-    until : float
-        When all is over, on `time.perf_counter`.
-
-    Notes
-    -----
-    Each task, the truths of a case or one engine on it, gets an equal part of the time left when it
-    begins; what it does not need passes on to those after it, and in the end to those that were
-    not done, which go on where they were.
+    Each task gets an equal part of the time left when it begins. The time that it does not need passes on to those
+    after it, and in the end to the tasks that were not done, which go on where they were.
     """
-
-    def __init__(
-        self,
-        sweeps: Sequence[CaseSweep],
-        introductions: Mapping[str, Introduce],
-        home: Path,
-        jobs: int,
-        memory: int,
-        until: float,
-    ) -> None:
-        self._tasks: list[_Task] = []
-        for sweep in sweeps:
-            first = _Task(sweep.prepare)
-            self._tasks.append(first)
-            self._tasks += [_Task(partial(sweep.run, engine), first) for engine in sweep.engines]
-        self._until, self._jobs = until, jobs
-        self._stopping = threading.Event()
-        self._changed = threading.Condition()
-        self._faults: queue.Queue[BaseException | None] = queue.Queue()
-        self._workers = [Worker(home, memory, introductions) for _ in range(jobs)]
-        self._threads = [threading.Thread(target=self._slot, args=(w,), daemon=True) for w in self._workers]
-
-    def __enter__(self) -> Slots:
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopping.set()
-        with self._changed:
-            self._changed.notify_all()
-        for worker in self._workers:
-            worker.close()
-        for thread in self._threads:
-            thread.join()
-
-    def ticks(self, seconds: float) -> Iterator[None]:
-        """Yield every so many seconds until all is done; raise what went wrong in a slot."""
-        left = len(self._threads)
-        while left:
-            try:
-                fault = self._faults.get(timeout=seconds)
-            except queue.Empty:
-                yield
-                continue
-            if fault is not None:
-                raise fault
-            left -= 1
-
-    def _slot(self, worker: Worker) -> None:
-        try:
-            while (task := self._next()) is not None:
+    tasks: list[_Task] = []
+    for sweep in sweeps:
+        first = _Task(sweep.prepare)
+        tasks += [first, *(_Task(partial(sweep.run, engine), first) for engine in sweep.engines)]
+    workers = [Worker(home, memory, _environment(home)) for _ in range(jobs)]
+    idle = list(workers)
+    running: dict[Future[bool], tuple[_Task, Worker]] = {}
+    with ExitStack() as stack:
+        for worker in workers:
+            stack.callback(worker.end)
+        threads = stack.enter_context(ThreadPoolExecutor(jobs))
+        for worker in workers:
+            stack.callback(worker.close)
+        while True:
+            while idle and (ready := [task for task in tasks if task.ready]):
+                task, worker = min(ready, key=lambda task: task.rounds), idle.pop()
+                task.rounds, task.state = task.rounds + 1, "running"
+                # Those of this round: the others wait for the time that it leaves.
+                waiting = 1 + sum(t.state == "waiting" and t.rounds < task.rounds for t in tasks)
                 begun = time.perf_counter()
-                left = max(self._until - begun, 0.0)
-                with self._changed:
-                    # Those of this round: the others wait for what is left of it.
-                    waiting = 1 + sum(not t.done and not t.busy and t.rounds < task.rounds for t in self._tasks)
-                done = task.work(partial(self._ask, worker), begun + min(left, left * self._jobs / waiting))
-                with self._changed:
-                    task.busy, task.done = False, done or time.perf_counter() >= self._until
-                    self._changed.notify_all()
-        except BaseException as fault:  # whatever it is, the study must hear of it
-            if not self._stopping.is_set():
-                self._faults.put(fault)
-        else:
-            self._faults.put(None)
-        finally:
-            worker.end()
-
-    def _next(self) -> _Task | None:
-        """Return the first task that can be begun, waiting for one if need be; None when there is none left."""
-        with self._changed:
-            while not self._stopping.is_set():
-                open_tasks = [t for t in self._tasks if not t.done]
-                if not open_tasks:
-                    return None
-                ready = [t for t in open_tasks if not t.busy and _follows(t)]
-                if ready:
-                    task = min(ready, key=lambda t: t.rounds)
-                    task.rounds, task.busy = task.rounds + 1, True
-                    return task
-                self._changed.wait()
-        return None
-
-    def _ask(self, worker: Worker, request: Request, patience: Patience) -> Answer:
-        if time.perf_counter() >= self._until:
-            raise LostError("not run", USED_UP, "case")
-        try:
-            answer = worker.ask(request, patience, self._until)
-        except LostError:
-            if self._stopping.is_set():
-                # Ended by us: that is nobody's failure.
-                raise _StoppedError from None
-            raise
-        if isinstance(answer, Failed) and answer.misuse:
-            raise MisuseError(answer.note)
-        return answer
+                left = max(deadline - begun, 0.0)
+                until = begun + min(left, left * jobs / waiting)
+                running[threads.submit(task.work, worker, until)] = task, worker
+            if not running:
+                return
+            for future in wait(running, tick, FIRST_COMPLETED).done:
+                task, worker = running.pop(future)
+                idle.append(worker)
+                task.state = "done" if future.result() or time.perf_counter() >= deadline else "waiting"
+            yield
 
 
-def _follows(task: _Task) -> bool:
-    """Return whether what has to come before a task has come."""
-    before = task.after
-    return before is None or before.done or (not before.busy and before.rounds > task.rounds)
+def _environment(home: Path) -> dict[str, str]:
+    # One thread each: run times are compared. The study has a cache of its own, so that no entries of the user's are
+    # removed for it.
+    threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    caches = {"MBKIT_CACHE_DIR": str(home / "code"), "HEYOKA_CACHE_DIR": str(home / "code-heyoka")}
+    return {**os.environ, **dict.fromkeys(threads, "1"), **caches}

@@ -24,11 +24,11 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
-from mbkit.studies._processes import run
 from mbkit.studies.compare.rollouts import TooLongError, patience, quiet_simulate
 from mbkit.studies.results import Refusal
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
 from mbkit.studies.work_precision.settings import Settings
+from mbkit.studies.worker import run
 
 __all__ = ["CurveMeasurement", "Problem", "Sweep", "TimeBudget", "first_run", "repetitions"]
 
