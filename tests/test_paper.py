@@ -101,7 +101,7 @@ def test_what_is_read_is_what_runs(make, engine):
     for q, v, s in zip(*states(lag), strict=True):
         put = at(lag, q, v, s)
         dyn = lag.dynamics(engine)
-        dyn = dyn.at(**{lag.model.clock: s}) if lag.time else dyn
+        dyn = dyn.at(**{lag.model.time_parameter: s}) if lag.time else dyn
 
         def paper(matrix, put=put):
             return np.array(sp.Matrix(matrix).subs(put).evalf(30).tolist(), dtype=float)

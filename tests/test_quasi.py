@@ -155,7 +155,7 @@ def test_accelerations_are_lagranges(curved, engine):
         rate = dyn.forward_dynamics(q, v, curved.to_force(q, force))
         reference = whole.dynamics(t=at, options={"compile": False})
         expected = reference.forward_dynamics(q, curved.to_velocity(q, v), force)
-        assert model.rates.acceleration(q, v, rate) == pytest.approx(expected, rel=1e-13, abs=1e-13)
+        assert model.velocity_map.acceleration(q, v, rate) == pytest.approx(expected, rel=1e-13, abs=1e-13)
         assert curved.to_quasi_velocity(q, curved.to_velocity(q, v)) == pytest.approx(v, rel=1e-13)
 
 

@@ -133,7 +133,7 @@ def test_starts_are_consistent(case: Case) -> None:
         v = (4 * model.difference(first, second) - model.difference(first, third)) / (2 * h)
         rounding = 8 * np.spacing(np.abs(problem.q).max()) / h
         assert v == pytest.approx(problem.v, abs=1e-6 * (np.abs(problem.v).max() + rate * problem.scale) + rounding)
-        M = sample_mass_matrix(model) if model.written is None else np.eye(1)
+        M = sample_mass_matrix(model) if model.has_bodies else np.eye(1)
         scaled = M / np.sqrt(np.diag(M))[:, None] / np.sqrt(np.diag(M))
         assert np.linalg.eigvalsh(scaled)[0] > 0
 

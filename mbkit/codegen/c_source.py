@@ -145,7 +145,7 @@ def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_lin
         "",
         f"Model       {c_comment(model.name)}",
         f"Digest      {model.digest}",
-        f"Holds       {', '.join(present) or ('energies T and V' if model.written else 'inertia alone')}",
+        f"Holds       {', '.join(present) or ('inertia alone' if model.has_bodies else 'energies T and V')}",
         f"Functions   {functions[0].name}",
         *(f"            {f.name}" for f in functions[1:]),
         "",
@@ -224,7 +224,7 @@ def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
 
 def _units(model: Model) -> tuple[list[str], list[tuple[str, str]]]:
     """Return the unit of each coordinate, and those of each velocity and force."""
-    if model.written is not None:
+    if not model.has_bodies:
         return ["generalized"] * model.nq, [("generalized", "generalized")] * model.nv
     kinds = [joint.type for joint in model.independent_joints]
     coordinates = [

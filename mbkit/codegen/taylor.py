@@ -195,7 +195,7 @@ class TaylorSystem:
         rows = equations.constraints.value.numel() if model.constrained else 0  # type: ignore[attr-defined]  # written
         self.kinked = kinks > len(model.quaternions) + rows
         # Parameters stand first among what is behind tau.
-        self.clock = list(model.parameters).index(model.clock) if model.clock else None
+        self.clock = list(model.parameters).index(model.time_parameter) if model.time_parameter else None
         self._nq, self._nv = made.inputs[:2]
         #: Place of each parameter among heyoka's -> (argument, entry); unused ones have none.
         self._places: dict[tuple[int, int], int] = {}

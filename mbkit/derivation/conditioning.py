@@ -42,7 +42,7 @@ def loses_digits(model: Model) -> bool:
     a parameter without a value, for a tree too large to be written out, for a mass matrix that is singular at every
     pose, and for inertias that are no sum of squares.
     """
-    if model.written is not None or not model.nv or elimination_size(model) > _MAX_SIZE:
+    if not model.has_bodies or not model.nv or elimination_size(model) > _MAX_SIZE:
         return False
     if any(x is None for x in model.parameters.values()) or not has_squares(model):
         return False

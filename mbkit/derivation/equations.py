@@ -65,7 +65,8 @@ FUNCTIONS: Final = {
 
 def equations_of(model: Model, constants: Constants = "literal") -> Equations:
     """Return a model's equations: derived from its bodies, or from the energies that it was written as."""
-    return Equations(model, constants) if model.written is None else model.written(constants)
+    of_energies = model.energy_equations
+    return Equations(model, constants) if of_energies is None else of_energies(constants)
 
 
 class Equations:

@@ -89,7 +89,7 @@ class Dynamics(ABC):
     takes_written: ClassVar[bool] = False
 
     def __init__(self, model: Model) -> None:
-        if model.written is not None and not self.takes_written:
+        if not model.has_bodies and not self.takes_written:
             raise UnsupportedError(
                 f"{self.engine}: {model.name} was written as energies and has no bodies; "
                 "the lagrangian engine and the oracle take it"
@@ -319,12 +319,11 @@ class Dynamics(ABC):
         where = np.argwhere(~np.isfinite(out))[0]
         state = f" in sample {where[0]}" if next(iter(arguments.values())).ndim == 2 else ""
         index = tuple(int(i) for i in where)
-        if self.model.written is not None:
+        if not self.model.has_bodies:
             q = np.atleast_2d(arguments["q"])[where[0] if arguments["q"].ndim == 2 else 0]
             there = ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, q, strict=True))
-            if self.model.constrained:
-                # Rows that depend on each other are named.
-                self.model.require_independent(q)  # type: ignore[attr-defined]  # of a written model
+            # Rows that depend on each other are named.
+            self.model.require_independent(q)
             constraints = ", or the constraints depend on each other," if self.model.constrained else ""
             raise NumericalError(
                 f"{self.engine}: {quantity} of {self.model.name} is not finite at {there}{state}; perhaps the mass "
@@ -395,7 +394,7 @@ Any_ = TypeVar("Any_", bound=Dynamics)
 
 def at_time(dyn: Any_, t: float) -> Any_:
     """Return the dynamics at a time; the same ones where time does not enter."""
-    clock = dyn.model.clock
+    clock = dyn.model.time_parameter
     return dyn if clock is None else dyn.at(**{clock: t})  # type: ignore[return-value]  # of its own kind
 
 
@@ -409,7 +408,7 @@ def at_times(dyn: Any_, t: Array, trajectories: int | None = None) -> Any_:
     trajectories : int, optional
         Size of a batch; there is one sample for each time of each trajectory then.
     """
-    clock = dyn.model.clock
+    clock = dyn.model.time_parameter
     if clock is None:
         return dyn
     if not dyn.takes_parameters:

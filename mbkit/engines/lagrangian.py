@@ -439,7 +439,7 @@ class LagrangianDynamics(Dynamics):
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self.model.constrained:
-            self.model.require_meaningful(q)  # type: ignore[attr-defined]  # of a written model
+            self.model.require_independent(q, once=True)
         if self.written_out:
             return self._vector("forward_dynamics", q, v, tau)
         M, f = self._machine("applied_function")(q, v)

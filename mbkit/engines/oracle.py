@@ -253,7 +253,7 @@ class OracleDynamics(Dynamics):
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Any:
         if self.model.constrained:
-            self.model.require_meaningful(q)  # type: ignore[attr-defined]  # of a written model
+            self.model.require_independent(q, once=True)
             return self._run(("forward_dynamics",), self._state(q), v, tau)[0][:, :, 0]
         M, _, _, passive, nle = self._terms(q, v)
         force = self._arithmetic.array(tau) + passive - nle

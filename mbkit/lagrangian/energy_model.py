@@ -115,12 +115,12 @@ class EnergyModel(Model):
         return type(self), (self.form, self._values)
 
     @property
-    def written(self) -> Callable[..., EnergyEquations]:
-        """What makes the equations: a function of how numbers stand in them."""
+    def energy_equations(self) -> Callable[..., EnergyEquations]:
+        """The function that derives the equations, of how numbers stand in them."""
         return partial(EnergyEquations, self, self.form)
 
     @property
-    def clock(self) -> str | None:
+    def time_parameter(self) -> str | None:
         """Name of the time, a parameter that simulation moves."""
         return self.form.time.name if self.form.time is not None else None
 
@@ -130,7 +130,7 @@ class EnergyModel(Model):
         return bool(self.form.constraints)
 
     @cached_property
-    def rates(self) -> VelocityMap | None:
+    def velocity_map(self) -> VelocityMap | None:
         """q̇ = D(q) v of quasi-velocities; None where v is q̇."""
         return None if self.form.quasi is None else VelocityMap(self.form.quasi)
 
@@ -142,7 +142,8 @@ class EnergyModel(Model):
     @cached_property
     def parameters(self) -> Mapping[str, float | None]:
         """Value of each named parameter, None where it has none; the time is the last of them."""
-        time = {self.clock: self._values.get(self.clock, 0.0)} if self.clock else {}
+        t = self.time_parameter
+        time = {t: self._values.get(t, 0.0)} if t else {}
         return MappingProxyType({**self._values, **time})
 
     @property
@@ -226,17 +227,14 @@ class EnergyModel(Model):
         refuse_unreachable(self._states.dyn)
         return self._states.project(*super().random_state(rng))
 
-    def require_independent(self, q: Array) -> None:
-        """Refuse constraints that follow from each other at a configuration or contradict each other, with the rows.
+    def require_independent(self, q: Array, *, once: bool = False) -> None:
+        """Refuse constraints that depend on each other at a configuration; see `Model.require_independent`.
 
         Not while a parameter has no value, on which it may depend.
         """
-        if self.constrained and None not in self.parameters.values():
-            require_independent(self._states.dyn, q)
-
-    def require_meaningful(self, q: Array) -> None:
-        """Refuse constraints that depend on each other at the first configuration that is evaluated."""
-        if self.constrained and len(q) and None not in self.parameters.values() and not is_judged(self.form, self):
+        if not self.constrained or not len(q) or None in self.parameters.values():
+            return
+        if not (once and is_judged(self.form, self)):
             require_independent(self._states.dyn, np.atleast_2d(q)[0])
 
     @cached_property
@@ -245,19 +243,19 @@ class EnergyModel(Model):
 
     def integrate(self, q: ArrayLike, dq: ArrayLike) -> Array:
         """Return q + D(q) dq: the configuration that a displacement dq in the space of v leads to."""
-        if self.rates is None:
+        if self.velocity_map is None:
             return super().integrate(q, dq)
         q, dq = self.check_q(q), self.check_v(dq, "dq")
         batch_of(q=q, dq=dq)
-        return np.asarray(q + self.rates.enter(q, dq))
+        return np.asarray(q + self.velocity_map.enter(q, dq))
 
     def difference(self, q0: ArrayLike, q1: ArrayLike) -> Array:
         """Return the dq with ``integrate(q0, dq) = q1``."""
-        if self.rates is None:
+        if self.velocity_map is None:
             return super().difference(q0, q1)
         q0, q1 = self.check_q(q0, "q0"), self.check_q(q1, "q1")
         batch_of(q0=q0, q1=q1)
-        return np.asarray(self.rates.leave(q0, q1 - q0))
+        return np.asarray(self.velocity_map.leave(q0, q1 - q0))
 
     def frame(self, name: str) -> Frame:
         """Refuse: energies have no frames."""

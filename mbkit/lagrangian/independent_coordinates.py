@@ -57,15 +57,15 @@ class ReducedModel(Model):
 
     def __init__(self, whole: Model, names: tuple[str, ...]) -> None:
         # The parts of a frozen class are set once, here.
-        object.__setattr__(self, "_clock", whole.clock)
+        object.__setattr__(self, "_time", whole.time_parameter)
         super().__init__(whole.name, np.zeros(3), *abstract_parts(names))
 
-    _clock: str | None
+    _time: str | None
 
     @property
-    def clock(self) -> str | None:
+    def time_parameter(self) -> str | None:
         """Name of the time, where it enters."""
-        return self._clock
+        return self._time
 
 
 @dataclass(frozen=True)

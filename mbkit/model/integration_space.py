@@ -30,7 +30,7 @@ class Space:
     """
 
     def __init__(self, model: Model) -> None:
-        self._rates, self._adds = model.rates, not model.quaternions
+        self._rates, self._adds = model.velocity_map, not model.quaternions
         self.flat = self._adds and self._rates is None
         self.nv = model.nv
         self._turns: list[tuple[slice, slice]] = []

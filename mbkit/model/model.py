@@ -39,27 +39,48 @@ class Model(Description):
     because the builder holds the checks. Its attributes are those of `Description`.
     """
 
-    # What else a model may be
+    # What engines, simulation and studies ask of every model, of bodies or of energies
 
     @property
-    def written(self) -> Callable[..., Any] | None:
-        """What makes the equations of a model that was written as energies and has no bodies; else None."""
+    def has_bodies(self) -> bool:
+        """Whether it consists of bodies and joints; False of energies T and V alone, whose T need not be ½ vᵀ M v."""
+        return self.energy_equations is None
+
+    @property
+    def energy_equations(self) -> Callable[..., Any] | None:
+        """A function of "literal" or "symbol" that returns the equations of energies; None with bodies."""
         return None
 
     @property
-    def clock(self) -> str | None:
-        """The parameter that is the time, where the equation depends on it."""
+    def time_parameter(self) -> str | None:
+        """Name of the parameter that is the time; None where the equations do not depend on it."""
+        return None
+
+    @property
+    def velocity_map(self) -> Any:
+        """q̇ = D(q) v of quasi-velocities; None where the joints' types give q̇."""
         return None
 
     @property
     def constrained(self) -> bool:
-        """Whether constraints bind the coordinates to each other, so that not every state is one."""
+        """Whether constraints bind the coordinates to each other, so that not every (q, v) is a state."""
         return False
 
-    @property
-    def rates(self) -> Any:
-        """The map from velocities to coordinate rates, where the joints do not give it; else None."""
-        return None
+    def require_independent(self, q: Array, *, once: bool = False) -> None:
+        """Refuse constraints that depend on each other at a configuration, with the rows.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array
+            Of which the first is judged.
+        once : bool
+            Whether constraints that were independent at some configuration are taken to be so everywhere.
+        """
+
+    # Earlier names of the same, for scripts.
+    written = property(lambda self: self.energy_equations)
+    clock = property(lambda self: self.time_parameter)
+    rates = property(lambda self: self.velocity_map)
 
     # Configurations
 

@@ -53,7 +53,7 @@ def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array],
     out = np.full((int(np.prod(lead)), *shape), np.nan)
     for start in range(0, len(good), _MANY):
         which = good[start : start + _MANY]
-        if dyn.model.clock is not None:
+        if dyn.model.time_parameter is not None:
             own = dyn.of_samples(which)
         else:
             own = dyn.of_samples(which // lead[1]) if len(lead) == 2 else dyn
@@ -80,7 +80,7 @@ _NEAR: Final = 1e-4
 
 def kinetic_energy(dyn: Dynamics, q: Array, v: Array) -> Array:
     """Return ½ vᵀ M v, which no known defect of an engine touches; (K,) or (N, K)."""
-    if dyn.model.written is not None:
+    if not dyn.model.has_bodies:
         # T may have terms of lower degree.
         return along(dyn, (), lambda own, q, v: own.kinetic_energy(q, v), q, v)
     return along(dyn, (), lambda own, q, v: 0.5 * np.einsum("ni,nij,nj->n", v, own.mass_matrix(q), v), q, v)
@@ -151,7 +151,7 @@ def _damped(dyn: Dynamics, h: Array, q: Array, v: Array, a: Array) -> tuple[Arra
 def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
     if not is_damped(dyn.model):
         return np.zeros(v.shape)
-    if dyn.model.written is not None:
+    if not dyn.model.has_bodies:
         return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v), q, v)
     # Springs are what is left of the passive force at rest.
     return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v) - own.passive(q, np.zeros_like(v)), q, v)
@@ -159,7 +159,7 @@ def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
 
 def is_damped(model: Model) -> bool:
     """Return whether anything takes energy out."""
-    if model.written is not None:
+    if not model.has_bodies:
         return model.needs.damping
     bound = any(b.field == "damping" for b in model.bindings)
     return (
@@ -173,7 +173,7 @@ def is_damped(model: Model) -> bool:
 def _plain(model: Model) -> list[tuple[int, int]]:
     """Return (coordinate, velocity) of those where v = q̇: all but free and ball joints'."""
     out: list[tuple[int, int]] = []
-    if model.rates is not None:
+    if model.velocity_map is not None:
         return out
     for joint in model.independent_joints:
         if joint.type.coordinate_velocities:
@@ -214,7 +214,7 @@ def canonical_momentum(dyn: Dynamics, q: Array, v: Array) -> Array:
 
 def _canonical(dyn: Dynamics, q: Array, v: Array) -> Array:
     p = np.einsum("nij,nj->ni", dyn.mass_matrix(q), v)
-    if dyn.model.written is None:
+    if dyn.model.has_bodies:
         return np.asarray(p)
     # T's part of first degree is half of what changes with the sign of v.
     first = [dyn.kinetic_energy(q, e + 0 * v) - dyn.kinetic_energy(q, -e + 0 * v) for e in np.eye(v.shape[1])]
@@ -223,7 +223,7 @@ def _canonical(dyn: Dynamics, q: Array, v: Array) -> Array:
 
 def momentum(dyn: Dynamics, q: Array, v: Array) -> Array:
     """Return the bodies' linear and angular momentum about the world's origin; (K, 6) or (N, K, 6)."""
-    if dyn.model.written is not None:
+    if not dyn.model.has_bodies:
         raise UnsupportedError(f"momentum: {dyn.model.name} was written as energies and has no bodies")
     if dyn.samples is None:
         return along(dyn, (6,), lambda own, q, v: _momentum(own, dyn.model, q, v), q, v)

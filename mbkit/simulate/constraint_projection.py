@@ -177,7 +177,7 @@ def along_constraints(dyn: Dynamics, outcome: Outcome) -> Outcome:
     good = np.flatnonzero(np.isfinite(flat_q).all(axis=1) & np.isfinite(flat_v).all(axis=1))
     own = manifold_of(dyn).dyn
     trajectories = shape[0] if q.ndim == 3 else None
-    if own.model.clock is not None:
+    if own.model.time_parameter is not None:
         own = at_times(own, outcome.t, trajectories)
     elif trajectories is not None:
         own = own.of_samples(np.repeat(np.arange(trajectories), shape[1]))

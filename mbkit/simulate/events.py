@@ -236,5 +236,5 @@ def _beyond(i: int, value: float, _t: float, q: Array, _v: Array) -> float:
 
 def _above(dyn: Dynamics, level: float, t: float, q: Array, v: Array) -> float:
     own = at_time(dyn, t)
-    kinetic = 0.5 * v @ own.mass_matrix(q) @ v if own.model.written is None else own.kinetic_energy(q, v)
+    kinetic = 0.5 * v @ own.mass_matrix(q) @ v if own.model.has_bodies else own.kinetic_energy(q, v)
     return float(kinetic + own.potential_energy(q) - level)

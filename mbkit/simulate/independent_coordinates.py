@@ -193,7 +193,7 @@ def _pulled(dyn: EmbeddedDynamics, force: Force, begin: float) -> Any:
 
 
 def _at(dyn: EmbeddedDynamics, t: float) -> EmbeddedDynamics:
-    return dyn.at(**{dyn.model.clock: t}) if dyn.model.clock else dyn
+    return dyn.at(**{dyn.model.time_parameter: t}) if dyn.model.time_parameter else dyn
 
 
 def _part(dyn: Dynamics, q: Array, v: Array, chart: Chart | None, *given: Any, **more: Any) -> Any:
@@ -263,7 +263,7 @@ def _adaptive(
 
 def _passes(system: Embedded) -> bool:
     """Return whether a run goes through singular poses: the choice is open, and nothing is moved in time."""
-    return system.independent is None and system.model.clock is None
+    return system.independent is None and system.model.time_parameter is None
 
 
 def _later(event: Event, t: float) -> Callable[[float, Array, Array], float]:
@@ -385,7 +385,7 @@ def _watch(system: Embedded, chart: Chart, way: _Way, begin: float, what: str) -
         return float(np.log(max(value, _LEAST) / limit))
 
     # On a choice that stays, the motion beyond the pose is another one than that which comes out.
-    return Event(function, what, direction=-1, terminal=what == _WORN or system.model.clock is None)
+    return Event(function, what, direction=-1, terminal=what == _WORN or system.model.time_parameter is None)
 
 
 def _stepped(

@@ -88,7 +88,7 @@ def _compiles(dyn: Dynamics) -> bool:
     from mbkit.engines.lagrangian import LagrangianDynamics
 
     # A compiled step has one value of each parameter, the time among them.
-    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out or dyn.model.clock:
+    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out or dyn.model.time_parameter:
         return False
     # Nor does it look for constraints after each step.
     if dyn.model.constrained:
@@ -237,8 +237,8 @@ def simulate(
     chosen = method_of(method)
     model = dyn.model
     q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
-    if model.rates is not None:
-        model.rates.check_start(q, v)
+    if model.velocity_map is not None:
+        model.velocity_map.check_start(q, v)
     batch = _batch(dyn, batch_of(q0=q, v0=v))
     if batch is not None:
         q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
@@ -271,7 +271,7 @@ def simulate(
         found = doubts(dyn, chosen, setting, *states, pushed=torque is not None, steps=outcome.steps)
         steps = round(duration / dt)
         first_order = chosen.order == 1 and chosen.kind != "adaptive"
-        if first_order and torque is None and _FEWEST <= steps <= _MOST and not model.clock and v.size:
+        if first_order and torque is None and _FEWEST <= steps <= _MOST and not model.time_parameter and v.size:
             one = (dyn, q, v) if batch is None else (dyn.of_samples([0]), q[:1], v[:1])
             found += halved(model, chosen.name, dt, states, lambda times: _coarser(one, chosen.name, start, dt, times))
     return _wrapped(dyn, chosen, applied, outcome, seconds, (*outcome.doubts, *found))
@@ -325,7 +325,7 @@ def _warn_beyond_limits(model: Model, q: Array) -> None:
 
 def _held_time(dyn: Dynamics) -> float:
     """Return the time at which the dynamics stands, s; 0 where time does not enter."""
-    clock = dyn.model.clock
+    clock = dyn.model.time_parameter
     if clock is None:
         return 0.0
     if isinstance(dyn, TakesParameters):

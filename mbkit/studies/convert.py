@@ -113,7 +113,7 @@ def convert(model: Model, to: str) -> Converted:
     expect_model(model)
     if to not in FORMATS:
         raise UnknownNameError("format", str(to), FORMATS)
-    if model.written is not None:
+    if not model.has_bodies:
         raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
     names = [model.name, *(x.name for x in model.bodies), *(x.name for x in model.joints)]
     names += [*(x.name for x in model.frames), *(x.name for x in model.springs), *(x.name for x in model.couplings)]

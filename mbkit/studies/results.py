@@ -282,7 +282,7 @@ def model_info(model: Model) -> dict[str, Any]:
         "nq": model.nq,
         "nv": model.nv,
         # Energies do not tell it.
-        **({} if model.written is not None else {"mass": model.mass}),
+        **({} if not model.has_bodies else {"mass": model.mass}),
         "digest": model.digest,
         "needs": model.needs.as_dict(),
         "joints": list(model.joint_names),

@@ -119,7 +119,7 @@ class Manifold:
 
     def at(self, t: float) -> Manifold:
         """Return the states at a time."""
-        return Manifold(at_time(self.dyn, t)) if self.dyn.model.clock else self
+        return Manifold(at_time(self.dyn, t)) if self.dyn.model.time_parameter else self
 
     # What is compiled
 
@@ -254,7 +254,7 @@ def manifold_of(dyn: Dynamics) -> Manifold:
     """Return the consistent states of dynamics; those of another engine by the own derivation."""
     if isinstance(dyn, LagrangianDynamics):
         return Manifold(dyn)
-    if dyn.model.written is None:
+    if dyn.model.has_bodies:
         raise UnsupportedError(f"{dyn.model.name}: has no constraints; mbkit.lagrangian.Lagrangian takes them")
     # Deriving costs more than most runs: once for each engine's object.
     if _TWIN not in vars(dyn):

@@ -56,7 +56,7 @@ def require_few(form: EnergyForm) -> None:
 
 
 def _values(model: Model) -> tuple[float, ...]:
-    return tuple(float(x or 0.0) for n, x in model.parameters.items() if n != model.clock)
+    return tuple(float(x or 0.0) for n, x in model.parameters.items() if n != model.time_parameter)
 
 
 def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) -> None:

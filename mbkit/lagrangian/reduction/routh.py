@@ -28,6 +28,7 @@ from mbkit._check import Array, finite_array, real, require_finite, rows
 from mbkit._escape import one_line, terminal
 from mbkit.codegen.interpreter import Machine
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
 from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values, require_values, timed_parameters
 from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain
@@ -361,8 +362,8 @@ def _read(routhian: Routhian[Any], run: Any, values: Mapping[str, float]) -> tup
         told[name] = real(f"parameter {name!r}", x)
     require_values(told, "reconstruct")
     parameters = np.tile(np.array(list(told.values()), dtype=np.float64), (len(t), 1))
-    if model.clock is not None:
-        parameters[:, list(told).index(model.clock)] = t
+    if model.time_parameter is not None:
+        parameters[:, list(told).index(model.time_parameter)] = t
     return t, q, v, parameters
 
 
@@ -399,11 +400,11 @@ def _increments(routhian: Routhian[Any], t: Array, q: Array, v: Array, parameter
     if not len(spans):
         return np.empty((0, m))
     model = routhian._model
-    equations = model.written("literal")
+    equations = EnergyEquations(model, routhian.lagrangian)
     forward = ca.substitute(equations.forward_dynamics, equations.tau, ca.SX.zeros(model.nv))
     given = [equations.q, equations.v, equations.parameters]
     machine = Machine(ca.Function("reduced", given, [ca.densify(forward)], {"cse": True}))
-    clock = None if model.clock is None else list(model.parameters).index(model.clock)
+    clock = None if model.time_parameter is None else list(model.parameters).index(model.time_parameter)
     r, behind = model.nq, parameters[:-1].copy()
 
     def field(s: float, y: Array) -> Array:

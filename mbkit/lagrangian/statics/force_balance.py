@@ -39,11 +39,11 @@ class Balance:
 
     def __init__(self, dyn: Dynamics, wrenches: Mapping[str, Array], t: float = 0.0) -> None:
         self._whole = dyn
-        self.dyn, self.model = at_time(dyn, t) if dyn.model.clock else dyn, dyn.model
+        self.dyn, self.model = at_time(dyn, t) if dyn.model.time_parameter else dyn, dyn.model
         self._wrenches = wrenches
         for name in self._wrenches:
             self.model.frame(name)
-            if self.model.written is not None:
+            if not self.model.has_bodies:
                 raise UnknownNameError("frame", name, (), hint="a system on paper takes tau=")
         self._manifold: Any = None
         self.rows = 0
@@ -176,7 +176,7 @@ class Balance:
         InputError
             The forces do, or the constraints: there is no rest.
         """
-        if self.model.clock is None:
+        if self.model.time_parameter is None:
             return False
         now, moved = self._linear(q, multipliers), False
         for t in _LATER:
@@ -185,7 +185,7 @@ class Balance:
             left = np.abs(later.residual(q, theirs, tau)).max(initial=0.0)
             if left > _SAME * (1 + later.scale(q, tau)):
                 raise InputError(
-                    f"dynamics: {self.model.name} depends on the time {self.model.clock}, which moves it; "
+                    f"dynamics: {self.model.name} depends on the time {self.model.time_parameter}, which moves it; "
                     "there is no equilibrium of such a system"
                 )
             pairs = zip(now, later._linear(q, theirs), strict=True)

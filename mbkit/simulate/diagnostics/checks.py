@@ -128,7 +128,7 @@ def doubts(
 def idle(dyn: Dynamics, q: Array) -> str:
     """Return which joints move next to no mass at a configuration, to stand behind a message; empty where all do."""
     model = dyn.model
-    if model.written is not None or dyn.samples is not None or not model.nv:
+    if not model.has_bodies or dyn.samples is not None or not model.nv:
         return ""
     try:
         there = dyn.mass_matrix(model.random_state(np.random.default_rng(0))[0])
@@ -197,12 +197,12 @@ def _first(q: Array, v: Array, k: int) -> tuple[Array, Array]:
 def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool, most: float) -> Iterator[str]:
     """Hold against a run what nothing drives: its energy stays, or with dampers falls."""
     model = dyn.model
-    if pushed or model.clock is not None or (model.written is not None and is_damped(model)):
+    if pushed or model.time_parameter is not None or (not model.has_bodies and is_damped(model)):
         # What was written on paper may have forces that drive.
         return
     # Of a system on paper this is T2, and Jacobi's integral T2 - T0 + V is what stays.
     kinetic, potential = 0.5 * np.einsum("...i,...ij,...j->...", v, M, v), potential_energy(dyn, q)
-    if model.written is not None:
+    if not model.has_bodies:
         kinetic = kinetic - kinetic_energy(dyn, q, 0 * v)
     total = kinetic + potential
     whole = np.isfinite(total).all(axis=-1)
@@ -225,7 +225,7 @@ def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool, most: flo
 
 def _pole(dyn: Dynamics, q: Array) -> Iterator[str]:
     """Look for steps over gimbal lock, after which three angles are those of another sheet."""
-    if dyn.model.written is not None:
+    if not dyn.model.has_bodies:
         return
     for joint in dyn.model.independent_joints:
         if joint.type.gimbal is not None:
@@ -259,7 +259,7 @@ def _condition(M: Array) -> Iterator[str]:
 def _step(dyn: Dynamics, method: str, h: float, duration: float, states: list[tuple[Array, Array]]) -> Iterator[str]:
     """Hold the step against the modes of the motion's linearization, at its first, last and fastest state."""
     model = dyn.model
-    if dyn.samples is not None or model.clock is not None or model.constrained:
+    if dyn.samples is not None or model.time_parameter is not None or model.constrained:
         return
     space = Space(model)
 

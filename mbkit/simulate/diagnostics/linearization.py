@@ -59,7 +59,7 @@ class Linearization:
         nq, nv = dyn.model.nq, dyn.model.nv
         self._last: Array = np.zeros((nq + nv,) * 2)
         # Where positions add and v is q̇.
-        self._plain = np.eye(nq + nv, k=nq) if dyn.model.rates is None and not dyn.model.quaternions else None
+        self._plain = np.eye(nq + nv, k=nq) if dyn.model.velocity_map is None and not dyn.model.quaternions else None
         self.evaluations = 0
 
     def only(self, member: int) -> None:
@@ -98,8 +98,8 @@ class Linearization:
     def _kinematics(self, q: Array, v: Array, lengths: Array) -> tuple[Array, Array, Array]:
         """Return ∂(D v)/∂q, D, and the tangent of a change of q, (nv, nq)."""
         nq, nv = self._model.nq, self._model.nv
-        if self._model.rates is not None:
-            rate, D, tangent = self._model.rates.linear(q, v)
+        if self._model.velocity_map is not None:
+            rate, D, tangent = self._model.velocity_map.linear(q, v)
             return rate, D, tangent
         rate, D, tangent = np.zeros((nq, nq)), np.zeros((nq, nv)), np.zeros((nv, nq))
         left = iter(lengths.tolist())

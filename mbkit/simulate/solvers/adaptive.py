@@ -81,7 +81,7 @@ def make_trials(
     """Return what tries the steps of ``"rk853"`` or ``"rodas5"``: machine code where there can be some."""
     given = dyn, space, tolerances, torque, duration, batch
     # A compiled step has one value of the time, and does not look for constraints.
-    plain = not torque.callable and not dyn.model.clock and not dyn.model.constrained
+    plain = not torque.callable and not dyn.model.time_parameter and not dyn.model.constrained
     if dyn.engine == "lagrangian" and plain and dyn.model.nv:
         # Other engines need no CasADi.
         from mbkit.codegen.backend import has_compiler

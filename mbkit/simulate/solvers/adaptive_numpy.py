@@ -250,7 +250,7 @@ class RosenbrockTrials(StageTrials):
         own = rodas5p()
         self._gamma, self._A, self._C, self._b, self._d = own.gamma, own.A, own.C, own.b, own.d
         self._ends, self._e = own.c.tolist(), own.error
-        self._timed = torque.callable or dyn.model.clock is not None
+        self._timed = torque.callable or dyn.model.time_parameter is not None
         # Each number of y is as large as itself, those of a quaternion as 1.
         self._turning = np.zeros(dyn.model.nq + dyn.model.nv)
         for start, _ in dyn.model.quaternions:

@@ -228,4 +228,4 @@ def _derived(eq: Equations) -> ca.Function:
 
 def _clock(model: Model) -> int | None:
     """Return which of the parameters is the time."""
-    return None if model.clock is None else list(model.parameters).index(model.clock)
+    return None if model.time_parameter is None else list(model.parameters).index(model.time_parameter)

@@ -58,9 +58,9 @@ def called(
     if dyn.model.parameters:
         values = dyn.parameter_values
         own = values[members] if values.ndim == 2 else np.broadcast_to(values, (n, len(values)))
-        if dyn.model.clock is not None:
+        if dyn.model.time_parameter is not None:
             own = own.copy()
-            own[:, list(dyn.model.parameters).index(dyn.model.clock)] = t
+            own[:, list(dyn.model.parameters).index(dyn.model.time_parameter)] = t
         given.append(own)
     results = dyn.code(part.name, make=part.make)(*given, threads=dyn.threads)
     return [

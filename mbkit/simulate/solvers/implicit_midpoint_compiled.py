@@ -69,7 +69,7 @@ class MidpointChunk:
         # The velocity of each step behind those of the last ones before the block.
         rooms += [("w", n + back, nv), ("guess", 2, nv), ("trial", 2, nv), ("miss", 1, 1), ("dt", 1, 1)]
         # The time is one of them, and another in each step.
-        names, clock = list(dyn.model.parameters), dyn.model.clock
+        names, clock = list(dyn.model.parameters), dyn.model.time_parameter
         self._clock = None if clock is None else names.index(clock)
         rooms += [("parameters", 1 if clock is None else n, len(names))]
         self._rooms = {name: _room(places, rows, width) for name, places, rows in rooms}

@@ -71,7 +71,7 @@ class Field:
         self._use(self._dyn.of_samples(members))
 
     def _use(self, own: Dynamics) -> None:
-        self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.clock is not None
+        self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.time_parameter is not None
         self._approach = Approach()
 
     @property

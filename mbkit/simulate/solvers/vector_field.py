@@ -35,7 +35,7 @@ class Rates:
     def __init__(self, dyn: Dynamics, *, explicit: bool = False) -> None:
         self._explicit, self._approach = explicit, Approach()
         self._dyn, self._model, self._own = dyn, dyn.model, dyn
-        self._forward, self._timed = dyn.forward_dynamics, dyn.model.clock is not None
+        self._forward, self._timed = dyn.forward_dynamics, dyn.model.time_parameter is not None
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         self.evaluations = 0
@@ -80,8 +80,8 @@ class Rates:
         return np.concatenate([self._qdot(q, v, lengths), a])
 
     def _qdot(self, q: Array, v: Array, lengths: Array) -> Array:
-        if self._model.rates is not None:
-            return np.asarray(self._model.rates.enter(q, v))
+        if self._model.velocity_map is not None:
+            return np.asarray(self._model.velocity_map.enter(q, v))
         if not self._model.quaternions:
             return v
         out = np.empty(len(q))

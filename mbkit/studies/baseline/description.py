@@ -64,7 +64,7 @@ _TRIANGLE: Final = np.triu_indices(3)
 
 def described(model: Model) -> Description:
     """Return every number and name of a model, in its own order."""
-    if model.written is not None:
+    if not model.has_bodies:
         return _written(model, model.form)  # type: ignore[attr-defined]  # energies have their system
     out: Description = {
         "system": {"": {"name": model.name, "gravity": _plain(model.gravity)}},

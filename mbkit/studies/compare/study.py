@@ -274,7 +274,7 @@ def compare(
     reference = ""
     rows: list[Row] = []
     # What was written as energies has the derivation and its 34 digits, and no other engine.
-    enough = len(made) > 1 or (bool(made) and model.written is not None)
+    enough = len(made) > 1 or (bool(made) and not model.has_bodies)
     if enough:
         tell(0.05, "34 digits")
         reference = OracleDynamics.engine
@@ -345,7 +345,7 @@ def _beyond_terms(
 
     study(0.42, "rollouts", run_rollouts)
     study(0.6, "error against run time", run_times)
-    if model.written is None:
+    if model.has_bodies:
         study(0.9, "what was left out", run_omissions)
     return result, refusals
 

@@ -90,7 +90,7 @@ def _model(x: Model | Dynamics, which: str) -> Model:
         raise InputError(
             f"{which}: expected a Model or a Dynamics, got {type(x).__name__}; mbkit.load(...) makes a Model"
         )
-    if model.written is not None:
+    if not model.has_bodies:
         raise UnsupportedError(f"explain: {model.name} was written as energies and has no bodies to compare")
     if not model.nv:
         raise InputError(f"{which}: nothing moves in {model.name} (nv = 0), so there is nothing to explain")

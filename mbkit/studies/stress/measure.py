@@ -243,10 +243,10 @@ def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
     NaN where there are dampers, where time enters, and where rounding hides it.
     """
     model = dyn.model
-    if model.needs.damping or model.clock is not None:
+    if model.needs.damping or model.time_parameter is not None:
         return math.nan
     T, V = _energy(dyn, "kinetic_energy", run.q, run.v), _energy(dyn, "potential_energy", run.q)
-    if model.written is not None:
+    if not model.has_bodies:
         # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
         T0 = _energy(dyn, "kinetic_energy", run.q, 0 * run.v)
         T, V = (T[0] - T0[0], T[1] - T0[1]), (V[0] - T0[0], V[1] - T0[1])

@@ -270,7 +270,7 @@ def reference_terms(problem: Problem, oracle: OracleDynamics) -> Terms:
     exponent = _exponent(M)
     acting = np.abs(at.tau) + np.abs(oracle.nle(q, v)) + np.abs(oracle.passive(q, v))
     gravity = float(np.linalg.norm(model.gravity))
-    weight = gravity * float(np.sqrt(np.ldexp(model.mass, exponent))) if gravity and model.written is None else 0.0
+    weight = gravity * float(np.sqrt(np.ldexp(model.mass, exponent))) if gravity and model.has_bodies else 0.0
     with np.errstate(all="ignore"):
         scales = Scales.of(np.ldexp(M, exponent), v, np.ldexp(acting, exponent), weight)
     return Terms(at, values, missing, scales, exponent)

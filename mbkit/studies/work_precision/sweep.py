@@ -179,11 +179,11 @@ class Problem:
         NaN with dampers, applied forces or explicit time: the saved states are too few to know their work as
         well as the methods are good.
         """
-        if self.torque is not None or self.model.needs.damping or self.model.clock is not None:
+        if self.torque is not None or self.model.needs.damping or self.model.time_parameter is not None:
             return math.nan
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", run.v, dyn.mass_matrix(run.q), run.v)
         potential = dyn.potential_energy(run.q)
-        if self.model.written is not None:
+        if not self.model.has_bodies:
             # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
             potential = potential - dyn.kinetic_energy(run.q, 0 * run.v)
         drift = np.abs((kinetic - kinetic[0]) + (potential - potential[0])).max()
