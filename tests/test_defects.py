@@ -12,8 +12,8 @@ import pytest
 import mbkit as mb
 from mbkit.errors import KnownDefectWarning
 from mbkit.model.joint_types import KINDS
-from mbkit.report.compare_view import headline
-from mbkit.report.page import check_page
+from mbkit.report.compare_view import headline, view
+from mbkit.report.page import render
 from tests.random_trees import off, random_tree, states
 
 PINOCCHIO = version("pin")
@@ -130,7 +130,7 @@ def test_a_comparison_names_the_engine_and_its_defect_where_nothing_else_differs
     assert not result.passed
     assert result.only_known_defects
     assert {(r.engine, r.term) for r in result.rows if r.defect} == {("pinocchio", term)}
-    for text in (result.verdict, headline(result), result.to_markdown(), result._repr_html_(), check_page(result)):
+    for text in (result.verdict, headline(result), result.to_markdown(), result._repr_html_(), render(view(result))):
         first = next(line for line in text.splitlines() if "differs in" in line)
         assert word in first
         assert "mujoco" not in first.split("differs in")[0].rpartition(">")[2]

@@ -11,11 +11,10 @@ import pytest
 from rich.console import Console
 
 from mbkit.errors import UnknownNameError
-from mbkit.report import stress_view
+from mbkit.report import stress_view, terminal
 from mbkit.report.page import stress_page
-from mbkit.report.stress_case import section
+from mbkit.report.stress_page import section
 from mbkit.report.stress_steps import kinds, rules, stable_steps, steps
-from mbkit.report.stress_terminal import summary
 from mbkit.report.stress_view import avoid, methods
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
 from mbkit.studies.stress.result import CaseResult, Cell, Row, StressResult, best, lines, place, recommended
@@ -163,6 +162,10 @@ def printed(what: object, width: int = 100) -> str:
     with console.capture() as capture:
         console.print(what)
     return capture.get()
+
+
+def summary(result: StressResult) -> object:
+    return terminal.render(stress_view.view(result))
 
 
 @pytest.fixture(scope="module")

@@ -162,8 +162,9 @@ def _check_one(
     file: Path, target: str | None, options: dict[str, Any], strict: bool, rebaseline: bool, *, table: bool
 ) -> tuple[BaselineResult, bool]:
     """Return what was found, and whether it was recorded anew."""
-    from mbkit.report import terminal as tables
+    from mbkit.report.explain_view import baseline_view
     from mbkit.report.progress import Bar
+    from mbkit.report.terminal import render
     from mbkit.studies import baseline as baselines
     from mbkit.studies._targets import kept, model_of
 
@@ -175,7 +176,7 @@ def _check_one(
     with Bar(f"check {file.name}") as bar:
         result = baselines.check(model, file, strict=strict, target=asked, progress=bar)
     if table:
-        console().print(tables.result(result, _again(file, target)))
+        console().print(render(baseline_view(result, _again(file, target))))
     differs = result.status not in ("same", "skipped")
     if not differs or not (rebaseline or (table and result.status == "versions" and _confirmed(file))):
         return result, False
@@ -215,14 +216,15 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     Exit status: 0 the same robot with the same numbers, 1 something differs, 2 misuse or a file
     that cannot be read.
     """
-    from mbkit.report import terminal as tables
+    from mbkit.report.explain_view import baseline_view
+    from mbkit.report.terminal import render
     from mbkit.studies import baseline as baselines
 
     result = baselines.diff(path_a, path_b)
     if as_json:
         tell(result.to_json())
     else:
-        console().print(tables.result(result))
+        console().print(render(baseline_view(result)))
     leave(DONE if result.passed else DIFFER)
 
 

@@ -143,14 +143,15 @@ def _workers(jobs: int | None) -> Iterator[Executor | None]:
 
 def _show(result: WorkPrecision, target: str, stem: str, out: Path, as_json: bool, force: bool) -> bool:
     def table() -> RenderableType:
-        from mbkit.report import terminal
+        from mbkit.report import terminal, work_precision_view
 
-        return terminal.bench(result, target)
+        return terminal.render(work_precision_view.view(result, target))
 
     def page() -> str:
-        from mbkit.report.page import bench_page
+        from mbkit.report import work_precision_view
+        from mbkit.report.page import render
 
-        return bench_page(result, asked=target, data=f"{stem}.json", table=f"{stem}.csv")
+        return render(work_precision_view.view(result, target), data=f"{stem}.json", table=f"{stem}.csv")
 
     def picture() -> bytes:
         from mbkit.report import work_precision_view

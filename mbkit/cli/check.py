@@ -120,14 +120,15 @@ def _check_one(
         result = compare(model, engines, samples, seed, terms_only=no_rollouts, progress=bar)
 
     def table() -> RenderableType:
-        from mbkit.report import terminal
+        from mbkit.report import compare_view, terminal
 
-        return terminal.comparison(result, target)
+        return terminal.render(compare_view.view(result, target))
 
     def page() -> str:
-        from mbkit.report.page import check_page
+        from mbkit.report import compare_view
+        from mbkit.report.page import render
 
-        return check_page(result, asked=target, data=f"{stem}.json")
+        return render(compare_view.view(result, target), data=f"{stem}.json")
 
     data = result.to_json()
     files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
@@ -149,14 +150,15 @@ def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, o
     result = compare_parsers(target, floating_base=floating_base, seed=seed)
 
     def table() -> RenderableType:
-        from mbkit.report import terminal
+        from mbkit.report import explain_view, terminal
 
-        return terminal.importers(result)
+        return terminal.render(explain_view.importers_view(result))
 
     def page() -> str:
-        from mbkit.report.page import importers_page
+        from mbkit.report import explain_view
+        from mbkit.report.page import render
 
-        return importers_page(result, data=f"{stem}.json")
+        return render(explain_view.importers_view(result), data=f"{stem}.json")
 
     data = result.to_json()
     files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
@@ -207,14 +209,15 @@ def _check_all(
     )
 
     def table() -> RenderableType:
-        from mbkit.report import terminal
+        from mbkit.report import compare_view, terminal
 
-        return terminal.sweep(result)
+        return terminal.render(compare_view.robots_view(result))
 
     def page() -> str:
-        from mbkit.report.page import sweep_page
+        from mbkit.report import compare_view
+        from mbkit.report.page import render
 
-        return sweep_page(result, data="all.json")
+        return render(compare_view.robots_view(result), data="all.json")
 
     data = result.to_json()
     files = (File("data", "all.json", lambda: data + "\n"), File("page", "all.html", page))

@@ -68,9 +68,10 @@ def diff(
     if as_json:
         tell(result.to_json())
     else:
-        from mbkit.report.terminal import explanation
+        from mbkit.report.explain_view import explanation_view
+        from mbkit.report.terminal import render
 
-        console().print(explanation(result))
+        console().print(render(explanation_view(result)))
     leave(AGREE if result.agree else DIFFER)
 
 

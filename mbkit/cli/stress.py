@@ -106,9 +106,9 @@ def stress(
 def _show(result: StressResult, stem: str, out: Path, *, as_json: bool, force: bool) -> bool:
 
     def table() -> RenderableType:
-        from mbkit.report import stress_terminal
+        from mbkit.report import stress_view, terminal
 
-        return stress_terminal.summary(result)
+        return terminal.render(stress_view.view(result))
 
     def page() -> str:
         from mbkit.report.page import stress_page

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import html, one_line
-from mbkit.report.compare_view import by_term
 from mbkit.studies._figure_style import Palette, engine_mark, log_ticks, style
 from mbkit.studies.compare.all_robots import Sweep
 from mbkit.studies.compare.result import Comparison, Row
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["PAGE", "canvas", "digits", "page_style", "robots", "svg", "term_costs"]
+__all__ = ["PAGE", "by_term", "canvas", "digits", "page_style", "robots", "svg", "term_costs"]
 
 
 # Figures as SVG that takes its colours from the page, so that light and dark both read.
@@ -80,6 +79,14 @@ def svg(fig: Figure, title: str) -> str:
     for stand_in, variable in _VARIABLES.items():
         text = text.replace(stand_in, variable)
     return text
+
+
+def by_term(result: Comparison) -> dict[str, dict[str, Row]]:
+    """Return term -> engine -> row, terms in their order."""
+    out: dict[str, dict[str, Row]] = {}
+    for row in result.rows:
+        out.setdefault(row.term, {})[row.engine] = row
+    return out
 
 
 _GROUP_MARKS: Final = "osD^vP"

@@ -1,11 +1,15 @@
-"""Numbers as text, the same on a terminal and on a page."""
+"""Numbers, judgements, settings and facts as text, the same on a terminal and on a page."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final
 
-__all__ = ["count_text", "error_text", "time_text"]
+from mbkit.report.document import Bullet, Span, Text
+from mbkit.studies.results import Refusal
+
+__all__ = ["choice", "count_text", "error_text", "mark", "model_facts", "refusals", "time_text"]
 
 _UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
@@ -43,3 +47,50 @@ def _three(x: float) -> str:
 def count_text(x: float) -> str:
     """Return a factor without decimals where it has three digits."""
     return "" if math.isnan(x) else "∞" if math.isinf(x) else f"{x:.3g}" if abs(x) < 1000 else f"{x:.1e}"
+
+
+def mark(passed: bool | None, text: str) -> Span:
+    """Return a text with ✓ or ✗ before it; with a dash where nothing was judged."""
+    if passed is None:
+        return Span(f"– {text:>7}", "muted")
+    return Span(f"✓ {text:>7}", "good") if passed else Span(f"✗ {text:>7}", "bad")
+
+
+def choice(value: Any) -> str:
+    """Return a setting (a switch, a number, a text or several of them) as a person writes it."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.12g}"
+    if isinstance(value, Mapping):
+        return "; ".join(f"{k}: {choice(x)}" for k, x in value.items())
+    return ", ".join(map(choice, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def refusals(found: Iterable[Refusal]) -> list[Bullet]:
+    """Return what engines could not do, those of one reason together."""
+    terms: dict[tuple[str, str], list[str]] = {}
+    for r in found:
+        terms.setdefault((r.engine, r.reason), []).extend([r.term] if r.term else [])
+    out = []
+    for (engine, reason), names in terms.items():
+        of = f" ({', '.join(dict.fromkeys(names))})" if names else ""
+        out.append(Bullet(f"{engine}{of}".strip(), reason))
+    return out
+
+
+def model_facts(facts: Mapping[str, Any], asked: str, setup: Mapping[str, float]) -> Iterator[tuple[str, Text]]:
+    """Yield what a page says of a model."""
+    if asked:
+        yield "asked for as", asked
+    mass = f", {facts['mass']:.5g} kg" if "mass" in facts else ""
+    yield "size", f"nq = {facts.get('nq', '?')} coordinates, nv = {facts.get('nv', '?')} velocities{mass}"
+    if "needs" in facts:
+        yield "has", ", ".join(need for need, has in facts["needs"].items() if has) or "–"
+        yield "has not", Span(", ".join(need for need, has in facts["needs"].items() if not has) or "–", "muted")
+    if "digest" in facts:
+        yield "digest", Span(facts["digest"], "mono")
+    if setup:
+        yield "set-up", ", ".join(f"{engine} {time_text(seconds)}" for engine, seconds in setup.items())

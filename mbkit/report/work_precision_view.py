@@ -1,4 +1,4 @@
-"""The work-precision study as a figure, and what is read from it for tables."""
+"""Error against run time as a document: the fastest for each error, then curve by curve."""
 
 from __future__ import annotations
 
@@ -8,8 +8,23 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from mbkit.report.document import (
+    Block,
+    Bullet,
+    Column,
+    Details,
+    Document,
+    Facts,
+    Figure,
+    Items,
+    Paragraph,
+    Section,
+    Span,
+    Table,
+    Text,
+)
 from mbkit.report.figures import PAGE, page_style, svg
-from mbkit.report.formatting import count_text, time_text
+from mbkit.report.formatting import choice, count_text, error_text, model_facts, refusals, time_text
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import USEFUL, figure
 from mbkit.studies.work_precision.result import WorkPrecision
@@ -19,14 +34,14 @@ __all__ = [
     "Lead",
     "Level",
     "curve_lines",
-    "curve_name",
     "error_against_time",
     "front_names",
     "headline",
     "leads",
     "levels",
     "picture",
-    "setting_text",
+    "sections",
+    "view",
 ]
 
 #: An observed order farther than this from the method's own is flagged.
@@ -153,19 +168,14 @@ def curve_lines(result: WorkPrecision) -> list[CurveLine]:
     return out
 
 
-def curve_name(curve: Curve) -> str:
+def _name(curve: Curve) -> str:
     """Return engine and method; MuJoCo's own integrators have the engine in their names."""
     return curve.method if curve.method.startswith(f"{curve.engine}_") else f"{curve.engine} {curve.method}"
 
 
 def front_names(result: WorkPrecision) -> list[str]:
     """Return the names of the curves on the front, the fastest first; no answers are left out."""
-    return list(dict.fromkeys(curve_name(c) for c, p in result.front if p.error <= USEFUL))
-
-
-def setting_text(point: PrecisionPoint) -> str:
-    """Return the step with its unit, or the tolerance."""
-    return f"dt {time_text(point.value)}" if point.setting == "dt" else f"rtol {point.value:.0e}"
+    return list(dict.fromkeys(_name(c) for c, p in result.front if p.error <= USEFUL))
 
 
 def headline(result: WorkPrecision) -> str:
@@ -176,7 +186,7 @@ def headline(result: WorkPrecision) -> str:
     if not found:
         return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m{missing}"
     parts = []
-    for name, group in itertools.groupby(found, key=lambda level: curve_name(level.curve)):
+    for name, group in itertools.groupby(found, key=lambda level: _name(level.curve)):
         first, *rest = [f"{level.error:.0e}" for level in group]
         parts.append(f"{name} for an error of {first}" + (f" to {rest[-1]}" if rest else ""))
     count = f"{len(result.curves)} curve{'s' * (len(result.curves) != 1)}"
@@ -197,3 +207,183 @@ def picture(result: WorkPrecision) -> bytes:
     fig = figure(result.curves, result.duration, result.floor)
     fig.savefig(stream, format="png", dpi=_DOTS_PER_INCH, facecolor="white", metadata={"Software": "mbkit"})
     return stream.getvalue()
+
+
+# The document.
+
+
+def view(result: WorkPrecision, asked: str = "") -> Document:
+    """Return the document of a study; `asked` is what a person called the model."""
+    asked = asked if asked != result.model else ""
+    facts = result.facts
+    count = sum(len(c.points) for c in result.curves)
+    notes = [Bullet("", note) for note in facts.get("notes", ())]
+    return Document(
+        name=f"{result.model} ({asked})" if asked else result.model,
+        heading=f"{result.model}: error against run time",
+        title=f"{result.model}: error against run time",
+        verdict=headline(result),
+        good=bool(result.complete and result.front),
+        marked=False,
+        summary=f"nq {facts.get('nq', '?')}, nv {facts.get('nv', '?')} · {count} settings · {result.seconds:.1f} s",
+        sections=[
+            *sections(result, whole=True),
+            Section(
+                "The model",
+                [Facts(list(model_facts(facts, asked, {}))), *([Items(notes)] if notes else [])],
+                on="page",
+            ),
+        ],
+        result=result,
+        basis={name: choice(value) for name, value in result.settings.items()},
+    )
+
+
+def sections(result: WorkPrecision, whole: bool) -> list[Section]:
+    """Return the sections of a study; unless `whole`, a terminal shows the fastest only."""
+    missing = [Paragraph(Span(f"! {'; '.join(result.shortened)}", "allowed"))] if result.shortened else []
+    cut = f", cut from {result.asked:g} s where the reference stops holding" if result.duration < result.asked else ""
+    known = f"known to {error_text(result.floor)}" if math.isfinite(result.floor) else "known to an unknown error"
+    front = "Lower left is better. On the front, fastest first: {}. Names beside the grey band are the methods that "
+    front += (
+        "join it there, in their engine’s colour. Run times are without deriving and compiling, first runs with both."
+    )
+    drawn = Figure(lambda: error_against_time(result), front.format(", ".join(front_names(result))), wide=True)
+    fastest = leads(result)
+    about = f"Error against run time, {result.duration:g} s of motion: errors of q in rad or m"
+    unable = refusals(result.refusals)
+    return [
+        Section(
+            about,
+            [
+                *missing,
+                Paragraph(f"Errors are the largest difference of q on the manifold over the saved times{cut}.", "page"),
+                Paragraph(f"Reference: {result.reference}; {known}."),
+                *([drawn] if result.front else []),
+            ],
+        ),
+        Section(
+            "Who reaches an error first",
+            [Table(_LEADS, fastest) if fastest else Paragraph(Span("no run reached 1e-02", "muted"))],
+            level=3,
+        ),
+        Section(
+            "Engine by engine, method by method; the run time is that of the least error",
+            _curves(result),
+            on="both" if whole else "page",
+            level=3,
+        ),
+        Section(
+            "What could not be measured",
+            [Items(unable)] if unable else [],
+            on="both" if whole else "page",
+            level=3,
+        ),
+        Section(
+            "",
+            [Details("the motion", [Facts([(n, f"{n} = [{choice(getattr(result, n))}]") for n in ("q0", "v0")])])],
+            on="page",
+            level=3,
+        ),
+    ]
+
+
+def setting_text(point: PrecisionPoint) -> str:
+    """Return the step with its unit, or the tolerance."""
+    return f"dt {time_text(point.value)}" if point.setting == "dt" else f"rtol {point.value:.0e}"
+
+
+def _known(x: float) -> str:
+    return "" if math.isnan(x) else error_text(x)
+
+
+_LEADS: Final = (
+    Column("error ≤", lambda x: x.errors, right=True),
+    Column("engine", lambda x: x.curve.engine),
+    Column("method", lambda x: x.curve.method),
+    Column("setting", lambda x: setting_text(x.point), right=True),
+    Column("run time", lambda x: time_text(x.point.seconds), right=True),
+    Column("±", lambda x: Span(time_text(x.point.spread), "muted"), right=True, on="page"),
+    Column("first run", lambda x: time_text(x.curve.compile + x.point.seconds) or "–", right=True),
+    Column("next engine", lambda x: Span(_next(x), "muted")),
+    Column("its method", lambda x: ", ".join(methods for _, methods, _ in x.nexts), on="page"),
+)
+
+
+def _next(lead: Lead) -> str:
+    return ", ".join(f"{engine} × {factor}" if factor else engine for engine, _, factor in lead.nexts)
+
+
+def _order(line: CurveLine) -> Text:
+    order = "" if math.isnan(line.curve.order) else f"{line.curve.order:.2f}"
+    return Span(f"! {order}", "allowed") if line.off else order
+
+
+_CURVES: Final = (
+    Column("", lambda x: Span("●" if x.on_front else "", "good")),
+    Column("engine", lambda x: x.curve.engine),
+    Column("method", lambda x: x.curve.method),
+    Column("order", _order, right=True),
+    Column("of", lambda x: "" if math.isnan(x.curve.expected) else f"{x.curve.expected:g}", right=True),
+    Column("from\npoints", lambda x: Span(str(x.curve.order_points or ""), "muted"), right=True, on="page"),
+    Column("least error", lambda x: error_text(x.best.error) if x.best else "none", right=True),
+    Column("at", lambda x: setting_text(x.best) if x.best else "", right=True, on="page"),
+    Column("run time", lambda x: time_text(x.best.seconds) if x.best else "", right=True),
+    Column("±", lambda x: Span(time_text(x.best.spread) if x.best else "", "muted"), right=True, on="page"),
+    Column("energy\ndrift", lambda x: _known(x.best.energy) if x.best else "", right=True, on="page"),
+    Column("compile", lambda x: time_text(x.curve.compile) or "–", right=True),
+    Column(
+        "first run",
+        lambda x: (time_text(x.curve.compile + x.best.seconds) or "–") if x.best else "",
+        right=True,
+        on="page",
+    ),
+    Column("note", lambda x: Span(_why_none(x), "muted"), on="page"),
+)
+
+
+def _why_none(line: CurveLine) -> str:
+    """Return why a curve has no error at all."""
+    if line.best:
+        return ""
+    return next((p.note for p in line.curve.points if p.note), "no run came to an end")
+
+
+_POINTS: Final = (
+    Column("engine", lambda x: x[0].engine),
+    Column("method", lambda x: x[0].method),
+    Column("setting", lambda x: setting_text(x[1]), right=True),
+    Column("error of q,\nrad or m", lambda x: _known(x[1].error) or "–", right=True),
+    Column("energy\ndrift", lambda x: _known(x[1].energy), right=True),
+    Column("run time", lambda x: time_text(x[1].seconds), right=True),
+    Column("±", lambda x: Span(time_text(x[1].spread), "muted"), right=True),
+    Column("first run", lambda x: time_text(x[0].compile + x[1].seconds), right=True),
+    Column("steps", lambda x: str(x[1].steps or ""), right=True),
+    Column("evaluations", lambda x: str(x[1].evaluations or ""), right=True),
+    Column("note", lambda x: Span(x[1].note, "muted")),
+)
+
+
+def _curves(result: WorkPrecision) -> list[Block]:
+    lines = curve_lines(result)
+    if not lines:
+        return []
+    work, timing = result.settings.get("work"), result.settings.get("timing")
+    most = f" ({work:.0f} evaluations of the dynamics; one that is called from Python counts eight)" if work else ""
+    legend = [Bullet("", "on the front: nothing beats it in both error and run time", "●", "good")]
+    if any(line.off for line in lines):
+        off = f"the observed order is not the method's own: it is more than {ORDER_TOLERANCE} off"
+        legend.append(Bullet("", off, "!", "allowed"))
+    return [
+        Table(_CURVES, lines),
+        Items(legend),
+        Paragraph(
+            "The order is the slope of log error over log step, where neither coarse steps nor rounding hide it. A "
+            f"curve ends where finer settings bring nothing, or a run would take too much work{most}. Run times are "
+            f"medians of repeated runs{f', {timing}' if timing else ''}; ± is half the interquartile range. Compiling "
+            "is timed from nothing, whatever the caches hold.",
+            on="page",
+            note=True,
+        ),
+        Details("every setting", [Table(_POINTS, list(result.rows()))]),
+    ]

@@ -1,4 +1,4 @@
-"""A case on the page: its map, a table of coloured cells, and what stands under it.
+"""The content of the stress page; a case has a map, a table of coloured cells, and what stands under it.
 
 The map is a table and no picture: as sharp as the page on any screen, to be searched and copied, with the rest
 of a cell told to whoever points at it.
@@ -10,16 +10,17 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
+from mbkit.report import stress_view
 from mbkit.report.formatting import error_text, time_text
-from mbkit.report.stress_steps import against_theory
-from mbkit.report.stress_view import HOW, Overview, told, value_text
+from mbkit.report.stress_steps import against_theory, kinds, rules, stable_steps, steps
+from mbkit.report.stress_view import HOW, Overview, held_text, told, value_text
 from mbkit.studies._figure_style import engine_index
-from mbkit.studies.stress.figure import ROOMY, cell_text, shade
-from mbkit.studies.stress.result import CaseResult, Cell, Line, Outcome, Row, name_of, place
+from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
+from mbkit.studies.stress.result import CaseResult, Cell, Line, Outcome, Row, StressResult, engines_of, name_of, place
 
-__all__ = ["MapCell", "MapRow", "Section", "section"]
+__all__ = ["FILTERS", "MapCell", "MapRow", "Section", "content", "section"]
 
 _MEASURES: Final = {
     "motion": "the largest difference of q along the run, over the size of the motion",
@@ -171,3 +172,54 @@ def _facts(case: CaseResult) -> list[tuple[str, list[float]]]:
     names = dict.fromkeys(name for facts in case.facts for name in facts)
     padded = [*case.facts, *({} for _ in range(len(case.values) - len(case.facts)))]
     return [(name, [facts.get(name, math.nan) for facts in padded]) for name in names]
+
+
+def content(result: StressResult) -> dict[str, Any]:
+    """Return what the template of the page is filled with."""
+    overview = stress_view.overview(result)
+    step_cases = steps(overview)
+    step_rules = rules(step_cases)
+    engines = engines_of(result.cases)
+    return {
+        "headline": stress_view.headline(result),
+        "avoid": stress_view.avoid(result),
+        "silences": stress_view.silences(result),
+        "asked": [o for o in overview if o.choice is not None],
+        "behind": [o for o in overview if o.behind],
+        "methods": stress_view.methods(result),
+        "run_families": stress_view.families([o for o in overview if stress_view.ranks(o.case)]),
+        "families": stress_view.families(overview),
+        "sections": {o.anchor: section(o) for o in overview},
+        "engines": engines,
+        "series": {e: engine_index(e) + 1 for e in engines},
+        "steps": step_cases,
+        "rules": step_rules,
+        "kinds": kinds(step_rules),
+        "step_figure": stable_steps(step_cases) if step_cases else None,
+        "bars": stress_view.bars(result),
+    }
+
+
+def _three_digits(x: float) -> str:
+    return "" if math.isnan(x) else number_text(float(f"{x:.3g}"))
+
+
+def _limit(x: float | None, unit: str = "") -> str:
+    """Return where theory lets something break."""
+    if x is None or math.isnan(x):
+        return "–"
+    return "no limit" if math.isinf(x) else f"{_three_digits(x)} {unit}".rstrip()
+
+
+#: What the template writes numbers and rows with.
+FILTERS: Final = {
+    "short": error_short,
+    "number": number_text,
+    "fact": _three_digits,
+    "limit": _limit,
+    "value": value_text,
+    "held": held_text,
+    "how": lambda outcome: HOW.get(outcome, ""),
+    "told": told,
+    "rowname": name_of,
+}

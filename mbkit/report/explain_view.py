@@ -1,0 +1,278 @@
+"""Why descriptions, importers or engines differ, and a model against its baseline, as documents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import PurePath
+from typing import Final
+
+from mbkit.report.document import Block, Bullet, Column, Document, Items, Paragraph, Section, Span, Style, Table
+from mbkit.report.formatting import error_text
+from mbkit.studies.baseline import BaselineResult
+from mbkit.studies.explain.result import Cause, Explanation, grouped
+from mbkit.studies.importers.result import DECIDING, TERMS, Parsed, ParserComparison, Stage
+
+__all__ = ["baseline_view", "explanation_view", "importers_view", "meaning"]
+
+
+def explanation_view(result: Explanation) -> Document:
+    """Return the document of an explanation: verdict, terms, causes and notes."""
+    gaps = (
+        Column("term", lambda g: g.term),
+        Column(
+            "relative difference",
+            lambda g: Span(error_text(g.relative), "good" if g.relative <= result.tolerance else "bad"),
+            right=True,
+        ),
+        Column("joint", lambda g: g.joint),
+    )
+    joints = [Bullet("", f"{m.a} is {m.b}") for m in result.matches if m.how == "structure"]
+    for names, side in ((result.only_a, result.a), (result.only_b, result.b)):
+        joints += [Bullet("", f"{name} is only in {side}") for name in names]
+    by_name = sum(m.how == "name" for m in result.matches)
+    return Document(
+        name=f"{result.a} and {result.b}",
+        heading=f"{result.a} and {result.b}",
+        title=f"{result.a} and {result.b}",
+        verdict=result.verdict,
+        good=result.agree,
+        sections=[
+            Section("Terms, by joint name", [Table(gaps, result.gaps)] if result.gaps else []),
+            Section("Causes", _causes(result.causes)),
+            Section(f"Joints: {by_name} matched by name, and", [Items(joints)] if joints else []),
+            Section("Notes", [Items([Bullet("", note) for note in result.notes])] if result.notes else []),
+        ],
+        result=result,
+    )
+
+
+def _causes(causes: Iterable[Cause]) -> list[Block]:
+    """Return the causes, those that move something first."""
+    bullets: list[Bullet] = []
+    known = list(causes)
+    for acts, mark, style in ((True, "✗", "bad"), (False, "!", "allowed")):
+        for kind, says, what in grouped(c for c in known if c.acts == acts):
+            # What a kind means is told once.
+            again = any(b.head == kind for b in bullets)
+            bullets.append(Bullet(kind, f"{says} ({what})", mark, style, "" if again else meaning(kind)))  # type: ignore[arg-type]
+    return [Items(bullets)] if bullets else []
+
+
+# One file through several importers.
+
+_GLOSS: Final = {
+    "joints": "every moving joint has its counterpart",
+    "kinds": "they move in the same way",
+    "parents": "they hang on the same bodies",
+    "places": "they stand at the same places",
+    "axes": "about or along the same directions",
+    "mimic": "what follows another joint does so",
+    "total mass": "with all that stands still",
+    "masses": "of each moving body, with what is fixed to it",
+    "centres of mass": "of the same bodies",
+    "inertias": "about their centres of mass",
+    "armature": "motors' inertias at the joints",
+    "damping": "viscous, at the joints",
+    "friction": "dry, at the joints",
+    "limits": "of position, speed and effort",
+    "M": "mass matrix, by the engine itself",
+    "g": "forces of gravity, by the engine itself",
+    "nle": "C v + g, by the engine itself",
+    "passive": "springs, dampers and all else that acts without a command, by the engine itself",
+}
+_LEGEND: Final = (
+    "✓ the same. ✗ another motion: these stages decide whether an importer agrees. ! another number, which decides "
+    "nothing by itself: what it does shows in M, g, nle and passive. – cannot be compared."
+)
+
+
+def importers_view(result: ParserComparison) -> Document:
+    """Return the document of several importers of one file: stage by stage, and why they differ."""
+    name = PurePath(result.source).name
+    read = [p for p in result.importers if p.stages]
+    alone = [p for p in result.importers if not p.stages and not p.refused]
+    outcome = "agree" if result.agree else "differ" if read else "are not compared" if alone else "refuse"
+    rows = [p.stages for p in read]
+    columns = [
+        Column("stage", lambda k: Span(rows[0][k].name, "bold")),
+        Column("", lambda k: Span(_GLOSS.get(rows[0][k].name, ""), "muted"), on="page"),
+        *(_importer(p) for p in read),
+    ]
+    plural = "s" * (result.samples != 1)
+    notes = [Bullet("the file", note) for note in (*([result.faults] if result.faults else []), *result.notes)]
+    notes += [Bullet(p.engine, note) for p in (*read, *alone) for note in p.notes]
+    fused = (
+        "What an importer fuses is fused on the other side too; mimic joints are left free in M, g, nle and passive, "
+        f"whose differences are relative to the forces at play and count above {result.tolerance:g}."
+    )
+    return Document(
+        name=name,
+        heading=name,
+        title=f"{name}: importers {outcome}",
+        verdict=result.verdict,
+        good=result.agree,
+        opening=[Paragraph(_setting(result, read, alone), on="page")],
+        sections=[
+            Section(
+                "Stage by stage" + (f", against the {result.against}" if result.against else ""),
+                [
+                    Table(columns, range(len(rows[0])), style="stages"),
+                    Paragraph(_LEGEND, on="page", note=True),
+                    Paragraph(fused, on="page", note=True),
+                ]
+                if read
+                else [],
+            ),
+            *(_differences(p) for p in read),
+            Section(
+                "Refused",
+                [
+                    Items([Bullet(f"{p.engine} {p.version}", p.refused, "✗", "bad") for p in refusing])
+                    for refusing in [[p for p in result.importers if p.refused]]
+                    if refusing
+                ],
+            ),
+            Section("Notes", [Items(notes)] if notes else []),
+        ],
+        result=result,
+        basis={
+            "file": Span(result.source, "mono"),
+            "states": f"{result.samples} random one{plural}, seed {result.seed}; M, g, nle and passive are each "
+            "engine's own, on its own model",
+        },
+    )
+
+
+def _importer(p: Parsed) -> Column:
+    return Column(f"{p.engine} {p.version}", lambda k: _stage(p.stages[k]))
+
+
+def _setting(result: ParserComparison, read: list[Parsed], alone: list[Parsed]) -> str:
+    """Return what was done with the file, in words."""
+    head = f"The same {'URDF' if result.format == 'urdf' else 'MJCF'} was given to each engine's own importer"
+    because = ", because mbkit itself does not read the file"
+    if not read:
+        why = because if not result.reference else ""
+        return f"{head}. Nothing is compared{why}." if alone else f"{head}, and none reads it."
+    still = "stands still" if result.format == "urdf" else "is as the file has it"
+    why = because if result.reference != "file" else ""
+    base = "floats" if result.floating_base else still
+    return f"{head}. What came out is compared with the {result.against}{why}; the base {base}."
+
+
+def _differences(p: Parsed) -> Section:
+    found = p.explanation
+    causes = _causes(found.causes) if found else []
+    title = f"Why {p.engine} differs"
+    if found and not found.explained:
+        title += ": not all is explained"
+        title += f"; the smallest part that still differs: {', '.join(found.subtree)}" if found.subtree else ""
+    elif found and not found.acting:
+        title = f"{p.engine} moves the same; what differs is data"
+    about = (
+        "Each cause was applied to the other side, to see whether the difference vanishes. ✗ moves something, by so "
+    )
+    return Section(title, [Paragraph(f"{about}by so much; ! moves nothing.", on="page"), *causes] if causes else [])
+
+
+def _stage(stage: Stage) -> Span:
+    """Return a stage as mark, word and what differs."""
+    if stage.same is None:
+        return Span("– not comparable" + (f": {stage.says}" if stage.says else ""), "muted", "none")
+    number = error_text(stage.worst) if stage.name in TERMS and math.isfinite(stage.worst) else ""
+    if stage.same:
+        return Span(f"✓ same to {number}" if number else "✓ same", "good", "same")
+    joint = f", most at {stage.where}" if stage.where else ""
+    says = f" by {number}{joint}" if number else f" {stage.says}"
+    return Span(f"✗ differs{says}", "bad", "differs") if stage.name in DECIDING else Span(f"! differs{says}", "allowed")
+
+
+# A model against its baseline.
+
+_MARKS: Final[dict[str, tuple[str, Style]]] = {
+    "note": ("·", "muted"),
+    "version": ("·", "muted"),
+    "processor": ("·", "muted"),
+    "effect": ("→", "bold"),
+}
+
+
+def baseline_view(result: BaselineResult, again: str = "") -> Document:
+    """Return the document of a check or a diff; `again` is the command that records anew."""
+    name = result.path if result.question == "check" else f"{result.path} → {result.against}"
+    skipped = {r.engine for r in result.skipped}
+    bullets = []
+    for what, line in result.lines():
+        mark, style = ("–", "allowed") if what in skipped else _MARKS.get(what, ("✗", "bad"))
+        bullets.append(Bullet(what, line, mark, style))  # type: ignore[arg-type]
+    if again and result.question == "check" and result.status in ("description", "numbers", "versions"):
+        bullets.append(Bullet("if this is meant" if result.status != "versions" else "to record anew", again))
+    return Document(
+        name=f"{result.model} ({name})",
+        heading=result.model,
+        title=result.model,
+        verdict=result.verdict,
+        good=result.passed,
+        opening=[Items(bullets)] if bullets else [],
+        sections=[],
+        result=result,
+    )
+
+
+# What each kind of cause means, for a reader who meets it for the first time.
+
+_MEANINGS: Final = {
+    "actuator": "A motor or servo: its armature adds to M, and at zero control its gain and damping still act.",
+    "added body": "It has matter where the other side has none.",
+    "added joint": "It has a joint that the other side has not.",
+    "armature": "A motor's inertia, seen through its gear: it adds to the diagonal of M.",
+    "axis": "The joint turns or slides about another direction.",
+    "axis sign": "Positive q goes the other way.",
+    "base mass": "Matter that never moves, fused into the world: no term holds it while the base stands.",
+    "centre of mass": "The matter is as heavy, and elsewhere.",
+    "damping": "Viscous friction in the joint. It is in no term of M and nle.",
+    "fluid": "The drag and lift of the medium in which the bodies move.",
+    "friction": "Dry friction in the joint. It is in no term of M and nle.",
+    "fused at the wrong place": "Links that are fixed to each other were made one body, and one was put elsewhere.",
+    "fused with a rotated frame": "Links that are fixed to each other were made one body, and one was turned wrongly.",
+    "gravity": "Another acceleration of gravity.",
+    "gravity compensation": "A force that holds some of a body's weight.",
+    "inertia": "The matter is as heavy, and resists turning otherwise.",
+    "inertia about the wrong point": "The moments are about another point than the centre of mass.",
+    "inertia axes": "The same principal moments, about other axes.",
+    "inverse placement": "A frame's place in another was taken for the other's place in it.",
+    "joint held still": "What moves on one side is fixed on the other, so q and v are not the same there.",
+    "joint kind": "The joint moves in another way.",
+    "joint order": "q and v name the same joints in another order; read them by name.",
+    "joint origin": "The joint stands elsewhere in its parent.",
+    "joint rotation": "The joint stands turned in its parent.",
+    "limits": "Bounds of position, speed or effort. They are in no term of M and nle.",
+    "lost body": "Matter is gone: with no joint of its own and little mass, an importer may take a link for empty.",
+    "lost joint": "A joint is gone, with all that it carries, so q and v are not the same there.",
+    "mass": "Another mass.",
+    "mimic": "A joint that follows another has a coordinate of its own, or follows otherwise.",
+    "names exchanged": "Joints are called by each other's names.",
+    "own terms": "The engine computes other terms than the bodies and joints that were read out of it have.",
+    "parent": "The joint hangs on another body.",
+    "passive forces": "Springs and dampers were put where they do not belong, or left out.",
+    "pitch": "How far a screw goes in a turn.",
+    "products of inertia": "The off-diagonal moments have another sign, or are gone.",
+    "quaternion order": "w, x, y, z was read for x, y, z, w, or the other way round.",
+    "renamed": "The same joints are called otherwise.",
+    "replaced inertia": "An inertia that no body can have was taken out, and a ball of water put in its place.",
+    "rounding": "The numbers were written with few digits on the way.",
+    "spring": "A spring in the joint. It is in no term of M and nle.",
+    "tendon": "It couples joints: its armature adds to M, its spring and damper pull at them.",
+    "unit of inertia": "The numbers are of another unit of inertia.",
+    "unit of length": "The numbers are of another unit of length.",
+    "unit of mass": "The numbers are of another unit of mass.",
+    "unit of pitch": "Metres a radian, or a turn.",
+    "velocity frame": "Velocities of a free body are in other axes.",
+    "zero position": "q counts from another pose.",
+}
+
+
+def meaning(kind: str) -> str:
+    """Return a sentence on a kind of cause; empty where its name says it all."""
+    return _MEANINGS.get(kind, "")
