@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import PurePath
 from typing import Final
 
@@ -124,7 +124,7 @@ def importers_view(result: ParserComparison) -> Document:
                 if read
                 else [],
             ),
-            *(_differences(p) for p in read),
+            *_differences(read),
             Section(
                 "Refused",
                 [
@@ -161,19 +161,23 @@ def _setting(result: ParserComparison, read: list[Parsed], alone: list[Parsed]) 
     return f"{head}. What came out is compared with the {result.against}{why}; the base {base}."
 
 
-def _differences(p: Parsed) -> Section:
-    found = p.explanation
-    causes = _causes(found.causes) if found else []
-    title = f"Why {p.engine} differs"
-    if found and not found.explained:
-        title += ": not all is explained"
-        title += f"; the smallest part that still differs: {', '.join(found.subtree)}" if found.subtree else ""
-    elif found and not found.acting:
-        title = f"{p.engine} moves the same; what differs is data"
-    about = (
+def _differences(read: list[Parsed]) -> Iterator[Section]:
+    about = Paragraph(
         "Each cause was applied to the other side, to see whether the difference vanishes. ✗ moves something, by so "
+        "much; ! moves nothing.",
+        on="page",
     )
-    return Section(title, [Paragraph(f"{about}by so much; ! moves nothing.", on="page"), *causes] if causes else [])
+    for p in read:
+        found = p.explanation
+        if found is None or not found.causes:
+            continue
+        title = p.engine
+        if not found.explained:
+            where = f"; the smallest part that still differs: {', '.join(found.subtree)}" if found.subtree else ""
+            title += f": not all is explained{where}"
+        elif not found.acting:
+            title += " moves the same; what differs is data"
+        yield Section(f"Why they differ: {title}", [about, *_causes(found.causes)])
 
 
 def _stage(stage: Stage) -> Span:
