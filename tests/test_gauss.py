@@ -14,12 +14,11 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.errors import InputError, MbkitWarning, TorqueError
-from mbkit.methods.tableaus import ImplicitTableau, Tableau
+from mbkit.methods.tableaus import ImplicitTableau, Tableau, gauss_legendre
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import METHODS, simulate
 from mbkit.simulate.solvers.fixed_step import make_step
-from mbkit.simulate.solvers.gauss import gauss_legendre
 from mbkit.simulate.solvers.runge_kutta import Field
 from tests.random_trees import random_tree
 

@@ -1,15 +1,70 @@
-"""The methods of integration, as data."""
+"""The methods of integration, as data, and their names.
+
+What other code asks of a method is an attribute of it: no method is told apart by its name elsewhere.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
 from mbkit.errors import InputError, UnknownNameError
+from mbkit.methods.one_step import SemiImplicitEuler
+from mbkit.methods.stability import (
+    IMPLICIT_EULER,
+    IMPLICIT_IN_VELOCITY,
+    SYMPLECTIC_EULER,
+    Stability,
+    TableauStability,
+)
+from mbkit.methods.tableaus import (
+    RK4,
+    EmbeddedTableau,
+    ImplicitTableau,
+    RosenbrockTableau,
+    Tableau,
+    dormand_prince_853,
+    gauss_legendre,
+    rodas5p,
+)
 
-__all__ = ["METHODS", "Method", "Tolerances", "method_of"]
+__all__ = [
+    "ADAPTIVE_METHOD",
+    "AUTOMATIC_METHOD",
+    "DEFAULT_METHOD",
+    "EULER_METHOD",
+    "IMPLICIT_METHODS",
+    "METHODS",
+    "SERIES_METHOD",
+    "STIFF_METHOD",
+    "Method",
+    "Tolerances",
+    "method_of",
+    "register_method",
+]
 
 _EPS: Final = 2.0**-52
+#: With a step, when nothing else is said.
+DEFAULT_METHOD: Final = "rk4"
+#: Of first order, as MuJoCo does it.
+EULER_METHOD: Final = "semi_implicit_euler"
+#: With a tolerance, for motions that are not stiff.
+ADAPTIVE_METHOD: Final = "rk853"
+#: With a tolerance, for stiff systems.
+STIFF_METHOD: Final = "rodas5"
+#: Chooses between the last two.
+AUTOMATIC_METHOD: Final = "auto"
+#: The most accurate one; with 34 digits on the oracle.
+SERIES_METHOD: Final = "taylor"
+
+#: With a fixed step, on any engine, for a sentence.
+IMPLICIT_METHODS: Final = "'gauss4' and 'gauss6'"
+
+#: A step in mbkit's own code.
+Formula = Tableau | RosenbrockTableau | SemiImplicitEuler
 
 
 @dataclass(frozen=True)
@@ -37,6 +92,31 @@ class Method:
         Whether the torque may be a function.
     lacks : str
         Why other engines do not have it; empty for what is an engine's own.
+    formula_source : Formula, callable or None
+        The step in mbkit's own code, or a function that constructs it; None for what another program integrates.
+    solver : str
+        ``"module:function"`` below `mbkit.simulate.solvers` that runs it.
+    scheme : str
+        Its name in the program that integrates.
+    stability : Stability or None
+        What a fixed step does to linear systems.
+    jacobian : bool
+        Whether it needs the Jacobian of the forward dynamics.
+    mass_matrix : bool
+        Whether it solves with the mass matrix itself, however the engine computes accelerations.
+    compiled : bool
+        Whether the Lagrangian engine runs its steps as machine code.
+    fills_tolerance : bool
+        Whether the error of a step is as large as the tolerance allows; that of other methods is a third to a
+        three-hundredth of it.
+    scaled_by_start : bool
+        Whether the tolerance is relative to the numbers of the start.
+    extended : bool
+        Whether the oracle runs it with 34 digits.
+    multistep : bool
+        Whether its interpolant is as accurate as its steps, and stopping often slows it.
+    own : str
+        Of an engine's integrator: the method of mbkit with the same formula.
     """
 
     name: str
@@ -49,33 +129,108 @@ class Method:
     least: float = 0.0
     callables: bool = True
     lacks: str = ""
+    formula_source: Formula | Callable[[], Formula] | None = None
+    solver: str = ""
+    scheme: str = ""
+    stability: Stability | None = None
+    jacobian: bool = False
+    mass_matrix: bool = False
+    compiled: bool = False
+    fills_tolerance: bool = False
+    scaled_by_start: bool = False
+    extended: bool = False
+    multistep: bool = False
+    own: str = ""
+
+    @cached_property
+    def formula(self) -> Formula | None:
+        """The step in mbkit's own code: `formula_source`, constructed."""
+        source = self.formula_source
+        return source() if callable(source) else source
+
+    @property
+    def code_name(self) -> str:
+        """Prefix of the names of compiled functions; it tells a tableau's coefficients."""
+        return f"{self.name}_{self.formula.digest}" if isinstance(self.formula, Tableau) else self.name
 
 
 class Tolerances(NamedTuple):
-    """What an adaptive method keeps its error per step below: atol + rtol |y|."""
+    """An adaptive method keeps its error per step below atol + rtol |y|."""
 
     rtol: float
     atol: float
 
 
-def _scipy(name: str, order: int | None, stages: int, about: str) -> Method:
+def _fixed(name: str, order: int, about: str, **more: object) -> Method:
+    return Method(name, "fixed", order, solver="fixed_step:run_fixed", about=about, **{"stages": 0, **more})  # type: ignore[arg-type]
+
+
+def _adaptive(name: str, order: int | None, about: str, solver: str, **more: object) -> Method:
+    more = {"stages": 0, "events": True, "least": _EPS, **more}
+    return Method(name, "adaptive", order, about=about, solver=solver, **more)  # type: ignore[arg-type]
+
+
+def _scipy(name: str, scheme: str, order: int | None, about: str, **more: object) -> Method:
     # SciPy's solvers raise a smaller rtol to this by themselves.
-    return Method(name, "adaptive", order, stages, about, events=True, least=100 * _EPS)
+    return _adaptive(name, order, about, "scipy:run_scipy", scheme=scheme, least=100 * _EPS, **more)
 
 
-def _mujoco(name: str, order: int, stages: int, about: str) -> Method:
-    return Method(f"mujoco_{name}", "native", order, stages, about, engines=("mujoco",), callables=False)
+def _mujoco(scheme: str, stability: Stability, about: str, *, own: str = "") -> Method:
+    order = 4 if isinstance(stability, TableauStability) else 1
+    return Method(
+        f"mujoco_{scheme}",
+        "native",
+        order,
+        stages=order,
+        about=about,
+        engines=("mujoco",),
+        callables=False,
+        solver="native:run_native",
+        scheme=scheme,
+        stability=stability,
+        own=own,
+    )
 
 
-def _drake(name: str, order: int | None, about: str) -> Method:
-    return Method(f"drake_{name}", "adaptive", order, 0, about, engines=("drake",), least=1e-15, callables=False)
+def _drake(scheme: str, order: int | None, about: str) -> Method:
+    return Method(
+        f"drake_{scheme}",
+        "adaptive",
+        order,
+        stages=0,
+        about=about,
+        engines=("drake",),
+        least=1e-15,
+        callables=False,
+        solver="drake:run_drake",
+        scheme=scheme,
+    )
 
+
+_RK4_STABILITY: Final = TableauStability(RK4)
+_MIDPOINT: Final = ImplicitTableau("implicit_midpoint", [[0.5]], [1.0], 2)
 
 METHODS: Final[dict[str, Method]] = {
     m.name: m
     for m in (
-        Method("rk4", "fixed", 4, 4, "Kutta's method of 1901; Munthe-Kaas (1999) on rotations, as MuJoCo 4 does it"),
-        Method("semi_implicit_euler", "fixed", 1, 1, "new velocity, then the position with it, as MuJoCo does it"),
+        _fixed(
+            DEFAULT_METHOD,
+            4,
+            "Kutta's method of 1901; Munthe-Kaas (1999) on rotations, as MuJoCo 4 does it",
+            stages=4,
+            formula_source=RK4,
+            stability=_RK4_STABILITY,
+            compiled=True,
+        ),
+        _fixed(
+            EULER_METHOD,
+            1,
+            "new velocity, then the position with it, as MuJoCo does it",
+            stages=1,
+            formula_source=SemiImplicitEuler(),
+            stability=SYMPLECTIC_EULER,
+            compiled=True,
+        ),
         Method(
             "implicit_midpoint",
             "fixed",
@@ -84,68 +239,115 @@ METHODS: Final[dict[str, Method]] = {
             "the midpoint rule in (q, p), on rotations its variational form: symplectic",
             engines=("lagrangian",),
             lacks="gives neither momenta nor ∂T/∂q with their derivatives, which the rule in (q, p) is made of",
+            solver="implicit_midpoint:run_midpoint",
+            stability=TableauStability(_MIDPOINT),
+            mass_matrix=True,
+            compiled=True,
         ),
-        Method("gauss4", "fixed", 4, 0, "Gauss-Legendre collocation, 2 stages (Hairer, Nørsett, Wanner 1993, II.7)"),
-        Method("gauss6", "fixed", 6, 0, "Gauss-Legendre collocation, 3 stages (Hairer, Nørsett, Wanner 1993, II.7)"),
-        Method(
-            "rk853",
-            "adaptive",
+        *(
+            _fixed(
+                f"gauss{2 * stages}",
+                2 * stages,
+                f"Gauss-Legendre collocation, {stages} stages (Hairer, Nørsett, Wanner 1993, II.7)",
+                formula_source=gauss_legendre(stages),
+                stability=TableauStability(gauss_legendre(stages)),
+            )
+            for stages in (2, 3)
+        ),
+        _adaptive(
+            ADAPTIVE_METHOD,
             8,
-            12,
             "Dormand and Prince 8(5,3) on the manifold, compiled where the dynamics is",
-            events=True,
-            least=_EPS,
+            "adaptive:run_embedded",
+            stages=12,
+            formula_source=dormand_prince_853,
+            compiled=True,
         ),
-        Method(
-            "auto",
-            "adaptive",
+        _adaptive(
+            AUTOMATIC_METHOD,
             None,
-            0,
-            "rk853, or rodas5 where stability holds its steps, by a look at the linearized system; stats.chosen tells",
-            events=True,
-            least=_EPS,
+            f"{ADAPTIVE_METHOD}, or {STIFF_METHOD} where stability holds its steps, by a look at the linearized "
+            "system; stats.chosen tells",
+            "auto:run_auto",
+            jacobian=True,
+            compiled=True,
         ),
-        Method(
-            "rodas5",
-            "adaptive",
+        _adaptive(
+            STIFF_METHOD,
             5,
-            8,
             "Rosenbrock's method Rodas5P, stiff: one Jacobian and one factorization a step (Steinebach 2023)",
-            events=True,
-            least=_EPS,
+            "adaptive:run_embedded",
+            stages=8,
+            formula_source=rodas5p,
+            jacobian=True,
+            mass_matrix=True,
+            compiled=True,
+            fills_tolerance=True,
         ),
-        Method(
-            "taylor",
-            "adaptive",
+        _adaptive(
+            SERIES_METHOD,
             None,
-            0,
             "heyoka's Taylor series, order by tolerance (Jorba and Zou 2005); 34 digits on the oracle",
+            "taylor:run_taylor",
             engines=("lagrangian", "oracle"),
-            events=True,
-            least=_EPS,
             callables=False,
             lacks="gives numbers and no expressions, which a series is made of",
+            scaled_by_start=True,
+            extended=True,
+            compiled=True,
         ),
-        _scipy("dop853", 8, 12, "SciPy's DOP853 (Hairer, Nørsett, Wanner 1993, II.5)"),
-        _scipy("radau", 5, 0, "SciPy's Radau IIA, implicit (Hairer, Wanner 1996, IV.8)"),
-        _scipy("bdf", None, 0, "SciPy's BDF, orders 1 to 5, implicit (Shampine, Reichelt 1997)"),
-        _scipy("lsoda", None, 0, "ODEPACK's LSODA: Adams or BDF, whichever suits (Petzold 1983)"),
-        Method(
-            "cvodes",
-            "adaptive",
+        _scipy("dop853", "DOP853", 8, "SciPy's DOP853 (Hairer, Nørsett, Wanner 1993, II.5)", stages=12),
+        _scipy(
+            "radau",
+            "Radau",
+            5,
+            "SciPy's Radau IIA, implicit (Hairer, Wanner 1996, IV.8)",
+            jacobian=True,
+            fills_tolerance=True,
+        ),
+        _scipy(
+            "bdf",
+            "BDF",
             None,
-            0,
+            "SciPy's BDF, orders 1 to 5, implicit (Shampine, Reichelt 1997)",
+            jacobian=True,
+            fills_tolerance=True,
+            multistep=True,
+        ),
+        _scipy(
+            "lsoda",
+            "LSODA",
+            None,
+            "ODEPACK's LSODA: Adams or BDF, whichever suits (Petzold 1983)",
+            jacobian=True,
+            fills_tolerance=True,
+            multistep=True,
+        ),
+        _adaptive(
+            "cvodes",
+            None,
             "SUNDIALS' CVODES through CasADi: BDF, orders 1 to 5 (Hindmarsh and others 2005)",
+            "cvodes:run_cvodes",
             engines=("lagrangian",),
+            events=False,
             least=100 * _EPS,
             callables=False,
             lacks="gives numbers and no expressions, which it integrates",
+            scheme="cvodes",
+            jacobian=True,
+            compiled=True,
+            fills_tolerance=True,
+            multistep=True,
         ),
-        _mujoco("euler", 1, 1, "MuJoCo's own semi-implicit Euler"),
-        _mujoco("rk4", 4, 4, "MuJoCo's own RK4"),
-        _mujoco("implicit", 1, 1, "MuJoCo's own Euler, implicit in dampers and all velocity terms"),
-        _mujoco("implicitfast", 1, 1, "as mujoco_implicit, with the Coriolis derivatives of free bodies alone"),
-        _mujoco("discrete", 1, 1, "MuJoCo's own Euler, implicit in dampers and springs"),
+        _mujoco("euler", SYMPLECTIC_EULER, "MuJoCo's own semi-implicit Euler", own=EULER_METHOD),
+        _mujoco("rk4", _RK4_STABILITY, "MuJoCo's own RK4", own=DEFAULT_METHOD),
+        _mujoco("implicit", IMPLICIT_IN_VELOCITY, "MuJoCo's own Euler, implicit in dampers and all velocity terms"),
+        _mujoco(
+            "implicitfast",
+            IMPLICIT_IN_VELOCITY,
+            "as mujoco_implicit, with the Coriolis derivatives of free bodies alone",
+        ),
+        _mujoco("discrete", IMPLICIT_EULER, "MuJoCo's own Euler, implicit in dampers and springs"),
         _drake("runge_kutta3", 3, "Drake's own third-order Runge-Kutta with error control"),
         _drake("runge_kutta5", 5, "Drake's own Dormand-Prince 5(4)"),
         _drake("bogacki_shampine3", 3, "Drake's own Bogacki-Shampine 3(2)"),
@@ -162,3 +364,70 @@ def method_of(name: object) -> Method:
     if name not in METHODS:
         raise UnknownNameError("method", name, METHODS)
     return METHODS[name]
+
+
+def register_method(method: Method | Tableau) -> Method:
+    """Add a Runge-Kutta method with a fixed step to `METHODS`, for this process.
+
+    Every engine runs it; where the Lagrangian engine compiles and the method is explicit, as machine code.
+
+    Parameters
+    ----------
+    method : Tableau, ImplicitTableau or Method
+        A tableau, named as the method; or a `Method` of kind ``"fixed"`` with a tableau as `formula_source`.
+
+    Returns
+    -------
+    Method
+        Now in `METHODS`.
+
+    Raises
+    ------
+    InputError
+        The name is taken or no identifier of lower-case letters, digits and single underscores; or the method is no
+        Runge-Kutta method with a fixed step.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> heun = mb.simulate.Tableau("heun", [[0, 0], [1, 0]], [0.5, 0.5], order=2)
+    >>> mb.simulate.register_method(heun).stages
+    2
+    >>> del mb.simulate.METHODS["heun"]
+    """
+    tableau = method.formula if isinstance(method, Method) else method
+    if not isinstance(tableau, Tableau) or isinstance(tableau, EmbeddedTableau):
+        raise InputError(
+            "method: expected a Tableau or an ImplicitTableau, or a Method with one as formula_source, "
+            f"got {type(tableau).__name__}; give a pair with an error estimate as Tableau(name, A, b, order)"
+        )
+    if isinstance(method, Tableau):
+        method = _runge_kutta(method)
+    name = method.name
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name):
+        raise InputError(f"method: expected a name of lower-case letters, digits and single underscores, got {name!r}")
+    if name in METHODS:
+        raise InputError(f"method: {name} is registered already; choose another name")
+    if method.kind != "fixed" or method.order != tableau.order:
+        raise InputError(
+            f"method: {name}: expected kind 'fixed' and the tableau's order {tableau.order}, "
+            f"got {method.kind!r} and {method.order}"
+        )
+    if not tableau.explicit and len({*tableau.c.tolist()}) < tableau.stages:
+        raise InputError(
+            f"method: {name}: expected an implicit method whose stages have different times, got {tableau.c.tolist()}"
+        )
+    METHODS[name] = method
+    return method
+
+
+def _runge_kutta(tableau: Tableau) -> Method:
+    return _fixed(
+        tableau.name,
+        tableau.order,
+        f"Runge-Kutta method of order {tableau.order} in {tableau.stages} stages",
+        stages=tableau.stages if tableau.explicit else 0,
+        formula_source=tableau,
+        stability=TableauStability(tableau),
+        compiled=tableau.explicit,
+    )

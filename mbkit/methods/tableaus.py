@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
+from math import sqrt
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -13,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.errors import InputError
+from mbkit.methods.one_step import StageRates, Stages
+from mbkit.model.integration_space import Space
 
 __all__ = [
     "RK4",
@@ -23,6 +27,7 @@ __all__ = [
     "Tree",
     "density",
     "dormand_prince_853",
+    "gauss_legendre",
     "rodas5p",
     "rooted_trees",
 ]
@@ -142,6 +147,45 @@ class Tableau:
         """Number of stages."""
         return len(self.b)
 
+    @cached_property
+    def _times(self) -> list[float]:
+        return [float(x) for x in self.c]
+
+    @property
+    def digest(self) -> str:
+        """Eight digits that tell the coefficients, for the name of compiled code."""
+        return hashlib.sha256(self.A.tobytes() + self.b.tobytes()).hexdigest()[:8]
+
+    def step(
+        self, space: Space, rates: StageRates, stages: Stages, t: Any, h: Any, q: Any, w: Any
+    ) -> tuple[Any, Any, Any]:
+        """Take an explicit step on any arithmetic; rotations by Munthe-Kaas (1999).
+
+        Parameters
+        ----------
+        space : Space
+        rates : callable
+            (t, q, u, w) -> (u̇, ẇ) at a stage, which q moved by u; u is None where it is zero.
+        stages : Stages
+            Rates of the stages that are known already, none as a rule.
+        t, h : scalars
+            Start and length of the step, s.
+        q, w : state
+
+        Returns
+        -------
+        q, w, u
+            The new state, which is the old q moved by u.
+        """
+        for c, row in zip(self._times[len(stages) :], self.A[len(stages) :], strict=True):
+            if not len(stages):
+                stages.append(*rates(t, q, None, w))
+                continue
+            u, dw = stages.moved(h, row[: len(stages)])
+            stages.append(*rates(t + c * h, space.move(q, u), u, w + dw))
+        u, dw = stages.moved(h, self.b)
+        return space.move(q, u), w + dw, u
+
     def __reduce__(self) -> tuple[type, tuple[str, Array, Array, int]]:
         return type(self), (self.name, self.A, self.b, self.order)
 
@@ -161,9 +205,27 @@ RK4: Final = Tableau(
 )
 
 
+@cache
+def gauss_legendre(stages: int) -> ImplicitTableau:
+    """Return Gauss-Legendre collocation of 2 or 3 stages, of order 4 or 6: the highest for so many stages.
+
+    Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.7.
+    """
+    if stages == 2:
+        r = sqrt(3) / 6
+        return ImplicitTableau("gauss4", [[1 / 4, 1 / 4 - r], [1 / 4 + r, 1 / 4]], [1 / 2, 1 / 2], 4)
+    r = sqrt(15)
+    rows = [
+        [5 / 36, 2 / 9 - r / 15, 5 / 36 - r / 30],
+        [5 / 36 + r / 24, 2 / 9, 5 / 36 - r / 24],
+        [5 / 36 + r / 30, 2 / 9 + r / 15, 5 / 36],
+    ]
+    return ImplicitTableau("gauss6", rows, [5 / 18, 4 / 9, 5 / 18], 6)
+
+
 @dataclass(frozen=True, eq=False)
 class EmbeddedTableau(Tableau):
-    """An explicit method with others of lower order on the same stages, to tell its error by.
+    """An explicit method with others of lower order on the same stages, which estimate its error.
 
     Parameters
     ----------
@@ -203,10 +265,10 @@ class EmbeddedTableau(Tableau):
 
 @cache
 def dormand_prince_853() -> EmbeddedTableau:
-    """Return Dormand and Prince's pair of order 8, with errors told by orders 5 and 3.
+    """Return Dormand and Prince's pair of order 8, with errors estimated by orders 5 and 3.
 
     Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.5 and
-    its program DOP853. Made when first asked for: 218 order conditions are checked.
+    its program DOP853. Constructed at the first call: 218 order conditions are checked.
     """
     A = np.zeros((12, 12))
     for i, row in enumerate(_A_853):

@@ -1,8 +1,8 @@
 """Motion in time: one trajectory or a batch, by any engine's forward dynamics."""
 
 from mbkit._callable import make_callable
-from mbkit.methods.registry import METHODS, Method
-from mbkit.methods.tableaus import RK4, Tableau
+from mbkit.methods.registry import METHODS, Method, register_method
+from mbkit.methods.tableaus import RK4, ImplicitTableau, Tableau
 from mbkit.simulate.diagnostics.eigenvalues import Stiffness, stiffness
 from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.result import Stats
@@ -14,6 +14,7 @@ __all__ = [
     "RK4",
     "Event",
     "Hit",
+    "ImplicitTableau",
     "Method",
     "Stats",
     "Stiffness",
@@ -22,6 +23,7 @@ __all__ = [
     "at_energy",
     "at_limits",
     "at_section",
+    "register_method",
     "simulate",
     "stiffness",
 ]

@@ -189,6 +189,6 @@ def refuse_constraints(dyn: Dynamics, method: str, why: str) -> None:
     """Say that a method does not run under constraints."""
     if dyn.model.constrained:
         raise UnsupportedError(
-            f"{method}: {dyn.model.name} has constraints, {why}; 'gauss4' and 'gauss6' are the implicit methods "
-            "for it, 'rk853' and 'taylor' the accurate ones"
+            f"{method}: {dyn.model.name} has constraints, {why}; {IMPLICIT_METHODS} are the implicit methods "
+            f"for it, {ADAPTIVE_METHOD!r} and {SERIES_METHOD!r} the accurate ones"
         )

@@ -24,7 +24,7 @@ from mbkit._check import Array, finite_array
 from mbkit.engines import Dynamics
 from mbkit.errors import DoubtfulRunWarning, FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.lagrangian.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
-from mbkit.methods.registry import Method
+from mbkit.methods.registry import METHODS, Method
 from mbkit.simulate.constraint_projection import SingularPoses, from_consistent
 from mbkit.simulate.events import Event, Hit
 from mbkit.simulate.progress import Progress
@@ -33,9 +33,8 @@ from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.torque import Force, Torque, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
 
-__all__ = ["METHODS_ON_CHARTS", "run_on_charts"]
+__all__ = ["run_on_charts"]
 
-METHODS_ON_CHARTS: Final = ("rk853", "dop853", "rk4", "gauss4", "gauss6", "semi_implicit_euler")
 _WORN: Final = "the dependent coordinates are badly chosen"
 _NEAR: Final = "near a singular pose"
 # Steps of a fixed-step method between two looks at the chart.
@@ -76,6 +75,11 @@ class _Run:
         self.rejected += part.stats.rejected
 
 
+def _on_charts(method: Method) -> bool:
+    """Return whether a method needs accelerations alone: charts have no derivatives and no expressions."""
+    return not method.engines and not method.jacobian
+
+
 def run_on_charts(
     system: Embedded,
     method: Method,
@@ -93,10 +97,11 @@ def run_on_charts(
 ) -> Trajectory:
     """Integrate one state; arguments are those of `mbkit.simulate`, on all coordinates."""
     model, started = system.model, time.perf_counter()
-    if method.name not in METHODS_ON_CHARTS:
+    if not _on_charts(method):
+        usable = ", ".join(m.name for m in METHODS.values() if _on_charts(m))
         raise UnsupportedError(
             f"{method.name}: not on independent coordinates, which Newton's iteration leads to; "
-            f"use {', '.join(METHODS_ON_CHARTS)}, or the form with multipliers, lag.dynamics()"
+            f"use {usable}, or the form with multipliers, lag.dynamics()"
         )
     q, v = finite_array("q0", q0, (model.nq,)), finite_array("v0", v0, (model.nv,))
     q, v = from_consistent(system.dynamics, q, v, t0)

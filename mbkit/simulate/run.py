@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,7 +16,7 @@ from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, UnsupportedError
-from mbkit.methods.registry import METHODS, Method, Tolerances, method_of
+from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.diagnostics.checks import doubts, halved, idle
@@ -23,7 +24,6 @@ from mbkit.simulate.events import Event, as_events
 from mbkit.simulate.problem import Asked
 from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.result import Outcome, Stats
-from mbkit.simulate.solvers.native import run_native
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.torque import Applied, Torque, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
@@ -31,52 +31,26 @@ from mbkit.simulate.trajectory import Trajectory
 if TYPE_CHECKING:
     from mbkit.lagrangian.independent_coordinates import Embedded
 
-__all__ = ["adaptive_runner", "fixed_runner", "simulate"]
+__all__ = ["fixed_runner", "simulate", "solver_of"]
 
 
-# Which integrator runs a method, each imported when it is first needed.
+# Which solver runs a method, each imported when it is first needed.
+
+
+def solver_of(method: Method) -> Callable[..., Outcome]:
+    """Return the function that runs a method: run(problem), or with a step what `run_fixed` takes."""
+    module, function = method.solver.split(":")
+    run: Callable[..., Outcome] = getattr(import_module(f"mbkit.simulate.solvers.{module}"), function)
+    return run
 
 
 def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[..., Outcome]:
     """Return run(dyn, method, q0, v0, grid, kept, torque, bar)."""
-    if method.name == "implicit_midpoint":
-        from mbkit.simulate.solvers.implicit_midpoint import run_midpoint
-
-        return run_midpoint
-    if method.name in ("rk4", "semi_implicit_euler") and not torque.callable and _compiles(dyn):
+    if method.compiled and method.formula is not None and not torque.callable and _compiles(dyn):
         from mbkit.simulate.solvers.compiled_fixed_step import run_rollout
 
         return run_rollout
-    from mbkit.simulate.solvers.fixed_step import run_fixed
-
-    return run_fixed
-
-
-def adaptive_runner(method: Method) -> Callable[[Asked], Outcome]:
-    """Return what integrates with tolerances."""
-    if method.name == "auto":
-        from mbkit.simulate.solvers.auto import run_auto
-
-        return run_auto
-    if method.name in ("rk853", "rodas5"):
-        from mbkit.simulate.solvers.adaptive import run_embedded
-
-        return run_embedded
-    if method.name == "taylor":
-        from mbkit.simulate.solvers.taylor import run_taylor
-
-        return run_taylor
-    if method.name == "cvodes":
-        from mbkit.simulate.solvers.cvodes import run_cvodes
-
-        return run_cvodes
-    if method.name.startswith("drake_"):
-        from mbkit.simulate.solvers.drake import run_drake
-
-        return run_drake
-    from mbkit.simulate.solvers.scipy import run_scipy
-
-    return run_scipy
+    return solver_of(method)
 
 
 def _compiles(dyn: Dynamics) -> bool:
@@ -108,7 +82,7 @@ def simulate(
     q0: ArrayLike,
     v0: ArrayLike,
     duration: float,
-    method: str = "rk4",
+    method: str = DEFAULT_METHOD,
     dt: float | None = None,
     rtol: float | None = None,
     atol: float | None = None,
@@ -249,7 +223,7 @@ def simulate(
     if wanted and not chosen.events:
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
     if callable(torque) and not chosen.callables:
-        _refuse("torque functions", chosen, ["rk4", "rk853", "dop853"])
+        _refuse("torque functions", chosen, [m.name for m in METHODS.values() if m.callables])
     _warn_beyond_limits(model, q)
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
     arguments: dict[str, Any] = {"batch": batch, "torque": torque, "save": save, "bar": bar}
@@ -295,7 +269,7 @@ def _times(
         raise InputError(f"duration: expected 0 or at least {np.finfo(float).tiny:.3g} s, got {duration:g} s")
     step = DEFAULT_STEP if dt is None else real("dt", dt, positive=True)
     if dt is not None and method.kind == "adaptive":
-        raise InputError(f"dt: {method.name} chooses its own steps; give rtol, or method='rk4' with dt")
+        raise InputError(f"dt: {method.name} chooses its own steps; give rtol, or method={DEFAULT_METHOD!r} with dt")
     start = _held_time(dyn) if t0 is None else real("t0", t0)
     shortest = duration if method.kind == "adaptive" else min(duration, step)
     if 4 * np.finfo(float).eps * abs(start) > shortest > 0:
@@ -403,13 +377,13 @@ def _adaptive(
     whole = times is not None and times[0] == start and times[-1] == start + duration
     read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
     given = dyn, method.name, q, v, start, duration, tolerances, read, times, events, bar
-    outcome = adaptive_runner(method)(Asked(*given))
+    outcome = solver_of(method)(Asked(*given))
     return read.applied(times), outcome
 
 
 def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float | None) -> Tolerances:
     rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
-    least = _LEAST_EXTENDED if dyn.engine == "oracle" and method.name == "taylor" else method.least
+    least = _LEAST_EXTENDED if dyn.engine == "oracle" and method.extended else method.least
     if rtol < least:
         raise InputError(f"rtol: expected at least {least:.3g} for {method.name} on {dyn.engine}, got {rtol:g}")
     return Tolerances(rtol, rtol if atol is None else real("atol", atol, positive=True))
@@ -418,7 +392,9 @@ def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float |
 def _refuse_tolerances(method: Method, rtol: float | None, atol: float | None) -> None:
     for name, value in (("rtol", rtol), ("atol", atol)):
         if value is not None:
-            raise InputError(f"{name}: {method.name} has a fixed step and no tolerance; give dt, or method='rk853'")
+            raise InputError(
+                f"{name}: {method.name} has a fixed step and no tolerance; give dt, or method={ADAPTIVE_METHOD!r}"
+            )
 
 
 def _stepped(
@@ -437,7 +413,7 @@ def _stepped(
     kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
     read = Torque(torque, model, batch, grid.steps)
     if method.kind == "native":
-        outcome = run_native(dyn, method, q, v, grid, kept, read, bar)
+        outcome = solver_of(method)(dyn, method, q, v, grid, kept, read, bar)
         bar.update(1.0)
     else:
         outcome = fixed_runner(method, dyn, read)(dyn, method.name, q, v, grid, kept, read, bar)

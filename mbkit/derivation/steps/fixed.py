@@ -1,27 +1,40 @@
-"""A whole step of a fixed-step method as one function, with the forward dynamics written into it.
+"""Steps of one-step methods as CasADi functions, with the forward dynamics written into them.
 
-The formulas are those of `mbkit.simulate`, which are MuJoCo 4's: on rotations the
-exponential, inside a Runge-Kutta step the inverse of its differential
-(Munthe-Kaas 1999), and a free joint's linear velocity in the axes of its fixed
-frame (`mbkit.model.integration_space`). The torque is held over the step.
+The formulas are those of `mbkit.methods`, on the space of `mbkit.model.integration_space`. The torque is held over
+the step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
+from itertools import groupby
+from operator import add, itemgetter
 from typing import Any, Final
 
 import casadi as ca
 
+from mbkit._check import Array
 from mbkit.derivation.equations import Equations
-from mbkit.errors import UnknownNameError
+from mbkit.errors import InputError
+from mbkit.methods.one_step import SemiImplicitEuler
+from mbkit.methods.registry import METHODS, method_of
+from mbkit.methods.tableaus import Tableau
 from mbkit.model.integration_space import Space
 from mbkit.model.quaternions import Arithmetic
 
-__all__ = ["STEPS", "Part", "SymbolicSpace", "choose", "function_of", "march", "march_in_stages", "step"]
-
-Rate = Callable[[Any, Any], Any]
+__all__ = [
+    "SYMBOLS",
+    "Part",
+    "SymbolicSpace",
+    "SymbolicStages",
+    "choose",
+    "function_of",
+    "march",
+    "march_in_stages",
+    "step",
+]
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
@@ -34,7 +47,8 @@ def choose(condition: ca.SX, yes: Any, no: Any) -> Any:
     return chosen + ca.SX.binary(ca.OP_IF_ELSE_ZERO, 1 - condition, ca.SX(no))
 
 
-_SYMBOLS: Final = Arithmetic(ca.sqrt, ca.sin, ca.cos, choose)
+#: Arithmetic of expressions.
+SYMBOLS: Final = Arithmetic(ca.sqrt, ca.sin, ca.cos, choose)
 
 
 class SymbolicSpace(Space):
@@ -43,7 +57,7 @@ class SymbolicSpace(Space):
     @staticmethod
     def arithmetic(x: Any) -> Arithmetic:  # noqa: ARG004  # of symbols there is one kind
         """Return the functions of symbols."""
-        return _SYMBOLS
+        return SYMBOLS
 
     @staticmethod
     def part(x: Any, part: slice) -> Any:
@@ -66,24 +80,53 @@ class SymbolicSpace(Space):
         return ca.SX(x)
 
 
-def _semi_implicit_euler(space: Space, rate: Rate, q: Any, w: Any, h: Any) -> tuple[Any, Any]:
-    w = w + h * rate(q, w)
-    return space.move(q, h * w), w
+class SymbolicStages:
+    """Rates of the stages so far as expressions."""
 
+    def __init__(self, nv: int) -> None:
+        self._nv, self._rates = nv, list[tuple[Any, Any]]()
 
-def _rk4(space: Space, rate: Rate, q: Any, w: Any, h: Any) -> tuple[Any, Any]:
-    # Kutta's classical method: each stage starts from the one before it alone.
-    us, ws = [w], [rate(q, w)]
-    for part in (0.5, 0.5, 1.0):
-        u, w_i = (part * h) * us[-1], w + (part * h) * ws[-1]
-        us.append(space.rate(u, w_i))
-        ws.append(rate(space.move(q, u), w_i))
-    u, dw = ((h / 6) * (x[0] + 2 * (x[1] + x[2]) + x[3]) for x in (us, ws))
-    return space.move(q, u), w + dw
+    def __len__(self) -> int:
+        return len(self._rates)
 
+    def append(self, u_rate: Any, w_rate: Any) -> None:
+        """Add a stage."""
+        self._rates.append((u_rate, w_rate))
 
-#: Name of each method -> its step.
-STEPS: Final = {"rk4": _rk4, "semi_implicit_euler": _semi_implicit_euler}
+    def moved(self, h: Any, weights: Array) -> tuple[Any, Any]:
+        """Return h times the weighted sums of u̇ and ẇ."""
+        used = [(weight, i) for i, weight in enumerate(weights.tolist()) if weight]
+        share = 1 / min((abs(weight) for weight, _ in used), default=1.0)
+        times = [weight * share for weight, _ in used]
+        # Whole multiples of a simple part of the step, as Kutta's weights are, save products.
+        if not used or not all(x == int(x) for x in (share, *times)):
+            u, w = self.sums(weights)
+            return h * u, h * w
+        groups = [
+            (factor, [i for _, (_, i) in same])
+            for factor, same in groupby(zip(times, used, strict=True), itemgetter(0))
+        ]
+        u, w = (
+            sum(factor * reduce(add, (self._rates[i][kind] for i in members)) for factor, members in groups)
+            for kind in (0, 1)
+        )
+        return (h / share) * u, (h / share) * w
+
+    def sums(self, weights: Array) -> tuple[Any, Any]:
+        """Return the weighted sums of u̇ and ẇ."""
+        u, w = (
+            sum(
+                (weight * pair[kind] for weight, pair in zip(weights.tolist(), self._rates, strict=False) if weight),
+                ca.SX.zeros(self._nv),
+            )
+            for kind in (0, 1)
+        )
+        return u, w
+
+    def squares(self, weights: Array, scales: tuple[Any, Any]) -> Any:
+        """Return the sum of the squares of the weighted sums, each divided by its scale."""
+        u, w = (ca.sumsqr(x / scale) for x, scale in zip(self.sums(weights), scales, strict=True))
+        return w + u
 
 
 @dataclass(frozen=True)
@@ -112,7 +155,8 @@ def step(equations: Equations, method: str) -> ca.Function:
     Parameters
     ----------
     equations : Equations
-    method : {"rk4", "semi_implicit_euler"}
+    method : str
+        With a fixed step and compiled: ``"rk4"``, ``"semi_implicit_euler"``, an explicit method of the user's.
 
     Returns
     -------
@@ -123,32 +167,30 @@ def step(equations: Equations, method: str) -> ca.Function:
     Raises
     ------
     UnknownNameError
-        No method of this name has a step here.
+        There is no method of this name.
+    InputError
+        The method has no explicit step.
     """
     s, space = _symbols(equations), SymbolicSpace(equations.model)
-    given = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.trailing)}
-    rate = _rate(equations, space, s)
-    q1, w1 = _formula(method)(space, rate, s["q"], space.enter(s["q"], s["v"]), s["dt"])
-    return function_of(f"{method}_step", given, {"q1": q1, "v1": space.leave(q1, w1)})
+    names = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.trailing)}
+    q1, w1 = _stepped(equations, method, s, space.enter(s["q"], s["v"]), _acceleration(equations, space, s))
+    return function_of(f"{method}_step", names, {"q1": q1, "v1": space.leave(q1, w1)})
 
 
 def march(equations: Equations, method: str) -> tuple[Part, ...]:
     """Return one part: the whole step in the integrators' own velocity, for many steps in a row.
 
-    It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum
-    of the squares of all states so far: whatever once was no number, or beyond all
-    bounds, shows in it for ever.
+    It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
+    far: a number that once was not finite, or beyond all bounds, shows in it for ever.
     """
-    name, behind = f"{method}_march", tuple(equations.trailing)
+    name, trailing = f"{method_of(method).code_name}_march", tuple(equations.trailing)
 
     def make() -> ca.Function:
         s, space = _symbols(equations), SymbolicSpace(equations.model)
-        rate = _rate(equations, space, s)
-        q1, w1 = _formula(method)(space, rate, s["q"], s["w"], s["dt"])
-        return function_of(name, {n: s[n] for n in (*_MARCH, *behind)}, _watched(s, q1, w1))
+        q1, w1 = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s))
+        return function_of(name, {n: s[n] for n in (*_MARCH, *trailing)}, _with_squares(s, q1, w1))
 
-    _formula(method)
-    return (Part(name, (*_MARCH, *behind), _MARCHED, make),)
+    return (Part(name, (*_MARCH, *trailing), _MARCHED, make),)
 
 
 def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
@@ -158,35 +200,46 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
     stage. Between the parts go the stages' states (q_i, v_i) and accelerations a_i.
     """
     s, space = _symbols(equations), SymbolicSpace(equations.model)
-    given = {n: s[n] for n in ("q", "w", "dt")}
+    known = {n: s[n] for n in ("q", "w", "dt")}
     parts: list[Part] = []
+    prefix = method_of(method).code_name
 
-    def cut(name: str, made: dict[str, Any]) -> None:
-        held = dict(given)
-        parts.append(Part(name, tuple(held), tuple(made), lambda: function_of(name, held, made)))
+    def cut(name: str, results: dict[str, Any]) -> None:
+        arguments = dict(known)
+        parts.append(Part(name, tuple(arguments), tuple(results), lambda: function_of(name, arguments, results)))
 
-    def rate(q: Any, w: Any) -> Any:
+    def acceleration(q: Any, w: Any) -> Any:
         i = sum(part.name == "forward_dynamics" for part in parts)
         v = space.leave(q, w)
         at = ("q", "w")
         if i or not space.flat:
             at = (f"q_{i}", f"v_{i}")
-            cut(f"{method}_stage_{i}", dict(zip(at, (q, v), strict=True)))
+            cut(f"{prefix}_stage_{i}", dict(zip(at, (q, v), strict=True)))
         reads = (*at, "tau", *equations.trailing)
         parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
-        a = given[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
+        a = known[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
         return space.acceleration(q, v, a)
 
-    q1, w1 = _formula(method)(space, rate, s["q"], s["w"], s["dt"])
-    given["squares"] = s["squares"]
-    cut(f"{method}_end", _watched(s, q1, w1))
+    q1, w1 = _stepped(equations, method, s, s["w"], acceleration)
+    known["squares"] = s["squares"]
+    cut(f"{prefix}_end", _with_squares(s, q1, w1))
     return tuple(parts)
 
 
-def _formula(method: str) -> Any:
-    if method not in STEPS:
-        raise UnknownNameError("method", method, STEPS)
-    return STEPS[method]
+def _stepped(
+    equations: Equations, method: str, s: dict[str, Any], w: Any, acceleration: Callable[[Any, Any], Any]
+) -> tuple[Any, Any]:
+    """Return q and w after a step from q and this w, with acceleration(q, w) -> ẇ."""
+    formula, space = method_of(method).formula, SymbolicSpace(equations.model)
+    if not isinstance(formula, (Tableau, SemiImplicitEuler)) or not formula.explicit:
+        explicit = ", ".join(m.name for m in METHODS.values() if m.kind == "fixed" and m.compiled and m.formula)
+        raise InputError(f"method: expected one with an explicit step, got {method!r}; there are: {explicit}")
+
+    def rates(t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:  # noqa: ARG001  # the time is a parameter
+        return w if u is None else space.rate(u, w), acceleration(q, w)
+
+    q1, w1, _ = formula.step(space, rates, SymbolicStages(space.nv), 0.0, s["dt"], s["q"], w)
+    return q1, w1
 
 
 def _symbols(equations: Equations) -> dict[str, Any]:
@@ -195,22 +248,22 @@ def _symbols(equations: Equations) -> dict[str, Any]:
     return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.trailing}
 
 
-def _rate(equations: Equations, space: Space, s: dict[str, Any]) -> Rate:
+def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Callable[[Any, Any], Any]:
     forward = equations.function("forward_dynamics")
-    behind = [s["tau"], *equations.trailing.values()]
+    trailing = [s["tau"], *equations.trailing.values()]
 
-    def rate(q: Any, w: Any) -> Any:
+    def acceleration(q: Any, w: Any) -> Any:
         v = space.leave(q, w)
-        return space.acceleration(q, v, forward(q, v, *behind))
+        return space.acceleration(q, v, forward(q, v, *trailing))
 
-    return rate
+    return acceleration
 
 
-def _watched(s: dict[str, Any], q1: Any, w1: Any) -> dict[str, Any]:
+def _with_squares(s: dict[str, Any], q1: Any, w1: Any) -> dict[str, Any]:
     return dict(zip(_MARCHED, (q1, w1, s["squares"] + (ca.sumsqr(q1) + ca.sumsqr(w1))), strict=True))
 
 
-def function_of(name: str, given: dict[str, Any], made: dict[str, Any]) -> ca.Function:
+def function_of(name: str, arguments: dict[str, Any], results: dict[str, Any]) -> ca.Function:
     """Return the function of named symbols whose named results are dense."""
-    outs = [ca.densify(x) for x in made.values()]
-    return ca.Function(name, list(given.values()), outs, list(given), list(made))
+    outs = [ca.densify(x) for x in results.values()]
+    return ca.Function(name, list(arguments.values()), outs, list(arguments), list(results))

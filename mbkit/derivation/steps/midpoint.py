@@ -34,9 +34,10 @@ import casadi as ca
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.fixed import Part, SymbolicSpace, function_of
+from mbkit.derivation.steps.rosenbrock import Factors
 from mbkit.model import quaternions
 
-__all__ = ["GUESS", "LEAST", "MOST", "SMALL", "Midpoint", "eliminated"]
+__all__ = ["GUESS", "LEAST", "MOST", "SMALL", "Midpoint"]
 
 #: Weights of the velocities of the last steps in the first guess of the next one: the
 #: parabola through them, continued.
@@ -196,7 +197,8 @@ class Midpoint:
         s = self._s
         # ∂ residual/∂w is M + O(h), with M's own zeros.
         residual, jacobian = self._system()
-        change = eliminated(jacobian, residual, self._equations.elimination_order)
+        factors = Factors.of(jacobian, self._equations.elimination_order)
+        change = factors.applied(factors.values, ca.vertsplit(residual))
         w1 = s["w"] - change
         reach = (LEAST / s["dt"]) ** 2
         limit = SMALL**2 * ca.sumsqr(w1) + reach * (1 + ca.sumsqr(s["q"]))
@@ -225,40 +227,3 @@ class Midpoint:
 
     def _velocity(self) -> tuple[Any]:
         return (solve(*self._velocity_system(), self._equations.elimination_order),)
-
-
-def eliminated(A: ca.SX, b: ca.SX, order: Any) -> ca.SX:
-    """Return A⁻¹ b, written out, without pivoting.
-
-    Parameters
-    ----------
-    A : (n, n) casadi.SX
-        Near a symmetric positive definite matrix, with the zeros of a tree's mass
-        matrix: eliminating from the leaves to the root then fills in nothing.
-    b : (n,) casadi.SX
-    order : sequence of int
-        The indices with every parent before its children.
-    """
-    rank = {index: k for k, index in enumerate(order)}
-    rows: list[dict[int, Any]] = [{} for _ in rank]
-    for i, j in zip(*A.sparsity().get_triplet(), strict=True):
-        rows[rank[i]][rank[j]] = A[i, j]
-    x = [b[index] for index in order]
-    for k in reversed(range(len(x))):
-        # Where nothing moves there is no entry at all: the quotient is then no number.
-        inverse = 1 / ca.SX(rows[k].get(k, 0.0))
-        for i in range(k):
-            if k not in rows[i]:
-                continue
-            factor = rows[i].pop(k) * inverse
-            x[i] = x[i] - factor * x[k]
-            for j, entry in rows[k].items():
-                if j < k:
-                    rows[i][j] = rows[i].get(j, 0.0) - factor * entry
-        rows[k][k] = inverse
-    for k in range(len(x)):
-        x[k] = (x[k] - sum((rows[k][j] * x[j] for j in rows[k] if j < k), 0.0)) * rows[k][k]
-    out: list[Any] = [None] * len(x)
-    for k, index in enumerate(order):
-        out[index] = x[k]
-    return ca.vertcat(ca.SX(0, 1), *out)

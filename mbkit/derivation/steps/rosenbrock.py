@@ -27,25 +27,23 @@ import casadi as ca
 
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.steps.adaptive import AdaptiveParts
-from mbkit.derivation.steps.fixed import Part, SymbolicSpace, choose, function_of
-from mbkit.methods.step_control import DEFECT, GROWTH, SAFETY
+from mbkit.derivation.steps.adaptive import AttemptParts
+from mbkit.derivation.steps.fixed import SYMBOLS, Part, SymbolicSpace, SymbolicStages, function_of
+from mbkit.methods.one_step import elementary_factors, with_defect
+from mbkit.methods.tableaus import RosenbrockTableau
 
-__all__ = ["rosenbrock_parts"]
+__all__ = ["Factors", "rosenbrock_parts"]
 
 
-def rosenbrock_parts(
-    equations: Equations, gamma: float, A: Array, C: Array, b: Array, error: Array, dense: Array
-) -> tuple[Part, ...]:
-    """Return the parts of one try, in order.
+def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> tuple[Part, ...]:
+    """Return the parts of one attempt, in order.
 
     Parameters
     ----------
     equations : Equations
         In which time does not enter.
-    gamma : float
-    A, C, b, error, dense : (s, s), (s, s), (s,), (s,) and (3, s) arrays
-        Of a method of order 5 with one of order 4 inside, as in `mbkit.methods.tableaus`.
+    tableau : RosenbrockTableau
+        Of order 5 with one of order 4 inside.
 
     Returns
     -------
@@ -53,19 +51,19 @@ def rosenbrock_parts(
         They read and write what those of `mbkit.derivation.steps.adaptive` do. The parts
         "field" and "solve" stand once for each stage, "field" at the end too; it writes k = ẇ and r = u̇.
     """
-    stages = _Stages(equations, gamma, len(b))
-    stages.begin()
-    for i in range(len(b)):
+    parts = _Parts(equations, tableau)
+    parts.begin()
+    for i in range(tableau.stages):
         if i:
-            stages.stage(i, A[i, :i], C[i, :i])
-        stages.field()
+            parts.add_stage(i)
+        parts.add_field("k", "r")
         if not i:
-            stages.matrix()
-        stages.solve(i)
-    stages.arrive(b)
-    stages.field()
-    stages.end(b, error, dense)
-    return tuple(stages.parts)
+            parts.add_matrix()
+        parts.add_solve(i)
+    parts.arrive()
+    parts.add_field("k", "r")
+    parts.end()
+    return tuple(parts.parts)
 
 
 class _Space(SymbolicSpace):
@@ -79,34 +77,26 @@ class _Space(SymbolicSpace):
         return out
 
 
-class _Stages(AdaptiveParts):
-    def __init__(self, equations: Equations, gamma: float, count: int) -> None:
+class _Parts(AttemptParts):
+    def __init__(self, equations: Equations, tableau: RosenbrockTableau) -> None:
         super().__init__(equations)
         nv = equations.model.nv
-        self._gamma, self._rotating = gamma, _Space(equations.model)
-        self._s |= {name: ca.SX.sym(name, nv) for name in ("k", "r", "sum_u", "sum_w")}
-        self._solved = [(ca.SX.sym(f"du_{i}", nv), ca.SX.sym(f"dw_{i}", nv)) for i in range(count)]
-
-    def _named(self, count: int) -> dict[str, Any]:
-        pairs = enumerate(self._solved[:count])
-        return {f"{kind}_{i}": x for i, pair in pairs for kind, x in zip(("du", "dw"), pair, strict=True)}
+        self._tableau, self._gamma, self._rotating = tableau, tableau.gamma, _Space(equations.model)
+        self.symbols |= {name: ca.SX.sym(name, nv) for name in ("k", "r", "sum_u", "sum_w")}
+        self._stages, self._increments = SymbolicStages(nv), dict[str, Any]()
 
     def begin(self) -> None:
-        """Settle the length of the step; the first stage is where the state is."""
+        """Choose the length of the step; the first stage is where the state is."""
         super().begin()
-        w = self._given("w")
-        self._part("sums", w, {"sum_u": 0 * w["w"], "sum_w": 0 * w["w"]})
-
-    def field(self) -> None:
-        """Evaluate the rates where the stage is."""
-        self._field("k", "r")
+        w = self.named("w")
+        self.add("sums", w, {"sum_u": 0 * w["w"], "sum_w": 0 * w["w"]})
 
     # The linear system
 
     @cached_property
     def _linear(self) -> tuple[Any, Any, Any]:
         """M, D and K at the state, as expressions of q, w and k there."""
-        eq, space, s = self._equations, self._space, self._s
+        eq, space, s = self._equations, self.space, self.symbols
         q, w, k = s["q"], s["w"], s["k"]
         trailing = list(eq.trailing.values())
         u = ca.SX.sym("u", eq.model.nv)
@@ -126,93 +116,79 @@ class _Stages(AdaptiveParts):
         K, D = (_pruned(ca.substitute(x, *at)) for x in (K, D))
         return _pruned(M), D, K
 
-    def matrix(self) -> None:
+    def add_matrix(self) -> None:
         """Form the linear system at the state and factorize it."""
-        g = self._gamma * self._s["step"]
+        g = self._gamma * self.symbols["step"]
+        arguments = {**self.named("q", "w", "k", "step"), **self._equations.trailing}
 
         def make() -> ca.Function:
             M, D, K = self._linear
-            pull = g * ca.mtimes(K, self._rotating.spun(self._s["w"], g))
-            factors = _factorized(M + g * D + g * pull, self._equations.elimination_order)
-            made = {"mass": _entries(M), "pull": _entries(pull), "factors": ca.vertcat(*factors.values)}
-            return function_of("matrix", given, made)
+            pull = g * ca.mtimes(K, self._rotating.spun(self.symbols["w"], g))
+            factors = Factors.of(M + g * D + g * pull, self._equations.elimination_order)
+            results = {"mass": _entries(M), "pull": _entries(pull), "factors": ca.vertcat(*factors.values)}
+            return function_of("matrix", arguments, results)
 
-        given = {**self._given("q", "w", "k", "step"), **self._equations.trailing}
-        self.parts.append(Part("matrix", tuple(given), ("mass", "pull", "factors"), make))
+        self.parts.append(Part("matrix", tuple(arguments), ("mass", "pull", "factors"), make))
 
-    def solve(self, i: int) -> None:
+    def add_solve(self, i: int) -> None:
         """Solve for stage i."""
         names = ("w", "k", "r", "sum_u", "sum_w", "step")
 
         def make() -> ca.Function:
-            s, g = self._s, self._gamma * self._s["step"]
+            s, g = self.symbols, self._gamma * self.symbols["step"]
             M, D, K = self._linear
             spun = self._rotating.spun(s["w"], g)
             pattern = ca.mtimes(K, spun)
-            factors = _factorized(M + D + pattern, self._equations.elimination_order)
-            held = {"mass": _held(M, "mass"), "pull": _held(pattern, "pull")}
-            # Of the same zeros, whatever the numbers.
+            factors = Factors.of(M + D + pattern, self._equations.elimination_order)
+            # Symbols with the same zeros.
+            mass, pull = ca.SX.sym("mass", M.nnz()), ca.SX.sym("pull", pattern.nnz())
             known = ca.SX.sym("factors", len(factors.values))
             a, b = g * s["r"] + self._gamma * s["sum_u"], g * s["k"] + self._gamma * s["sum_w"]
-            right = ca.mtimes(held["mass"][0], b) - ca.mtimes(held["pull"][0], a)
+            right = ca.mtimes(ca.SX(M.sparsity(), mass), b) - ca.mtimes(ca.SX(pattern.sparsity(), pull), a)
             dw = factors.applied(ca.vertsplit(known), right)
             du = ca.mtimes(spun, a + g * dw)
-            given = {**self._given(*names), **{name: column for name, (_, column) in held.items()}, "factors": known}
-            return function_of("solve", given, {"du": du, "dw": dw})
+            arguments = {**self.named(*names), "mass": mass, "pull": pull, "factors": known}
+            return function_of("solve", arguments, {"du": du, "dw": dw})
 
-        self.parts.append(Part("solve", (*names, "mass", "pull", "factors"), (f"du_{i}", f"dw_{i}"), make))
+        nv = self._equations.model.nv
+        increments = {name: ca.SX.sym(name, nv) for name in (f"du_{i}", f"dw_{i}")}
+
+        self.parts.append(Part("solve", (*names, "mass", "pull", "factors"), tuple(increments), make))
+        self._increments |= increments
+        self._stages.append(*increments.values())
 
     # Stages and the end
 
-    def _sum(self, weights: Array) -> tuple[Any, Any]:
-        totals = []
-        for kind in (0, 1):
-            total = ca.SX.zeros(self._equations.model.nv)
-            for weight, pair in zip(weights.tolist(), self._solved, strict=False):
-                if weight:
-                    total = total + weight * pair[kind]
-            totals.append(total)
-        return totals[0], totals[1]
-
-    def stage(self, i: int, places: Array, sums: Array) -> None:
+    def add_stage(self, i: int) -> None:
         """Go to where stage i is evaluated."""
-        given = {**self._given("q", "w"), **self._named(i)}
-        u, dw = self._sum(places)
-        sum_u, sum_w = self._sum(sums)
-        made = {"q_i": self._space.move(given["q"], u), "w_i": given["w"] + dw, "u_i": u}
-        self._part(f"stage_{i}", given, made | {"sum_u": sum_u, "sum_w": sum_w})
+        sum_u, sum_w = self._stages.sums(self._tableau.C[i, :i])
+        self._go(f"stage_{i}", self._tableau.A[i, :i], {"sum_u": sum_u, "sum_w": sum_w})
 
-    def arrive(self, b: Array) -> None:
-        """Form the new state, where the rates are looked at too."""
-        given = {**self._given("q", "w"), **self._named(len(b))}
-        u, dw = self._sum(b)
-        made = {"q_i": self._space.move(given["q"], u), "w_i": given["w"] + dw, "u_i": u}
-        self._part("arrive", given, made)
+    def arrive(self) -> None:
+        """Form the new state, where the rates are evaluated too."""
+        self._go("arrive", self._tableau.b, {})
 
-    def end(self, b: Array, error: Array, dense: Array) -> None:
+    def _go(self, name: str, weights: Array, more: dict[str, Any]) -> None:
+        arguments = {**self.named("q", "w"), **self._increments}
+        u, dw = self._stages.sums(weights)
+        results = {"q_i": self.space.move(arguments["q"], u), "w_i": arguments["w"] + dw, "u_i": u}
+        self.add(name, arguments, results | more)
+
+    def end(self) -> None:
         """Estimate the error of the new state, and decide."""
-        s, step = self._s, self._s["step"]
-        q1, w1, u = self._at["q_i"], self._at["w_i"], self._at["u_i"]
-        by_w, by_u = self._scales(q1, w1, u)
+        s, step, own = self.symbols, self.symbols["step"], self._tableau
+        q1, w1, u = self.at["q_i"], self.at["w_i"], self.at["u_i"]
+        by_u, by_w = self.scales(q1, w1, u)
 
         def norm(in_u: Any, in_w: Any) -> Any:
             return ca.sqrt((ca.sumsqr(in_w / by_w) + ca.sumsqr(in_u / by_u)) / (2 * self._equations.model.nv))
 
         # The slope of the polynomial at the end, times the step.
-        slope_u, slope_w = self._sum(b - dense.sum(axis=0))
-        defect = norm(step * s["r"] - slope_u, step * s["k"] - slope_w) / DEFECT
-        found = norm(*self._sum(error))
-        # NaN is chosen where it is one of the two.
-        worst = choose(found < defect, defect, found) + 0 * defect
-        self._decide({**self._at, **self._given("k", "r"), **self._named(len(b))}, q1, w1, worst)
-
-    def _factors(self, error: Any) -> tuple[Any, Any, Any]:
-        eighth = ca.sqrt(ca.sqrt(ca.sqrt(error)))
-        sixteenth = ca.sqrt(eighth)
-        # Error to the power of -3/16, near the fifth root that its order asks for.
-        under = eighth * sixteenth
-        factor = choose(GROWTH * under < SAFETY, GROWTH, SAFETY / under)
-        return factor, SAFETY / under, ca.sqrt(sixteenth)
+        slope_u, slope_w = self._stages.sums(own.b - own.dense.sum(axis=0))
+        defect = norm(step * s["r"] - slope_u, step * s["k"] - slope_w)
+        error = with_defect(SYMBOLS, norm(*self._stages.sums(own.error)), defect)
+        rates = {**self.at, **self.named("k", "r"), **self._increments}
+        self.decide(rates, q1, w1, error, elementary_factors(SYMBOLS, error, s["last"]))
 
 
 def _pruned(A: Any) -> Any:
@@ -224,15 +200,11 @@ def _entries(A: Any) -> Any:
     return ca.vertcat(ca.SX(0, 1), *A.nonzeros())
 
 
-def _held(A: Any, name: str) -> tuple[Any, Any]:
-    """Return a matrix of symbols with the same zeros, and the column of them."""
-    column = ca.SX.sym(name, A.nnz())
-    return ca.SX(A.sparsity(), column), column
-
-
 @dataclass(frozen=True)
-class _Factors:
-    """What eliminating leaves behind: numbers, and where they belong.
+class Factors:
+    """Factors of a matrix with the zeros of a tree's mass matrix, eliminated from the leaves to the root.
+
+    There is no fill-in and no pivoting.
 
     Attributes
     ----------
@@ -250,6 +222,31 @@ class _Factors:
     rest: list[tuple[int, int]]
     rows: tuple[int, ...]
 
+    @classmethod
+    def of(cls, A: Any, order: Sequence[int]) -> Factors:
+        """Return the factors of a matrix; `order` has every parent before its children."""
+        rank = {index: k for k, index in enumerate(order)}
+        rows: list[dict[int, Any]] = [{} for _ in rank]
+        for i, j in zip(*A.sparsity().get_triplet(), strict=True):
+            rows[rank[i]][rank[j]] = A[i, j]
+        factors: list[Any] = []
+        steps: list[tuple[int, int]] = []
+        inverses: list[Any] = [None] * len(rows)
+        for k in reversed(range(len(rows))):
+            # Where nothing moves there is no entry at all: the quotient is then no number.
+            inverses[k] = 1 / ca.SX(rows[k].pop(k, 0.0))
+            for i in range(k):
+                if k not in rows[i]:
+                    continue
+                factors.append(rows[i].pop(k) * inverses[k])
+                steps.append((i, k))
+                for j, entry in rows[k].items():
+                    if j < k:
+                        rows[i][j] = rows[i].get(j, 0.0) - factors[-1] * entry
+        rest = [(k, j) for k, row in enumerate(rows) for j in row]
+        values = [*factors, *(rows[k][j] for k, j in rest), *inverses]
+        return cls(values, steps, rest, tuple(rank[index] for index in range(len(rank))))
+
     def applied(self, values: Sequence[Any], b: Any) -> Any:
         """Return the solution for a right-hand side."""
         n = len(self.rows)
@@ -265,28 +262,3 @@ class _Factors:
             done = [entry * x[j] for (row, j), entry in behind.items() if row == k]
             x[k] = (x[k] - sum(done, 0.0)) * inverses[k]
         return ca.vertcat(ca.SX(0, 1), *(x[row] for row in self.rows))
-
-
-def _factorized(A: Any, order: Sequence[int]) -> _Factors:
-    """Return the factors of a matrix with the zeros of a tree's mass matrix, leaves first."""
-    rank = {index: k for k, index in enumerate(order)}
-    rows: list[dict[int, Any]] = [{} for _ in rank]
-    for i, j in zip(*A.sparsity().get_triplet(), strict=True):
-        rows[rank[i]][rank[j]] = A[i, j]
-    factors: list[Any] = []
-    steps: list[tuple[int, int]] = []
-    inverses: list[Any] = [None] * len(rows)
-    for k in reversed(range(len(rows))):
-        # Where nothing moves there is no entry at all: the quotient is then no number.
-        inverses[k] = 1 / ca.SX(rows[k].pop(k, 0.0))
-        for i in range(k):
-            if k not in rows[i]:
-                continue
-            factors.append(rows[i].pop(k) * inverses[k])
-            steps.append((i, k))
-            for j, entry in rows[k].items():
-                if j < k:
-                    rows[i][j] = rows[i].get(j, 0.0) - factors[-1] * entry
-    rest = [(k, j) for k, row in enumerate(rows) for j in row]
-    values = [*factors, *(rows[k][j] for k, j in rest), *inverses]
-    return _Factors(values, steps, rest, tuple(rank[index] for index in range(len(rank))))

@@ -15,12 +15,12 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times
 from mbkit.errors import MbkitError
-from mbkit.methods.registry import Method, Tolerances
+from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances
 from mbkit.model import Model
 from mbkit.model.integration_space import Space
 from mbkit.simulate.along_trajectory import along, is_damped, kinetic_energy, potential_energy
 from mbkit.simulate.diagnostics.eigenvalues import linearized
-from mbkit.simulate.diagnostics.stability import STEPS, growth, lost
+from mbkit.simulate.diagnostics.stability import growth, lost
 from mbkit.simulate.solvers.vector_field import size_of, unit_quaternions
 
 __all__ = ["doubts", "halved", "idle"]
@@ -42,13 +42,7 @@ _OFF: Final = 0.008
 _BEYOND: Final = 3.0
 #: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by two to four times that.
 _LOST: Final = 0.02
-#: Whose errors of a step are those allowed, or more; what the others make is a third to a three-hundredth of that.
-_TO_THE_FULL: Final = ("rodas5", "radau", "lsoda", "bdf", "cvodes")
 _SUM: Final = 1e-3
-#: Whose tolerance is that of the state at the start.
-_OF_START: Final = "taylor"
-#: Who solves with the mass matrix, whatever accelerations come from.
-_BY_MASSES: Final = ("rodas5", "implicit_midpoint")
 #: Least eigenvalue of a mass matrix beside its largest, in units in which it has ones at a random configuration.
 _IDLE: Final = 1e-7
 #: m or rad: what engineers still call a position.
@@ -105,15 +99,15 @@ def doubts(
     looks = [
         _pole(dyn, crossed),
         _energy(here, M, q, v, pushed, _ENERGY if method.order in _LOW else _ENERGY_HIGH),
-        [] if _keeps_digits(dyn, method.name) else _condition(M),
-        _far(q, setting if isinstance(setting, Tolerances) and method.name != _OF_START else None),
+        [] if _keeps_digits(dyn, method) else _condition(M),
+        _far(q, setting if isinstance(setting, Tolerances) and not method.scaled_by_start else None),
     ]
-    if not isinstance(setting, Tolerances) and method.name in STEPS:
+    if not isinstance(setting, Tolerances) and method.stability is not None:
         # The cause is told before what came of it.
         looks.insert(0, _step(dyn, method.name, setting, float(t[-1] - t[0]), ends))
-    if isinstance(setting, Tolerances) and method.name == _OF_START:
+    if isinstance(setting, Tolerances) and method.scaled_by_start:
         looks.append(_outgrown(q, v, setting))
-    if isinstance(setting, Tolerances) and method.name in _TO_THE_FULL:
+    if isinstance(setting, Tolerances) and method.fills_tolerance:
         looks.append(_adding(method.name, setting, 2 * nv, steps / members))
     found: list[str] = []
     for look in looks:
@@ -185,7 +179,7 @@ def halved(
     if off > _OFF:
         yield (
             f"by a run with a step of {2 * h:g} s it is off by {off:.2g} of the motion, since {method} is of "
-            "first order; take a smaller step, or method='auto'"
+            f"first order; take a smaller step, or method={AUTOMATIC_METHOD!r}"
         )
 
 
@@ -219,7 +213,7 @@ def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool, most: flo
         gained = "gained" if change[worst][np.abs(change[worst]).argmax()] > 0 or is_damped(model) else "lost"
         yield (
             f"{gained} {share[worst]:.2g} of its energy ({wrong[worst]:.2g} J) with nothing that drives it; "
-            "take a smaller step, or method='auto'"
+            f"take a smaller step, or method={AUTOMATIC_METHOD!r}"
         )
 
 
@@ -252,7 +246,7 @@ def _condition(M: Array) -> Iterator[str]:
         yield (
             f"the mass matrix is singular to {max(float(least), 0.0):.1g} of its size, so that accelerations hold "
             f"about {max(0, int(-np.log10(_EPS / max(least, _EPS)))):d} digits; leave out what has no mass, or compute "
-            "with 34 digits: mbkit.dynamics(model, 'oracle') and method='taylor'"
+            f"with 34 digits: mbkit.dynamics(model, 'oracle') and method={SERIES_METHOD!r}"
         )
 
 
@@ -284,7 +278,7 @@ def _step(dyn: Dynamics, method: str, h: float, duration: float, states: list[tu
             told = (
                 f"a step of {h:g} s is too long for the fastest mode, {fastest:.2g} 1/s (h|λ| = {h * fastest:.2g}): "
                 f"{method} makes it grow by {np.expm1(min(grows, 700.0)):.1g} a step; take a step below "
-                f"{1 / fastest:.1g} s, or method='auto'"
+                f"{1 / fastest:.1g} s, or method={AUTOMATIC_METHOD!r}"
             )
             found.append((np.inf, told))
             continue
@@ -293,7 +287,7 @@ def _step(dyn: Dynamics, method: str, h: float, duration: float, states: list[tu
             kind = f"an oscillation of {abs(rate.imag):.2g} rad/s" if abs(rate.imag) > abs(rate.real) else "a motion"
             told = (
                 f"a step of {h:g} s is too long to follow {kind} with h|λ| = {h * abs(rate):.2g}: where it is "
-                f"excited, {min(1.0, part):.0%} of it is lost over the run; take a smaller step, or method='auto'"
+                f"excited, {min(1.0, part):.0%} of it is lost over the run; take a smaller step, or method={AUTOMATIC_METHOD!r}"
             )
             found.append((part, told))
     if found:
@@ -325,13 +319,13 @@ def _outgrown(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
     if allowed > max(1e3 * tolerances.atol, _POSITION):
         yield (
             f"the state grew to {largest:.2g}, of which the tolerance allows an error of {allowed:.1g} to all "
-            "numbers in each step; take a smaller rtol, or method='rk853'"
+            f"numbers in each step; take a smaller rtol, or method={ADAPTIVE_METHOD!r}"
         )
 
 
-def _keeps_digits(dyn: Dynamics, method: str) -> bool:
+def _keeps_digits(dyn: Dynamics, method: Method) -> bool:
     """Return whether no accelerations come from the mass matrix: not by the engine, nor by the method."""
-    return getattr(dyn, "elimination", "") == "least constraint" and method not in _BY_MASSES
+    return getattr(dyn, "elimination", "") == "least constraint" and not method.mass_matrix
 
 
 def _adding(method: str, tolerances: Tolerances, numbers: int, steps: float) -> Iterator[str]:
@@ -341,5 +335,5 @@ def _adding(method: str, tolerances: Tolerances, numbers: int, steps: float) -> 
     if together > _SUM:
         yield (
             f"errors of {steps:.2g} steps that each use the tolerance of {tolerances.rtol:g}, as those of {method} do, "
-            f"add up to {together:.1g} of the motion and more; take a smaller rtol, or method='auto'"
+            f"add up to {together:.1g} of the motion and more; take a smaller rtol, or method={AUTOMATIC_METHOD!r}"
         )

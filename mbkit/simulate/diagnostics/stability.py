@@ -6,82 +6,19 @@ radius is at most that of the exact flow (Hairer, Wanner 1996, IV.2).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.methods.registry import method_of
+from mbkit.methods.stability import companion
 
-__all__ = ["STEPS", "growth", "lost"]
+__all__ = ["growth", "lost"]
 
 
 #: Of a run: what is gone after that is a transient.
 _BRIEF: Final = 0.01
-
-
-def _companion(A: Array, B: Array) -> Array:
-    n = len(A)
-    return np.block([[np.zeros((n, n)), np.eye(n)], [A, B]])
-
-
-def _series(order: int) -> Callable[[float, Array, Array], Array]:
-    def step(h: float, A: Array, B: Array) -> Array:
-        Z = h * _companion(A, B)
-        out = term = np.eye(len(Z))
-        for k in range(1, order + 1):
-            term = term @ Z / k
-            out = out + term
-        return np.asarray(out)
-
-    return step
-
-
-def _symplectic_euler(h: float, A: Array, B: Array) -> Array:
-    one = np.eye(len(A))
-    v = np.hstack([h * A, one + h * B])
-    return np.vstack([np.hstack([one, 0 * one]) + h * v, v])
-
-
-def _implicit_in_velocity(h: float, A: Array, B: Array) -> Array:
-    one = np.eye(len(A))
-    v = np.linalg.solve(one - h * B, np.hstack([h * A, one]))
-    return np.vstack([np.hstack([one, 0 * one]) + h * v, v])
-
-
-def _implicit(h: float, A: Array, B: Array) -> Array:
-    one = np.eye(len(A))
-    v = np.linalg.solve(one - h * B - h * h * A, np.hstack([h * A, one]))
-    return np.vstack([np.hstack([one, 0 * one]) + h * v, v])
-
-
-def _pade(numerator: tuple[float, ...]) -> Callable[[float, Array, Array], Array]:
-    """Gauss's methods: the diagonal Padé approximant N(z) / N(-z) of the exponential."""
-
-    def step(h: float, A: Array, B: Array) -> Array:
-        Z = h * _companion(A, B)
-        powers = [np.linalg.matrix_power(Z, k) for k in range(len(numerator))]
-        above = sum(c * P for c, P in zip(numerator, powers, strict=True))
-        below = sum((-1) ** k * c * P for k, (c, P) in enumerate(zip(numerator, powers, strict=True)))
-        return np.asarray(np.linalg.solve(below, above))
-
-    return step
-
-
-#: The step's matrix of each fixed-step method. MuJoCo's implicit methods take what B is from dampers
-#: implicitly, which is all of it where dampers are what is stiff.
-STEPS: Final[dict[str, Callable[[float, Array, Array], Array]]] = {
-    "rk4": _series(4),
-    "mujoco_rk4": _series(4),
-    "semi_implicit_euler": _symplectic_euler,
-    "mujoco_euler": _symplectic_euler,
-    "mujoco_implicit": _implicit_in_velocity,
-    "mujoco_implicitfast": _implicit_in_velocity,
-    "mujoco_discrete": _implicit,
-    "implicit_midpoint": _pade((1, 1 / 2)),
-    "gauss4": _pade((1, 1 / 2, 1 / 12)),
-    "gauss6": _pade((1, 1 / 2, 1 / 10, 1 / 120)),
-}
 
 
 def growth(method: str, h: float, A: Array, B: Array) -> float:
@@ -105,7 +42,7 @@ def growth(method: str, h: float, A: Array, B: Array) -> float:
     >>> growth("semi_implicit_euler", 1.99, spring, none) < 1 + 1e-12
     True
     """
-    return float(np.abs(np.linalg.eigvals(STEPS[method](h, A, B))).max())
+    return float(np.abs(np.linalg.eigvals(_matrix(method, h, A, B))).max())
 
 
 def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[float, complex]:
@@ -123,8 +60,8 @@ def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[fl
     >>> bool(abs(part - 10.0**3 * 0.01**2 / 24 * 24.0) < 1e-3), abs(round(rate.imag, 6))
     (True, 10.0)
     """
-    rates = np.linalg.eigvals(_companion(A, B))
-    made = np.linalg.eigvals(STEPS[method](h, A, B))
+    rates = np.linalg.eigvals(companion(A, B))
+    made = np.linalg.eigvals(_matrix(method, h, A, B))
     # Beyond a turn a step no phase is its own; and what a step ends has no logarithm.
     made = np.log(np.where(np.abs(made) > 1e-300, made, 1e-300).astype(complex))
     exact = h * rates
@@ -138,6 +75,12 @@ def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[fl
     part = np.where(lasting < _BRIEF * duration, 0.0, off * lasting / h)
     worst = int(part.argmax())
     return float(part[worst]), complex(rates[modes[worst]])
+
+
+def _matrix(method: str, h: float, A: Array, B: Array) -> Array:
+    stability = method_of(method).stability
+    assert stability is not None
+    return stability.matrix(h, A, B)
 
 
 def _paired(gap: Array) -> tuple[Array, Array]:

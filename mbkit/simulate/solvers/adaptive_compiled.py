@@ -18,8 +18,8 @@ from mbkit.derivation.steps.adaptive import STATE, embedded_parts
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.rosenbrock import rosenbrock_parts
 from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.methods.one_step import FIRST_ROOT, MAX_GROWTH
 from mbkit.methods.registry import Tolerances
-from mbkit.methods.step_control import GROWTH, LAST
 from mbkit.methods.tableaus import dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
 from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, DivergenceError, Field
@@ -69,7 +69,7 @@ def _scheme(method: str) -> _Scheme:
         return _Scheme(
             own.name,
             [[own.gamma], *(x.tolist() for x in tables)],
-            lambda equations: rosenbrock_parts(equations, own.gamma, *tables),
+            lambda equations: rosenbrock_parts(equations, own),
             stages=own.stages + 1,
             rate="k",
             grows=5,
@@ -80,7 +80,7 @@ def _scheme(method: str) -> _Scheme:
     return _Scheme(
         pair.name,
         [x.tolist() for x in (pair.A, pair.b, first, second)],
-        lambda equations: embedded_parts(equations, pair.A, pair.b, (first, second)),
+        lambda equations: embedded_parts(equations, pair),
         stages=pair.stages,
         rate="k_0",
         grows=8,
@@ -163,7 +163,7 @@ class LaneTrials:
         state = self._outer.state
         state[:] = 0.0
         state[self._at["q"]], state[self._at["w"]], state[self._row["t"]] = q[pick].T, w[pick].T, t
-        state[self._row["most"]], state[self._row["last"]], state[self._row["h"]] = GROWTH, LAST, h
+        state[self._row["most"]], state[self._row["last"]], state[self._row["h"]] = MAX_GROWTH, FIRST_ROOT, h
         self._give_parameters(self._outer, self._which)
         self._active = np.zeros(self.width, dtype=bool)
         self._dropped = np.zeros(self.width, dtype=bool)
@@ -287,7 +287,7 @@ class LaneTrials:
         pick = np.minimum(np.arange(rounds * self.width), count - 1)
         tasks = np.zeros((len(pick), arena.rows))
         tasks[:, self._at["q"]], tasks[:, self._at["w"]] = start.q[pick], start.w[pick]
-        given: dict[str, Array | float] = {"t": start.t[pick], "end": times[pick], "h": _HUGE, "most": GROWTH}
+        given: dict[str, Array | float] = {"t": start.t[pick], "end": times[pick], "h": _HUGE, "most": MAX_GROWTH}
         for name, value in given.items():
             tasks[:, self._row[name]] = value
         queue = np.ascontiguousarray(tasks.reshape(rounds, self.width, -1).transpose(0, 2, 1))

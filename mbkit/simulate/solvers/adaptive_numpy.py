@@ -10,8 +10,19 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.methods.one_step import (
+    FIRST_ROOT,
+    MAX_GROWTH,
+    SCALARS,
+    ArrayStages,
+    elementary_factors,
+    embedded_error,
+    end_of_attempt,
+    next_step,
+    predictive_factors,
+    with_defect,
+)
 from mbkit.methods.registry import Tolerances
-from mbkit.methods.step_control import DEFECT, GROWTH, LAST, SAFETY, SHRINK
 from mbkit.methods.tableaus import dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import LOOSEST
@@ -45,6 +56,7 @@ class StageTrials:
     width = rounds = 1
     #: The power of a step's length with which its estimated error grows.
     grows = 8
+    _factors = staticmethod(predictive_factors)
 
     def __init__(
         self,
@@ -58,12 +70,9 @@ class StageTrials:
         self._space, self._tolerances, self._torque, self._batch = space, tolerances, torque, batch
         self._field = _OneOf(dyn, self._space)
         self._tableau = dormand_prince_853()
-        self._c = self._tableau.c.tolist()
         self._least = duration * float(np.finfo(float).eps)
-        nv = self._space.nv
-        # (u̇, ẇ) of each stage.
-        self._rates = np.empty((self._tableau.stages, 2 * nv))
-        self._force: Force = np.zeros(nv)
+        self._stages = ArrayStages(self._tableau.stages, np.empty(space.nv))
+        self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
         self._why = ""
         # What the tolerance is multiplied by.
@@ -86,7 +95,7 @@ class StageTrials:
             self._field.one(member)
         self._of_interval = self._torque.of_member(None if self._batch is None else member)
         self._q, self._w, self._t, self._h = q[0], w[0], t, h
-        self._most, self._last, self._error = GROWTH, LAST, 0.0
+        self._most, self._last, self._error = MAX_GROWTH, FIRST_ROOT, 0.0
         self._dropped, self._fresh = False, True
 
     def hold(self, k: int, stop: float) -> None:
@@ -112,9 +121,7 @@ class StageTrials:
         """Try one step."""
         if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
             return []
-        gap = self._stop - self._t
-        ends = self._h >= gap
-        t = self._stop if ends else self._t + (self._h if 2 * self._h < gap else 0.5 * gap)
+        t = end_of_attempt(SCALARS, self._t, self._h, self._stop)
         step = t - self._t
         before = [self._t], [self._q], [self._w]
         q, w, self._error = self._try(step)
@@ -128,26 +135,22 @@ class StageTrials:
         return [(0, Stretch(np.array(before[0]), np.array(before[1]), np.array(before[2]), 1))]
 
     def _settle(self, step: float, good: bool) -> None:
-        factor, under, root = self._factors(self._error if self._error >= 0 else math.nan)
-        if good:
-            grown = step * min(factor, self._most)
-            # A step that was short only because the end was near says little.
-            self._h = self._h if 2 * step < self._h and grown < self._h else grown
-            self._last, self._slack = max(root, LAST), 1.0
-        elif self._field.near_singular and self._slack * self._tolerances.rtol < LOOSEST and self._error >= 1:
+        if (
+            not good
+            and self._field.near_singular
+            and self._slack * self._tolerances.rtol < LOOSEST
+            and self._error >= 1
+        ):
             # Near a singular pose shorter steps are no better: their stages are nearer to it, and rounding grows.
-            self._slack, self._h = 10 * self._slack, 0.8 * step
-        else:
-            self._h = step * (SAFETY / under if SHRINK * under < SAFETY else SHRINK)
-        self._most = GROWTH if good else 1.0
-
-    def _factors(self, error: float) -> tuple[float, float, float]:
-        """Return what a step grows by after this error, what it shrinks in proportion to, and the root to remember."""
-        eighth = math.sqrt(math.sqrt(math.sqrt(error)))
-        sixteenth = math.sqrt(eighth)
-        root = math.sqrt(sixteenth)
-        over, under = SAFETY * self._last, sixteenth * root
-        return GROWTH if GROWTH * under < over else over / under, eighth, root
+            self._slack, self._h, self._most = 10 * self._slack, 0.8 * step, 1.0
+            return
+        self._slack = 1.0 if good else self._slack
+        factors = self._factors(SCALARS, np.float64(self._error if self._error >= 0 else math.nan), self._last)
+        # A step of no length, far from the time's zero, ends the run.
+        h, self._most, self._last = next_step(
+            SCALARS, factors, good, step, self._h if step > 0 else 0.0, self._most, self._last
+        )
+        self._h = float(h)
 
     def _try(self, step: float) -> tuple[Array, Array, float]:
         try:
@@ -161,26 +164,21 @@ class StageTrials:
     def _tried(self, step: float) -> tuple[Array, Array, float]:
         q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
         space, (rtol, atol) = self._space, self._tolerances
-        sizes = np.concatenate(
-            [np.maximum(space.sizes(self._q, u), space.sizes(q, u)), np.maximum(np.abs(self._w), np.abs(w))]
-        )
-        scale = self._slack * (atol + rtol * sizes)
-        fifth, third = (float(np.sum((e @ self._rates / scale) ** 2)) for e in self._tableau.errors)
-        total = fifth + 0.01 * third
-        return q, w, 0.0 if total == 0 else step * fifth / math.sqrt(total * len(scale))
+        sizes = np.maximum(space.sizes(self._q, u), space.sizes(q, u)), np.maximum(np.abs(self._w), np.abs(w))
+        by_u, by_w = (self._slack * (atol + rtol * x) for x in sizes)
+        error = embedded_error(SCALARS, self._tableau.errors, self._stages, (by_u, by_w), step, 2 * space.nv)
+        return q, w, float(error)
 
     def _step(self, t: float, q: Array, w: Array, h: float, *, fresh: bool = True) -> tuple[Array, Array, Array]:
         """Return q, w and u after h; the first stage is there already unless the start is fresh."""
-        A, rates, space, nv = self._tableau.A, self._rates, self._space, self._space.nv
-        if fresh:
-            rates[0, :nv], rates[0, nv:] = w, self._field(t, q, w, self._force)
-        for i in range(1, len(rates)):
-            moved = (h * A[i, :i]) @ rates[:i]
-            u, w_i = moved[:nv], w + moved[nv:]
-            rates[i, :nv] = space.rate(u, w_i)
-            rates[i, nv:] = self._field.consistent(t + self._c[i] * h, space.move(q, u), w_i, self._force)
-        moved = (h * self._tableau.b) @ rates
-        return space.move(q, moved[:nv]), w + moved[nv:], moved[:nv]
+
+        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
+            if u is None:
+                return w, self._field(t, q, w, self._force)
+            return self._space.rate(u, w), self._field.consistent(t, q, w, self._force)
+
+        self._stages.keep(0 if fresh else 1)
+        return self._tableau.step(self._space, rates, self._stages, t, h, q, w)
 
     def drop(self, place: int) -> None:  # noqa: ARG002  # there is one
         """Stay here."""
@@ -234,6 +232,7 @@ class RosenbrockTrials(StageTrials):
     """Tries one step at a time, in NumPy; `Trials` says what its methods do."""
 
     grows = 5
+    _factors = staticmethod(elementary_factors)
 
     def __init__(
         self,
@@ -278,29 +277,23 @@ class RosenbrockTrials(StageTrials):
             self._own_rates.only(which[0])
             self._exact.only(which[0])
 
-    def _factors(self, error: float) -> tuple[float, float, float]:
-        eighth = math.sqrt(math.sqrt(math.sqrt(error)))
-        sixteenth = math.sqrt(eighth)
-        under = eighth * sixteenth
-        return GROWTH if GROWTH * under < SAFETY else SAFETY / under, under, math.sqrt(sixteenth)
-
     def _tried(self, step: float) -> tuple[Array, Array, float]:
         y, there, J = self._known()
-        k = self._stages(self._t, y, step, there, J)
+        k = self._increments(self._t, y, step, there, J)
         y1, error = y + self._b @ k, self._e @ k
         t1 = self._t + step
         self._last_try = self._t, t1, y, y1, k
         rtol, atol = self._tolerances
         scale = atol + rtol * np.maximum(np.maximum(np.abs(y), np.abs(y1)), self._turning)
-        found = _norm(error / scale)
-        if found < 1:
+        size = _norm(error / scale)
+        if size < 1:
             rate = self._rate(t1, y1)
             slope = (self._b - self._dense.sum(axis=0)) @ k
-            found = max(found, _norm((step * rate - slope) / scale) / DEFECT)
+            size = float(with_defect(SCALARS, size, _norm((step * rate - slope) / scale)))
             self._arrived = y1, rate
-            if not math.isfinite(found):
+            if not math.isfinite(size):
                 raise DivergenceError(self._own_rates.why or RAN_AWAY)
-        return *self._state(y1), found
+        return *self._state(y1), size
 
     def _known(self) -> tuple[Array, Array, Array]:
         """Return y, ẏ and ∂ẏ/∂y where the step starts, evaluated once for all tries from there."""
@@ -327,7 +320,7 @@ class RosenbrockTrials(StageTrials):
         q = unit_quaternions(self._model, y[:nq])[0]
         return q, self._space.enter(q, y[nq:])
 
-    def _stages(self, t: float, y: Array, h: float, there: Array, J: Array) -> Array:
+    def _increments(self, t: float, y: Array, h: float, there: Array, J: Array) -> Array:
         """Return what the stages of a step of length h come to, (s, n)."""
         from scipy.linalg import lapack
 
@@ -372,7 +365,7 @@ class RosenbrockTrials(StageTrials):
                 return self._state((1 - part) * y0 + part * (y1 + bend))
             self._own_rates.why = ""
             y = np.concatenate([q, self._space.leave(q, w)])
-            k = self._stages(t, y, end - t, self._rate(t, y), self._exact(t, y, self._force))
+            k = self._increments(t, y, end - t, self._rate(t, y), self._exact(t, y, self._force))
             return self._state(y + self._b @ k)
         except DivergenceError:
             return np.full(q.shape, np.nan), np.full(w.shape, np.nan)

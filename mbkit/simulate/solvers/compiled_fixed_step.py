@@ -21,7 +21,7 @@ from mbkit._check import Array
 from mbkit.codegen.compiled import Call, CallSequence, Compiled, aligned, cores
 from mbkit.derivation.steps.fixed import Part, march, march_in_stages
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.methods.registry import METHODS
+from mbkit.methods.registry import method_of
 from mbkit.model.integration_space import Space
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Outcome
@@ -74,7 +74,7 @@ class Plan:
 
         self.parts = march_in_stages(dyn.equations, method)
         forward = next(part for part in self.parts if part.name == "forward_dynamics")
-        if METHODS[method].stages * code(forward).operations <= _ONE_PIECE:
+        if method_of(method).stages * code(forward).operations <= _ONE_PIECE:
             self.parts = march(dyn.equations, method)
         self.codes = tuple(code(part) for part in self.parts)
         self.sizes: dict[str, int] = {}
@@ -222,9 +222,10 @@ def run_rollout(
 
 def _plan(dyn: LagrangianDynamics, method: str) -> Plan:
     plans: dict[str, Plan] = dyn.equations.kept.setdefault("rollout", {})
-    if method not in plans:
-        plans[method] = Plan(dyn, method)
-    return plans[method]
+    name = method_of(method).code_name
+    if name not in plans:
+        plans[name] = Plan(dyn, method)
+    return plans[name]
 
 
 @dataclass(frozen=True)
@@ -367,7 +368,7 @@ class _Run:
             q=q[0] if single else q,
             v=v[0] if single else v,
             steps=int(steps.sum()),
-            evaluations=METHODS[self._method].stages * (int(steps.sum()) + len(self._lost)),
+            evaluations=method_of(self._method).stages * (int(steps.sum()) + len(self._lost)),
             ended="diverged" if message else "finished",
             reached=np.asarray(times[0] if single else times),
             message=message,

@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
-from mbkit.methods.tableaus import RK4
+from mbkit.methods.one_step import SemiImplicitEuler
+from mbkit.methods.registry import method_of
+from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Ended, Outcome
-from mbkit.simulate.solvers.gauss import gauss_step
+from mbkit.simulate.solvers.gauss import CollocationStep
 from mbkit.simulate.solvers.runge_kutta import (
     RAN_AWAY,
     DivergenceError,
     Field,
     Step,
     credible,
-    euler_step,
-    runge_kutta_step,
+    explicit_step,
 )
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
 __all__ = ["make_step", "reason", "run_fixed"]
-
-_TABLEAUS: Final = {"rk4": RK4}
 
 
 def run_fixed(
@@ -178,8 +175,8 @@ def reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, f
 
 def make_step(method: str, field: Field, space: Space) -> Step:
     """Return the step of a fixed-step method."""
-    if method in _TABLEAUS:
-        return runge_kutta_step(_TABLEAUS[method], field, space)
-    if method.startswith("gauss"):
-        return gauss_step(method, field, space)
-    return euler_step(field, space)
+    formula = method_of(method).formula
+    if isinstance(formula, ImplicitTableau):
+        return CollocationStep(formula, field, space)
+    assert isinstance(formula, (Tableau, SemiImplicitEuler))
+    return explicit_step(formula, field, space)

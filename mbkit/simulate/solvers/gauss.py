@@ -10,7 +10,6 @@ here they act on (q, v), where they are not: `implicit_midpoint` is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from math import sqrt
 from typing import Final
 
@@ -20,10 +19,10 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, DivergenceError, Field, Step
+from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
-__all__ = ["gauss_legendre", "gauss_step"]
+__all__ = ["CollocationStep"]
 
 _EPS: Final = float(np.finfo(float).eps)
 _MOST: Final = 60
@@ -38,26 +37,6 @@ _LEAST: Final = 1e-13
 _UNSOLVED: Final = "the iteration does not solve the equations of the step's stages"
 
 
-@cache
-def gauss_legendre(stages: int) -> ImplicitTableau:
-    """Return the tableau of 2 or 3 stages, of order 4 or 6."""
-    if stages == 2:
-        r = sqrt(3) / 6
-        return ImplicitTableau("gauss4", [[1 / 4, 1 / 4 - r], [1 / 4 + r, 1 / 4]], [1 / 2, 1 / 2], 4)
-    r = sqrt(15)
-    rows = [
-        [5 / 36, 2 / 9 - r / 15, 5 / 36 - r / 30],
-        [5 / 36 + r / 24, 2 / 9, 5 / 36 - r / 24],
-        [5 / 36 + r / 30, 2 / 9 + r / 15, 5 / 36],
-    ]
-    return ImplicitTableau("gauss6", rows, [5 / 18, 4 / 9, 5 / 18], 6)
-
-
-def gauss_step(method: str, field: Field, space: Space) -> Step:
-    """Return the step of ``"gauss4"`` or ``"gauss6"``; it remembers its last step, to guess the next one."""
-    return _Gauss(gauss_legendre({"gauss4": 2, "gauss6": 3}[method]), field, space)
-
-
 @dataclass(frozen=True)
 class _Past:
     """The last step: where it ended, the stages' ẇ, its length, and Newton's matrix if there was one."""
@@ -68,8 +47,11 @@ class _Past:
     inverse: Array | None
 
 
-class _Gauss:
-    """The stages' rates (u̇, ẇ) side by side, (stages, ..., 2 nv), are what is solved for."""
+class CollocationStep:
+    """The step of an implicit Runge-Kutta method; it remembers its last step, from which it guesses the next one.
+
+    The unknowns are the stages' rates (u̇, ẇ) side by side, (stages, ..., 2 nv).
+    """
 
     def __init__(self, tableau: ImplicitTableau, field: Field, space: Space) -> None:
         self._A, self._b, self._c, self._s = tableau.A, tableau.b, tableau.c, tableau.stages
@@ -78,6 +60,7 @@ class _Gauss:
         self._past: _Past | None = None
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        """Return q and w after a step of h seconds."""
         past = self._past if self._past is not None and self._past.q is q else None
         inverse = past.inverse if past is not None and past.h == h else None
         rates, inverse = self._solved(t, h, q, w, force, self._guess(h, w, past), inverse)

@@ -20,13 +20,14 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import InputError, NumericalError
+from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.tableaus import Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import Approach, beside, settled
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
-__all__ = ["RAN_AWAY", "RUNAWAY", "DivergenceError", "Field", "Step", "credible", "euler_step", "runge_kutta_step"]
+__all__ = ["RAN_AWAY", "RUNAWAY", "DivergenceError", "Field", "Step", "credible", "explicit_step"]
 
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
@@ -121,32 +122,14 @@ def _blamed(told: str, q: Array, v: Array) -> str:
     return told if largest < 1e50 else RAN_AWAY
 
 
-def euler_step(field: Field, space: Space) -> Step:
-    """Return the step of semi-implicit Euler."""
+def explicit_step(formula: Tableau | SemiImplicitEuler, field: Field, space: Space) -> Step:
+    """Return the step of a method with an explicit formula."""
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
-        w = w + h * field(t, q, w, force)
-        return space.move(q, h * w), w
+        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
+            return w if u is None else space.rate(u, w), field.consistent(t, q, w, force)
 
-    return step
-
-
-def runge_kutta_step(tableau: Tableau, field: Field, space: Space) -> Step:
-    """Return the step of an explicit Runge-Kutta method."""
-    A, b, c, s, nv = tableau.A, tableau.b, tableau.c.tolist(), tableau.stages, space.nv
-
-    def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
-        # The rates (u̇, ẇ) of all stages; a row of A times them is one product.
-        rates = np.empty((s, *w.shape[:-1], 2 * nv))
-        flat = rates.reshape(s, -1)
-        rates[0, ..., :nv] = w
-        rates[0, ..., nv:] = field.consistent(t, q, w, force)
-        for i in range(1, s):
-            moved = ((h * A[i, :i]) @ flat[:i]).reshape(rates.shape[1:])
-            u, w_i = moved[..., :nv], w + moved[..., nv:]
-            rates[i, ..., :nv] = space.rate(u, w_i)
-            rates[i, ..., nv:] = field.consistent(t + c[i] * h, space.move(q, u), w_i, force)
-        moved = ((h * b) @ flat).reshape(rates.shape[1:])
-        return space.move(q, moved[..., :nv]), w + moved[..., nv:]
+        q, w, _ = formula.step(space, rates, ArrayStages(formula.stages, w), t, h, q, w)
+        return q, w
 
     return step
