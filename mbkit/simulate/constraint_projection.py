@@ -20,6 +20,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times
 from mbkit.errors import InputError, UnsupportedError
+from mbkit.methods.registry import ADAPTIVE_METHOD, IMPLICIT_METHODS, SERIES_METHOD
 from mbkit.simulate.result import Outcome
 
 __all__ = [

@@ -287,7 +287,8 @@ def _step(dyn: Dynamics, method: str, h: float, duration: float, states: list[tu
             kind = f"an oscillation of {abs(rate.imag):.2g} rad/s" if abs(rate.imag) > abs(rate.real) else "a motion"
             told = (
                 f"a step of {h:g} s is too long to follow {kind} with h|λ| = {h * abs(rate):.2g}: where it is "
-                f"excited, {min(1.0, part):.0%} of it is lost over the run; take a smaller step, or method={AUTOMATIC_METHOD!r}"
+                f"excited, {min(1.0, part):.0%} of it is lost over the run; take a smaller step, "
+                f"or method={AUTOMATIC_METHOD!r}"
             )
             found.append((part, told))
     if found:
