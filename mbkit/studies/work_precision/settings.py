@@ -53,7 +53,7 @@ class Settings:
     @property
     def info(self) -> Method:
         """The method as data."""
-        return METHODS[self.method]
+        return method_of(self.method)
 
     def work(self, steps: int, evaluations: int) -> int:
         """Return the cost of a run in compiled evaluations of the forward dynamics, equal on every machine."""
