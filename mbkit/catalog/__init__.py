@@ -11,12 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mbkit.catalog.beams import clamped_beam
+from mbkit.catalog.mechanisms import acrobot, cart_pole, furuta_pendulum, slider_crank
 from mbkit.catalog.pendulums import chain, double_pendulum, elastic_pendulum, pendulum, spherical_pendulum
 from mbkit.catalog.rigid_bodies import free_body, gyroscope, heavy_top
-from mbkit.catalog.slider_crank import slider_crank
-from mbkit.catalog.spacecraft import flexible_spacecraft, spacecraft_with_wheels
-from mbkit.catalog.underactuated import acrobot, cart_pole, furuta_pendulum
+from mbkit.catalog.spacecraft import clamped_beam, flexible_spacecraft, spacecraft_with_wheels
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 

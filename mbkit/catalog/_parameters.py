@@ -1,51 +1,94 @@
-"""Reading the parameters of a system, and what several of them share."""
+"""Checks of the systems' parameters, and the decorator that makes them."""
 
 from __future__ import annotations
 
+import inspect
 import operator
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from functools import partial, wraps
+from typing import Any, Final, ParamSpec, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import finite_array, real, shown
 from mbkit.errors import InputError
-from mbkit.model import Expression, Number, known, nominal
+from mbkit.model import Expression, Model, Number, known, nominal
 
-__all__ = ["SWING", "Vector", "count", "down", "moments", "nonnegative", "point", "positive"]
+__all__ = ["SWING", "Vector", "count", "down", "lengths", "moments", "nonnegative", "point", "positive", "system"]
 
-#: What a system takes for three numbers.
+#: Three numbers.
 Vector = ArrayLike | Sequence[Number]
 
 #: Axis of planar hinges: a positive turn about -y swings what hangs down towards +x.
 SWING: Final = (0.0, -1.0, 0.0)
 
-# Rods and segments; `ModelBuilder.build` takes few more.
-_MOST: Final = 2000
+# Rods and segments; `ModelBuilder.build` has a similar limit.
+_MAX_COUNT: Final = 2000
+
+
+P = ParamSpec("P")
+_RAISES: Final = """Raises
+------
+InputError
+    A parameter that is not finite or has the wrong sign, or moments that no body has.
+
+"""
+
+
+@overload
+def system(make: Callable[P, Model], /) -> Callable[P, Model]: ...
+@overload
+def system(**rules: Callable[[str, Any], Any]) -> Callable[[Callable[P, Model]], Callable[P, Model]]: ...
+def system(make: Callable[..., Model] | None = None, /, **rules: Callable[[str, Any], Any]) -> Any:
+    """Check the parameters of a system's function before it runs, and document the error.
+
+    Parameters
+    ----------
+    make : callable
+        With keyword parameters that have defaults.
+    **rules : callable
+        By a parameter's name: takes the name and the value, and returns the value to use. By default a whole number is
+        a `count`, gravity is nonnegative, and every other parameter is positive.
+    """
+    if make is None:
+        return partial(system, **rules)
+    defaults = {name: p.default for name, p in inspect.signature(make).parameters.items()}
+    usual = {name: count if type(x) is int else positive for name, x in defaults.items()} | {"gravity": nonnegative}
+
+    @wraps(make)
+    def checked(**values: Any) -> Model:
+        values = defaults | values
+        # An unknown name has no rule, and Python's own error follows.
+        return make(**{n: (rules.get(n) or usual.get(n, lambda _, x: x))(n, x) for n, x in values.items()})
+
+    doc = inspect.cleandoc(make.__doc__ or "")
+    next_section = "Notes\n-----" if "Notes\n-----" in doc else "References\n-----"
+    checked.__doc__ = doc.replace(next_section, _RAISES + next_section)
+    return checked
 
 
 def positive(name: str, value: Number) -> Number:
-    """Return a number above zero, or an expression that is above zero as far as is known: a length, a mass."""
-    if not isinstance(value, Expression):
-        return real(name, value, positive=True)
-    if known(value):
-        real(name, nominal(value), positive=True)
-    return value
+    """Return a number above zero, or an expression whose nominal value, if known, is above zero."""
+    return _signed(name, value, positive=True)
 
 
 def nonnegative(name: str, value: Number) -> Number:
-    """Return a number of at least zero, or an expression that is so as far as is known."""
+    """Return a number of at least zero, or an expression whose nominal value, if known, is at least zero."""
+    return _signed(name, value, nonnegative=True)
+
+
+def _signed(name: str, value: Number, **sign: bool) -> Number:
     if not isinstance(value, Expression):
-        return real(name, value, nonnegative=True)
+        return real(name, value, **sign)
     if known(value):
-        real(name, nominal(value), nonnegative=True)
+        real(name, nominal(value), **sign)
     return value
 
 
 def down(value: Number) -> tuple[float, float, Number]:
-    """Return the gravity vector of an acceleration of at least zero along -z."""
-    return (0.0, 0.0, -nonnegative("gravity", value))
+    """Return the gravity vector of an acceleration along -z."""
+    return (0.0, 0.0, -value)
 
 
 def point(name: str, value: Any) -> tuple[Number, Number, Number]:
@@ -58,23 +101,32 @@ def point(name: str, value: Any) -> tuple[Number, Number, Number]:
     return (x, y, z)
 
 
+def lengths(name: str, value: Any) -> tuple[Number, Number, Number]:
+    """Return three numbers or expressions whose nominal values are above zero."""
+    sides = point(name, value)
+    values = [nominal(x) for x in sides]
+    if any(x <= 0 for x in values):
+        raise InputError(f"{name}: expected three lengths above 0, got ({', '.join(f'{x:g}' for x in values)}) m")
+    return sides
+
+
 def moments(name: str, value: Any) -> tuple[Number, Number, Number]:
     """Return three principal moments of inertia that matter can have."""
-    given = point(name, value)
-    if not all(known(x) for x in given):
-        return given
-    a, b, c = (nominal(x) for x in given)
+    principal = point(name, value)
+    if not all(known(x) for x in principal):
+        return principal
+    a, b, c = (nominal(x) for x in principal)
     if min(a, b, c) < 0 or 2 * max(a, b, c) > (a + b + c) * (1 + 1e-12):
         raise InputError(f"{name}: expected moments of at least 0 with A + B >= C, got ({a:g}, {b:g}, {c:g}) kg m²")
-    return given
+    return principal
 
 
 def count(name: str, value: int) -> int:
-    """Return a whole number of at least one, and of no more than a description holds."""
+    """Return a whole number from one to the most that a description holds."""
     try:
         n = 0 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         n = 0
-    if not 1 <= n <= _MOST:
-        raise InputError(f"{name}: expected a whole number from 1 to {_MOST}, got {shown(value)}")
+    if not 1 <= n <= _MAX_COUNT:
+        raise InputError(f"{name}: expected a whole number from 1 to {_MAX_COUNT}, got {shown(value)}")
     return n

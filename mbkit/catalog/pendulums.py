@@ -1,13 +1,14 @@
-"""The mathematical pendulum."""
+"""Pendulums and chains."""
 
 from __future__ import annotations
 
-from mbkit.catalog._parameters import SWING, count, down, positive
+from mbkit.catalog._parameters import SWING, down, system
 from mbkit.model import Model, ModelBuilder, Number, known, nominal
 
 __all__ = ["chain", "double_pendulum", "elastic_pendulum", "pendulum", "spherical_pendulum"]
 
 
+@system
 def pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81) -> Model:
     """Return a point mass on a massless rod.
 
@@ -23,17 +24,11 @@ def pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite or has the wrong sign.
-
     References
     ----------
     Landau, Lifshitz 1976, Mechanics, §11 problem 1; IFToMM library of
     computational benchmark problems, A01, which starts at θ = -π/2.
     """
-    length, mass = positive("length", length), positive("mass", mass)
     b = ModelBuilder("pendulum", gravity=down(gravity))
     b.add_body("bob", mass=mass, com=(0.0, 0.0, -length))
     b.add_joint("theta", "continuous", parent="world", child="bob", axis=SWING)
@@ -41,9 +36,7 @@ def pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81
     return b.build()
 
 
-# The double pendulum.
-
-
+@system
 def double_pendulum(
     *,
     length1: Number = 1.0,
@@ -67,29 +60,20 @@ def double_pendulum(
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite or has the wrong sign.
-
     References
     ----------
     Landau, Lifshitz 1976, Mechanics, §5 problem 1.
     """
-    l1, m1 = positive("length1", length1), positive("mass1", mass1)
-    l2, m2 = positive("length2", length2), positive("mass2", mass2)
     b = ModelBuilder("double_pendulum", gravity=down(gravity))
-    b.add_body("rod1", mass=m1, com=(0.0, 0.0, -l1))
-    b.add_body("rod2", mass=m2, com=(0.0, 0.0, -l2))
+    b.add_body("rod1", mass=mass1, com=(0.0, 0.0, -length1))
+    b.add_body("rod2", mass=mass2, com=(0.0, 0.0, -length2))
     b.add_joint("theta1", "continuous", parent="world", child="rod1", axis=SWING)
-    b.add_joint("theta2", "continuous", parent="rod1", child="rod2", axis=SWING, translation=(0.0, 0.0, -l1))
-    b.add_frame("tip", body="rod2", translation=(0.0, 0.0, -l2))
+    b.add_joint("theta2", "continuous", parent="rod1", child="rod2", axis=SWING, translation=(0.0, 0.0, -length1))
+    b.add_frame("tip", body="rod2", translation=(0.0, 0.0, -length2))
     return b.build()
 
 
-# The spherical pendulum.
-
-
+@system
 def spherical_pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81) -> Model:
     """Return a point mass on a massless rod that hangs in a Cardan suspension.
 
@@ -107,11 +91,6 @@ def spherical_pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Num
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite or has the wrong sign.
-
     Notes
     -----
     The textbooks' coordinates, azimuth φ and angle ϑ from the downward vertical, have no
@@ -125,7 +104,6 @@ def spherical_pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Num
     ----------
     Landau, Lifshitz 1976, Mechanics, §14 problem 1.
     """
-    length, mass = positive("length", length), positive("mass", mass)
     b = ModelBuilder("spherical_pendulum", gravity=down(gravity))
     b.add_body("fork", mass=0.0)
     b.add_body("bob", mass=mass, com=(0.0, 0.0, -length))
@@ -135,9 +113,7 @@ def spherical_pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Num
     return b.build()
 
 
-# The elastic pendulum.
-
-
+@system
 def elastic_pendulum(
     *, length: Number = 1.0, mass: Number = 1.0, stiffness: Number = 100.0, gravity: Number = 9.81
 ) -> Model:
@@ -160,18 +136,12 @@ def elastic_pendulum(
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite or has the wrong sign.
-
     References
     ----------
     Vitt, Gorelik 1933, Oscillations of an elastic pendulum as an example of two
     parametrically coupled linear systems: swing and stretch exchange their energy
     where stiffness length' = 4 mass gravity nearly holds, length' the length at which it hangs at rest.
     """
-    length, mass = positive("length", length), positive("mass", mass)
     lower = -nominal(length) / 2 if known(length) else None
     b = ModelBuilder("elastic_pendulum", gravity=down(gravity))
     b.add_body("rod", mass=0.0)
@@ -184,15 +154,13 @@ def elastic_pendulum(
         child="bob",
         axis=(0.0, 0.0, -1.0),
         lower=lower,
-        stiffness=positive("stiffness", stiffness),
+        stiffness=stiffness,
     )
     b.add_frame("tip", body="bob", translation=(0.0, 0.0, -length))
     return b.build()
 
 
-# A planar chain of thin rods.
-
-
+@system
 def chain(*, n: int = 5, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81) -> Model:
     """Return n equal thin rods hinged end to end, hanging from the origin.
 
@@ -210,18 +178,11 @@ def chain(*, n: int = 5, length: Number = 1.0, mass: Number = 1.0, gravity: Numb
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite or has the wrong sign.
-
     References
     ----------
     Featherstone 2004, An empirical study of the joint space inertia matrix: the
     straight chain's mass matrix has a condition number of about 4 n⁴.
     """
-    n = count("n", n)
-    length, mass = positive("length", length), positive("mass", mass)
     across = mass * length**2 / 12
     b = ModelBuilder(f"chain_{n}", gravity=down(gravity))
     for i in range(1, n + 1):

@@ -1,14 +1,14 @@
-"""The free rigid body."""
+"""Single rigid bodies: free, with a fixed point, and in gimbals."""
 
 from __future__ import annotations
 
-from mbkit.catalog._parameters import Vector, down, moments, nonnegative, point, positive
-from mbkit.errors import InputError
-from mbkit.model import Model, ModelBuilder, Number, nominal
+from mbkit.catalog._parameters import Vector, down, lengths, moments, nonnegative, point, system
+from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["free_body", "gyroscope", "heavy_top"]
 
 
+@system(sides=lengths)
 def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: Number = 0.0) -> Model:
     """Return a homogeneous box that floats freely.
 
@@ -25,22 +25,13 @@ def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: 
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite or has the wrong sign.
-
     References
     ----------
     Gazebo's "boxes" benchmark, complex case without gravity: it starts with
     ω = (0.1, 5, 0.1) rad/s about the middle axis and tumbles, as Dzhanibekov saw a wing nut
     do (Ashbaugh, Chicone, Cushman 1991, The twisting tennis racket).
     """
-    mass = positive("mass", mass)
     a, b, c = point("sides", sides)
-    told = [nominal(x) for x in (a, b, c)]
-    if any(x <= 0 for x in told):
-        raise InputError(f"sides: expected three lengths above 0, got ({', '.join(f'{x:g}' for x in told)}) m")
     inertia = tuple(mass / 12 * x for x in (b * b + c * c, a * a + c * c, a * a + b * b))
     builder = ModelBuilder("free_body", gravity=down(gravity))
     builder.add_body("box", mass=mass, inertia=inertia)
@@ -48,9 +39,7 @@ def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: 
     return builder.build()
 
 
-# The heavy top.
-
-
+@system(inertia=moments, com=point)
 def heavy_top(
     *,
     mass: Number = 15.0,
@@ -75,28 +64,19 @@ def heavy_top(
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite, has the wrong sign, or moments that no
-        body has.
-
     References
     ----------
     Terze, Müller, Zlatar 2016, Singularity-free time integration of rotational
     quaternions using non-redundant ordinary differential equations: the default
     values; it starts from the identity with ω = (0, 150, -4.61538) rad/s.
     """
-    mass = positive("mass", mass)
     b = ModelBuilder("heavy_top", gravity=down(gravity))
-    b.add_body("top", mass=mass, com=point("com", com), inertia=moments("inertia", inertia))
+    b.add_body("top", mass=mass, com=com, inertia=inertia)
     b.add_joint("spin", "ball", parent="world", child="top")
     return b.build()
 
 
-# The gyroscope in two gimbals.
-
-
+@system(inner_inertia=moments, offset=nonnegative)
 def gyroscope(
     *,
     rotor_mass: Number = 1.0,
@@ -133,27 +113,19 @@ def gyroscope(
     gravity : float or Parameter
         m/s², along -z.
 
-    Raises
-    ------
-    InputError
-        A parameter that is not finite, has the wrong sign, or moments that no
-        body has.
-
     References
     ----------
     Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 5.7, for the rotor; Magnus 1971, Kreisel, for what
     the gimbals' inertia changes. The default values are those of a classroom gyroscope.
     """
-    axial, across = positive("rotor_axial", rotor_axial), positive("rotor_across", rotor_across)
-    ring, outer = positive("gimbal_mass", gimbal_mass), positive("outer_inertia", outer_inertia)
     b = ModelBuilder("gyroscope", gravity=down(gravity))
-    b.add_body("outer gimbal", mass=ring, inertia=(outer, outer, outer))
-    b.add_body("inner gimbal", mass=ring, inertia=moments("inner_inertia", inner_inertia))
+    b.add_body("outer gimbal", mass=gimbal_mass, inertia=(outer_inertia, outer_inertia, outer_inertia))
+    b.add_body("inner gimbal", mass=gimbal_mass, inertia=inner_inertia)
     b.add_body(
         "rotor",
-        mass=positive("rotor_mass", rotor_mass),
-        com=(0.0, nonnegative("offset", offset), 0.0),
-        inertia=moments("rotor_axial", (across, axial, across)),
+        mass=rotor_mass,
+        com=(0.0, offset, 0.0),
+        inertia=moments("rotor_axial", (rotor_across, rotor_axial, rotor_across)),
     )
     b.add_joint("precession", "continuous", parent="world", child="outer gimbal", axis=(0.0, 0.0, 1.0))
     b.add_joint("nutation", "continuous", parent="outer gimbal", child="inner gimbal", axis=(1.0, 0.0, 0.0))
