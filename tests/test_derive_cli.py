@@ -14,10 +14,10 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.lagrangian import systems
-from mbkit.lagrangian.printer import Blackboard, folded, written
+from mbkit.lagrangian.printer import ExpressionPrinter, folded, written
 from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
 from mbkit.lagrangian.printing.numpy_module import python_code
-from mbkit.lagrangian.printing.summary import Account
+from mbkit.lagrangian.printing.summary import SystemSummary
 from mbkit.load.robot_data import find
 
 
@@ -75,7 +75,7 @@ def test_terms_and_factors_stand_where_one_writes_them():
     assert "((A - C) φ̇ cos θ - ½ C ψ̇) sin θ" in derive("heavy_top").stdout
     # Coordinates in their own order, not the alphabet's, and no line beyond the page.
     names = sp.symbols("q1:12")
-    board = Blackboard(names, sp.symbols("v1:12"))
+    board = ExpressionPrinter(names, sp.symbols("v1:12"))
     assert board.text(sp.cos(sum(names))).endswith("q₉ + q₁₀ + q₁₁)")
     a, b, m = sp.symbols("m1 m2 m3")
     v = sp.Symbol("v1")
@@ -134,7 +134,7 @@ def test_a_files_rounded_quarter_turn_is_read_as_exact_and_said(tmp_path):
 def test_derivation_says_how_far_it_is():
     seen = []
     lag = systems.get("double_pendulum")()
-    Account(lag, progress=lambda fraction, what: seen.append((fraction, what))).text()
+    SystemSummary(lag, progress=lambda fraction, what: seen.append((fraction, what))).text()
     assert [what for _, what in seen][-2:] == ["equation 1 of 2", "equation 2 of 2"]
     assert sorted(seen) == seen
     assert seen[0][0] == 0.0
@@ -242,7 +242,7 @@ def test_symbols_as_they_are_written():
 
 def test_expressions_on_one_line():
     orbit = systems.kepler()
-    board = Blackboard(orbit.coordinates, orbit.velocities)
+    board = ExpressionPrinter(orbit.coordinates, orbit.velocities)
     m, k, r, g, th = sp.symbols("m k r g theta")
     told = {
         -k / r: "-k/r",

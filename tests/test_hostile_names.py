@@ -25,7 +25,7 @@ import mbkit as mb
 from mbkit import _escape
 from mbkit.cli import cli
 from mbkit.lagrangian.printing.numpy_module import python_code
-from mbkit.lagrangian.printing.summary import Account
+from mbkit.lagrangian.printing.summary import SystemSummary
 
 #: Code for every reader of an output, and what a terminal obeys. XML can hold the first of them.
 SEEN = (
@@ -180,7 +180,7 @@ def test_a_symbol_of_any_name_is_a_variable_of_its_own(name):
 
 
 def test_what_sympy_evaluates_holds_only_names():
-    data = Account(paper()).data()
+    data = SystemSummary(paper()).data()
     names = {*data["coordinates"], *data["velocities"], *data["accelerations"], *data["parameters"]}
     assert all(n.isidentifier() for n in names)
     assert len(names) == 8
@@ -189,10 +189,10 @@ def test_what_sympy_evaluates_holds_only_names():
 
 
 def test_latex_has_no_command_of_a_name():
-    account = Account(paper())
+    account = SystemSummary(paper())
     assert is_latex(account.latex())
     assert not [line for line in account.latex().splitlines() if line.lstrip().startswith(("\\input", "import"))]
-    ordinary = Account(mb.lagrangian.systems.get("double_pendulum")()).latex()
+    ordinary = SystemSummary(mb.lagrangian.systems.get("double_pendulum")()).latex()
     assert r"\dot{\theta}_{1}" in ordinary
     assert "mathrm" not in ordinary
 

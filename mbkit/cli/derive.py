@@ -154,9 +154,9 @@ def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: boo
 
         bar(0.1, "equations")
         return python_code(lag).rstrip("\n"), ".py"
-    from mbkit.lagrangian.printing.summary import Account
+    from mbkit.lagrangian.printing.summary import SystemSummary
 
-    account = Account(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text))
+    account = SystemSummary(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text))
     if as_json:
         import json
 

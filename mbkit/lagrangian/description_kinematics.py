@@ -18,8 +18,8 @@ import sympy as sp
 
 from mbkit._check import Array
 from mbkit.errors import InputError
-from mbkit.lagrangian.trig.polynomial import Harmonic, Key, Space
-from mbkit.lagrangian.trig.shortest_form import number, written_out
+from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
+from mbkit.lagrangian.trig.shortest_form import number, shortest_form
 from mbkit.model import Joint, JointCoupling, Model
 from mbkit.model.joint_types import cross3
 from mbkit.model.parts import Loop, Prescribed
@@ -94,7 +94,7 @@ class SymbolicKinematics:
         }
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
         self.coordinates = coordinates
-        self.space = Space(model.name, angles, generators, instead=instead_of_writing(model))
+        self.space = TrigRing(model.name, angles, generators, instead=instead_of_writing(model))
         self.values = {
             (where, part.name): self._read(where, part, fields)
             for where, fields in _FIELDS.items()
@@ -166,7 +166,7 @@ class SymbolicKinematics:
             i, ratio = self._velocity(joint, k)
             yield i, ([ratio * x for x in linear], [ratio * x for x in angular])
 
-    def _velocity(self, joint: Joint, k: int) -> tuple[int, Harmonic]:
+    def _velocity(self, joint: Joint, k: int) -> tuple[int, TrigPolynomial]:
         """Return the index of a joint's velocity, its leader's if it mimics, and the ratio to it."""
         at = self.model.layout.v[joint.mimic.joint if joint.mimic else joint.name].start + k
         return at, self.space.of(self._v[joint.name][k] / self.velocities[at])
@@ -246,7 +246,7 @@ class SymbolicKinematics:
         total = -_dot(gravity, moments["world"])
         self.drop_dust([total])
         # Height by height rather than with g before them all, so that forces read term by term.
-        return self._back(written_out(total, whole=False))
+        return self._back(shortest_form(total, whole=False))
 
     @cached_property
     def spring_energy(self) -> sp.Expr:
@@ -307,7 +307,7 @@ class SymbolicKinematics:
 
     def shown(self, x: Any) -> sp.Expr:
         """Return a sum as it is shown."""
-        return self._back(written_out(x))
+        return self._back(shortest_form(x))
 
     def moves(self, key: Key) -> bool:
         """Return whether a term of a sum depends on a coordinate."""
@@ -522,7 +522,7 @@ def _at_rest(way: _Way) -> Array:
     return R
 
 
-def _independent(kin: SymbolicKinematics, sums: list[Harmonic], told: str) -> list[sp.Expr]:
+def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], told: str) -> list[sp.Expr]:
     """Return those of three sums that the others do not imply."""
     # This loads SciPy.
     from scipy.linalg import qr
@@ -541,7 +541,7 @@ def _independent(kin: SymbolicKinematics, sums: list[Harmonic], told: str) -> li
         weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
         left = A[i] - weights @ A[kept]
         if np.abs(left[~moving]).max(initial=0.0) > _MEETS * largest:
-            rest = kin.shown(Harmonic(kin.space, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
+            rest = kin.shown(TrigPolynomial(kin.space, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
             why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
             raise InputError(f"{kin.model.name}: {told}, whatever the joints do{'' if weights.any() else why}")
     return [kin.shown(sums[i]) for i in kept]

@@ -23,7 +23,7 @@ from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
 from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.quasi_velocities import VelocityMap
 from mbkit.lagrangian.energies.symbols import plain
-from mbkit.lagrangian.printer import Blackboard
+from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.model import Model
 from mbkit.model.description import Needs
 from mbkit.model.joint_types import PRISMATIC
@@ -34,7 +34,7 @@ __all__ = ["EnergyModel", "abstract_parts", "energies_latex"]
 
 def energies_latex(form: EnergyForm) -> str:
     """Return T and V as inline LaTeX."""
-    board = Blackboard(form.coordinates, form.velocities, time=form.time)
+    board = ExpressionPrinter(form.coordinates, form.velocities, time=form.time)
     return f"$T = {board.latex(form.T)},\\quad V = {board.latex(form.V)}$"
 
 

@@ -18,7 +18,7 @@ from sympy.printing.pretty.pretty_symbology import pretty_symbol
 
 from mbkit._escape import latex, one_line
 
-__all__ = ["Abbreviations", "Blackboard", "folded", "matrix", "spread", "written"]
+__all__ = ["Abbreviations", "ExpressionPrinter", "folded", "matrix", "spread", "written"]
 
 
 _FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
@@ -29,7 +29,7 @@ _READ: Final = 10_000
 _INERTIA: Final = re.compile(r"[A-CIJ](\d*|_\w+)|EI")
 
 
-class Blackboard:
+class ExpressionPrinter:
     """How expressions of one system are written, on one line of text or in LaTeX.
 
     Parameters

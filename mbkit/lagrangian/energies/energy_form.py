@@ -27,7 +27,7 @@ from mbkit.lagrangian.energies.symbols import (
     velocity_of,
 )
 from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
-from mbkit.lagrangian.trig.zero_test import vanishes
+from mbkit.lagrangian.trig.zero_test import is_zero
 
 __all__ = [
     "EnergyForm",
@@ -183,7 +183,7 @@ class EnergyForm:
 
 def vanish(parts: Iterable[sp.Expr]) -> bool:
     """Return whether all expressions are zero; decimals that cancel do so in their own digits only."""
-    return all(vanishes(x) or (x.has(sp.Float) and tidy(x) == 0) for x in parts)
+    return all(is_zero(x) or (x.has(sp.Float) and tidy(x) == 0) for x in parts)
 
 
 def acting_forces(form: EnergyForm) -> list[sp.Expr]:

@@ -14,8 +14,8 @@ from sympy.matrices.exceptions import NonInvertibleMatrixError
 from mbkit._escape import one_line, terminal
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm
-from mbkit.lagrangian.printer import Abbreviations, Blackboard, spread
-from mbkit.lagrangian.trig.shortest_form import cost
+from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, spread
+from mbkit.lagrangian.trig.shortest_form import complexity
 from mbkit.lagrangian.trig.simplify import gradient, slope, tidy, tidy_matrix
 
 __all__ = ["EquationsOfMotion", "christoffel", "equations_of_motion", "printed_equations"]
@@ -119,7 +119,7 @@ class EquationsOfMotion:
 
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block, in the order of a blackboard."""
-        board = Blackboard(self.coordinates, self.velocities, self.accelerations, self.multipliers)
+        board = ExpressionPrinter(self.coordinates, self.velocities, self.accelerations, self.multipliers)
         shown = (*self.mass_matrix, *self.coriolis_force, *self.drift, *self.potential_gradient, *self.forces)
         shown = (*shown, *self.constraints)
         short = Abbreviations(shown, set().union(*(x.free_symbols for x in shown)))
@@ -153,7 +153,7 @@ def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
 
 def printed_equations(
     e: EquationsOfMotion,
-    board: Blackboard,
+    board: ExpressionPrinter,
     short: Abbreviations,
     *,
     latex: bool = False,
@@ -184,7 +184,7 @@ def _by_speeds(x: sp.Expr, velocities: tuple[sp.Symbol, ...]) -> sp.Expr:
     terms = ((tidy(sp.diff(x, v, w) / (2 if v == w else 1)), v * w) for v, w in pairs)
     grouped = sp.Add(*(factor * pair for factor, pair in terms))
     brackets = (a for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add)
-    return grouped if cost(grouped) < cost(x) or any(a.has(sp.sin, sp.cos) for a in brackets) else x
+    return grouped if complexity(grouped) < complexity(x) or any(a.has(sp.sin, sp.cos) for a in brackets) else x
 
 
 def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> EquationsOfMotion:

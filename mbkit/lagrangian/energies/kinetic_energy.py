@@ -13,9 +13,9 @@ import numpy as np
 import sympy as sp
 
 from mbkit.errors import InputError
-from mbkit.lagrangian.trig.shortest_form import cost
+from mbkit.lagrangian.trig.shortest_form import complexity
 from mbkit.lagrangian.trig.simplify import LARGE, tidy
-from mbkit.lagrangian.trig.zero_test import DIGITS, Probe
+from mbkit.lagrangian.trig.zero_test import DIGITS, RandomEvaluation
 
 __all__ = ["KineticSplit", "Squares", "blocks", "inverse", "require_inertia", "split"]
 
@@ -102,7 +102,7 @@ def _check(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> None:
 
 def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
     """Return whether an expression is of second degree at most: along random lines its third differences are zero."""
-    probe = Probe([x], velocities)
+    probe = RandomEvaluation([x], velocities)
     with mpmath.workdps(DIGITS):
         for seed in range(_LINES):
             start, way = probe.place(2 * seed), probe.place(2 * seed + 1)
@@ -143,7 +143,7 @@ def require_inertia(
         bound = " and no constraint holds its coordinate" if constraints else ""
         names = ", ".join(w.name for w in idle)
         raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {names}{bound}")
-    probe = Probe([*M, *J])
+    probe = RandomEvaluation([*M, *J])
     for seed in range(_PLACES):
         values = probe(probe.place(seed))
         if values is None:
@@ -275,7 +275,7 @@ class Squares:
             part = sp.ImmutableMatrix(M.extract(block, block))
             p = sp.symbols(f"p0:{len(block)}", cls=sp.Dummy)
             tried = _tried(part, f"{what} {sp.Matrix(M).tolist()}")
-            self._blocks.append((block, min(tried, key=lambda a: cost(a.form(p, p)) if len(tried) > 1 else 0)))
+            self._blocks.append((block, min(tried, key=lambda a: complexity(a.form(p, p)) if len(tried) > 1 else 0)))
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
         """Return xᵀ M⁻¹ y."""

@@ -12,10 +12,10 @@ import sympy as sp
 from mbkit._escape import identifier, one_line
 from mbkit._version import __version__
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion, printed_equations
-from mbkit.lagrangian.printer import Abbreviations, Blackboard, folded, matrix, spread, written
+from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, folded, matrix, spread, written
 from mbkit.lagrangian.system import Lagrangian
 
-__all__ = ["Account"]
+__all__ = ["SystemSummary"]
 
 #: Operations of T above which C and the equations are left out of a page.
 _READABLE: Final = 1500
@@ -25,7 +25,7 @@ _WRITTEN: Final = 6000
 _LONG: Final = 800
 
 
-class Account:
+class SystemSummary:
     """A system's energies, matrices and equations as text, LaTeX or data.
 
     Parameters
@@ -55,9 +55,9 @@ class Account:
         return self.system.equations()
 
     @cached_property
-    def _board(self) -> Blackboard:
+    def _board(self) -> ExpressionPrinter:
         e = self.equations
-        return Blackboard(e.coordinates, e.velocities, e.accelerations, e.multipliers, time=self.system.time)
+        return ExpressionPrinter(e.coordinates, e.velocities, e.accelerations, e.multipliers, time=self.system.time)
 
     @cached_property
     def _short(self) -> Abbreviations:

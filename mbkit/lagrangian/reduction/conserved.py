@@ -17,7 +17,7 @@ import sympy as sp
 
 from mbkit._escape import one_line, terminal
 from mbkit.lagrangian.energies.energy_form import EnergyForm, acting_forces, vanish
-from mbkit.lagrangian.printer import Blackboard
+from mbkit.lagrangian.printer import ExpressionPrinter
 
 __all__ = [
     "JACOBI",
@@ -62,7 +62,7 @@ class ConservedQuantity:
 
     def latex(self) -> str:
         """Return name = expression."""
-        board = Blackboard(*self.moving)
+        board = ExpressionPrinter(*self.moving)
         return f"{board.latex(sp.Symbol(self.name))} = {board.latex(self.expression)}"
 
     def _repr_latex_(self) -> str:

@@ -33,11 +33,11 @@ from mbkit.lagrangian.energies.energy_form import (
 from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import free_name, velocity_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
-from mbkit.lagrangian.printer import Blackboard
+from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.lagrangian.reduction import conserved
 from mbkit.lagrangian.reduction.conserved import ConservedQuantity
 from mbkit.lagrangian.trig.simplify import slope, tidy
-from mbkit.lagrangian.trig.zero_test import vanishes
+from mbkit.lagrangian.trig.zero_test import is_zero
 
 __all__ = ["CanonicalEquations", "Hamiltonian", "bracket", "hamiltonian", "momentum_symbols", "shorter"]
 
@@ -71,7 +71,7 @@ def bracket(f: Any, g: Any, coordinates: Sequence[sp.Symbol], momenta: Sequence[
 
 def shorter(x: sp.Expr) -> sp.Expr:
     """Return a short bracket tidied, and a long one as it is unless it is zero: nested ones grow fast."""
-    if vanishes(x):
+    if is_zero(x):
         return sp.Integer(0)
     return tidy(x) if x.count_ops() <= _SHORT else x
 
@@ -104,7 +104,7 @@ class CanonicalEquations:
 
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block."""
-        board = Blackboard(self.coordinates, self.momenta)
+        board = ExpressionPrinter(self.coordinates, self.momenta)
         rows = (f"{board.latex(e.lhs)} &= {board.latex(e.rhs)}" for e in self.equations())
         return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
 
@@ -156,7 +156,7 @@ class Hamiltonian:
 
     @cached_property
     def is_conserved(self) -> bool:
-        """Whether dH/dt = ∂H/∂t + Qᵀ q̇ vanishes."""
+        """Whether dH/dt = ∂H/∂t + Qᵀ q̇ is zero."""
         return conserved.keeps_energy(self.system)
 
     @cached_property
@@ -304,7 +304,7 @@ class Hamiltonian:
 
     def latex(self) -> str:
         """Return H = ... ."""
-        return f"H = {Blackboard(self.coordinates, self.momenta, time=self.system.time).latex(self.H)}"
+        return f"H = {ExpressionPrinter(self.coordinates, self.momenta, time=self.system.time).latex(self.H)}"
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"

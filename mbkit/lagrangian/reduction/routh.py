@@ -34,7 +34,7 @@ from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.energy_model import EnergyModel
-from mbkit.lagrangian.printer import Blackboard
+from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.lagrangian.reduction.hamilton import momentum_symbols
 from mbkit.lagrangian.trig.simplify import tidy
 
@@ -165,7 +165,7 @@ class Routhian(Generic[FormT]):
     def latex(self) -> str:
         """Return R, the momenta and the ignored rates as an aligned LaTeX block."""
         whole, s = self.system, self.lagrangian
-        board = Blackboard(whole.coordinates, whole.velocities, tuple(self.momenta), time=whole.time)
+        board = ExpressionPrinter(whole.coordinates, whole.velocities, tuple(self.momenta), time=whole.time)
         named = dict(zip(whole.coordinates, whole.velocities, strict=True))
         told = [(sp.Symbol("R"), s.L), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
         lines = (f"{board.latex(left)} &= {board.latex(right)}" for left, right in told)

@@ -24,7 +24,7 @@ from mbkit.lagrangian.statics.force_balance import BALANCED, Balance
 from mbkit.lagrangian.statics.small_motion import SmallMotion
 from mbkit.lagrangian.system import Lagrangian
 
-__all__ = ["Equilibrium", "equilibrium", "sought"]
+__all__ = ["Equilibrium", "equilibrium", "find_equilibrium"]
 
 
 # The search for a configuration at rest: Newton's iteration, damped after Levenberg and Marquardt far from the end.
@@ -32,7 +32,7 @@ __all__ = ["Equilibrium", "equilibrium", "sought"]
 _MOST: Final = 200
 
 
-def sought(balance: Balance, starts: list[Array], tau: Array) -> tuple[Array, Array]:
+def find_equilibrium(balance: Balance, starts: list[Array], tau: Array) -> tuple[Array, Array]:
     """Return the first configuration at rest that is found, and λ there.
 
     Raises
@@ -255,7 +255,7 @@ def equilibrium(
         starts = [dyn.model.random_state(rng)[0] for _ in range(_STARTS)]
         # From the neutral configuration there need be no way to the constraints.
         starts[:0] = [] if dyn.model.constrained else [dyn.model.neutral()]
-    q, multipliers = sought(balance, starts, tau)
+    q, multipliers = find_equilibrium(balance, starts, tau)
     return _told(balance, q, tau, multipliers)
 
 

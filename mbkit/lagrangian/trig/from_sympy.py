@@ -16,8 +16,8 @@ from typing import Any, Final
 import sympy as sp
 
 from mbkit.errors import UnsupportedError
-from mbkit.lagrangian.trig.polynomial import Harmonic, Key, Space, quotient
-from mbkit.lagrangian.trig.shortest_form import written_out
+from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, quotient
+from mbkit.lagrangian.trig.shortest_form import shortest_form
 
 __all__ = ["forms", "shortened"]
 
@@ -78,19 +78,19 @@ class _Power:
     base : sympy.Expr
     root : bool
         √base; else 1/base.
-    sum : Harmonic
+    sum : TrigPolynomial
         The base.
     """
 
     base: sp.Expr
     root: bool
-    sum: Harmonic
+    sum: TrigPolynomial
 
     @property
     def written(self) -> sp.Expr:
         return sp.sqrt(self.base) if self.root else 1 / self.base
 
-    def times(self, x: Harmonic, exponent: int) -> Harmonic:
+    def times(self, x: TrigPolynomial, exponent: int) -> TrigPolynomial:
         """Return x · base^exponent."""
         for _ in range(exponent):
             x = x * self.sum
@@ -106,7 +106,7 @@ class _Reading:
         self._powers: dict[sp.Expr, sp.Dummy] = {}
         self._gather(x)
         generators = [*self._symbols, *self._powers.values()]
-        self._space = Space("expression", list(self._angles), generators, _MOST)
+        self._space = TrigRing("expression", list(self._angles), generators, _MOST)
         self._known: dict[sp.Dummy, _Power] = {}
         self._decimals = x.has(sp.Float)
         self.sum = self._read(x)
@@ -132,7 +132,7 @@ class _Reading:
             self._gather(x.base)
             self._powers.setdefault(_power(x), sp.Dummy())
 
-    def _read(self, x: Any) -> Harmonic:
+    def _read(self, x: Any) -> TrigPolynomial:
         space = self._space
         if x.is_Float:
             return space.number(Fraction(repr(float(x))))
@@ -157,7 +157,7 @@ class _Reading:
             return space.power(x.base, int(x.exp))
         return self._read_power(x)
 
-    def _read_power(self, x: Any) -> Harmonic:
+    def _read_power(self, x: Any) -> TrigPolynomial:
         root = sp.sqrt(x.base)
         # One over what is under a root is a power of the root.
         written = root if root in self._powers else 1 / x.base
@@ -172,10 +172,10 @@ class _Reading:
 
     # Writing
 
-    def _written(self, x: Harmonic) -> sp.Expr:
+    def _written(self, x: TrigPolynomial) -> sp.Expr:
         if len(x.terms) > _LONG:
             raise UnsupportedError(f"expression: {len(x.terms)} terms are more than anybody reads")
-        return self._back(written_out(x, decimals=self._decimals))
+        return self._back(shortest_form(x, decimals=self._decimals))
 
     def _back(self, x: sp.Expr) -> sp.Expr:
         # One may stand in the base of another.
@@ -196,7 +196,7 @@ class _Reading:
         total = self._over_one(self.sum, list(reversed(self._known)))
         return [total, sp.factor_terms(total)]
 
-    def _over_one(self, x: Harmonic, left: list[sp.Dummy]) -> sp.Expr:
+    def _over_one(self, x: TrigPolynomial, left: list[sp.Dummy]) -> sp.Expr:
         """Return a sum as a numerator and powers of what the generators stand for, for each set of roots one."""
         if not left:
             return self._written(x)
@@ -215,10 +215,10 @@ class _Reading:
         return self._back(out)
 
 
-def _by_parity(x: Harmonic, i: int) -> list[Harmonic]:
+def _by_parity(x: TrigPolynomial, i: int) -> list[TrigPolynomial]:
     """Return the terms with even and those with odd powers of a generator."""
     parts = [{key: value for key, value in x.terms.items() if key[2][i] % 2 == odd} for odd in (0, 1)]
-    return [Harmonic(x.space, terms) for terms in parts if terms]
+    return [TrigPolynomial(x.space, terms) for terms in parts if terms]
 
 
 def _least(exponents: set[int], root: bool) -> int:
@@ -229,15 +229,15 @@ def _least(exponents: set[int], root: bool) -> int:
     return min(least, least % 2)
 
 
-def _shared(x: Harmonic, i: int, least: int, power: _Power, step: int) -> Harmonic:
+def _shared(x: TrigPolynomial, i: int, least: int, power: _Power, step: int) -> TrigPolynomial:
     """Return a sum over a power of a generator, whose other powers are written out."""
     parts: dict[int, dict[Key, Fraction]] = {}
     for (kind, turns, powers), value in x.terms.items():
         bare = (*powers[:i], 0, *powers[i + 1 :])
         parts.setdefault((powers[i] - least) // step, {})[kind, turns, bare] = value
-    out = Harmonic(x.space, {})
+    out = TrigPolynomial(x.space, {})
     for exponent, terms in parts.items():
-        out = out + power.times(Harmonic(x.space, terms), exponent)
+        out = out + power.times(TrigPolynomial(x.space, terms), exponent)
     return out
 
 

@@ -15,7 +15,7 @@ import sympy as sp
 
 from mbkit.errors import UnsupportedError
 
-__all__ = ["MOST", "Harmonic", "Space", "quotient"]
+__all__ = ["MOST", "TrigPolynomial", "TrigRing", "quotient"]
 
 
 #: Products of terms that one system may cost. A robot with six joints costs 10,000, a planar chain of 19 twice that.
@@ -25,7 +25,7 @@ MOST: Final = 200_000
 Key = tuple[int, tuple[int, ...], tuple[int, ...]]
 
 
-class Space:
+class TrigRing:
     """Angles and generators that a system's terms are made of.
 
     Parameters
@@ -58,12 +58,12 @@ class Space:
         self.one: Key = (0, self.still, self.plain)
         self.cost = 0
 
-    def number(self, value: Any) -> Harmonic:
+    def number(self, value: Any) -> TrigPolynomial:
         """Return a constant."""
         x = Fraction(value)
-        return Harmonic(self, {self.one: x} if x else {})
+        return TrigPolynomial(self, {self.one: x} if x else {})
 
-    def of(self, expression: Any) -> Harmonic:
+    def of(self, expression: Any) -> TrigPolynomial:
         """Return a polynomial of the generators."""
         terms: dict[Key, Fraction] = {}
         for term in sp.Add.make_args(sp.expand(expression)):
@@ -77,34 +77,34 @@ class Space:
                     exponents[self._generator[base]] += int(exponent)
             if number:
                 _gather(terms, (0, self.still, tuple(exponents)), Fraction(int(number.p), int(number.q)))
-        return Harmonic(self, terms)
+        return TrigPolynomial(self, terms)
 
-    def power(self, generator: sp.Expr, exponent: int) -> Harmonic:
+    def power(self, generator: sp.Expr, exponent: int) -> TrigPolynomial:
         """Return a power of a generator, of either sign."""
         exponents = list(self.plain)
         exponents[self._generator[generator]] = exponent
-        return Harmonic(self, {(0, self.still, tuple(exponents)): Fraction(1)})
+        return TrigPolynomial(self, {(0, self.still, tuple(exponents)): Fraction(1)})
 
-    def cos(self, angle: Any) -> Harmonic:
+    def cos(self, angle: Any) -> TrigPolynomial:
         """Return the cosine of a sum of angles."""
         return self._turned(0, angle)
 
-    def sin(self, angle: Any) -> Harmonic:
+    def sin(self, angle: Any) -> TrigPolynomial:
         """Return the sine of a sum of angles."""
         return self._turned(1, angle)
 
-    def _turned(self, kind: int, angle: Any) -> Harmonic:
+    def _turned(self, kind: int, angle: Any) -> TrigPolynomial:
         wanted = angle.expression
         if wanted in self._angle:
             return self.turned(kind, {wanted: 1})
         value, rest = wanted.as_coeff_Mul()
         return self.turned(kind, {rest: int(value)})
 
-    def turned(self, kind: int, multiples: Mapping[sp.Expr, int]) -> Harmonic:
+    def turned(self, kind: int, multiples: Mapping[sp.Expr, int]) -> TrigPolynomial:
         """Return the cosine (0) or sine (1) of whole multiples of angles."""
         out: dict[Key, Fraction] = {}
         _put(out, kind, tuple(multiples.get(a, 0) for a in self.angles), self.plain, Fraction(1))
-        return Harmonic(self, out)
+        return TrigPolynomial(self, out)
 
     def spend(self, products: int) -> None:
         """Count products of terms, and refuse too many of them."""
@@ -113,41 +113,41 @@ class Space:
             raise UnsupportedError(f"{self.name}: its energies have too many terms to be written out; {self.instead}")
 
 
-class Harmonic:
+class TrigPolynomial:
     """One sum; adds, multiplies and is asked for its terms. Numbers mix with it."""
 
     __slots__ = ("space", "terms")
 
-    def __init__(self, space: Space, terms: dict[Key, Fraction]) -> None:
+    def __init__(self, space: TrigRing, terms: dict[Key, Fraction]) -> None:
         self.space, self.terms = space, terms
 
-    def _other(self, x: Any) -> Harmonic:
-        if isinstance(x, Harmonic):
+    def _other(self, x: Any) -> TrigPolynomial:
+        if isinstance(x, TrigPolynomial):
             return x
         return self.space.number(x)
 
     def __bool__(self) -> bool:
         return bool(self.terms)
 
-    def __add__(self, x: Any) -> Harmonic:
+    def __add__(self, x: Any) -> TrigPolynomial:
         other = self._other(x)
         out = dict(self.terms)
         for key, value in other.terms.items():
             _gather(out, key, value)
-        return Harmonic(self.space, out)
+        return TrigPolynomial(self.space, out)
 
     __radd__ = __add__
 
-    def __neg__(self) -> Harmonic:
-        return Harmonic(self.space, {k: -x for k, x in self.terms.items()})
+    def __neg__(self) -> TrigPolynomial:
+        return TrigPolynomial(self.space, {k: -x for k, x in self.terms.items()})
 
-    def __sub__(self, x: Any) -> Harmonic:
+    def __sub__(self, x: Any) -> TrigPolynomial:
         return self + (-self._other(x))
 
-    def __rsub__(self, x: Any) -> Harmonic:
+    def __rsub__(self, x: Any) -> TrigPolynomial:
         return self._other(x) + (-self)
 
-    def __mul__(self, x: Any) -> Harmonic:
+    def __mul__(self, x: Any) -> TrigPolynomial:
         other = self._other(x)
         a, b = (self.terms, other.terms) if len(self.terms) < len(other.terms) else (other.terms, self.terms)
         self.space.spend(len(a) * len(b))
@@ -167,7 +167,7 @@ class Harmonic:
                     gap = tuple(i - j for i, j in zip(k, l, strict=True))
                     _put(out, s ^ t, total, powers, -half if s and t else half)
                     _put(out, s ^ t, gap, powers, -half if t and not s else half)
-        return Harmonic(self.space, out)
+        return TrigPolynomial(self.space, out)
 
     __rmul__ = __mul__
 
@@ -225,7 +225,7 @@ _Complex = tuple[Fraction, Fraction]
 _Exponential = dict[_Exponents, _Complex]
 
 
-def quotient(above: Harmonic, below: Harmonic) -> Harmonic | None:
+def quotient(above: TrigPolynomial, below: TrigPolynomial) -> TrigPolynomial | None:
     """Return above / below where that is such a sum again; None where it is not."""
     if not above.terms or not below.terms:
         return None
@@ -245,7 +245,7 @@ def quotient(above: Harmonic, below: Harmonic) -> Harmonic | None:
     return _sum(above, out)
 
 
-def _exponential(x: Harmonic) -> _Exponential:
+def _exponential(x: TrigPolynomial) -> _Exponential:
     out: _Exponential = {}
     for (kind, turns, powers), value in x.terms.items():
         if not any(turns):
@@ -258,7 +258,7 @@ def _exponential(x: Harmonic) -> _Exponential:
     return out
 
 
-def _sum(like: Harmonic, x: _Exponential) -> Harmonic:
+def _sum(like: TrigPolynomial, x: _Exponential) -> TrigPolynomial:
     n, terms = len(like.space.angles), {}
     for exponents, (real, imaginary) in x.items():
         turns, powers = exponents[:n], exponents[n:]
@@ -267,7 +267,7 @@ def _sum(like: Harmonic, x: _Exponential) -> Harmonic:
             terms[0, turns, powers] = real
         elif first > 0:
             terms |= {(kind, turns, powers): part for kind, part in ((0, 2 * real), (1, -2 * imaginary)) if part}
-    return Harmonic(like.space, terms)
+    return TrigPolynomial(like.space, terms)
 
 
 def _least(x: _Exponential) -> list[int]:

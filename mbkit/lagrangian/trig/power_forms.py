@@ -10,9 +10,9 @@ from typing import Final
 
 import sympy as sp
 
-from mbkit.lagrangian.trig.polynomial import Harmonic, Space
+from mbkit.lagrangian.trig.polynomial import TrigPolynomial, TrigRing
 
-__all__ = ["Form", "FormKey", "Poly", "content", "of_one_angle", "paired", "product", "split"]
+__all__ = ["Form", "FormKey", "Poly", "combine_angles", "content", "paired", "power_form", "product"]
 
 
 #: Sums of angles that are taken as one.
@@ -25,7 +25,7 @@ FormKey = tuple[_Powers, int, tuple[int, ...], tuple[int, ...]]
 Form = dict[FormKey, Fraction]
 
 
-def split(x: Harmonic, subset: tuple[int, ...], kept: int) -> Form:
+def power_form(x: TrigPolynomial, subset: tuple[int, ...], kept: int) -> Form:
     """Return a form: Re or Im of Π (cos a + i sin a)^k (cos rest + i sin rest), power by power."""
     out: Form = {}
     for (kind, multiples, powers), value in x.terms.items():
@@ -80,7 +80,7 @@ def _gather(out: Form, key: FormKey, value: Fraction) -> None:
         out.pop(key, None)
 
 
-def of_one_angle(x: Harmonic) -> Iterator[Harmonic]:
+def combine_angles(x: TrigPolynomial) -> Iterator[TrigPolynomial]:
     """Yield a sum with an angle more, such as θ₁ - θ₂, where twice that angle stands in it."""
     space = x.space
     found = dict.fromkeys(_direction(key[1]) for key in x.terms if gcd(*key[1]) > 1 and sum(map(bool, key[1])) > 1)
@@ -88,14 +88,14 @@ def of_one_angle(x: Harmonic) -> Iterator[Harmonic]:
         angle = sp.Add(*(k * a for k, a in zip(direction, space.angles, strict=True)))
         # SymPy writes sin(b - a) as -sin(a - b).
         sign = -1 if sp.sin(angle).is_Mul else 1
-        wider = Space(space.name, [*space.angles, sign * angle], space.generators, space.most, space.instead)
+        wider = TrigRing(space.name, [*space.angles, sign * angle], space.generators, space.most, space.instead)
         terms = {}
         for (kind, turns, powers), value in x.terms.items():
             along = any(turns) and _direction(turns) == direction
             more = ((0,) * len(turns), gcd(*turns)) if along else (turns, 0)
             # Of a sine the sign of the angle comes before it.
             terms[kind, (*more[0], more[1]), powers] = value * (sign if along and kind else 1)
-        yield Harmonic(wider, terms)
+        yield TrigPolynomial(wider, terms)
 
 
 def _direction(turns: tuple[int, ...]) -> tuple[int, ...]:

@@ -8,10 +8,10 @@ from typing import Any, Final
 
 import sympy as sp
 
-from mbkit.lagrangian.trig.polynomial import Harmonic, Key
-from mbkit.lagrangian.trig.power_forms import Form, FormKey, Poly, content, of_one_angle, paired, product, split
+from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial
+from mbkit.lagrangian.trig.power_forms import Form, FormKey, Poly, combine_angles, content, paired, power_form, product
 
-__all__ = ["cost", "number", "written_out"]
+__all__ = ["complexity", "number", "shortest_form"]
 
 #: Terms up to which products of cosines and sines are looked for.
 _SMALL: Final = 60
@@ -21,7 +21,7 @@ _TRIED: Final = 4
 _FACTORED: Final = 10
 
 
-def cost(x: sp.Expr) -> int:
+def complexity(x: sp.Expr) -> int:
     """Return how long an expression reads: its operations, more for a sum that begins with a minus or stands deep."""
     sums = x.atoms(sp.Add)
     minus = sum(bool(e.could_extract_minus_sign()) for e in sums)
@@ -50,12 +50,12 @@ def _without(n: int, p: int) -> int:
     return n
 
 
-def written_out(x: Harmonic, *, whole: bool = True, decimals: bool = True) -> sp.Expr:
+def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = True) -> sp.Expr:
     """Return a sum of cosines and sines as a SymPy expression that is short to read.
 
     Parameters
     ----------
-    x : Harmonic
+    x : TrigPolynomial
     whole : bool
         Whether what all terms share is taken out of the sum.
     decimals : bool
@@ -67,26 +67,26 @@ def written_out(x: Harmonic, *, whole: bool = True, decimals: bool = True) -> sp
     if len(x.terms) > _SMALL:
         return writer.expression(writer.as_it_is())
     forms = [(writer, form) for form in writer.forms()]
-    forms += [(other, form) for other in map(writer.like, of_one_angle(x)) for form in other.squares()]
+    forms += [(other, form) for other in map(writer.like, combine_angles(x)) for form in other.squares()]
     forms.sort(key=lambda pair: len(pair[1]))
     near = [(w, form) for w, form in forms[:_TRIED] if len(form) <= len(forms[0][1]) + 2]
     made = [w.expression(form) for w, form in near]
-    return min(made, key=lambda e: (cost(e), made.index(e)))
+    return min(made, key=lambda e: (complexity(e), made.index(e)))
 
 
 class _Writer:
-    def __init__(self, x: Harmonic, whole: bool, decimals: bool) -> None:
+    def __init__(self, x: TrigPolynomial, whole: bool, decimals: bool) -> None:
         self._x, self._whole, self._decimals = x, whole, decimals
         self._sums: dict[frozenset[Any], sp.Expr] = {}
 
-    def like(self, x: Harmonic) -> _Writer:
+    def like(self, x: TrigPolynomial) -> _Writer:
         """Return a writer of another sum."""
         return _Writer(x, self._whole, self._decimals)
 
     def squares(self) -> list[Form]:
         """Return the sum with its last angle split off."""
         last = len(self._x.space.angles) - 1
-        return [split(self._x, (last,), kept) for kept in (0, 1)]
+        return [power_form(self._x, (last,), kept) for kept in (0, 1)]
 
     def as_it_is(self) -> Form:
         return {((), kind, multiples, powers): value for (kind, multiples, powers), value in self._x.terms.items()}
@@ -102,7 +102,7 @@ class _Writer:
         for subset in subsets:
             # The square that stays, of cosines (0) or sines (1); neither is shorter always.
             for kept in (0, 1) if subset else (0,):
-                form = split(x, subset, kept)
+                form = power_form(x, subset, kept)
                 if form not in forms:
                     forms.append(form)
         mixed = self._by_monomial(subsets)
@@ -115,8 +115,8 @@ class _Writer:
             groups.setdefault(key[2], {})[key] = value
         out: Form = {}
         for terms in groups.values():
-            part = Harmonic(self._x.space, terms)
-            tried = [split(part, subset, kept) for subset in subsets for kept in ((0, 1) if subset else (0,))]
+            part = TrigPolynomial(self._x.space, terms)
+            tried = [power_form(part, subset, kept) for subset in subsets for kept in ((0, 1) if subset else (0,))]
             best: Form = min(tried, key=len)
             out |= best
         return out
@@ -132,7 +132,7 @@ class _Writer:
             made = [sp.Mul(self._number(scale), *(a**e for a, e in shared), inside)]
         if self._whole:
             made.append(self._written(poly))
-        return min(made, key=lambda e: (cost(e), made.index(e)))
+        return min(made, key=lambda e: (complexity(e), made.index(e)))
 
     def _by_angle(self, poly: Poly) -> list[Poly]:
         """Return the terms of each cosine and sine."""
@@ -193,7 +193,7 @@ class _Writer:
         if len(poly) > 2:
             tried += [self._taken(poly, a) for a in counts if counts[a] == most > 1]
             tried += product(poly, tried[0])
-        return min(tried, key=lambda e: (cost(e), -tried.index(e)))
+        return min(tried, key=lambda e: (complexity(e), -tried.index(e)))
 
     def _plain(self, poly: Poly) -> sp.Expr:
         return sp.Add(*(self._written({atoms: value}) for atoms, value in poly.items()))

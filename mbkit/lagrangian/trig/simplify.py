@@ -9,7 +9,7 @@ import sympy as sp
 from sympy.functions.elementary.trigonometric import TrigonometricFunction
 
 from mbkit.lagrangian.trig.from_sympy import forms
-from mbkit.lagrangian.trig.shortest_form import cost
+from mbkit.lagrangian.trig.shortest_form import complexity
 
 __all__ = ["LARGE", "gradient", "slope", "tidy", "tidy_matrix"]
 
@@ -32,7 +32,7 @@ def tidy(x: sp.Expr) -> sp.Expr:
         return x
     rooted = any(p.has(TrigonometricFunction) for p in x.atoms(sp.Pow) if not p.exp.is_Integer)
     # Of equal forms one that was combined.
-    tried = [(cost(form), form) for form in forms(x)] + [(cost(x) * (_WORTH if rooted else 1.0), x)]
+    tried = [(complexity(form), form) for form in forms(x)] + [(complexity(x) * (_WORTH if rooted else 1.0), x)]
     return min(tried, key=lambda pair: pair[0])[1]
 
 
@@ -64,7 +64,7 @@ def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
         return product
     plain = tidy(sp.diff(x, q))
     # A sum that was written as products stays one, unless it gets much shorter.
-    return plain if cost(plain) < (_WORTH if x.is_Add else 1.0) * cost(product) else product
+    return plain if complexity(plain) < (_WORTH if x.is_Add else 1.0) * complexity(product) else product
 
 
 def gradient(x: sp.Expr, coordinates: Any) -> list[sp.Expr]:

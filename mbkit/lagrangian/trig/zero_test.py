@@ -14,7 +14,7 @@ import sympy as sp
 from mpmath.libmp import NoConvergence
 from numpy.random import default_rng
 
-__all__ = ["DIGITS", "Probe", "vanishes"]
+__all__ = ["DIGITS", "RandomEvaluation", "is_zero"]
 
 #: That values have, and that they have where it is asked whether they are zero.
 DIGITS: Final = 30
@@ -28,7 +28,7 @@ _PLACES: Final = 2
 _SIGNED: Final = 8
 
 
-class Probe:
+class RandomEvaluation:
     """Expressions as numbers at random places.
 
     Parameters
@@ -64,7 +64,7 @@ class Probe:
         return out if all(mpmath.isfinite(x) for x in out) else None
 
 
-def vanishes(x: sp.Expr) -> bool:
+def is_zero(x: sp.Expr) -> bool:
     """Return whether an expression is zero everywhere, whatever it looks like.
 
     What is put together of pieces may be zero in some of them: it is zero only where it says so itself.
@@ -72,7 +72,7 @@ def vanishes(x: sp.Expr) -> bool:
     if not x.free_symbols or x.is_zero is not None or x.has(sp.Piecewise, sp.Max, sp.Min):
         return bool(x == 0 or x.is_zero)
     broken = x.has(sp.Abs, sp.sign) or any(not p.exp.is_Integer for p in x.atoms(sp.Pow))
-    probe, needed = Probe([x]), _SIGNED if broken else _PLACES
+    probe, needed = RandomEvaluation([x]), _SIGNED if broken else _PLACES
     for seed in range(2 * needed):
         place = probe.place(seed)
         rough, fine = (probe(place, digits) for digits in (DIGITS, _MORE))
