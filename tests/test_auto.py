@@ -18,7 +18,7 @@ from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, TorqueErr
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Trajectory, at_section, simulate, stiffness
 from mbkit.simulate.solvers.auto import Gauge
-from mbkit.simulate.solvers.step_attempts import Stretch
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps
 from mbkit.studies.stress.cases.exact_motions import cart_pole as light_cart_pole
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms
@@ -255,7 +255,7 @@ def test_the_pace_is_that_of_the_later_half() -> None:
     gauge = Gauge(0.0, 4, 2)
     for k in range(8):
         t = np.array([k, k + 1.0]) if k < 4 else np.array([4 + (k - 4) / 10, 4 + (k - 3) / 10])
-        gauge.saw(Stretch(t, np.zeros((2, 1)), np.zeros((2, 1)), 1))
+        gauge.saw(AcceptedSteps(t, np.zeros((2, 1)), np.zeros((2, 1)), 1))
         assert gauge.due() == (k in (3, 7))
     assert gauge.rate() == pytest.approx(10.0)
     assert gauge.overall() == pytest.approx(8 / 4.4)

@@ -21,9 +21,9 @@ from mbkit.methods.tableaus import EmbeddedTableau, dormand_prince_853
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import Event, Trajectory, at_section, simulate
-from mbkit.simulate.solvers.adaptive_compiled import LaneTrials
-from mbkit.simulate.solvers.adaptive_numpy import StageTrials
-from mbkit.simulate.solvers.step_attempts import Stretch
+from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
+from mbkit.simulate.solvers.adaptive_numpy import RungeKuttaAttempts
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 
@@ -62,8 +62,8 @@ def both(model: Model) -> dict[str, Dynamics]:
     return {"lanes": dynamics(model, "lagrangian", compile=True), "stages": dynamics(model, "pinocchio")}
 
 
-def trials(kind: str, dyn: Any, rtol: float = 1e-10) -> LaneTrials | StageTrials:
-    make = {"lanes": LaneTrials, "stages": StageTrials}[kind]
+def trials(kind: str, dyn: Any, rtol: float = 1e-10) -> CompiledAttempts | RungeKuttaAttempts:
+    make = {"lanes": CompiledAttempts, "stages": RungeKuttaAttempts}[kind]
     return make(dyn, Space(dyn.model), Tolerances(rtol, rtol), Torque(None, dyn.model, None, None), 1.0, None)
 
 
@@ -112,7 +112,7 @@ def fixed_steps(kind: str, dyn: Any, q: np.ndarray, v: np.ndarray, duration: flo
     made.hold(0, duration)
     times = np.linspace(0.0, duration, n + 1)
     for a, b in pairwise(times):
-        (q,), (w,) = made.within(0, Stretch(np.array([a]), q[None], w[None], 0), np.array([b]))
+        (q,), (w,) = made.within(0, AcceptedSteps(np.array([a]), q[None], w[None], 0), np.array([b]))
     return np.concatenate([q, w])
 
 
@@ -154,7 +154,7 @@ def test_each_step_is_scipys(kind: str) -> None:
     while solver.status == "running":
         t, y = solver.t, solver.y.copy()
         solver.step()
-        start = Stretch(np.array([t]), y[None, :2], y[None, 2:], 0)
+        start = AcceptedSteps(np.array([t]), y[None, :2], y[None, 2:], 0)
         (q1,), (w1,) = made.within(0, start, np.array([solver.t]))
         # Weights up to 43 multiply the rounding of accelerations up to 30 rad/s².
         assert np.abs(np.concatenate([q1, w1]) - solver.y).max() < 1e3 * EPS

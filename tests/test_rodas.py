@@ -20,9 +20,9 @@ from mbkit.methods.tableaus import rodas5p
 from mbkit.model import ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import at_section, simulate
-from mbkit.simulate.solvers.adaptive_compiled import LaneTrials
-from mbkit.simulate.solvers.adaptive_numpy import RosenbrockTrials
-from mbkit.simulate.solvers.step_attempts import Stretch
+from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
+from mbkit.simulate.solvers.adaptive_numpy import RosenbrockAttempts
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms
@@ -73,7 +73,7 @@ def test_it_is_l_stable() -> None:
 
 def both(dyns: dict[str, Dynamics], rtol: float = 1e-10) -> dict[str, Any]:
     made: dict[str, Any] = {}
-    for name, make in (("lanes", LaneTrials), ("stages", RosenbrockTrials)):
+    for name, make in (("lanes", CompiledAttempts), ("stages", RosenbrockAttempts)):
         dyn = dyns[name]
         given = Space(dyn.model), Tolerances(rtol, rtol), Torque(None, dyn.model, None, None), 1.0, None
         made[name] = make(dyn, *given, *(("rodas5",) if name == "lanes" else ()))  # type: ignore[arg-type, operator]
@@ -96,7 +96,7 @@ def test_the_step_is_of_order_five_on_every_joint_compiled_or_not(name: str) -> 
     for trials in both(dyns).values():
         trials.start([0], q[None], w[None])
         trials.hold(0, 1.0)
-        row = Stretch(np.zeros(3), np.tile(q, (3, 1)), np.tile(w, (3, 1)), 0)
+        row = AcceptedSteps(np.zeros(3), np.tile(q, (3, 1)), np.tile(w, (3, 1)), 0)
         ends, speeds = trials.within(0, row, lengths)
         errors = [
             max(np.abs(model.difference(a, b)).max(), np.abs(space.leave(b, c) - d).max())

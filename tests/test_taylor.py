@@ -25,7 +25,7 @@ from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import Tolerances
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, Trajectory, at_section, simulate
-from mbkit.simulate.problem import Asked
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.taylor import run_taylor
 from mbkit.simulate.torque import Torque
@@ -346,7 +346,9 @@ def test_progress_is_told(swing: Any) -> None:
 def _direct(dyn: Any, torque: Any) -> None:
     read = Torque(torque, dyn.model, None, None)
     q, v = dyn.model.neutral(), np.zeros(dyn.model.nv)
-    run_taylor(Asked(dyn, "taylor", q, v, 0.0, 1.0, Tolerances(1e-10, 1e-10), read, None, (), Progress(None, "")))
+    run_taylor(
+        IntegrationProblem(dyn, "taylor", q, v, 0.0, 1.0, Tolerances(1e-10, 1e-10), read, None, (), Progress(None, ""))
+    )
 
 
 def test_what_has_no_series_is_refused(swing: Any) -> None:

@@ -18,10 +18,10 @@ __all__ = [
     "canonical_momentum",
     "is_damped",
     "kinetic_energy",
-    "member_of",
     "momentum",
     "moved",
     "potential_energy",
+    "record_of",
     "work",
 ]
 
@@ -228,10 +228,10 @@ def momentum(dyn: Dynamics, q: Array, v: Array) -> Array:
     if dyn.samples is None:
         return along(dyn, (6,), lambda own, q, v: _momentum(own, dyn.model, q, v), q, v)
     # Of a batch with values of its own, each trajectory is a system of its own.
-    return np.array([momentum(member_of(dyn, i), q[i], v[i]) for i in range(len(q))]).reshape(*q.shape[:-1], 6)
+    return np.array([momentum(record_of(dyn, i), q[i], v[i]) for i in range(len(q))]).reshape(*q.shape[:-1], 6)
 
 
-def member_of(dyn: Dynamics, i: int) -> Dynamics:
+def record_of(dyn: Dynamics, i: int) -> Dynamics:
     """Return the dynamics of one trajectory of a batch, with plain values of the parameters."""
     if dyn.samples is None:
         return dyn

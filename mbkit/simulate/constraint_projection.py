@@ -21,7 +21,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, IMPLICIT_METHODS, SERIES_METHOD
-from mbkit.simulate.result import Outcome
+from mbkit.simulate.result import SolverResult
 
 __all__ = [
     "LOOSEST",
@@ -166,7 +166,7 @@ class SingularPoses:
         )
 
 
-def along_constraints(dyn: Dynamics, outcome: Outcome) -> Outcome:
+def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
     """Return what was kept of a run, with consistent states."""
     if not dyn.model.constrained or not outcome.q.size:
         return outcome

@@ -1,4 +1,4 @@
-"""What a run by tolerances is asked for, as every adaptive method takes it."""
+"""The integration problem handed to every adaptive solver."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.trajectory_record import check_save, reporter
 from mbkit.simulate.torque import Torque
 
-__all__ = ["Asked"]
+__all__ = ["IntegrationProblem"]
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class IntegrationProblem:
     """States to integrate, and how.
 
     Attributes

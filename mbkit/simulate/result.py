@@ -9,7 +9,7 @@ from mbkit._check import Array
 from mbkit.errors import FunctionError
 from mbkit.simulate.events import Hit
 
-__all__ = ["Ended", "Outcome", "Stats"]
+__all__ = ["Ended", "SolverResult", "Stats"]
 
 
 # What a run cost and how it ended.
@@ -73,7 +73,7 @@ class Stats:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SolverResult:
     """Kept states and the figures of a run; `reached` has shape () or (N,).
 
     `last` is the last good configuration of the first trajectory that could not go on, where the method tells it.

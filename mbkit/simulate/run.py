@@ -21,9 +21,9 @@ from mbkit.model import Model
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.diagnostics.checks import doubts, halved, idle
 from mbkit.simulate.events import Event, as_events
-from mbkit.simulate.problem import Asked
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress, ProgressFunction
-from mbkit.simulate.result import Outcome, Stats
+from mbkit.simulate.result import SolverResult, Stats
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.torque import Applied, Torque, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
@@ -37,14 +37,14 @@ __all__ = ["fixed_runner", "simulate", "solver_of"]
 # Which solver runs a method, each imported when it is first needed.
 
 
-def solver_of(method: Method) -> Callable[..., Outcome]:
+def solver_of(method: Method) -> Callable[..., SolverResult]:
     """Return the function that runs a method: run(problem), or with a step what `run_fixed` takes."""
     module, function = method.solver.split(":")
-    run: Callable[..., Outcome] = getattr(import_module(f"mbkit.simulate.solvers.{module}"), function)
+    run: Callable[..., SolverResult] = getattr(import_module(f"mbkit.simulate.solvers.{module}"), function)
     return run
 
 
-def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[..., Outcome]:
+def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[..., SolverResult]:
     """Return run(dyn, method, q0, v0, grid, kept, torque, bar)."""
     if method.compiled and method.formula is not None and not torque.callable and _compiles(dyn):
         from mbkit.simulate.solvers.compiled_fixed_step import run_rollout
@@ -311,7 +311,7 @@ def _held_time(dyn: Dynamics) -> float:
     return float(held[0])
 
 
-def _from_start(outcome: Outcome, start: float, q0: Array, v0: Array) -> tuple[Array, Array, Array]:
+def _from_start(outcome: SolverResult, start: float, q0: Array, v0: Array) -> tuple[Array, Array, Array]:
     """Return what was kept, with the start."""
     if len(outcome.t) and outcome.t[0] == start:
         return outcome.t, outcome.q, outcome.v
@@ -369,7 +369,7 @@ def _adaptive(
     save: ArrayLike | int | None,
     bar: Progress,
     events: tuple[Event, ...],
-) -> tuple[Applied | None, Outcome]:
+) -> tuple[Applied | None, SolverResult]:
     tolerances = _tolerances(dyn, method, rtol, atol)
     if isinstance(save, (int, np.integer)):
         raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
@@ -377,7 +377,7 @@ def _adaptive(
     whole = times is not None and times[0] == start and times[-1] == start + duration
     read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
     given = dyn, method.name, q, v, start, duration, tolerances, read, times, events, bar
-    outcome = solver_of(method)(Asked(*given))
+    outcome = solver_of(method)(IntegrationProblem(*given))
     return read.applied(times), outcome
 
 
@@ -408,7 +408,7 @@ def _stepped(
     torque: ArrayLike | TorqueFunction | None,
     save: ArrayLike | int | None,
     bar: Progress,
-) -> tuple[Applied | None, Outcome]:
+) -> tuple[Applied | None, SolverResult]:
     model = dyn.model
     kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
     read = Torque(torque, model, batch, grid.steps)
@@ -421,7 +421,12 @@ def _stepped(
 
 
 def _wrapped(
-    dyn: Dynamics, method: Method, applied: Applied | None, outcome: Outcome, seconds: float, found: tuple[str, ...]
+    dyn: Dynamics,
+    method: Method,
+    applied: Applied | None,
+    outcome: SolverResult,
+    seconds: float,
+    found: tuple[str, ...],
 ) -> Trajectory:
     reached = outcome.reached
     stats = Stats(

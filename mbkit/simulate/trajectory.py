@@ -21,9 +21,9 @@ from mbkit.model import Model
 from mbkit.simulate.along_trajectory import (
     canonical_momentum,
     kinetic_energy,
-    member_of,
     momentum,
     potential_energy,
+    record_of,
     work,
 )
 from mbkit.simulate.events import Hit
@@ -245,7 +245,7 @@ class Trajectory:
         if member >= members:
             raise InputError(f"member: expected less than {members}, the number of trajectories, got {member}")
         # What is drawn is the description alone: no engine is made for it.
-        model = self.model if self._dyn is None else member_of(self._dyn, member).model
+        model = self.model if self._dyn is None else record_of(self._dyn, member).model
         return picture(self, model, count, view, member)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:

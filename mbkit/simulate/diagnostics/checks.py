@@ -21,7 +21,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.along_trajectory import along, is_damped, kinetic_energy, potential_energy
 from mbkit.simulate.diagnostics.eigenvalues import linearized
 from mbkit.simulate.diagnostics.stability import growth, lost
-from mbkit.simulate.solvers.vector_field import size_of, unit_quaternions
+from mbkit.simulate.solvers.vector_field import magnitude, unit_quaternions
 
 __all__ = ["doubts", "halved", "idle"]
 
@@ -316,7 +316,7 @@ def _far(q: Array, tolerances: Tolerances | None) -> Iterator[str]:
 def _outgrown(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
     """Look for numbers that have outgrown those of the start, and what their tolerance allows to the others."""
     largest = max(float(np.nan_to_num(np.abs(x), posinf=0.0).max()) for x in (q, v))
-    allowed = min(tolerances) * largest / size_of(q[..., 0, :], v[..., 0, :])
+    allowed = min(tolerances) * largest / magnitude(q[..., 0, :], v[..., 0, :])
     if allowed > max(1e3 * tolerances.atol, _POSITION):
         yield (
             f"the state grew to {largest:.2g}, of which the tolerance allows an error of {allowed:.1g} to all "

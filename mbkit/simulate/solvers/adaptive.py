@@ -20,21 +20,21 @@ from mbkit.errors import FunctionError
 from mbkit.methods.registry import Tolerances
 from mbkit.model.integration_space import Space
 from mbkit.simulate.events import Event, Hit, State, Watch
-from mbkit.simulate.problem import Asked
-from mbkit.simulate.result import Outcome
-from mbkit.simulate.solvers.adaptive_numpy import StageTrials
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, credible
-from mbkit.simulate.solvers.step_attempts import Stretch, Trials
-from mbkit.simulate.solvers.trajectory_record import Member, gathered, member_of
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.adaptive_numpy import RungeKuttaAttempts
+from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps, StepAttempts
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Torque
 
-__all__ = ["Track", "make_trials", "march", "outcome_of", "run_embedded", "stops_of"]
+__all__ = ["TrajectoryRecorder", "make_attempts", "march", "recorded_result", "run_embedded", "stop_times"]
 
-_BEYOND: Final = f"diverged: {RAN_AWAY}"
+_BEYOND: Final = f"diverged: {DIVERGED}"
 
 
-def run_embedded(asked: Asked) -> Outcome:
+def run_embedded(asked: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, each with steps of its own.
 
     Where the own derivation is compiled and the torque is no function, the steps run
@@ -43,12 +43,12 @@ def run_embedded(asked: Asked) -> Outcome:
     """
     dyn, tolerances, batch, save = asked.dyn, asked.tolerances, asked.batch, asked.save
     q0, v0, space = asked.q, asked.v, Space(asked.dyn.model)
-    trials = make_trials(asked.method, dyn, space, tolerances, asked.torque, asked.duration, batch)
+    trials = make_attempts(asked.method, dyn, space, tolerances, asked.torque, asked.duration, batch)
     tracks = []
     for i in range(len(q0)):
-        member = member_of(dyn, asked.member(i), asked.start, asked.duration)
-        tracks.append(Track(space, q0.shape[1], i, batch, save, asked.events, tolerances, member))
-    stops = stops_of(asked)
+        member = record_of(dyn, asked.member(i), asked.start, asked.duration)
+        tracks.append(TrajectoryRecorder(space, q0.shape[1], i, batch, save, asked.events, tolerances, member))
+    stops = stop_times(asked)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), trials.width):
             part = slice(first, first + trials.width)
@@ -66,10 +66,10 @@ def run_embedded(asked: Asked) -> Outcome:
                 which = getattr(error, "member", None)
                 group[0 if which is None else which - first].member.fail(error)
                 break
-    return outcome_of(dyn, tracks, batch, save, trials.evaluations, trials.jacobians)
+    return recorded_result(dyn, tracks, batch, save, trials.evaluations, trials.jacobians)
 
 
-def make_trials(
+def make_attempts(
     method: str,
     dyn: Dynamics,
     space: Space,
@@ -77,7 +77,7 @@ def make_trials(
     torque: Torque,
     duration: float,
     batch: int | None,
-) -> Trials:
+) -> StepAttempts:
     """Return what tries the steps of ``"rk853"`` or ``"rodas5"``: machine code where there can be some."""
     given = dyn, space, tolerances, torque, duration, batch
     # A compiled step has one value of the time, and does not look for constraints.
@@ -89,35 +89,35 @@ def make_trials(
 
         if isinstance(dyn, LagrangianDynamics) and dyn.compile and dyn.written_out and has_compiler():
             # Loads LLVM, which interpreting never needs.
-            from mbkit.simulate.solvers.adaptive_compiled import LaneTrials
+            from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
 
-            return LaneTrials(dyn, *given[1:], method)
+            return CompiledAttempts(dyn, *given[1:], method)
     if method == "rodas5":
         # Its Jacobian loads CasADi.
-        from mbkit.simulate.solvers.adaptive_numpy import RosenbrockTrials
+        from mbkit.simulate.solvers.adaptive_numpy import RosenbrockAttempts
 
-        return RosenbrockTrials(*given)
-    return StageTrials(*given)
+        return RosenbrockAttempts(*given)
+    return RungeKuttaAttempts(*given)
 
 
-def stops_of(asked: Asked) -> list[float]:
+def stop_times(asked: IntegrationProblem) -> list[float]:
     """Return the times at which a run must stop on its way: where a held torque jumps, and the end."""
     held = asked.save.tolist() if asked.save is not None and asked.torque.held else []
     return sorted({*held, asked.end} - {asked.start})
 
 
 def march(
-    trials: Trials, group: Sequence[Track], stops: Sequence[float], first: int = 0
-) -> Iterator[list[tuple[int, Stretch]]]:
+    trials: StepAttempts, group: Sequence[TrajectoryRecorder], stops: Sequence[float], first: int = 0
+) -> Iterator[list[tuple[int, AcceptedSteps]]]:
     """Take trajectories to the end; yields what was made, after each look at it.
 
     Parameters
     ----------
-    trials : Trials
+    trials : StepAttempts
         Begun.
-    group : sequence of Track
+    group : sequence of TrajectoryRecorder
     stops : sequence of float
-        As of `stops_of`.
+        As of `stop_times`.
     first : int
         Index of the stop to go to first.
     """
@@ -131,7 +131,7 @@ def march(
             yield made
 
 
-class Track:
+class TrajectoryRecorder:
     """One trajectory: what is kept of it, and how it ends.
 
     Parameters
@@ -144,7 +144,7 @@ class Track:
     save : (K,) array or None
     events : tuple of Event
     tolerances : Tolerances
-    member : Member
+    member : TrajectoryRecord
         Of which this holds the states.
     """
 
@@ -157,7 +157,7 @@ class Track:
         save: Array | None,
         events: tuple[Event, ...],
         tolerances: Tolerances,
-        member: Member,
+        member: TrajectoryRecord,
     ) -> None:
         which = None if batch is None else index
         self.member, self._nq, self._start = member, nq, member.reached
@@ -180,15 +180,15 @@ class Track:
         t, q, v = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
         return t, q, v
 
-    def take(self, trials: Trials, place: int, made: Stretch) -> bool:
+    def take(self, trials: StepAttempts, place: int, made: AcceptedSteps) -> bool:
         """Take in some steps; return whether to go on."""
         member = self.member
         steps = len(made.t) - 1
         member.rejected += made.tried - steps
         # A state that is none stays so: the last one tells.
-        lost = not (credible(made.q[-1]) and credible(made.w[-1]))
+        lost = not (is_bounded(made.q[-1]) and is_bounded(made.w[-1]))
         if lost:
-            good = credible(made.q[1:]) & credible(made.w[1:])
+            good = is_bounded(made.q[1:]) & is_bounded(made.w[1:])
             steps = int(np.argmin(good)) if len(good) else 0
         hit = self._look(trials, place, made, steps)
         if hit is not None:
@@ -208,7 +208,7 @@ class Track:
             member.stop("diverged", _BEYOND)
         return hit is None and not lost
 
-    def stuck(self, trials: Trials, place: int) -> bool:
+    def stuck(self, trials: StepAttempts, place: int) -> bool:
         """Return whether no step can be made any more, and end there."""
         stuck = trials.stuck(place)
         if stuck:
@@ -220,7 +220,7 @@ class Track:
             self.member.stop("step_too_small", told)
         return stuck is not None or (self.member.ended == "finished" and self.member.crawls())
 
-    def _look(self, trials: Trials, place: int, made: Stretch, steps: int) -> Hit | None:
+    def _look(self, trials: StepAttempts, place: int, made: AcceptedSteps, steps: int) -> Hit | None:
         if self._watch is None:
             return None
         for k in range(steps):
@@ -230,7 +230,7 @@ class Track:
                 return last
         return None
 
-    def _within(self, trials: Trials, place: int, made: Stretch, k: int) -> State:
+    def _within(self, trials: StepAttempts, place: int, made: AcceptedSteps, k: int) -> State:
         """Return the states of step k by time, each made by a step that ends there."""
 
         def state(t: float) -> tuple[Array, Array]:
@@ -242,7 +242,7 @@ class Track:
 
         return state
 
-    def _keep(self, trials: Trials, place: int, made: Stretch, steps: int, until: float) -> bool:
+    def _keep(self, trials: StepAttempts, place: int, made: AcceptedSteps, steps: int, until: float) -> bool:
         """Keep what is wanted after the start, up to a time in or at the end of the last step.
 
         Returns whether all that was wanted is a state; if not, nothing is kept.
@@ -260,7 +260,7 @@ class Track:
         return self._add(times, q, w)
 
     def _add(self, t: Array, q: Array, w: Array) -> bool:
-        good = bool(credible(q).all() and credible(w).all())
+        good = bool(is_bounded(q).all() and is_bounded(w).all())
         if good and len(t):
             self._kept.append((t, q, self._space.leave(q, w)))
         return good
@@ -272,19 +272,24 @@ class Track:
             self._kept.append((np.array([hit.t]), hit.q[None], hit.v[None]))
 
 
-def _rows(made: Stretch, which: Indices) -> Stretch:
-    return Stretch(made.t[which], made.q[which], made.w[which], 0)
+def _rows(made: AcceptedSteps, which: Indices) -> AcceptedSteps:
+    return AcceptedSteps(made.t[which], made.q[which], made.w[which], 0)
 
 
-def outcome_of(
-    dyn: Dynamics, tracks: Sequence[Track], batch: int | None, save: Array | None, evaluations: int, jacobians: int
-) -> Outcome:
+def recorded_result(
+    dyn: Dynamics,
+    tracks: Sequence[TrajectoryRecorder],
+    batch: int | None,
+    save: Array | None,
+    evaluations: int,
+    jacobians: int,
+) -> SolverResult:
     """Return all trajectories as an outcome."""
     for track in tracks:
         # The states are put in below, whole arrays of them.
         track.member.t, track.member.y = [], []
     members = [track.member for track in tracks]
-    told = gathered(dyn.model, members, batch, save, evaluations=evaluations, jacobians=jacobians)
+    told = assemble_result(dyn.model, members, batch, save, evaluations=evaluations, jacobians=jacobians)
     kept = [track.states() for track in tracks]
     if batch is None:
         t, q, v = kept[0]

@@ -22,11 +22,11 @@ from mbkit.methods.one_step import FIRST_ROOT, MAX_GROWTH
 from mbkit.methods.registry import Tolerances
 from mbkit.methods.tableaus import dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, DivergenceError, Field
-from mbkit.simulate.solvers.step_attempts import ROUNDS, Stretch, first_length
+from mbkit.simulate.solvers.runge_kutta import DIVERGED, DivergenceError, Field
+from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, first_length
 from mbkit.simulate.torque import Torque
 
-__all__ = ["LaneTrials"]
+__all__ = ["CompiledAttempts"]
 
 #: Larger than any scale or length: no error is seen, and a step is as long as its gap.
 _HUGE: Final = 1e300
@@ -129,8 +129,8 @@ class _Arena:
         return int(self._ways[3])
 
 
-class LaneTrials:
-    """Tries up to some hundred steps at once; `Trials` says what its methods do."""
+class CompiledAttempts:
+    """Tries up to some hundred steps at once; `StepAttempts` says what its methods do."""
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class LaneTrials:
         # Where there is no rate, the step finds that out.
         return np.where(h > 0, h, 1e-6 * (stop - arena.state[self._row["t"]]))
 
-    def advance(self) -> list[tuple[int, Stretch]]:
+    def advance(self) -> list[tuple[int, AcceptedSteps]]:
         """Try until all have arrived or are stuck, some hundred times at most."""
         if not self._active.any():
             return []
@@ -226,11 +226,11 @@ class LaneTrials:
             self.jacobians += self._scheme.jacobians * tried
         return out
 
-    def _stretch(self, before: Array, tries: Array) -> Stretch:
+    def _stretch(self, before: Array, tries: Array) -> AcceptedSteps:
         t = np.concatenate([before[None, self._row["t"]], tries[:, self._row["t"]]])
         accepted = np.flatnonzero(np.diff(t) > 0)
         states = np.concatenate([before[None], tries[accepted]])
-        return Stretch(states[:, self._row["t"]], states[:, self._at["q"]], states[:, self._at["w"]], len(tries))
+        return AcceptedSteps(states[:, self._row["t"]], states[:, self._at["q"]], states[:, self._at["w"]], len(tries))
 
     def drop(self, place: int) -> None:
         """Leave a lane where it is."""
@@ -252,7 +252,7 @@ class LaneTrials:
             field(0.0, q, w, self._force(self._k, member)[None])
         except DivergenceError as error:
             return str(error)
-        return RAN_AWAY
+        return DIVERGED
 
     def tighten(self, place: int, tolerances: Tolerances) -> None:
         """Go on with other tolerances."""
@@ -280,7 +280,7 @@ class LaneTrials:
         self.evaluations += len(q)
         return np.concatenate(found)[: len(q)]
 
-    def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:
+    def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:
         """Return states within steps, several side by side."""
         arena, count = self._beside(place), len(times)
         rounds = -(-count // self.width)

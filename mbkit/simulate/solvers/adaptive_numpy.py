@@ -27,12 +27,12 @@ from mbkit.methods.tableaus import dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import LOOSEST
 from mbkit.simulate.diagnostics.linearization import Linearization
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, DivergenceError, Field
-from mbkit.simulate.solvers.step_attempts import Stretch, first_length
+from mbkit.simulate.solvers.runge_kutta import DIVERGED, DivergenceError, Field
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps, first_length
 from mbkit.simulate.solvers.vector_field import Rates, unit_quaternions
 from mbkit.simulate.torque import Force, Torque
 
-__all__ = ["RosenbrockTrials", "StageTrials"]
+__all__ = ["RosenbrockAttempts", "RungeKuttaAttempts"]
 
 
 class _OneOf(Field):
@@ -50,8 +50,8 @@ class _OneOf(Field):
         return super().__call__(t, q, w, force).reshape(-1)
 
 
-class StageTrials:
-    """Tries one step at a time, in NumPy; `Trials` says what its methods do."""
+class RungeKuttaAttempts:
+    """Tries one step at a time, in NumPy; `StepAttempts` says what its methods do."""
 
     width = rounds = 1
     #: The power of a step's length with which its estimated error grows.
@@ -117,7 +117,7 @@ class StageTrials:
         # would be tried at all, and nobody be told.
         return max(h if h > 0 else 1e-6 * (self._stop - self._t), 2 * self._least)
 
-    def advance(self) -> list[tuple[int, Stretch]]:
+    def advance(self) -> list[tuple[int, AcceptedSteps]]:
         """Try one step."""
         if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
             return []
@@ -132,7 +132,7 @@ class StageTrials:
             self._t, self._q, self._w, self._fresh = t, q, w, True
             for row, x in zip(before, (t, q, w), strict=True):
                 row.append(x)
-        return [(0, Stretch(np.array(before[0]), np.array(before[1]), np.array(before[2]), 1))]
+        return [(0, AcceptedSteps(np.array(before[0]), np.array(before[1]), np.array(before[2]), 1))]
 
     def _settle(self, step: float, good: bool) -> None:
         if (
@@ -190,7 +190,7 @@ class StageTrials:
 
     def why(self, place: int) -> str:  # noqa: ARG002
         """Return what the engine said."""
-        return self._why or RAN_AWAY
+        return self._why or DIVERGED
 
     def tighten(self, place: int, tolerances: Tolerances) -> None:  # noqa: ARG002
         """Go on with other tolerances."""
@@ -203,7 +203,7 @@ class StageTrials:
         except DivergenceError:
             return np.full(w.shape, np.nan)
 
-    def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
+    def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """Return states within steps."""
         rows = zip(start.t.tolist(), start.q, start.w, times.tolist(), strict=True)
         made = []
@@ -228,8 +228,8 @@ class StageTrials:
 _APART: Final = 1e-3
 
 
-class RosenbrockTrials(StageTrials):
-    """Tries one step at a time, in NumPy; `Trials` says what its methods do."""
+class RosenbrockAttempts(RungeKuttaAttempts):
+    """Tries one step at a time, in NumPy; `StepAttempts` says what its methods do."""
 
     grows = 5
     _factors = staticmethod(elementary_factors)
@@ -292,7 +292,7 @@ class RosenbrockTrials(StageTrials):
             size = float(with_defect(SCALARS, size, _norm((step * rate - slope) / scale)))
             self._arrived = y1, rate
             if not math.isfinite(size):
-                raise DivergenceError(self._own_rates.why or RAN_AWAY)
+                raise DivergenceError(self._own_rates.why or DIVERGED)
         return *self._state(y1), size
 
     def _known(self) -> tuple[Array, Array, Array]:
@@ -338,7 +338,7 @@ class RosenbrockTrials(StageTrials):
             k[i], _ = lapack.dgetrs(lu, pivots, right)
         # What was no number anywhere is none here.
         if not np.isfinite(k).all():
-            raise DivergenceError(self._own_rates.why or RAN_AWAY)
+            raise DivergenceError(self._own_rates.why or DIVERGED)
         return k
 
     def _by_time(self, t: float, y: Array, h: float, there: Array) -> Array:
@@ -346,7 +346,7 @@ class RosenbrockTrials(StageTrials):
         near, far = self._rate(t + apart, y), self._rate(t + 2 * apart, y)
         return (4 * near - far - 3 * there) / (2 * apart)
 
-    def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
+    def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """Return states within steps: of the last one by its polynomial, of others by shorter steps."""
         made = [
             self._within(t, q, w, end) for t, q, w, end in zip(start.t.tolist(), start.q, start.w, times, strict=True)

@@ -21,11 +21,11 @@ from mbkit.methods.registry import Tolerances
 from mbkit.model.integration_space import Space
 from mbkit.simulate.diagnostics.eigenvalues import Stiffness, linearized, stiffness_of
 from mbkit.simulate.events import Event
-from mbkit.simulate.problem import Asked
-from mbkit.simulate.result import Outcome
-from mbkit.simulate.solvers.adaptive import Track, make_trials, march, outcome_of, stops_of
-from mbkit.simulate.solvers.step_attempts import ROUNDS, Stretch, Trials
-from mbkit.simulate.solvers.trajectory_record import member_of
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.adaptive import TrajectoryRecorder, make_attempts, march, recorded_result, stop_times
+from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, StepAttempts
+from mbkit.simulate.solvers.trajectory_record import record_of
 
 __all__ = [
     "EXPLICIT",
@@ -103,21 +103,21 @@ class Scene:
         s.
     batch : int or None
     stops : sequence of float
-        As of `mbkit.simulate.solvers.adaptive.stops_of`.
+        As of `mbkit.simulate.solvers.adaptive.stop_times`.
     pace : Pace
     """
 
-    def __init__(self, asked: Asked, space: Space, stops: Sequence[float]) -> None:
+    def __init__(self, asked: IntegrationProblem, space: Space, stops: Sequence[float]) -> None:
         self.dyn, self._torque, self.batch = asked.dyn, asked.torque, asked.batch
         self.space, self.tolerances, self.stops = space, asked.tolerances, stops
         self.start, self.end, self.duration = asked.start, asked.end, asked.duration
-        self._trials: list[Trials] = []
+        self._trials: list[StepAttempts] = []
         self.pace = _IN_PYTHON
 
-    def make(self, method: str, tolerances: Tolerances) -> Trials:
+    def make(self, method: str, tolerances: Tolerances) -> StepAttempts:
         """Return what tries a method's steps; its evaluations are counted with all others."""
         given = self.dyn, self.space, tolerances, self._torque, self.duration, self.batch
-        made = make_trials(method, *given)
+        made = make_attempts(method, *given)
         self._trials.append(made)
         self.pace = _COMPILED if made.rounds > 1 else _IN_PYTHON
         return made
@@ -156,7 +156,7 @@ class Gauge:
         """Tries until the next look."""
         return self._next - self._marks[-1][0]
 
-    def saw(self, made: Stretch) -> None:
+    def saw(self, made: AcceptedSteps) -> None:
         """Count tries."""
         tries = self._marks[-1][0]
         if made.tried > 1:
@@ -292,13 +292,13 @@ _WEIGHT: Final = 2.0
 _ROUNDED: Final = 0.03
 
 
-class _Track(Track):
+class _Recorder(TrajectoryRecorder):
     """One trajectory that may go on in another way where a method is stuck."""
 
     rescues = 0
     stalled = False
 
-    def stuck(self, trials: Trials, place: int) -> bool:
+    def stuck(self, trials: StepAttempts, place: int) -> bool:
         """Return whether no step can be made any more; where steps were inaccurate however short, it is not the end."""
         if trials.stuck(place) is False and self.rescues < _RESCUES:
             self.rescues += 1
@@ -307,7 +307,7 @@ class _Track(Track):
         return super().stuck(trials, place)
 
 
-def pause(trials: Trials, courses: Sequence[Course]) -> None:
+def pause(trials: StepAttempts, courses: Sequence[Course]) -> None:
     """Let tries be made up to the next look of any of the trajectories."""
     if trials.rounds > 1:
         trials.rounds = max(2, min(ROUNDS, *(course.missing for course in courses)))
@@ -327,15 +327,15 @@ class Course:
 
     Attributes
     ----------
-    track : Track
+    track : TrajectoryRecorder
     doubt : str
         What the user must know; empty where all is well.
     """
 
     def __init__(self, scene: Scene, index: int, nq: int, save: Array | None, events: tuple[Event, ...]) -> None:
         self._scene, self._index = scene, index
-        member = member_of(scene.dyn, None if scene.batch is None else index, scene.start, scene.duration)
-        self.track = _Track(scene.space, nq, index, scene.batch, save, events, scene.tolerances, member)
+        member = record_of(scene.dyn, None if scene.batch is None else index, scene.start, scene.duration)
+        self.track = _Recorder(scene.space, nq, index, scene.batch, save, events, scene.tolerances, member)
         self.doubt = ""
         # As asked for or loosened, and as tightened.
         self._base, self._tolerances = scene.tolerances, scene.granted(EXPLICIT, scene.tolerances)
@@ -350,9 +350,9 @@ class Course:
         self._kept = _KEPT
         self._returns = 0
         self._least = LEAST
-        self._next: Trials | None = None
+        self._next: StepAttempts | None = None
         self._pilot_from = 0
-        self._ahead: list[Stretch] = []
+        self._ahead: list[AcceptedSteps] = []
 
     # On the way
 
@@ -376,7 +376,7 @@ class Course:
         member = self.track.member
         return member.ended != "finished" or member.reached >= self._scene.end
 
-    def leaves(self, trials: Trials, place: int, made: Stretch) -> bool:
+    def leaves(self, trials: StepAttempts, place: int, made: AcceptedSteps) -> bool:
         """Look at what was made and taken in; return whether other tries go on from its end."""
         if self._gauge is None:
             self._gauge = self._scene.gauge(float(made.t[0]), self._first)
@@ -403,7 +403,7 @@ class Course:
                     pause(trials, [self])
                     tell()
 
-    def _goes_on(self, trials: Trials, made: Stretch) -> bool:
+    def _goes_on(self, trials: StepAttempts, made: AcceptedSteps) -> bool:
         taken = self.track.take(trials, 0, made)
         return taken and not self.leaves(trials, 0, made)
 
@@ -411,7 +411,7 @@ class Course:
     def _interval(self) -> int:
         return int(np.searchsorted(self._scene.stops, self._at[0], side="right"))
 
-    def _begun(self, method: str) -> Trials:
+    def _begun(self, method: str) -> StepAttempts:
         """Return tries of a method that begin here."""
         t, q, w = self._at
         trials = self._scene.make(method, self._granted(method))
@@ -430,7 +430,7 @@ class Course:
 
     # Looks
 
-    def _look(self, trials: Trials, place: int, gauge: Gauge) -> None:
+    def _look(self, trials: StepAttempts, place: int, gauge: Gauge) -> None:
         """Decide on rk853."""
         rate, step, pace = gauge.rate(), gauge.step(), self._scene.pace
         to_come = rate * self._rest
@@ -456,7 +456,7 @@ class Course:
         self._mind(rate)
         self._add_up(trials, place, gauge)
 
-    def _add_up(self, trials: Trials, place: int, gauge: Gauge) -> None:
+    def _add_up(self, trials: StepAttempts, place: int, gauge: Gauge) -> None:
         """Let the tolerance follow the steps of rk853, by the pace of the whole leg.
 
         What comes and goes is no sign of what is to come.
@@ -486,7 +486,7 @@ class Course:
             self._looser = self._tolerances.rtol, 0.0
         return better
 
-    def _look_back(self, trials: Trials, place: int, gauge: Gauge) -> None:
+    def _look_back(self, trials: StepAttempts, place: int, gauge: Gauge) -> None:
         """Decide on rodas5."""
         pace, rate = self._scene.pace, gauge.rate()
         # Steps may be growing still.
@@ -510,7 +510,7 @@ class Course:
         self._looser = self._tolerances.rtol, rate
         return collapsed
 
-    def _spectrum(self, trials: Trials, place: int, enough: float) -> Stiffness | None:
+    def _spectrum(self, trials: StepAttempts, place: int, enough: float) -> Stiffness | None:
         """Return how fast the motions here are; None where that is no number."""
         _, q, w = self._at
         try:
@@ -525,7 +525,7 @@ class Course:
         share = self._granted(method).rtol / self._base.rtol
         return min(share, _SUM[method] / (steps * math.sqrt(2 * self._scene.space.nv)))
 
-    def _tolerate(self, trials: Trials, place: int, to_come: float) -> None:
+    def _tolerate(self, trials: StepAttempts, place: int, to_come: float) -> None:
         """Let the tolerance follow the number of steps to come."""
         if not math.isfinite(to_come):
             return
@@ -540,7 +540,7 @@ class Course:
                 self._tightest = rtol
                 leg.note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
 
-    def _rounds(self, trials: Trials, place: int, step: float, found: Stiffness | None) -> bool:
+    def _rounds(self, trials: StepAttempts, place: int, step: float, found: Stiffness | None) -> bool:
         """Return whether rounding takes part in the errors that hold rk853's steps, and let it have less part."""
         share, rough = self._rough(trials, place, step, _NEAR)
         # What is smooth is far smoother nearer by.
@@ -559,7 +559,7 @@ class Course:
             self._tolerate(trials, place, 0.0)
         return False
 
-    def _rough(self, trials: Trials, place: int, step: float, near: float) -> tuple[float, float]:
+    def _rough(self, trials: StepAttempts, place: int, step: float, near: float) -> tuple[float, float]:
         """Return what rounding makes of a step's estimated error, in terms of the tolerance, and of accelerations."""
         (_, q, w), space = self._at, self._scene.space
         try:
@@ -617,11 +617,11 @@ class Course:
 _FEW: Final = 3
 
 
-def run_auto(asked: Asked) -> Outcome:
+def run_auto(asked: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
     q0, v0, save, batch = asked.q, asked.v, asked.save, asked.batch
     space = Space(asked.dyn.model)
-    scene = Scene(asked, space, stops_of(asked))
+    scene = Scene(asked, space, stop_times(asked))
     courses = [Course(scene, i, q0.shape[1], save, asked.events) for i in range(len(q0))]
     explicit = scene.make(EXPLICIT, scene.granted(EXPLICIT, asked.tolerances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -640,7 +640,7 @@ def run_auto(asked: Asked) -> Outcome:
                 group.courses[0 if which is None else which - first].track.member.fail(error)
                 break
     tracks = [course.track for course in courses]
-    outcome = outcome_of(asked.dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
+    outcome = recorded_result(asked.dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
     told = outcome.ended in ("finished", "event")
     doubts = tuple(dict.fromkeys(course.doubt for course in courses if course.doubt and told))
     return replace(outcome, chosen=_chosen(courses, batch), doubts=(*outcome.doubts, *doubts))
@@ -649,10 +649,10 @@ def run_auto(asked: Asked) -> Outcome:
 class _Group:
     """Trajectories that begin side by side."""
 
-    def __init__(self, courses: Sequence[Course], first: int, asked: Asked) -> None:
+    def __init__(self, courses: Sequence[Course], first: int, asked: IntegrationProblem) -> None:
         self.courses, self._first, self._asked = courses, first, asked
 
-    def together(self, scene: Scene, explicit: Trials) -> None:
+    def together(self, scene: Scene, explicit: StepAttempts) -> None:
         """Take all to the end: explicitly side by side, what leaves that one by one."""
         tracks = [course.track for course in self.courses]
         pause(explicit, self.courses)

@@ -24,9 +24,9 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.registry import method_of
 from mbkit.model.integration_space import Space
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.result import Outcome
+from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.fixed_step import reason
-from mbkit.simulate.solvers.runge_kutta import RUNAWAY, credible
+from mbkit.simulate.solvers.runge_kutta import BOUND, is_bounded
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
@@ -204,7 +204,7 @@ def run_rollout(
     torque: Torque,
     bar: Progress,
     workers: int | None = None,
-) -> Outcome:
+) -> SolverResult:
     """Step one state or a batch over the grid.
 
     Parameters
@@ -275,7 +275,7 @@ class _Run:
         elif parts:
             self._work(lambda: bar.update(sum(self._done) / total))
         # A NaN is not below anything.
-        lost = np.flatnonzero(~(self._squares < RUNAWAY**2))
+        lost = np.flatnonzero(~(self._squares < BOUND**2))
         for start in range(0, len(lost), self._plan.widest):
             self._look(lost[start : start + self._plan.widest])
 
@@ -342,14 +342,14 @@ class _Run:
         for k, _ in self._blocks(chunk, members, members[:0]):
             q, w = (np.concatenate([chunk.start(n)[None], chunk.states(n)]) for n in ("q", "w"))
             for j in range(len(q) - 1):
-                good = credible(q[j + 1].T) & credible(w[j + 1].T)
+                good = is_bounded(q[j + 1].T) & is_bounded(w[j + 1].T)
                 for m in np.flatnonzero(alive & ~good):
                     self._lost[int(members[m])] = _Lost(k + j, q[j, :, m].copy(), w[j, :, m].copy())
                 alive &= good
             if not alive.any():
                 break
 
-    def outcome(self, single: bool) -> Outcome:
+    def outcome(self, single: bool) -> SolverResult:
         """Return what was kept; NaN where there is nothing."""
         n, grid, kept = len(self._q0), self._grid, self._kept
         steps = np.full(n, grid.steps)
@@ -363,7 +363,7 @@ class _Run:
         # Handed on as they are, however large, and not copied for fear of a later change.
         q.setflags(write=False)
         v.setflags(write=False)
-        return Outcome(
+        return SolverResult(
             t=np.array([grid.time(int(k)) for k in kept[:rows]]),
             q=q[0] if single else q,
             v=v[0] if single else v,

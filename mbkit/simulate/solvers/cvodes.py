@@ -20,10 +20,10 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import UnsupportedError
 from mbkit.methods.registry import Tolerances
 from mbkit.model import Model
-from mbkit.simulate.problem import Asked
-from mbkit.simulate.result import Ended, Outcome
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, credible
-from mbkit.simulate.solvers.trajectory_record import Member, gathered
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result
 
 __all__ = ["run_cvodes"]
 
@@ -44,7 +44,7 @@ class _Failure(NamedTuple):
     told: str
 
 
-def run_cvodes(asked: Asked) -> Outcome:
+def run_cvodes(asked: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself, to the times of `save`.
 
     The times are passed by and interpolated, as accurately as CVODES steps. Torques
@@ -76,7 +76,9 @@ def run_cvodes(asked: Asked) -> Outcome:
             if not run.over(piece, given):
                 break
         members.append(run.member)
-    return gathered(dyn.model, members, asked.batch, save, evaluations=solve.evaluations, jacobians=solve.jacobians)
+    return assemble_result(
+        dyn.model, members, asked.batch, save, evaluations=solve.evaluations, jacobians=solve.jacobians
+    )
 
 
 class _Run:
@@ -84,7 +86,7 @@ class _Run:
 
     def __init__(self, solve: _Solve, save: Array, done: Any) -> None:
         self._solve, self._saved, self._done = solve, frozenset(save.tolist()), done
-        self.member = Member()
+        self.member = TrajectoryRecord()
         self._y: Array = np.empty(0)
         self._intervals = 1
 
@@ -115,9 +117,9 @@ class _Run:
         if isinstance(out, _Failure):
             return 0, out
         y, steps, rejected = out
-        good = credible(y)
+        good = is_bounded(y)
         if not good.all():
-            return 0, _Failure("diverged", f"diverged: {RAN_AWAY}")
+            return 0, _Failure("diverged", f"diverged: {DIVERGED}")
         self.member.steps += steps
         self.member.rejected += rejected
         for t, state in zip(times[1:].tolist(), y, strict=True):

@@ -13,15 +13,15 @@ from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.result import Ended, Outcome
+from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.solvers.gauss import CollocationStep
 from mbkit.simulate.solvers.runge_kutta import (
-    RAN_AWAY,
+    DIVERGED,
     DivergenceError,
     Field,
     Step,
-    credible,
     explicit_step,
+    is_bounded,
 )
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
@@ -38,7 +38,7 @@ def run_fixed(
     kept: Indices,
     torque: Torque,
     bar: Progress,
-) -> Outcome:
+) -> SolverResult:
     """Step one state or a batch over the grid.
 
     A trajectory that diverges stops there; the others of its batch go on. A torque
@@ -85,10 +85,10 @@ class _Run:
     def advance(self, k: int) -> bool:
         """Take step k; return whether anything is left to go on with."""
         t, h = self._grid.time(k), self._grid.step(k)
-        why = RAN_AWAY
+        why = DIVERGED
         try:
             q, w = self._step(t, h, self._q, self._w, self._torque.during(k, self._members))
-            good = np.asarray(credible(q) & credible(w))
+            good = np.asarray(is_bounded(q) & is_bounded(w))
         except DivergenceError as error:
             q, w, good = self._one_by_one(t, h, k)
             why = str(error)
@@ -130,7 +130,7 @@ class _Run:
                 q[one], w[one] = self._step(t, h, self._q[one], self._w[one], force)
             except DivergenceError:
                 continue
-            good[i] = credible(q[i]) and credible(w[i])
+            good[i] = is_bounded(q[i]) and is_bounded(w[i])
         self._field.only(self._members)
         return q, w, good
 
@@ -140,7 +140,7 @@ class _Run:
         self._row += 1
         self._next = int(self._kept[self._row]) if self._row < len(self._kept) else -1
 
-    def outcome(self, evaluations: int) -> Outcome:
+    def outcome(self, evaluations: int) -> SolverResult:
         """Return what was kept."""
         message = self._message
         if message and self._members is not None:
@@ -149,7 +149,7 @@ class _Run:
         ended: Ended = "diverged" if message else "finished"
         if self._error is not None:
             ended, message = "function_failed", str(self._error)
-        return Outcome(
+        return SolverResult(
             t=np.array([self._grid.time(int(k)) for k in self._kept[: self._row]]),
             q=self._q_kept[..., : self._row, :],
             v=self._v_kept[..., : self._row, :],
@@ -170,7 +170,7 @@ def reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, f
             make_step(method, Field(dyn, space), space)(t, h, q, w, force)
         except DivergenceError as error:
             return str(error)
-    return RAN_AWAY
+    return DIVERGED
 
 
 def make_step(method: str, field: Field, space: Space) -> Step:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, DivergenceError, Field
+from mbkit.simulate.solvers.runge_kutta import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
 __all__ = ["CollocationStep"]
@@ -221,7 +221,7 @@ def _inverse_of(product: Array) -> Array:
     try:
         return np.asarray(np.linalg.inv(np.eye(rows) - product))
     except np.linalg.LinAlgError:
-        raise DivergenceError(_UNSOLVED if np.isfinite(product).all() else RAN_AWAY) from None
+        raise DivergenceError(_UNSOLVED if np.isfinite(product).all() else DIVERGED) from None
 
 
 def _mixed(weights: Array, rates: Array) -> Array:

@@ -28,8 +28,8 @@ from mbkit.errors import FunctionError, UnsupportedError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import refuse_constraints
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.result import Outcome
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, RUNAWAY
+from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.runge_kutta import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
@@ -176,7 +176,7 @@ def run_midpoint(
     kept: Indices,
     torque: Torque,
     bar: Progress,
-) -> Outcome:
+) -> SolverResult:
     """Step one state or a batch over the grid; a trajectory that diverges stops there, and the others go on."""
     if not isinstance(dyn, LagrangianDynamics):
         raise UnsupportedError(
@@ -305,7 +305,7 @@ class _Run:
                 w, tau, good = solver.velocity(members, k, grid.time(k), grid.step(k), q, pi, guess)
                 ws = [w, *ws[:-1]]
                 q1, pi1, guess = solver.end(members, grid.time(k), grid.step(k), q, pi, ws, tau)
-                good &= (np.abs(q1) < RUNAWAY).all(axis=1) & (np.abs(pi1) < RUNAWAY).all(axis=1)
+                good &= (np.abs(q1) < BOUND).all(axis=1) & (np.abs(pi1) < BOUND).all(axis=1)
                 if not good.all():
                     self._last[members[~good]] = np.maximum(np.abs(q).max(axis=1), np.abs(pi).max(axis=1))[~good]
                     members, q1, pi1, guess = members[good], q1[good], pi1[good], guess[good]
@@ -323,7 +323,7 @@ class _Run:
 
     # In the end
 
-    def outcome(self, single: bool) -> Outcome:
+    def outcome(self, single: bool) -> SolverResult:
         """Return what was kept, with velocities."""
         grid, kept, steps = self._grid, self._kept, self._steps
         for i in np.flatnonzero(steps < grid.steps):
@@ -335,7 +335,7 @@ class _Run:
         q, v = self._q[:, :rows], self._v[:, :rows]
         times = np.array([grid.time(int(k)) for k in steps])
         message = self._message(single)
-        return Outcome(
+        return SolverResult(
             t=np.array([grid.time(int(k)) for k in kept[:rows]]),
             q=q[0] if single else q,
             v=v[0] if single else v,
@@ -376,7 +376,7 @@ class _Run:
         i = int(short[np.argmin(steps[short])])
         t = grid.time(int(steps[i]))
         # What overflows in the middle of a step leaves no number for the iteration either.
-        why = RAN_AWAY if self._last[i] > RUNAWAY**0.5 else _UNSOLVED
+        why = DIVERGED if self._last[i] > BOUND**0.5 else _UNSOLVED
         message = f"diverged after t = {t:.6g} s (step {steps[i] + 1}): {why}; dt = {grid.dt:g} s may be too long"
         if not single:
             message += f"; {len(short)} of {len(steps)} trajectories diverged, see reached"

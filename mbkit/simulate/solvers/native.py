@@ -12,8 +12,8 @@ from mbkit.engines import Dynamics
 from mbkit.errors import UnsupportedError
 from mbkit.methods.registry import Method
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.result import Outcome
-from mbkit.simulate.solvers.runge_kutta import credible
+from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.runge_kutta import is_bounded
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
@@ -43,7 +43,7 @@ class HasRollout(Protocol):
 
 def run_native(
     dyn: Dynamics, method: Method, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque, bar: Progress
-) -> Outcome:
+) -> SolverResult:
     """Run the engine's integrator; from the first state that is none on, nothing is kept."""
     engine, integrator = method.name.split("_", 1)
     if dyn.engine != engine or not isinstance(dyn, HasRollout):
@@ -75,8 +75,8 @@ def run_native(
     return _outcome(method, grid, kept, np.asarray(q), np.asarray(v))
 
 
-def _outcome(method: Method, grid: Grid, kept: Indices, q: Array, v: Array) -> Outcome:
-    good = credible(q) & credible(v)
+def _outcome(method: Method, grid: Grid, kept: Indices, q: Array, v: Array) -> SolverResult:
+    good = is_bounded(q) & is_bounded(v)
     good[..., 0] = True  # the start is the caller's
     # After the first bad state everything is void, even what looks like numbers.
     good = np.logical_and.accumulate(good, axis=-1)
@@ -93,7 +93,7 @@ def _outcome(method: Method, grid: Grid, kept: Indices, q: Array, v: Array) -> O
     q, v = np.where(good[..., None], q, np.nan), np.where(good[..., None], v, np.nan)
     index = kept[kept < np.max(count)] if count.size else kept
     steps = int(np.sum(count - 1))
-    return Outcome(
+    return SolverResult(
         t=np.array([grid.time(int(k)) for k in index]),
         q=q[..., index, :],
         v=v[..., index, :],

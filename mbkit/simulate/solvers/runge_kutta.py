@@ -27,26 +27,26 @@ from mbkit.simulate.constraint_projection import Approach, beside, settled
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
-__all__ = ["RAN_AWAY", "RUNAWAY", "DivergenceError", "Field", "Step", "credible", "explicit_step"]
+__all__ = ["BOUND", "DIVERGED", "DivergenceError", "Field", "Step", "explicit_step", "is_bounded"]
 
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
 
-RAN_AWAY: Final = "the state grew beyond all bounds"
+DIVERGED: Final = "the state grew beyond all bounds"
 #: A state with a number of this size is none any more.
-RUNAWAY: Final = 1e100
+BOUND: Final = 1e100
 
 
 class DivergenceError(Exception):
     """A state or an acceleration is none any more; never leaves `mbkit.simulate`."""
 
 
-def credible(x: Array) -> NDArray[np.bool_]:
+def is_bounded(x: Array) -> NDArray[np.bool_]:
     """Return, per state, whether all its numbers are finite and below 1e100.
 
     No machine goes there, and energies of what lies below can still be computed.
     """
-    return np.asarray((np.abs(x) < RUNAWAY).all(axis=-1))
+    return np.asarray((np.abs(x) < BOUND).all(axis=-1))
 
 
 def _finite(q: Array, v: Array) -> bool:
@@ -99,8 +99,8 @@ class Field:
         v = self._space.leave(q, w)
         if not isinstance(force, np.ndarray):
             # A user's function never sees a state that is none.
-            if not (credible(q).all() and credible(v).all()):
-                raise DivergenceError(RAN_AWAY)
+            if not (is_bounded(q).all() and is_bounded(v).all()):
+                raise DivergenceError(DIVERGED)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
         if self._timed:
@@ -112,14 +112,14 @@ class Field:
         except InputError:
             if _finite(q, v):
                 raise
-            raise DivergenceError(RAN_AWAY) from None
+            raise DivergenceError(DIVERGED) from None
         return np.asarray(self._space.acceleration(q, v, a))
 
 
 def _blamed(told: str, q: Array, v: Array) -> str:
     # An engine overflows before its state does, and blames the model for it.
     largest = max(float(np.abs(x).max()) for x in (q, v))
-    return told if largest < 1e50 else RAN_AWAY
+    return told if largest < 1e50 else DIVERGED
 
 
 def explicit_step(formula: Tableau | SemiImplicitEuler, field: Field, space: Space) -> Step:

@@ -22,10 +22,10 @@ from mbkit.errors import FunctionError, MbkitError
 from mbkit.methods.registry import Tolerances
 from mbkit.model import Model
 from mbkit.simulate.events import State, Watch
-from mbkit.simulate.problem import Asked
-from mbkit.simulate.result import Outcome
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, credible
-from mbkit.simulate.solvers.trajectory_record import Member, gathered, member_of
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
 from mbkit.simulate.solvers.vector_field import Rates, unit_quaternions
 from mbkit.simulate.torque import Force
 
@@ -76,7 +76,7 @@ class _Task:
     watch: Watch | None
 
 
-def run_scipy(asked: Asked) -> Outcome:
+def run_scipy(asked: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself.
 
     Saved states are as accurate as the steps: steps of DOP853 and Radau end on the
@@ -97,11 +97,11 @@ def run_scipy(asked: Asked) -> Outcome:
             watch = Watch(asked.events, which) if asked.events else None
             saved = None if save is None else tuple(save.tolist())
             task = _Task(asked.start, start, stops, saved, torque.of_member(which), torque.held, watch)
-            member = member_of(dyn, which, asked.start, asked.duration)
+            member = record_of(dyn, which, asked.start, asked.duration)
             members.append(solve.member(task, member, asked.report(i)))
             if members[-1].error is not None:
                 break
-    return gathered(
+    return assemble_result(
         dyn.model, members, asked.batch, save, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations
     )
 
@@ -137,7 +137,7 @@ class _Solve:
         if self._jacobian is not None:
             self._jacobian.only(member)
 
-    def member(self, task: _Task, member: Member, done: Callable[[float], None]) -> Member:
+    def member(self, task: _Task, member: TrajectoryRecord, done: Callable[[float], None]) -> TrajectoryRecord:
         """Return what comes of one trajectory."""
         try:
             self._integrate(member, task, done)
@@ -145,7 +145,7 @@ class _Solve:
             member.fail(error)
         return member
 
-    def _integrate(self, member: Member, task: _Task, done: Callable[[float], None]) -> None:
+    def _integrate(self, member: TrajectoryRecord, task: _Task, done: Callable[[float], None]) -> None:
         if task.saved is None or (task.saved and task.saved[0] == task.t0):
             member.keep(task.t0, task.y0)
         if task.watch is not None:
@@ -157,7 +157,7 @@ class _Solve:
                 # A held force jumps here, and with it all that the solver remembers.
                 solver = self._anew(task, solver, force, stop)
             if solver is None:
-                member.stop("diverged", f"diverged: {self.rates.why or RAN_AWAY}")
+                member.stop("diverged", f"diverged: {self.rates.why or DIVERGED}")
                 return
             solver.t_bound, solver.status = stop, "running"
             while solver.status == "running":
@@ -200,20 +200,20 @@ class _Solve:
             **more,
         )
 
-    def _step(self, member: Member, solver: Any, force: Force, stop: float, duration: float) -> Any:
+    def _step(self, member: TrajectoryRecord, solver: Any, force: Force, stop: float, duration: float) -> Any:
         """Take a step and return the solver, or end the member and return None."""
         t, y = float(solver.t), solver.y.copy()
         self.rates.why = ""
         before = self.rates.evaluations
         wanted = self._shorten(solver, stop)
         if not _stepped(solver):
-            member.stop("diverged", f"diverged: {self.rates.why or RAN_AWAY}")
+            member.stop("diverged", f"diverged: {self.rates.why or DIVERGED}")
             return None
         self._lengthen(solver, wanted)
         if not self._scheme.implicit:
             tried = (self.rates.evaluations - before) // _STAGES
             member.rejected += max(0, tried - (solver.status != "failed"))
-        while self._scheme.solver == "LSODA" and solver.status != "failed" and not credible(solver.y):
+        while self._scheme.solver == "LSODA" and solver.status != "failed" and not is_bounded(solver.y):
             # It takes a step into what is no state; the others try a shorter one by themselves.
             first = (solver.t - t) / 4
             again = self._solver(t, y, force, stop, first) if first > duration * _EPS else None
@@ -234,8 +234,8 @@ class _Solve:
             member.stop("step_too_small", told)
             return None
         # Radau and DOP853 go on from the rate at the end of a step.
-        if not credible(solver.y) or not np.isfinite(getattr(solver, "f", 0.0)).all():
-            member.stop("diverged", f"diverged: {self.rates.why or RAN_AWAY}")
+        if not is_bounded(solver.y) or not np.isfinite(getattr(solver, "f", 0.0)).all():
+            member.stop("diverged", f"diverged: {self.rates.why or DIVERGED}")
             return None
         if self._model.constrained and not self._scheme.dense:
             solver.y = self.rates.settled(float(solver.t), solver.y)
@@ -263,7 +263,9 @@ class _Solve:
             # Radau keeps a factorization for the length that it knew.
             solver.LU_real = solver.LU_complex = None
 
-    def _stopped(self, member: Member, task: _Task, solver: Any, start: tuple[float, Array], force: Force) -> bool:
+    def _stopped(
+        self, member: TrajectoryRecord, task: _Task, solver: Any, start: tuple[float, Array], force: Force
+    ) -> bool:
         if task.watch is None:
             return False
         t = float(solver.t)
@@ -300,7 +302,7 @@ class _Solve:
             pass
         return np.asarray(solver.y)
 
-    def _keep(self, member: Member, task: _Task, solver: Any, end: float | None = None) -> None:
+    def _keep(self, member: TrajectoryRecord, task: _Task, solver: Any, end: float | None = None) -> None:
         """Keep what is wanted of the last step, up to its end or an earlier one."""
         t = float(solver.t)
         end = t if end is None else end

@@ -12,14 +12,14 @@ from mbkit._check import Array
 from mbkit.methods.registry import Tolerances
 from mbkit.model.integration_space import Space
 
-__all__ = ["ROUNDS", "Stretch", "Trials", "first_length"]
+__all__ = ["ROUNDS", "AcceptedSteps", "StepAttempts", "first_length"]
 
 #: Tries between two looks at them, at most.
 ROUNDS: Final = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class AcceptedSteps:
     """Accepted steps of one trajectory in a row, the state before the first in front.
 
     Attributes
@@ -37,7 +37,7 @@ class Stretch:
     tried: int
 
 
-class Trials(Protocol):
+class StepAttempts(Protocol):
     """Steps of a few trajectories side by side, each with times and lengths of its own.
 
     Attributes
@@ -65,7 +65,7 @@ class Trials(Protocol):
     def hold(self, k: int, stop: float) -> None:
         """Go on to a time, under the force of interval k."""
 
-    def advance(self) -> list[tuple[int, Stretch]]:
+    def advance(self) -> list[tuple[int, AcceptedSteps]]:
         """Take some steps; return, of each trajectory that had a way to go, its place and steps."""
 
     def drop(self, place: int) -> None:
@@ -87,7 +87,7 @@ class Trials(Protocol):
     def rates(self, place: int, q: Array, w: Array) -> Array:
         """Return ẇ at states, (n, nq) and (n, nv), of a trajectory's parameters under the force that acts now."""
 
-    def within(self, place: int, start: Stretch, times: Array) -> tuple[Array, Array]:
+    def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:
         """Return (q, w) at times, (m, nq) and (m, nv), each by one step from the state of the same row."""
 
 

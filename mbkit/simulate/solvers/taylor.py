@@ -20,11 +20,11 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.events import State, Watch
-from mbkit.simulate.problem import Asked
-from mbkit.simulate.result import Ended, Outcome
-from mbkit.simulate.solvers.runge_kutta import RAN_AWAY, credible
-from mbkit.simulate.solvers.trajectory_record import Member, gathered, member_of
-from mbkit.simulate.solvers.vector_field import Rates, size_of, unit_quaternions
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
+from mbkit.simulate.solvers.vector_field import Rates, magnitude, unit_quaternions
 
 __all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
 
@@ -33,7 +33,7 @@ _JUMP: Final = 1e-6
 _BITS: Final = {"lagrangian": 53, "oracle": 113}
 
 
-def run_taylor(asked: Asked) -> Outcome:
+def run_taylor(asked: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself.
 
     The tolerance bounds each step's error, with the smaller of rtol and atol: absolute up to a factor of ten in the
@@ -58,7 +58,7 @@ def run_taylor(asked: Asked) -> Outcome:
             f"{asked.method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')"
         )
     kind = precision(_BITS[dyn.engine])
-    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / size_of(asked.y), kind.eps)
+    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / magnitude(asked.y), kind.eps)
     ends = [asked.end, *(save.tolist() if save is not None and torque.held else [])]
     stops = sorted({*ends} - {asked.start})
     members = []
@@ -70,11 +70,11 @@ def run_taylor(asked: Asked) -> Outcome:
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             steps = TaylorSteps(system, integrator, kind, _behind(own, kind), settled)
             watch = Watch(asked.events, which) if asked.events else None
-            member = member_of(dyn, which, asked.start, asked.duration)
+            member = record_of(dyn, which, asked.start, asked.duration)
             one = _Run(own, steps, save, watch, member, asked.report(i))
             members.append(one.all(asked.start, start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
-    return gathered(dyn.model, members, asked.batch, save, evaluations=evaluations)
+    return assemble_result(dyn.model, members, asked.batch, save, evaluations=evaluations)
 
 
 def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:
@@ -180,8 +180,8 @@ class TaylorSteps:
                     raise self._without_series()
                 elif h < least:
                     raise StoppedError("step_too_small", "step below rounding: singular or diverging")
-                if not credible(_rounded(state)):
-                    raise StoppedError("diverged", RAN_AWAY)
+                if not is_bounded(_rounded(state)):
+                    raise StoppedError("diverged", DIVERGED)
                 if self._system.kinked and self._jumped(float(h), force(k)):
                     raise StoppedError(
                         "step_too_small", "a force jumps, which a series cannot follow and method='rk853' can,"
@@ -199,7 +199,7 @@ class TaylorSteps:
             return StoppedError(
                 "step_too_small", "a root or power of zero, which has no Taylor series and method='rk853' goes past,"
             )
-        return StoppedError("diverged", RAN_AWAY)
+        return StoppedError("diverged", DIVERGED)
 
     def _holds(self) -> float:
         """Return how long a step the series just made allows, by its last six orders.
@@ -248,14 +248,14 @@ class _Run:
         steps: TaylorSteps,
         save: Array | None,
         watch: Watch | None,
-        member: Member,
+        member: TrajectoryRecord,
         done: Callable[[float], None],
     ) -> None:
         self._dyn, self._steps, self._watch, self._done = dyn, steps, watch, done
         self._save = None if save is None else save.tolist()
         self._member = member
 
-    def all(self, t0: float, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> Member:
+    def all(self, t0: float, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> TrajectoryRecord:
         """Return what comes of it."""
         member, steps = self._member, self._steps
         member.reached = t0
@@ -317,7 +317,7 @@ class _Run:
                 at_time(self._dyn, self._steps.t).forward_dynamics(q, v, force)
             except NumericalError as error:
                 return str(error)
-        return RAN_AWAY
+        return DIVERGED
 
 
 def _rounded(y: Any) -> Array:

@@ -16,11 +16,11 @@ from mbkit.model import Model
 from mbkit.simulate.constraint_projection import SingularPoses
 from mbkit.simulate.events import Hit
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.result import Ended, Outcome
+from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.solvers.vector_field import unit_quaternions
 from mbkit.simulate.time_grid import check_room
 
-__all__ = ["Member", "check_save", "gathered", "member_of", "reporter"]
+__all__ = ["TrajectoryRecord", "assemble_result", "check_save", "record_of", "reporter"]
 
 #: Tried steps between two looks at the time that they covered, and the least part of the run that they must cover.
 #: A run at that pace takes 2e10 steps.
@@ -29,7 +29,7 @@ _COVERED: Final = 1e-6
 
 
 @dataclass
-class Member:
+class TrajectoryRecord:
     """What came of one trajectory.
 
     Attributes
@@ -108,7 +108,7 @@ class Member:
         self.ended, self.message, self.error = "function_failed", str(error), error
 
 
-def member_of(dyn: Dynamics, which: int | None, start: float, duration: float) -> Member:
+def record_of(dyn: Dynamics, which: int | None, start: float, duration: float) -> TrajectoryRecord:
     """Return what comes of one trajectory that has not begun.
 
     Parameters
@@ -120,7 +120,7 @@ def member_of(dyn: Dynamics, which: int | None, start: float, duration: float) -
         s.
     """
     poses = SingularPoses(dyn if which is None else dyn.of_samples([which])) if dyn.model.constrained else None
-    return Member(reached=start, duration=duration, poses=poses, _look=(0, start))
+    return TrajectoryRecord(reached=start, duration=duration, poses=poses, _look=(0, start))
 
 
 def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
@@ -142,21 +142,21 @@ def reporter(bar: Progress, i: int, count: int, start: float, duration: float) -
     return done
 
 
-def gathered(
+def assemble_result(
     model: Model,
-    members: Sequence[Member],
+    members: Sequence[TrajectoryRecord],
     batch: int | None,
     times: Array | None,
     *,
     evaluations: int,
     jacobians: int = 0,
-) -> Outcome:
+) -> SolverResult:
     """Return one trajectory, or a batch of them as far as they came, as an outcome.
 
     Parameters
     ----------
     model : Model
-    members : sequence of Member
+    members : sequence of TrajectoryRecord
         Those of a batch that were not begun are void.
     batch : int or None
     times : (K,) array or None
@@ -175,7 +175,7 @@ def gathered(
     reached[: len(members)] = [member.reached for member in members]
     ended, message = _told(members, batch)
     t = members[0].t if batch is None else [] if times is None else times[:count].tolist()
-    return Outcome(
+    return SolverResult(
         t=np.array(t, dtype=np.float64),
         q=(y[0] if batch is None else y)[..., : model.nq],
         v=(y[0] if batch is None else y)[..., model.nq :],
@@ -193,7 +193,7 @@ def gathered(
     )
 
 
-def _told(members: Sequence[Member], batch: int | None) -> tuple[Ended, str]:
+def _told(members: Sequence[TrajectoryRecord], batch: int | None) -> tuple[Ended, str]:
     # What went wrong is told before what was wished for.
     early = [member for member in members if member.ended != "finished"]
     early.sort(key=lambda member: ("function_failed", "diverged", "step_too_small", "event").index(member.ended))

@@ -12,10 +12,10 @@ from mbkit.engines.base import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
 from mbkit.simulate.constraint_projection import Approach, beside, settled
-from mbkit.simulate.solvers.runge_kutta import RUNAWAY
+from mbkit.simulate.solvers.runge_kutta import BOUND
 from mbkit.simulate.torque import Force
 
-__all__ = ["Rates", "size_of", "unit_quaternions"]
+__all__ = ["Rates", "magnitude", "unit_quaternions"]
 
 
 class Rates:
@@ -59,7 +59,7 @@ class Rates:
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
         # A user's function never sees a state that is none. By its norm, which is quicker than by each number.
-        if not float(y @ y) < RUNAWAY**2:
+        if not float(y @ y) < BOUND**2:
             return np.full(len(y), np.nan)
         nq = self._model.nq
         q, lengths = unit_quaternions(self._model, y[:nq])
@@ -111,7 +111,7 @@ def unit_quaternions(model: Model, q: Array) -> tuple[Array, Array]:
 _COMMON: Final = 10.0
 
 
-def size_of(*states: Array) -> float:
+def magnitude(*states: Array) -> float:
     """Return by what a tolerance relative to a state's largest number is too loose for the others.
 
     In whole decades, as Taylor series of each order are compiled once; below ten it is the slack that common motions
@@ -119,7 +119,7 @@ def size_of(*states: Array) -> float:
 
     Examples
     --------
-    >>> size_of(np.array([0.1, -3.0])), size_of(np.array([0.1, 1.0]), np.array([-2e4]))
+    >>> magnitude(np.array([0.1, -3.0])), magnitude(np.array([0.1, 1.0]), np.array([-2e4]))
     (1.0, 100000.0)
     """
     largest = max(float(np.abs(y).max(initial=0.0)) for y in states)
