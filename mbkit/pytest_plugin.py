@@ -34,7 +34,6 @@ _MARK = (
     "mbkit(robots=[...], engines=[...], **load): run a test for each robot (mbkit_model) and engine (mbkit_engine); "
     "a robot is a name, a file beside the test, package.module:function, or a Model; load are options of mbkit.load"
 )
-_ENGINES = ("pinocchio", "lagrangian", "mujoco")
 #: What a report brings from the process of the test to the one that prints.
 _TOLD = "mbkit"
 _CACHE = pytest.StashKey[dict[Any, Any]]()
@@ -85,7 +84,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
             )
         metafunc.parametrize("mbkit_model", robots, indirect=True, ids=[_id(r) for r in robots])
     if wants_engine:
-        engines = _several(asked.get("engines", _ENGINES), "engines")
+        from mbkit.engines.registry import STANDARD
+
+        engines = _several(asked.get("engines", STANDARD), "engines")
         metafunc.parametrize("mbkit_engine", engines, indirect=True, ids=[str(e) for e in engines])
 
 

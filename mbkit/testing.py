@@ -11,6 +11,8 @@ import unittest
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+from mbkit.engines.registry import STANDARD, find_engine
+
 if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.studies.baseline import BaselineResult
@@ -28,7 +30,7 @@ _SAMPLES = 16
 
 def assert_engines_agree(
     model: Model,
-    engines: Sequence[str] = ("pinocchio", "lagrangian", "mujoco"),
+    engines: Sequence[str] = STANDARD,
     rtol: float = 1e-12,
     *,
     samples: int = _SAMPLES,
@@ -194,9 +196,9 @@ def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterabl
     if worst and worst[0].worst_q:
         lines.append(f"  worst state ({worst[0].worst_kind}): q = {_numbers(worst[0].worst_q)}")
         lines.append(f"                v = {_numbers(worst[0].worst_v)}")
-    packages = {"pinocchio": "pin", "mujoco": "mujoco", "drake": "drake", "lagrangian": "casadi"}
+    packages = ((e, find_engine(e).distribution) for e in result.engines)
     # A user's own engine goes by its own name.
-    versions = (f"{packages[e]} {result.versions[packages[e]]}" if e in packages else e for e in result.engines)
+    versions = (f"{package} {result.versions[package]}" if package in result.versions else e for e, package in packages)
     lines.append(f"  {', '.join(versions)}")
     lines.append(f"  to see it all: mbkit.compare(model, {result.engines}, {result.samples}, {result.seed})")
     return "\n".join(lines)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import mbkit as mb
-from mbkit.engines import ENGINES
+from mbkit.engines import ENGINES, EngineInfo
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.testing import STRICT, assert_baseline, assert_engines_agree, assert_same_dynamics
 
@@ -66,10 +66,10 @@ def test_my_conversion_is_still_my_robot(mbkit_model):
 MISTAKES = """
 import pytest
 import mbkit as mb
-from mbkit.engines import ENGINES
+from mbkit.engines import ENGINES, EngineInfo
 from mbkit.engines.lagrangian import LagrangianDynamics
 
-ENGINES["drake"] = ("no_such_engine", "Dynamics", "mbkit[drake]")
+ENGINES["drake"] = EngineInfo("drake", module="no_such_engine", class_name="Dynamics", package="mbkit[drake]")
 
 
 @pytest.mark.mbkit(robots=["pandaa"])
@@ -198,8 +198,7 @@ class Heavy(LagrangianDynamics):
 
 
 def test_asserts_take_an_engine_of_ones_own(monkeypatch):
-    monkeypatch.setitem(ENGINES, "heavy", (__name__, "Heavy", "heavy"))
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "COMPARABLE", ("lagrangian", "heavy"))
+    monkeypatch.setitem(ENGINES, "heavy", EngineInfo("heavy", module=__name__, class_name="Heavy"))
     with pytest.raises(AssertionError, match=r"heavy, g: differs by(.|\n)*casadi .*, heavy"):
         assert_engines_agree(mb.catalog.pendulum(), ("lagrangian", "heavy"), samples=1)
 
@@ -207,7 +206,8 @@ def test_asserts_take_an_engine_of_ones_own(monkeypatch):
 def test_a_missing_engine_skips_or_fails(monkeypatch, tmp_path):
     model, path = mb.catalog.pendulum(), tmp_path / "a.toml"
     mb.baseline.record(model, path, ["mujoco"])
-    monkeypatch.setitem(ENGINES, "mujoco", ("no_such_engine", "Dynamics", "mujoco"))
+    absent = EngineInfo("mujoco", module="no_such_engine", class_name="Dynamics", package="mujoco")
+    monkeypatch.setitem(ENGINES, "mujoco", absent)
     with pytest.raises(unittest.SkipTest, match="mujoco: not installed"):
         assert_engines_agree(model, ("pinocchio", "mujoco"))
     with pytest.raises(unittest.SkipTest, match="nothing was checked: mujoco"):

@@ -93,11 +93,11 @@ def in_options(message: str) -> str:
 
 def check_engines(names: tuple[str, ...], least: int) -> None:
     """Raise for names that are no engine's, before anything is read, loaded or computed."""
-    from mbkit.engines import ENGINES
+    from mbkit.engines.registry import REFERENCE, compared
 
-    comparable = [name for name in ENGINES if name != "oracle"]
+    comparable = compared()
     for name in names:
-        if name == "oracle":
+        if name == REFERENCE:
             raise InputError("--engines: the oracle is what every engine is measured by; leave it out")
         if name not in comparable:
             raise UnknownNameError("engine", name, comparable)

@@ -19,6 +19,7 @@ from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Joint, Model
 
 __all__ = [
+    "DOUBLE_BITS",
     "QUANTITIES",
     "Dynamics",
     "at_time",
@@ -45,6 +46,9 @@ QUANTITIES: Final = (
     "jacobian",
     "function",
 )
+
+#: Bits of a double's significand.
+DOUBLE_BITS: Final = 53
 
 #: Loops or prescribed joints that a refusal names.
 _NAMED: Final = 3
@@ -87,6 +91,10 @@ class Dynamics(ABC):
     takes_parameters: ClassVar[bool] = False
     #: Whether a model may be energies without bodies.
     takes_written: ClassVar[bool] = False
+    #: Whether it has `mbkit.derivation.Equations` and compiles whole steps of them.
+    derived: ClassVar[bool] = False
+    #: Of the significand with which it computes.
+    bits: ClassVar[int] = DOUBLE_BITS
 
     def __init__(self, model: Model) -> None:
         if not model.has_bodies and not self.takes_written:

@@ -270,6 +270,7 @@ class LagrangianDynamics(Dynamics):
     """
 
     engine = "lagrangian"
+    derived = True
     takes_parameters = True
     takes_written = True
 

@@ -78,6 +78,7 @@ class OracleDynamics(Dynamics):
     """
 
     engine = "oracle"
+    bits = 113
     takes_written = True
     refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 

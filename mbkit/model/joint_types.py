@@ -458,6 +458,7 @@ def register_joint_type(joint_type: JointType) -> JointType:
     ...         return [a * v[0] for a in joint.axes[0]], [a * v[1] for a in joint.axes[0]]
     >>> register_joint_type(Cylindrical())
     <joint type 'doc_cylindrical': nq=2, nv=2>
+    >>> _ = KINDS.pop("doc_cylindrical")  # a script keeps it
     """
     if not isinstance(joint_type, JointType):
         raise InputError(f"joint_type: expected an instance of a subclass of JointType, got {joint_type!r}")

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
-from mbkit.engines.base import no_dynamics
+from mbkit.engines.base import DOUBLE_BITS, no_dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
@@ -55,7 +55,7 @@ def fixed_runner(method: Method, dyn: Dynamics, torque: Torque) -> Callable[...,
 
 def _compiles(dyn: Dynamics) -> bool:
     """Return whether whole steps can be compiled: own derivation, written out, and a compiler."""
-    if dyn.engine != "lagrangian":
+    if not dyn.derived:
         return False
     # Other engines need no CasADi.
     from mbkit.codegen.interpreter import Machine
@@ -383,7 +383,7 @@ def _adaptive(
 
 def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float | None) -> Tolerances:
     rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
-    least = _LEAST_EXTENDED if dyn.engine == "oracle" and method.extended else method.least
+    least = _LEAST_EXTENDED if dyn.bits > DOUBLE_BITS and method.extended else method.least
     if rtol < least:
         raise InputError(f"rtol: expected at least {least:.3g} for {method.name} on {dyn.engine}, got {rtol:g}")
     return Tolerances(rtol, rtol if atol is None else real("atol", atol, positive=True))

@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from mbkit.engines import ENGINES
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["PLAIN", "Palette", "engine_index", "engine_mark", "log_ticks", "style"]
 
-#: An engine keeps its colour and marker in every figure, whichever others are beside it.
-_ENGINES: Final = ("pinocchio", "lagrangian", "mujoco", "drake", "oracle")
 _MARKS: Final = "osD^vP"
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -39,8 +39,9 @@ PLAIN: Final = Palette(
 
 
 def engine_index(name: str) -> int:
-    """Return which of the six series an engine is drawn with."""
-    return _ENGINES.index(name) if name in _ENGINES else len(_ENGINES)
+    """Return which of the six series an engine is drawn with: the same in every figure, whichever others are there."""
+    order = list(ENGINES)
+    return min(order.index(name), len(_MARKS) - 1) if name in order else len(_MARKS) - 1
 
 
 def engine_mark(name: str) -> str:

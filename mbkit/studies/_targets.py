@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from mbkit import catalog
 from mbkit.engines import ENGINES
-from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError
+from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
 from mbkit.load.robot_data import find
 from mbkit.model import Model
@@ -171,11 +171,8 @@ def not_installed(engines: Iterable[str]) -> dict[str, str]:
     for name in engines:
         if name not in ENGINES:
             continue
-        module, _, package = ENGINES[name]
         try:
-            importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            if error.name and error.name.startswith("mbkit"):
-                raise
-            out[name] = f"not installed; pip install {package}"
+            ENGINES[name].load()
+        except UnsupportedError:
+            out[name] = f"not installed; pip install {ENGINES[name].package}"
     return out

@@ -22,6 +22,7 @@ import numpy as np
 
 from mbkit._escape import csv_text, html, markdown
 from mbkit._version import __version__
+from mbkit.engines.registry import ENGINES
 from mbkit.errors import InputError, OutputError
 from mbkit.model import Model
 
@@ -291,22 +292,23 @@ def model_info(model: Model) -> dict[str, Any]:
     }
 
 
-_PACKAGES: Final = (
-    *("pin", "mujoco", "drake", "casadi", "numpy", "scipy"),
-    *("llvmlite", "heyoka", "mpmath", "example-robot-data"),
-)
+#: What computes beside the engines.
+_BESIDE: Final = ("numpy", "scipy", "llvmlite", "heyoka", "example-robot-data")
 
 
 def versions() -> dict[str, str]:
     """Return the versions of everything that computes."""
-    return dict(_versions())
+    engines = (info.distribution for info in ENGINES.values())
+    return dict(_versions(tuple(dict.fromkeys([*engines, *_BESIDE]))))
 
 
 @cache
-def _versions() -> dict[str, str]:
+def _versions(packages: tuple[str, ...]) -> dict[str, str]:
     # Searching the installed packages takes some 10 ms.
     out = {"mbkit": __version__, "python": platform.python_version()}
-    for package in _PACKAGES:
+    for package in packages:
+        if package in out:
+            continue
         try:
             out[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

@@ -32,6 +32,7 @@ from typing import Any, Final, TypeVar
 from weakref import WeakSet
 
 from mbkit import _interrupt
+from mbkit.engines.registry import registered_engines
 from mbkit.errors import MbkitError, UnsupportedError
 
 __all__ = [
@@ -209,7 +210,7 @@ class Worker:
         """
         if self._closed.is_set():
             raise WorkerClosedError
-        call = pickle.dumps((function, args))
+        call = pickle.dumps((registered_engines(), function, args))
         # As multiprocessing has its children import the script that they were started from.
         main = spawn.get_preparation_data("mbkit") if b"__main__" in call else {}
         main = {k: x for k, x in main.items() if k.startswith("init_main")}
@@ -451,7 +452,7 @@ def _answer(main: dict[str, Any], call: bytes) -> bytes:
     try:
         if main:
             spawn.prepare(main)
-        function, args = pickle.loads(call)
+        _, function, args = pickle.loads(call)
     except Exception as error:  # a user's module may raise anything
         return pickle.dumps(("error", CallError(describe(error))))
     try:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import at_times
+from mbkit.engines.base import DOUBLE_BITS, at_times
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances
 from mbkit.model import Model
@@ -78,7 +78,7 @@ def doubts(
     """
     nv = dyn.model.nv
     # The oracle's digits are not in doubt, and its terms take long.
-    if len(t) < 2 or not nv or not v.size or dyn.engine == "oracle":
+    if len(t) < 2 or not nv or not v.size or dyn.bits > DOUBLE_BITS:
         return []
     # The first trajectory's fastest state is where a step is longest for it.
     fastest = int(np.nan_to_num(np.abs(v.reshape(-1, *v.shape[-2:])[0]).max(axis=-1), posinf=0.0).argmax())

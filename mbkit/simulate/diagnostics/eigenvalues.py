@@ -179,7 +179,7 @@ def _of_one(
     force = Asked(tau, model.nv).one if callable(tau) else tau
     if not model.nv:
         return Stiffness(np.zeros(0, dtype=complex), 0.0, member=member)
-    if dyn.engine == "lagrangian":
+    if dyn.derived:
         # Other engines need no CasADi.
         from mbkit.simulate.diagnostics.linearization import Linearization
 

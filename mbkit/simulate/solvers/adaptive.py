@@ -82,7 +82,7 @@ def make_attempts(
     given = dyn, space, tolerances, torque, duration, batch
     # A compiled step has one value of the time, and does not look for constraints.
     plain = not torque.callable and not dyn.model.time_parameter and not dyn.model.constrained
-    if dyn.engine == "lagrangian" and plain and dyn.model.nv:
+    if dyn.derived and plain and dyn.model.nv:
         # Other engines need no CasADi.
         from mbkit.codegen.backend import has_compiler
         from mbkit.engines.lagrangian import LagrangianDynamics

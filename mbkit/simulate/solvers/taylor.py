@@ -30,7 +30,6 @@ __all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
 
 # Of a rate, relative to the largest or 1: what no truncation of a series makes.
 _JUMP: Final = 1e-6
-_BITS: Final = {"lagrangian": 53, "oracle": 113}
 
 
 def run_taylor(asked: IntegrationProblem) -> SolverResult:
@@ -57,7 +56,7 @@ def run_taylor(asked: IntegrationProblem) -> SolverResult:
         raise UnsupportedError(
             f"{asked.method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')"
         )
-    kind = precision(_BITS[dyn.engine])
+    kind = precision(dyn.bits)
     system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / magnitude(asked.y), kind.eps)
     ends = [asked.end, *(save.tolist() if save is not None and torque.held else [])]
     stops = sorted({*ends} - {asked.start})

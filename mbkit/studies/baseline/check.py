@@ -11,6 +11,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.registry import REFERENCE
 from mbkit.errors import BaselineError
 from mbkit.model import Model
 from mbkit.studies import results
@@ -313,7 +314,7 @@ def _rows(a: Baseline, b: Baseline) -> list[Moved]:
     moved = tolerance.moved(a.versions, b.versions)
     rows = []
     for term, x in a.terms.items():
-        if term in b.terms and (row := yardstick.moved("oracle", term, b.terms[term], x, FINE)):
+        if term in b.terms and (row := yardstick.moved(REFERENCE, term, b.terms[term], x, FINE)):
             rows.append(row)
     for engine, terms in a.own.items():
         for term, x in terms.items():

@@ -11,8 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array, count
-from mbkit.engines import ENGINES, Dynamics, dynamics
+from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
+from mbkit.engines.registry import compared, find_engine
 from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
@@ -24,7 +25,6 @@ from mbkit.studies.baseline.description import described, links_of
 from mbkit.studies.baseline.file import check_replaceable, path_of, store, text_of
 from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Yardstick, relevant
 from mbkit.studies.compare.rollouts import quiet_simulate
-from mbkit.studies.compare.study import COMPARABLE
 from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.results import Refusal
 
@@ -33,8 +33,6 @@ __all__ = ["LONG", "checked_model", "checked_names", "evaluated", "made", "recor
 
 # What is recorded, evaluated: the states, every term at them, and where a short rollout ends.
 
-# The same formula everywhere: MuJoCo by its own steps, the others by mbkit's.
-_METHODS: Final = {"mujoco": "mujoco_rk4"}
 _METHOD: Final = "rk4"
 #: Of the motion of a robot an excerpt, in which rounding does not grow.
 LONG: Final = Rollout(dt=2e-3, steps=25)
@@ -90,7 +88,8 @@ def _refusal(dyn: Dynamics, term: str, error: MbkitError) -> Refusal:
 def _rolled(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
     """Return q and v at the end of a rollout from the first state, one after the other."""
     # MuJoCo's own steps make a mimic joint a soft equality, which is another system.
-    method = _METHOD if dyn.model.layout.reduced else _METHODS.get(dyn.engine, _METHOD)
+    # The same formula everywhere, by an engine's own steps where it has them.
+    method = _METHOD if dyn.model.layout.reduced else find_engine(dyn.engine).rk4
     run = quiet_simulate(dyn, at.q[0], at.v[0], rollout.dt * rollout.steps, method, rollout.dt)
     if run.stats.ended != "finished":
         raise NumericalError(f"{dyn.engine}: {method}: {run.stats.message}")
@@ -233,9 +232,6 @@ def _error(yardstick: Yardstick, term: str, value: Array, reference: Array) -> f
 
 # The engines of a baseline, made; one that is not installed is told apart from one that refuses.
 
-# A few states are no reason to compile.
-_OPTIONS: Final[dict[str, dict[str, Any]]] = {"lagrangian": {"compile": False}}
-
 
 def checked_model(given: object) -> Model:
     """Return a model that has something to record."""
@@ -249,14 +245,14 @@ def checked_model(given: object) -> Model:
 def checked_names(engines: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of engines, all that there are where none were given."""
     if engines is None:
-        return COMPARABLE
+        return compared()
     if isinstance(engines, str):
         raise InputError(f"engines: expected several names, got the string {engines!r}; write [{engines!r}]")
     for name in engines:
-        if name not in COMPARABLE:
-            raise UnknownNameError("engine", str(name), COMPARABLE)
+        if name not in compared():
+            raise UnknownNameError("engine", str(name), compared())
     if not engines:
-        raise InputError(f"engines: expected at least one of {', '.join(COMPARABLE)}")
+        raise InputError(f"engines: expected at least one of {', '.join(compared())}")
     return tuple(dict.fromkeys(engines))
 
 
@@ -273,10 +269,10 @@ def made(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[
     missing: list[Refusal] = []
     for name in names:
         try:
-            found[name] = dynamics(model, name, **_OPTIONS.get(name, {}))
+            found[name] = dynamics(model, name, **find_engine(name).brief)
         except UnsupportedError as error:
             absent = isinstance(error.__cause__, ModuleNotFoundError)
-            told = f"not installed; pip install {ENGINES[name][2]}" if absent else _plain(name, error)
+            told = f"not installed; pip install {find_engine(name).package}" if absent else _plain(name, error)
             (missing if absent else refused).append(Refusal(name, "", told))
         except MbkitError as error:
             refused.append(Refusal(name, "", _plain(name, error)))

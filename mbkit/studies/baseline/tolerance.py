@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.engines.registry import ENGINES
 from mbkit.studies import results
 from mbkit.studies.baseline.content import ROLLOUT, Baseline
 from mbkit.studies.baseline.description import Description, moving_mass
@@ -170,8 +171,6 @@ class Yardstick:
 
 # Which package computes for which engine, and which of them have moved.
 
-#: What an engine's numbers come from. The own derivation is interpreted by CasADi here.
-_PACKAGES: Final = {"pinocchio": "pin", "lagrangian": "casadi", "mujoco": "mujoco", "drake": "drake"}
 # The description and the states come from these, whatever the engine.
 _SHARED: Final = ("mbkit", "pin", "numpy")
 
@@ -193,7 +192,7 @@ _ABSENT: Final = "not installed"
 
 def relevant(engines: Iterable[str]) -> dict[str, str]:
     """Return the versions that can move numbers of these engines."""
-    packages = dict.fromkeys([*_SHARED, *(_PACKAGES[e] for e in engines if e in _PACKAGES)])
+    packages = dict.fromkeys([*_SHARED, *(ENGINES[e].distribution for e in engines if e in ENGINES)])
     now = results.versions()
     return {p: now[p] for p in packages}
 
@@ -206,7 +205,7 @@ def moved(old: Mapping[str, str], new: Mapping[str, str]) -> tuple[VersionChange
 def of_engine(engine: str, old: Mapping[str, str], changed: Iterable[VersionChange]) -> str:
     """Return which version of an engine moved, or that none did, for a failure."""
     changed = tuple(changed)
-    package = _PACKAGES.get(engine, "mbkit")
+    package = ENGINES[engine].distribution if engine in ENGINES else "mbkit"
     own = [str(m) for m in changed if m.package == package]
     others = [str(m) for m in changed if m.package in _SHARED and m.package != package]
     told = own or [f"{package} {old.get(package, '?')}, as recorded"]

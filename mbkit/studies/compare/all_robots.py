@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from mbkit.engines.registry import STANDARD
 from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError
 from mbkit.load import load, robots
 from mbkit.load.robot_data import find
@@ -134,7 +135,7 @@ class Sweep:
 def all_robots(
     names: Sequence[str] | None = None,
     *,
-    engines: Sequence[str] = ("pinocchio", "lagrangian", "mujoco"),
+    engines: Sequence[str] = STANDARD,
     samples: int = 64,
     seed: int = 0,
     floating_base: bool = False,

@@ -11,6 +11,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.registry import DERIVED, MUJOCO
 from mbkit.model import Model
 from mbkit.studies.compare.errors import interleaved
 from mbkit.studies.compare.result import Omission
@@ -38,10 +39,10 @@ def omissions(model: Model, made: Mapping[str, Dynamics], seed: int) -> tuple[Om
     # Well within the limits, where none of them acts.
     q, v = inside(model, np.random.default_rng([seed, 2]))
     rows: list[Omission] = []
-    mujoco = made.get("mujoco")
+    mujoco = made.get(MUJOCO)
     if mujoco is not None:
         rows += _in_mujoco(model, mujoco, q, v)
-    if "lagrangian" in made:
+    if DERIVED in made:
         rows.append(_coriolis(model, q, v))
     return tuple(rows)
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.model import Model
 from mbkit.simulate import Trajectory, simulate
@@ -84,14 +85,14 @@ def rollouts(model: Model, made: Mapping[str, Dynamics], seed: int, note: str) -
     Nothing is compared unless MuJoCo and another engine hold the model.
     """
     engines = dict(made)
-    ours_on = [name for name in ("pinocchio", "lagrangian") if name in engines]
-    if "mujoco" not in engines or not ours_on:
+    ours_on = [name for name in (PINOCCHIO, DERIVED) if name in engines]
+    if MUJOCO not in engines or not ours_on:
         return ()
     rows = []
     q0, v0 = start_state(model, seed)
     for method, native in _PAIRS:
-        theirs = quiet_simulate(engines["mujoco"], q0, v0, DURATION, native, STEP)
-        condition = _condition(engines["mujoco"], engines[ours_on[0]], native, theirs)
+        theirs = quiet_simulate(engines[MUJOCO], q0, v0, DURATION, native, STEP)
+        condition = _condition(engines[MUJOCO], engines[ours_on[0]], native, theirs)
         last = _safe(condition)
         for name in ours_on:
             # One step first: compiling it is not run time.
@@ -99,7 +100,7 @@ def rollouts(model: Model, made: Mapping[str, Dynamics], seed: int, note: str) -
             ours = quiet_simulate(engines[name], q0, v0, STEP * last, method, STEP)
             rows.append(_row(model, method, name, native, ours, theirs, condition, last, note))
     if model.needs.damping:
-        rows.append(_implicit_damping(model, engines["mujoco"], q0, v0))
+        rows.append(_implicit_damping(model, engines[MUJOCO], q0, v0))
     return tuple(rows)
 
 
@@ -180,7 +181,7 @@ def _implicit_damping(model: Model, dyn: Dynamics, q0: Array, v0: Array) -> Roll
     difference = float(np.abs(model.difference(begun.q[:n], q[:n])).max())
     return RolloutRow(
         method="mujoco_euler, damping explicit",
-        engine="mujoco",
+        engine=MUJOCO,
         against="mujoco_euler, damping implicit (MuJoCo's default)",
         dt=STEP,
         duration=(n - 1) * STEP,

@@ -11,8 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array, count, real
-from mbkit.engines import ENGINES, Dynamics, dynamics
+from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
+from mbkit.engines.registry import REFERENCE, STANDARD, compared, find_engine
 from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
@@ -25,7 +26,7 @@ from mbkit.studies.compare.terms import TERMS, States, Term, power_rows, states
 from mbkit.studies.results import Refusal, model_info
 from mbkit.studies.work_precision.study import work_precision
 
-__all__ = ["COMPARABLE", "Judge", "announced", "compare"]
+__all__ = ["Judge", "announced", "compare"]
 
 
 # Every term in every engine, judged against the oracle.
@@ -214,15 +215,7 @@ def announced(caught: Iterable[warnings.WarningMessage]) -> str:
     return "; ".join(dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)))
 
 
-#: Engines that can be compared: all but the one that they are measured by.
-COMPARABLE: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
-
 #: What a comparison shows of `work_precision`: a few methods, runs of little work, and seconds at the most.
-_METHODS: Final = {
-    "pinocchio": ("rk4", "semi_implicit_euler", "dop853"),
-    "lagrangian": ("rk853", "rk4"),
-    "mujoco": ("mujoco_euler", "mujoco_implicitfast", "mujoco_rk4"),
-}
 _HORIZON: Final = 0.5
 _REPEATS: Final = 3
 _WORK: Final = 24_000
@@ -231,7 +224,7 @@ _SECONDS: Final = 60.0
 
 def compare(
     model: Model,
-    engines: Sequence[str] = ("pinocchio", "lagrangian", "mujoco"),
+    engines: Sequence[str] = STANDARD,
     samples: int = 64,
     seed: int = 0,
     *,
@@ -331,7 +324,7 @@ def _beyond_terms(
         result["precision"] = work_precision(
             moving,
             tuple(movers),
-            {engine: _METHODS[engine] for engine in movers if engine in _METHODS},
+            {engine: shown for engine in movers if (shown := find_engine(engine).shown)},
             duration=_HORIZON,
             seed=seed,
             repeats=_REPEATS,
@@ -361,14 +354,14 @@ def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tole
     if isinstance(engines, str):
         raise InputError(f"engines: expected several names, got the string {engines!r}; write ({engines!r}, ...)")
     for name in engines:
-        if name == OracleDynamics.engine:
+        if name == REFERENCE:
             raise InputError("engines: the oracle is what every engine is measured by; leave it out")
-        if not isinstance(name, str) or name not in COMPARABLE:
-            raise UnknownNameError("engine", str(name), COMPARABLE)
+        if not isinstance(name, str) or name not in compared():
+            raise UnknownNameError("engine", str(name), compared())
     unique = tuple(dict.fromkeys(engines))
     if len(unique) < 2:
         raise InputError(
-            f"engines: expected at least two to compare, got {list(engines)}; there are {list(COMPARABLE)}"
+            f"engines: expected at least two to compare, got {list(engines)}; there are {list(compared())}"
         )
     count("samples", samples, least=1)
     count("seed", seed)
@@ -392,8 +385,7 @@ def _made(
             warnings.simplefilter("always", KnownDefectWarning)
             try:
                 # A few dozen states are no reason to compile; run times are.
-                options = {} if compile or name != "lagrangian" else {"compile": False}
-                made[name] = dynamics(model, name, **options)
+                made[name] = dynamics(model, name, **({} if compile else find_engine(name).brief))
             except MbkitError as error:
                 refusals.append(Refusal(name, "", str(error).removeprefix(f"{name}: ")))
         setup[name] = time.perf_counter() - start

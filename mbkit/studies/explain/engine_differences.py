@@ -271,7 +271,7 @@ def _on(x: Model | Dynamics, model: Model) -> Dynamics:
     from mbkit.engines import dynamics
 
     if not isinstance(x, Dynamics):
-        return dynamics(model, "pinocchio")
+        return dynamics(model)
     return x if x.model is model or x.model == model else type(x)(model)
 
 

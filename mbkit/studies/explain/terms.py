@@ -84,7 +84,7 @@ def model_terms(model: Model, at: States) -> Values:
     still = [f for f, has in (("loops", model.loops), ("prescribed", model.prescribed)) if has]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NonPhysicalWarning)
-        return evaluated(dynamics(model.without(*still), "pinocchio"), at)
+        return evaluated(dynamics(model.without(*still)), at)
 
 
 def evaluated(dyn: Dynamics, at: States) -> Values:

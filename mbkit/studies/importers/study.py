@@ -16,6 +16,7 @@ import numpy as np
 
 from mbkit._check import Array, count, real
 from mbkit.engines.imported import IMPORTERS, Imported, check_installed
+from mbkit.engines.registry import MUJOCO
 from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import robot_data
 from mbkit.load.mjcf import model_of_mjcf
@@ -508,8 +509,8 @@ def _reference(
         return _written(stripped, floating_base), "file", ""
     except MbkitError as error:
         faults = f"mbkit does not read it: {error}"
-    if stripped.format == "mjcf" and "mujoco" in read:
-        return read["mujoco"], "mujoco", faults
+    if stripped.format == "mjcf" and MUJOCO in read:
+        return read[MUJOCO], MUJOCO, faults
     return None, "", faults
 
 

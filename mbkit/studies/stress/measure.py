@@ -15,6 +15,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.methods.registry import METHODS
@@ -252,7 +253,7 @@ def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
         T, V = (T[0] - T0[0], T[1] - T0[1]), (V[0] - T0[0], V[1] - T0[1])
     gained, change = ((high - high[0]) + (low - low[0]) for high, low in (T, V))
     drift, size = float(np.abs(gained + change).max()), max(float(T[0].max()), float(np.ptp(change)))
-    rounding = 0.0 if dyn.engine == OracleDynamics.engine else _ROUNDINGS * _EPS * float(np.abs([T[0], V[0]]).max())
+    rounding = 0.0 if dyn.bits > DOUBLE_BITS else _ROUNDINGS * _EPS * float(np.abs([T[0], V[0]]).max())
     hidden = rounding > _HIDDEN * size and drift <= rounding
     return min(drift / size, _MAX_ERROR) if size > 0 and not hidden else math.nan
 

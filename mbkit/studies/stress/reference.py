@@ -24,6 +24,7 @@ from mbkit._check import Array
 from mbkit.codegen.extended_precision import arithmetic, solve
 from mbkit.engines import dynamics
 from mbkit.engines.oracle import OracleDynamics
+from mbkit.engines.registry import DERIVED, INDEPENDENT, PINOCCHIO
 from mbkit.errors import MbkitError, NumericalError
 from mbkit.methods.registry import METHODS
 from mbkit.studies.compare.errors import Errors, Scales, force_errors, matrix_errors
@@ -83,15 +84,14 @@ _WORTHLESS: Final = 1e-3
 _PARTS: Final = (0.35, 0.5, 1.0)
 #: Engine, method, and tolerance or number of steps; the third stands in for the second where that is not installed.
 _EXPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
-    ("lagrangian", "rk853", 1e-14),
-    ("pinocchio", "dop853", 1e-13),
-    ("mujoco", "dop853", 1e-13),
+    (DERIVED, "rk853", 1e-14),
+    *((engine, "dop853", 1e-13) for engine in INDEPENDENT),
 )
 _IMPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
-    ("lagrangian", "cvodes", 1e-12),
-    ("lagrangian", "gauss6", 1000),
-    ("pinocchio", "radau", 1e-11),
-    ("lagrangian", "gauss6", 4000),
+    (DERIVED, "cvodes", 1e-12),
+    (DERIVED, "gauss6", 1000),
+    (PINOCCHIO, "radau", 1e-11),
+    (DERIVED, "gauss6", 4000),
 )
 
 #: q at the times, how well it is known, and how it was computed.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from mbkit._check import real
 from mbkit._escape import csv_text, html, markdown
+from mbkit.engines.registry import DERIVED, PINOCCHIO
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies._figure_style import engine_index
 from mbkit.studies.results import csv_number as number
@@ -454,7 +455,6 @@ def _case(told: dict[str, Any]) -> CaseResult:
 
 #: What mbkit advises who does not want to choose.
 RECOMMENDED: Final = "auto"
-_OWN: Final = ("pinocchio", "lagrangian")
 #: Up to here an answer is of use, if not to the bar.
 _USABLE: Final = ("held", "inaccurate")
 
@@ -559,7 +559,7 @@ def best(case: CaseResult) -> dict[str, Line]:
 
 def recommended(case: CaseResult) -> Line | None:
     """Return mbkit's own choice of method, on the engine where it held furthest, if it was run."""
-    own = (x for x in lines(case) if x.row.method == RECOMMENDED and x.row.engine in _OWN)
+    own = (x for x in lines(case) if x.row.method == RECOMMENDED and x.row.engine in (PINOCCHIO, DERIVED))
     return next((x for x in own if not x.left_out), None)
 
 

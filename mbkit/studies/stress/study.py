@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mbkit._check import count, real
+from mbkit.engines.registry import DERIVED, ENGINES, INDEPENDENT, compared
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
 from mbkit.studies import results
@@ -23,15 +24,8 @@ from mbkit.studies.work_precision.result import InterruptedSweepError
 from mbkit.studies.work_precision.settings import pairs
 from mbkit.studies.worker import CallError, in_worker, processors
 
-__all__ = ["QUICK_METHODS", "stress"]
+__all__ = ["stress"]
 
-#: One of each kind, mbkit's own choice, and MuJoCo's own: a method that all engines share makes the same
-#: errors on each of them.
-QUICK_METHODS: Final = {
-    "lagrangian": ("auto", "rk4", "implicit_midpoint", "rk853", "cvodes"),
-    "pinocchio": ("auto", "rk4", "semi_implicit_euler", "radau"),
-    "mujoco": ("mujoco_rk4", "mujoco_euler", "mujoco_implicitfast", "mujoco_discrete"),
-}
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}
 _BUDGET: Final = {True: 100.0, False: 1700.0}
@@ -45,7 +39,7 @@ _TICK: Final = 0.2
 
 def stress(
     cases: Sequence[str | Case] | str | Case | None = None,
-    engines: Sequence[str] = ("lagrangian", "pinocchio", "mujoco"),
+    engines: Sequence[str] = (DERIVED, *INDEPENDENT),
     methods: Sequence[str] | Mapping[str, Sequence[str]] | None = None,
     *,
     values: Sequence[float] | Mapping[str, Sequence[float]] | None = None,
@@ -235,9 +229,10 @@ def _flag(name: str, value: object) -> bool:
 
 def _quick_methods(engines: object) -> dict[str, tuple[str, ...]] | None:
     """Return the quick methods of these engines; None for other engines, which are then refused by name."""
-    if isinstance(engines, str) or not isinstance(engines, Iterable) or not set(engines) <= set(QUICK_METHODS):
+    known = {name for name in compared() if ENGINES[name].quick}
+    if isinstance(engines, str) or not isinstance(engines, Iterable) or not {*engines} <= known:
         return None
-    return {engine: tuple(m for m in QUICK_METHODS[engine] if m in METHODS) for engine in engines}
+    return {engine: tuple(m for m in ENGINES[engine].quick if m in METHODS) for engine in engines}
 
 
 def _cases(cases: object) -> list[Case]:

@@ -26,6 +26,7 @@ from mbkit.codegen.taylor import PRECISIONS, order_of, precision, taylor_system
 from mbkit.derivation.equations import Equations, equations_of
 from mbkit.engines import dynamics
 from mbkit.engines.base import require_tree
+from mbkit.engines.registry import DERIVED, INDEPENDENT
 from mbkit.errors import InputError, MbkitError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import METHODS
 from mbkit.model import Model
@@ -49,8 +50,8 @@ _LEGS: Final = 20
 _COARSER: Final = 8.0
 #: Engine and method of each of two independent roads, best first.
 _ROADS: Final = (
-    (("lagrangian", "taylor"), ("lagrangian", "rk853"), ("lagrangian", "dop853")),
-    (("pinocchio", "dop853"), ("mujoco", "dop853")),
+    ((DERIVED, "taylor"), (DERIVED, "rk853"), (DERIVED, "dop853")),
+    tuple((engine, "dop853") for engine in INDEPENDENT),
 )
 
 
@@ -568,7 +569,7 @@ def _witness(motion: Motion, found: Reference) -> str:
     constants = np.broadcast_to(motion.equations.constant_values, (len(q), len(motion.equations.constant_values)))
     own = Machine(motion.equations.function("forward_dynamics"))
     a = own(q, v, tau, *([constants] if constants.size else []))[0][..., 0]
-    for engine in ("pinocchio", "mujoco"):
+    for engine in INDEPENDENT:
         try:
             other = dynamics(motion.model, engine).forward_dynamics(q, v, tau)
         except MbkitError:

@@ -8,17 +8,14 @@ from typing import Final, Literal
 
 import numpy as np
 
-from mbkit.engines import ENGINES
-from mbkit.engines.oracle import OracleDynamics
+from mbkit.engines.registry import REFERENCE, compared, find_engine
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.methods.registry import METHODS, Method, method_of
 
-__all__ = ["INTERVALS", "MEASURED", "Settings", "names_of", "pairs", "plans", "save_grid"]
+__all__ = ["INTERVALS", "Settings", "names_of", "pairs", "plans", "save_grid"]
 
 #: Errors are measured at the ends of this many equal parts of the horizon.
 INTERVALS: Final = 10
-#: Engines that can be measured.
-MEASURED: Final = tuple(name for name in ENGINES if name != OracleDynamics.engine)
 #: The coarsest step, s, and the finest, as a part of the horizon.
 _COARSEST: Final = 0.05
 _FINEST: Final = 1e-7
@@ -57,7 +54,7 @@ class Settings:
 
     def work(self, steps: int, evaluations: int) -> int:
         """Return the cost of a run in compiled evaluations of the forward dynamics, equal on every machine."""
-        compiled = self.info.kind == "native" or self.method.startswith("drake_") or self.engine == "lagrangian"
+        compiled = self.info.kind == "native" or self.method.startswith("drake_") or find_engine(self.engine).derived
         each = 1 if compiled and self.method not in _FROM_PYTHON else _PYTHON_CALL
         return each * (evaluations or steps * max(self.info.stages, 1))
 
@@ -130,10 +127,10 @@ def pairs(
     """
     names = names_of("engines", engines)
     for name in names:
-        if name == OracleDynamics.engine:
+        if name == REFERENCE:
             raise InputError("engines: the oracle is the reference for the others and is not measured; leave it out")
-        if name not in MEASURED:
-            raise UnknownNameError("engine", name, MEASURED)
+        if name not in compared():
+            raise UnknownNameError("engine", name, compared())
     if isinstance(methods, Mapping):
         for engine in methods:
             if engine not in names:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count, finite_array, real
+from mbkit.engines.registry import STANDARD
 from mbkit.errors import InputError, NumericalError
 from mbkit.methods.registry import METHODS
 from mbkit.model import Model
@@ -52,7 +53,7 @@ _TOGETHER: Final = "by workers that share the cores: errors are the same, run ti
 
 def work_precision(
     model: Model,
-    engines: Sequence[str] = ("pinocchio", "lagrangian", "mujoco"),
+    engines: Sequence[str] = STANDARD,
     methods: Sequence[str] | Mapping[str, Sequence[str]] | None = None,
     *,
     duration: float = 1.0,

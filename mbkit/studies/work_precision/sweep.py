@@ -21,6 +21,7 @@ from mbkit._fork import fork_safe
 from mbkit.catalog import pendulum
 from mbkit.codegen.disk_cache import anew
 from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.registry import find_engine
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
@@ -579,4 +580,4 @@ def _measure(problem: Problem, settings: Settings, repeats: int, seed: int, budg
 
 
 def _derivation_cost(one: CurveMeasurement) -> tuple[bool, bool]:
-    return one.settings.info.stages == 0, one.settings.engine == "lagrangian"
+    return one.settings.info.stages == 0, find_engine(one.settings.engine).derived

@@ -1,0 +1,328 @@
+"""The engines by name, and the registry for engines of one's own."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pickle
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any, Final
+
+from mbkit.engines.base import Dynamics
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.model import Model
+from mbkit.model.builder import expect_model
+
+__all__ = [
+    "DERIVED",
+    "ENGINES",
+    "INDEPENDENT",
+    "MUJOCO",
+    "PINOCCHIO",
+    "REFERENCE",
+    "STANDARD",
+    "EngineInfo",
+    "compared",
+    "dynamics",
+    "find_engine",
+    "register_engine",
+    "registered_engines",
+]
+
+#: Group of the entry points that name an `EngineInfo`, or a module that calls `register_engine`.
+ENTRY_POINTS: Final = "mbkit.engines"
+
+
+@dataclass(frozen=True)
+class EngineInfo:
+    """What mbkit knows of an engine before it is imported.
+
+    Attributes
+    ----------
+    name : str
+        As in ``mbkit.dynamics(model, name)``, in tables and in figures.
+    adapter : type
+        The subclass of `Dynamics`, whose attribute ``engine`` is the name; or None where `module` and `class_name` say
+        where it is, which imports the engine when it is first asked for.
+    module, class_name : str
+    package : str
+        To install, with pip.
+    distribution : str
+        Whose version decides the engine's numbers, as `importlib.metadata` knows it; ``"mbkit"`` of an engine without
+        a library.
+    standard : bool
+        Whether studies take it where no engines are named.
+    reference : bool
+        Whether others are measured by it; it cannot be compared then.
+    derived : bool
+        Whether it evaluates mbkit's own derivation in double precision.
+    brief : mapping
+        Options for a few evaluations.
+    rk4 : str
+        The engine's own Runge–Kutta method of fourth order, or mbkit's.
+    shown, quick : tuple of str
+        Methods that `mbkit.compare` and a quick `mbkit.stress` run on it.
+    """
+
+    name: str
+    adapter: type[Dynamics] | None = None
+    module: str = ""
+    class_name: str = ""
+    package: str = ""
+    distribution: str = "mbkit"
+    standard: bool = False
+    reference: bool = False
+    derived: bool = False
+    brief: Mapping[str, Any] = field(default_factory=dict)
+    rk4: str = "rk4"
+    shown: tuple[str, ...] = ("rk4",)
+    quick: tuple[str, ...] = ("auto", "rk4")
+
+    @property
+    def built_in(self) -> bool:
+        """Whether the adapter is mbkit's own."""
+        return self.name in _OWN
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process may not have registered the engine.
+        return _registered, tuple(getattr(self, f.name) for f in fields(self))
+
+    def load(self) -> type[Dynamics]:
+        """Return the adapter.
+
+        Raises
+        ------
+        UnsupportedError
+            The engine is not installed; with the package to install.
+        """
+        if self.adapter is not None:
+            return self.adapter
+        try:
+            adapter: type[Dynamics] = getattr(importlib.import_module(self.module), self.class_name)
+        except ModuleNotFoundError as error:
+            if error.name and error.name.startswith("mbkit"):
+                raise
+            raise UnsupportedError(f"{self.name} is not installed ({error}); pip install {self.package}") from error
+        return adapter
+
+
+#: The engines that a study of one engine's own features names.
+PINOCCHIO: Final = "pinocchio"
+MUJOCO: Final = "mujoco"
+
+#: Engine by name: mbkit's own adapters, then those of `register_engine`.
+ENGINES: Final[dict[str, EngineInfo]] = {
+    info.name: info
+    for info in (
+        EngineInfo(
+            PINOCCHIO,
+            module="mbkit.engines.pinocchio.engine",
+            class_name="PinocchioDynamics",
+            package="pin",
+            distribution="pin",
+            standard=True,
+            shown=("rk4", "semi_implicit_euler", "dop853"),
+            quick=("auto", "rk4", "semi_implicit_euler", "radau"),
+        ),
+        EngineInfo(
+            "lagrangian",
+            module="mbkit.engines.lagrangian",
+            class_name="LagrangianDynamics",
+            package="casadi",
+            # Where nothing is compiled, CasADi evaluates the expressions.
+            distribution="casadi",
+            standard=True,
+            derived=True,
+            brief={"compile": False},
+            shown=("rk853", "rk4"),
+            quick=("auto", "rk4", "implicit_midpoint", "rk853", "cvodes"),
+        ),
+        EngineInfo(
+            MUJOCO,
+            module="mbkit.engines.mujoco.engine",
+            class_name="MujocoDynamics",
+            package="mujoco",
+            distribution="mujoco",
+            standard=True,
+            rk4="mujoco_rk4",
+            shown=("mujoco_euler", "mujoco_implicitfast", "mujoco_rk4"),
+            quick=("mujoco_rk4", "mujoco_euler", "mujoco_implicitfast", "mujoco_discrete"),
+        ),
+        EngineInfo(
+            "drake",
+            module="mbkit.engines.drake.engine",
+            class_name="DrakeDynamics",
+            package="mbkit[drake]",
+            distribution="drake",
+            shown=(),
+            quick=(),
+        ),
+        EngineInfo(
+            "oracle",
+            module="mbkit.engines.oracle",
+            class_name="OracleDynamics",
+            package="mpmath",
+            distribution="mpmath",
+            reference=True,
+            shown=(),
+            quick=(),
+        ),
+    )
+}
+_OWN: Final = frozenset(ENGINES)
+
+#: Engines that a study takes where none are named.
+STANDARD: Final = tuple(info.name for info in ENGINES.values() if info.standard)
+#: mbkit's own derivation, and what others are measured by.
+(DERIVED,) = (info.name for info in ENGINES.values() if info.derived)
+(REFERENCE,) = (info.name for info in ENGINES.values() if info.reference)
+#: The standard engines that do not evaluate mbkit's own derivation.
+INDEPENDENT: Final = tuple(info.name for info in ENGINES.values() if info.standard and not info.derived)
+
+
+def register_engine(info: EngineInfo) -> EngineInfo:
+    """Make an engine known, so that `mbkit.dynamics`, simulation, studies, tests and reports take its name.
+
+    The command and worker processes import nothing of a script: they know engines whose package names them in the
+    entry point group ``"mbkit.engines"``, by an `EngineInfo` or by a module that calls this function.
+
+    Parameters
+    ----------
+    info : EngineInfo
+        With a subclass of `Dynamics`, or the module and class where it is.
+
+    Returns
+    -------
+    EngineInfo
+        The same.
+
+    Raises
+    ------
+    InputError
+        Attributes of a wrong type, an adapter that is no subclass of `Dynamics` or names another engine, or a name
+        that another engine has.
+
+    Examples
+    --------
+    >>> from mbkit.engines import EngineInfo, register_engine
+    >>> from mbkit.engines.lagrangian import LagrangianDynamics
+    >>> class Mine(LagrangianDynamics):
+    ...     engine = "doc_engine"
+    >>> register_engine(EngineInfo("doc_engine", Mine)).name
+    'doc_engine'
+    >>> _ = ENGINES.pop("doc_engine")  # a script keeps it
+    """
+    if not isinstance(info, EngineInfo):
+        raise InputError(f"info: expected an EngineInfo, got {type(info).__name__}")
+    if not isinstance(info.name, str) or not info.name.isidentifier():
+        raise InputError(f"name: expected a word of letters, digits and underscores, got {info.name!r}")
+    if info.adapter is None and not (info.module and info.class_name):
+        raise InputError(f"engine {info.name!r}: expected an adapter, or a module and a class_name; got none")
+    if info.adapter is not None:
+        if not isinstance(info.adapter, type) or not issubclass(info.adapter, Dynamics):
+            raise InputError(f"engine {info.name!r}: expected a subclass of Dynamics as adapter, got {info.adapter!r}")
+        if getattr(info.adapter, "engine", None) != info.name:
+            raise InputError(
+                f"engine {info.name!r}: {info.adapter.__name__}.engine is {getattr(info.adapter, 'engine', None)!r}; "
+                "expected the same name"
+            )
+    known = ENGINES.get(info.name)
+    if info.name in _OWN or (known is not None and _place(known) != _place(info)):
+        raise InputError(f"engine {info.name!r}: the name is taken; use another one")
+    if info.reference or info.derived:
+        raise InputError(
+            f"engine {info.name!r}: reference and derived are for mbkit's own derivation; leave them False"
+        )
+    ENGINES[info.name] = info
+    return info
+
+
+def registered_engines() -> tuple[EngineInfo, ...]:
+    """Return the engines of one's own that another process can import; unpickling registers them there."""
+    out = []
+    for info in ENGINES.values():
+        if not info.built_in:
+            with suppress(Exception):  # pickle raises errors of several kinds
+                pickle.dumps(info)
+                out.append(info)
+    return tuple(out)
+
+
+def _place(info: EngineInfo) -> tuple[str, str]:
+    """Return where the adapter is defined; a cell of a notebook that runs again defines it again."""
+    adapter = info.adapter
+    return (info.module, info.class_name) if adapter is None else (adapter.__module__, adapter.__qualname__)
+
+
+def _registered(name: str, *values: Any) -> EngineInfo:
+    return ENGINES[name] if name in ENGINES else register_engine(EngineInfo(name, *values))
+
+
+@cache
+def _load_entry_points() -> None:
+    for point in entry_points(group=ENTRY_POINTS):
+        loaded = point.load()
+        if isinstance(loaded, EngineInfo) and loaded.name not in ENGINES:
+            register_engine(loaded)
+
+
+def find_engine(name: str) -> EngineInfo:
+    """Return what is known of an engine.
+
+    Raises
+    ------
+    UnknownNameError
+        No engine of this name.
+    """
+    if name not in ENGINES:
+        _load_entry_points()
+    if name not in ENGINES:
+        raise UnknownNameError("engine", str(name), ENGINES)
+    return ENGINES[name]
+
+
+def compared() -> tuple[str, ...]:
+    """Return the engines that can be compared and measured: all but the reference."""
+    _load_entry_points()
+    return tuple(info.name for info in ENGINES.values() if not info.reference)
+
+
+def dynamics(model: Model, engine: str = PINOCCHIO, **options: Any) -> Dynamics:
+    """Return the model's dynamics as one engine computes them.
+
+    Parameters
+    ----------
+    model : Model
+    engine : {"pinocchio", "lagrangian", "mujoco", "drake", "oracle"}
+        Rigid-body algorithms of Pinocchio, mbkit's own derivation from energies,
+        MuJoCo, Drake (``pip install mbkit[drake]``), or the own derivation at 34 digits, for
+        measuring the others; or an engine of `register_engine`.
+    **options
+        The lagrangian engine's ``compile=`` (True or False) and ``threads=``; other
+        engines have none.
+
+    Returns
+    -------
+    Dynamics
+
+    Raises
+    ------
+    UnknownNameError
+        No engine of this name.
+    UnsupportedError
+        The engine is not installed, or cannot hold this model; with the reason.
+    """
+    expect_model(model)
+    if not isinstance(engine, str):
+        raise UnknownNameError("engine", str(engine), ENGINES)
+    adapter = find_engine(engine).load()
+    known = [name for name in inspect.signature(adapter).parameters if name != "model"]
+    for name in options:
+        if name not in known:
+            takes = f"it takes {', '.join(known)}" if known else "it takes none"
+            raise InputError(f"{name}: {engine} has no such option; {takes}")
+    return adapter(model, **options)
