@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.engines import ENGINES, EngineInfo
+from mbkit.engines import ENGINES
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import BaselineError, InputError, NonPhysicalWarning, OutputError, UnknownNameError, UnsupportedError
@@ -87,8 +87,8 @@ def moved_version(monkeypatch, package: str = "pin", version: str = "99.0") -> N
 
 def absent(monkeypatch, engine: str) -> None:
     """Make an engine one that is not installed."""
-    absent = EngineInfo(engine, module="no_such_engine", class_name="Dynamics", package=f"mbkit[{engine}]")
-    monkeypatch.setitem(ENGINES, engine, absent)
+    known = replace(ENGINES[engine], module="no_such_engine", package=f"mbkit[{engine}]")
+    monkeypatch.setitem(ENGINES, engine, known)
 
 
 # The whole.

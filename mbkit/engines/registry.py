@@ -52,8 +52,8 @@ class EngineInfo:
     package : str
         To install, with pip.
     distribution : str
-        Whose version decides the engine's numbers, as `importlib.metadata` knows it; ``"mbkit"`` of an engine without
-        a library.
+        Whose version decides the engine's numbers, as `importlib.metadata` knows it; empty of an engine without a
+        library.
     standard : bool
         Whether studies take it where no engines are named.
     reference : bool
@@ -73,7 +73,7 @@ class EngineInfo:
     module: str = ""
     class_name: str = ""
     package: str = ""
-    distribution: str = "mbkit"
+    distribution: str = ""
     standard: bool = False
     reference: bool = False
     derived: bool = False

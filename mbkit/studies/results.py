@@ -298,7 +298,7 @@ _BESIDE: Final = ("numpy", "scipy", "llvmlite", "heyoka", "example-robot-data")
 
 def versions() -> dict[str, str]:
     """Return the versions of everything that computes."""
-    engines = (info.distribution for info in ENGINES.values())
+    engines = (info.distribution for info in ENGINES.values() if info.distribution)
     return dict(_versions(tuple(dict.fromkeys([*engines, *_BESIDE]))))
 
 

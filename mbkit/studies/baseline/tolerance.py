@@ -190,9 +190,13 @@ class VersionChange:
 _ABSENT: Final = "not installed"
 
 
+def _package(engine: str) -> str:
+    return (ENGINES[engine].distribution if engine in ENGINES else "") or "mbkit"
+
+
 def relevant(engines: Iterable[str]) -> dict[str, str]:
     """Return the versions that can move numbers of these engines."""
-    packages = dict.fromkeys([*_SHARED, *(ENGINES[e].distribution for e in engines if e in ENGINES)])
+    packages = dict.fromkeys([*_SHARED, *(_package(e) for e in engines)])
     now = results.versions()
     return {p: now[p] for p in packages}
 
@@ -205,7 +209,7 @@ def moved(old: Mapping[str, str], new: Mapping[str, str]) -> tuple[VersionChange
 def of_engine(engine: str, old: Mapping[str, str], changed: Iterable[VersionChange]) -> str:
     """Return which version of an engine moved, or that none did, for a failure."""
     changed = tuple(changed)
-    package = ENGINES[engine].distribution if engine in ENGINES else "mbkit"
+    package = _package(engine)
     own = [str(m) for m in changed if m.package == package]
     others = [str(m) for m in changed if m.package in _SHARED and m.package != package]
     told = own or [f"{package} {old.get(package, '?')}, as recorded"]
