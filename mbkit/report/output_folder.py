@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import tempfile
 from pathlib import Path
 from typing import Final
 
 from mbkit import _interrupt
 from mbkit.errors import OutputError
+from mbkit.studies.results import write_whole
 
 __all__ = ["check_replaceable", "check_writable", "file_stem", "write"]
 
@@ -90,24 +90,10 @@ def write(folder: Path, name: str, content: str | bytes, *, force: bool = False)
 
 def _write(folder: Path, name: str, content: str | bytes) -> Path:
     path = folder / name
-    temporary = None
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
-            temporary = file.name
-            file.write(content if isinstance(content, bytes) else content.encode("utf-8", "backslashreplace"))
-        # A temporary file is for its owner only; a report is for whoever may read the folder.
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        write_whole(path, content if isinstance(content, bytes) else content.encode("utf-8", "backslashreplace"))
     except OSError as error:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
         why = error.strerror or error
         raise OutputError(f"cannot write {path}: {why}; choose another folder with --out") from error
     return path
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -1,9 +1,8 @@
-"""Who is told how far a study is, and where its result so far goes."""
+"""Progress of a study, and checkpoints of its result so far."""
 
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -11,15 +10,14 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from mbkit.errors import InputError, MbkitWarning
+from mbkit.studies.results import write_whole
 
-__all__ = ["Checkpoint", "Keeper", "Kept", "Progress"]
+__all__ = ["Checkpoint", "Checkpointer", "Progress", "silent"]
 
 
-class Kept(Protocol):
-    """A result that tells itself as JSON."""
-
+class _Result(Protocol):
     def to_json(self) -> str:
-        """Return it."""
+        """Return the result as JSON."""
         ...
 
 
@@ -31,8 +29,12 @@ Checkpoint = str | os.PathLike[str] | Callable[[Any], object]
 _BETWEEN: Final = 5.0
 
 
-class Keeper:
-    """Tells a progress function, and hands results to a checkpoint.
+def silent(_fraction: float, _text: str) -> None:
+    """Report no progress."""
+
+
+class Checkpointer:
+    """Reports progress, and saves results.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ class Keeper:
     Raises
     ------
     InputError
-        What is neither, or a path into a folder that does not exist.
+        An argument is of another kind, or the path is in a folder that does not exist.
     """
 
     def __init__(self, progress: Progress | None, checkpoint: Checkpoint | None) -> None:
@@ -55,46 +57,32 @@ class Keeper:
             folder = Path(checkpoint).parent
             if not folder.is_dir():
                 raise InputError(f"checkpoint: there is no folder {folder}; choose one that exists")
-        self._progress, self._checkpoint = progress, checkpoint
-        self._told, self._kept = 0.0, time.perf_counter()
+        self._progress, self._checkpoint = progress or silent, checkpoint
+        self._reported, self._saved = 0.0, time.perf_counter()
 
-    def tell(self, fraction: float, text: str) -> None:
-        """Tell how far it is, never less than before."""
-        self._told = max(self._told, min(fraction, 1.0))
-        if self._progress is not None:
-            self._progress(self._told, text)
+    def report(self, fraction: float, text: str) -> None:
+        """Report progress, never less than before."""
+        self._reported = max(self._reported, min(fraction, 1.0))
+        self._progress(self._reported, text)
 
-    def now_and_then(self, make: Callable[[], Kept]) -> None:
-        """Keep the result so far, unless that was done a moment ago."""
-        if self._checkpoint is not None and time.perf_counter() - self._kept > _BETWEEN:
-            self.keep(make())
-            self._kept = time.perf_counter()
+    def save_if_due(self, result: Callable[[], _Result]) -> None:
+        """Save the result so far, unless that was done a moment ago."""
+        if self._checkpoint is not None and time.perf_counter() - self._saved > _BETWEEN:
+            self.save(result())
+            self._saved = time.perf_counter()
 
-    def keep(self, result: Kept) -> None:
-        """Hand a result over; where that fails, the study goes on, and that is told."""
+    def save(self, result: _Result) -> None:
+        """Save a result; where that fails, a warning says so and the study goes on."""
+        message = ""
         if callable(self._checkpoint):
             try:
                 self._checkpoint(result)
             except Exception as error:
-                # What is measured must not be lost by whoever looks at it.
-                told = f"checkpoint: the function raised {type(error).__name__}: {error}; the study goes on"
-                warnings.warn(told, MbkitWarning, stacklevel=3)
+                message = f"the function raised {type(error).__name__}: {error}"
         elif self._checkpoint is not None:
             try:
-                _write_whole(Path(self._checkpoint), result.to_json() + "\n")
+                write_whole(Path(self._checkpoint), f"{result.to_json()}\n".encode())
             except OSError as error:
-                # A full disk is no reason to lose what is measured.
-                told = f"checkpoint: cannot write {self._checkpoint}: {error.strerror or error}; the study goes on"
-                warnings.warn(told, MbkitWarning, stacklevel=3)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Write a file that is whole at any time: under another name, and then renamed."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+                message = f"cannot write {self._checkpoint}: {error.strerror or error}"
+        if message:
+            warnings.warn(f"checkpoint: {message}; the study goes on", MbkitWarning, stacklevel=3)

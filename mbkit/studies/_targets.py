@@ -20,7 +20,7 @@ from mbkit.load import load
 from mbkit.load.robot_data import find
 from mbkit.model import Model
 
-__all__ = ["checked_target", "is_code", "kept", "model_of", "not_installed", "resolved"]
+__all__ = ["checked_target", "is_code", "kept", "model_of", "not_installed", "resolved", "with_values"]
 
 
 _FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
@@ -162,7 +162,13 @@ def resolved(target: str, baseline: Path) -> str:
     return os.path.normpath(baseline.absolute().parent / target) if target.startswith(".") else target
 
 
-# Which engines are there.
+# Which engines are there, and models as any of them takes them.
+
+
+def with_values(model: Model) -> Model:
+    """Return the model with numbers for its named parameters, which not every engine takes."""
+    values = {name: x for name, x in model.parameters.items() if x is not None}
+    return model.with_parameters(**values) if values else model
 
 
 def not_installed(engines: Iterable[str]) -> dict[str, str]:

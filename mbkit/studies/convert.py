@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from mbkit.load import load
 from mbkit.load.urdf_writer import urdf_text
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
+from mbkit.studies._targets import with_values
 from mbkit.studies.explain.result import Cause
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of
@@ -31,8 +31,6 @@ FORMATS: Final = ("mjcf", "urdf")
 #: What rounding of rotations and of principal axes may cost.
 _TOLERANCE: Final = 1e-11
 _STATES: Final = 5
-# What is no character of XML 1.0 (W3C 2008, production 2).
-_NO_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
@@ -115,25 +113,23 @@ def convert(model: Model, to: str) -> Converted:
         raise UnknownNameError("format", str(to), FORMATS)
     if not model.has_bodies:
         raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
-    names = [model.name, *(x.name for x in model.bodies), *(x.name for x in model.joints)]
-    names += [*(x.name for x in model.frames), *(x.name for x in model.springs), *(x.name for x in model.couplings)]
-    unwritable = [name for name in names if not xml_holds(name)]
-    if unwritable:
-        raise UnsupportedError(f"convert: XML cannot hold the characters of {unwritable[0]!r}; rename this part")
+    _check_names(model, to)
     if model.parameters:
         model.require_values("convert")
-        model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
-    _check_names(model, to)
+        model = with_values(model)
     return _to_mjcf(model) if to == "mjcf" else _to_urdf(model)
 
 
 def _check_names(model: Model, to: str) -> None:
     """Raise for names that XML 1.0 cannot hold, not even escaped."""
-    parts: Sequence[Any] = (*model.bodies, *model.joints, *model.frames, *model.springs, *model.loops)
-    bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if _NO_XML.search(name)]
+    parts: Sequence[Any] = (
+        *(*model.bodies, *model.joints, *model.frames),
+        *(*model.springs, *model.couplings, *model.loops),
+    )
+    bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if not xml_holds(name)]
     if bad:
-        told = ", ".join(repr(n) for n in bad[:10]) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
-        raise UnsupportedError(f"convert: {to} is XML, which cannot hold the control characters of {told}; rename them")
+        names = ", ".join(map(repr, bad[:10])) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
+        raise UnsupportedError(f"convert: {to} is XML, which cannot hold the characters of {names}; rename these parts")
 
 
 def _head(model: Model, to: str) -> str:

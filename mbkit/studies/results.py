@@ -7,7 +7,9 @@ import io
 import itertools
 import json
 import math
+import os
 import platform
+import tempfile
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -44,6 +46,7 @@ __all__ = [
     "to_plain",
     "versions",
     "write",
+    "write_whole",
 ]
 
 #: What JSON has for an infinite limit, where null stands for an unknown one.
@@ -57,6 +60,11 @@ class Refusal:
     engine: str
     term: str
     reason: str
+
+    @classmethod
+    def of(cls, engine: str, error: Exception, term: str = "") -> Refusal:
+        """Return an error as a refusal, whose reason does not name the engine again."""
+        return cls(engine, term, str(error).removeprefix(f"{engine}: "))
 
 
 # Plain data, and back.
@@ -256,6 +264,29 @@ def _csv_cell(value: Any) -> Any:
     if isinstance(value, float):
         return "" if math.isnan(value) else repr(value)
     return int(value) if isinstance(value, bool) else value
+
+
+def write_whole(path: Path, content: bytes, claim: Callable[[str], None] | None = None) -> None:
+    """Write a file as a whole or not at all: under a temporary name, and then renamed.
+
+    `claim` is called with the temporary name before; what it raises leaves the file as it was.
+    """
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".mbkit-")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            # A name must not stand for content that a crash can still take.
+            file.flush()
+            os.fsync(file.fileno())
+        # A temporary file is for its owner only; the file is for whoever may read the folder.
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
+        if claim is not None:
+            claim(temporary)
+        os.replace(temporary, path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
 
 
 def write(path: str | Path, text: str) -> None:

@@ -4,9 +4,8 @@
 """
 
 from mbkit.studies.baseline.check import check, diff
-from mbkit.studies.baseline.content import Baseline
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.baseline.file import read
+from mbkit.studies.baseline.file import Baseline, read
 from mbkit.studies.baseline.record import record
 from mbkit.studies.baseline.result import BaselineResult
 from mbkit.studies.baseline.tolerance import Moved, VersionChange

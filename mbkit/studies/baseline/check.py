@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,22 +15,18 @@ from mbkit.engines.registry import REFERENCE
 from mbkit.errors import BaselineError
 from mbkit.model import Model
 from mbkit.studies import results
-from mbkit.studies._targets import checked_target
-from mbkit.studies.baseline import record as engines_
+from mbkit.studies._checkpoint import Progress, silent
+from mbkit.studies._targets import checked_target, with_values
 from mbkit.studies.baseline import tolerance
-from mbkit.studies.baseline.content import Baseline
-from mbkit.studies.baseline.description import SECTIONS_LINKS as SECTIONS
-from mbkit.studies.baseline.description import Change, changes, described, links_of, without_consequences
-from mbkit.studies.baseline.file import path_of, read
-from mbkit.studies.baseline.record import evaluated
+from mbkit.studies.baseline.description import LINK_SECTIONS, Change, changes, described, links_of, without_consequences
+from mbkit.studies.baseline.file import Baseline, path_of, read
+from mbkit.studies.baseline.record import build_engines, checked_model, evaluate
 from mbkit.studies.baseline.result import BaselineResult, Status
-from mbkit.studies.baseline.tolerance import FINE, OWN, ROUNDING, Moved, VersionChange, Yardstick, allowed
+from mbkit.studies.baseline.tolerance import FINE, OWN, ROUNDING, Comparator, Moved, VersionChange, allowed
 from mbkit.studies.results import Refusal
 
 __all__ = ["check", "diff"]
 
-
-Progress = Callable[[float, str], object]
 _NAN = float("nan")
 
 
@@ -84,11 +80,11 @@ def check(
     >>> print(mb.baseline.check(mb.catalog.pendulum(mass=1.1), path).changes[0].text)
     mass of body bob (with tip fixed to it): 1 → 1.1
     """
-    model = engines_.checked_model(model)
+    model = checked_model(model)
     checked_target("" if target is None else target)
     recorded = read(path)
     _require_same_robot(recorded, model, os.fspath(path_of(path)))
-    tell = progress or _silent
+    tell = progress or silent
     now = tolerance.relevant(recorded.engines)
     moved_versions = tolerance.moved(recorded.versions, now)
     processor = results.processor()
@@ -110,27 +106,27 @@ def check(
     told = tuple(f"only rounding: {c.text}" for c in found if c not in meant)
     if not found and model.digest != recorded.digest:
         told = ("the digest is another, though no parameter is",)
-    plain = engines_.with_values(model)
+    plain = with_values(model)
     if meant:
         return replace(result, status="description", changes=meant, effect=_effect(recorded, plain, meant), engines=())
     tell(0.0, "building")
-    made, refused, missing = engines_.made(plain, recorded.engines)
-    rows = [_lost(recorded, r, moved_versions) for r in refused]
+    built, refused, missing = build_engines(plain, recorded.engines)
+    rows = [_engine_unavailable(recorded, r, moved_versions) for r in refused]
     worst = 0.0
-    yardstick = Yardstick.of(recorded)
-    for k, (name, dyn) in enumerate(made.items()):
-        tell(0.1 + 0.9 * k / len(made), name)
-        some, error = _held(recorded, yardstick, name, dyn, moved_versions)
+    comparator = Comparator.of(recorded)
+    for k, (name, dyn) in enumerate(built.items()):
+        tell(0.1 + 0.9 * k / len(built), name)
+        some, error = _differences(recorded, comparator, name, dyn, moved_versions)
         rows += some
         worst = max(worst, error)
     tell(1.0, "done")
     return replace(
         result,
-        status=_status(rows, made or refused, moved_versions),
-        engines=tuple(made),
+        status=_status(rows, built or refused, moved_versions),
+        engines=tuple(built),
         moved=tuple(rows),
         skipped=tuple(missing),
-        notes=(*told, *_shared(rows, made)),
+        notes=(*told, *_shared(rows, built)),
         worst=worst,
     )
 
@@ -138,15 +134,11 @@ def check(
 def _changes(recorded: Baseline, model: Model, target: str, path: Path) -> tuple[Change, ...]:
     """Return what differs in the descriptions, by the links' own names where a file tells them."""
     old, new = recorded.description, described(model)
-    found = changes({k: x for k, x in old.items() if k not in SECTIONS}, new)
+    found = changes({k: x for k, x in old.items() if k not in LINK_SECTIONS}, new)
     if not found or "links" not in old:
         return found
     links = links_of(model, target, recorded.options, path)
     return without_consequences(changes(old, new | links), old) if links else found
-
-
-def _silent(_fraction: float, _text: str) -> None:
-    """Tell nobody."""
 
 
 def _require_same_robot(recorded: Baseline, model: Model, path: str) -> None:
@@ -172,48 +164,52 @@ def _status(rows: list[Moved], tried: object, moved: tuple[VersionChange, ...]) 
     return "versions" if moved else "same"
 
 
-def _held(
-    recorded: Baseline, yardstick: Yardstick, name: str, dyn: Dynamics, moved: tuple[VersionChange, ...]
+def _differences(
+    recorded: Baseline, comparator: Comparator, name: str, dyn: Dynamics, moved: tuple[VersionChange, ...]
 ) -> tuple[list[Moved], float]:
     """Return what is not as recorded of one engine, and the worst error of what is."""
-    values, refusals = evaluated(dyn, recorded.states, recorded.rollout)
+    values, refusals = evaluate(dyn, recorded.states, recorded.rollout)
     cause = tolerance.of_engine(name, recorded.versions, moved)
-    rows = [replace(_lost(recorded, r, moved), term=r.term) for r in refusals if r.term in recorded.errors[name]]
+    rows = [
+        replace(_engine_unavailable(recorded, r, moved), term=r.term)
+        for r in refusals
+        if r.term in recorded.errors[name]
+    ]
     worst = 0.0
     for term, value in values.items():
         if term not in recorded.errors[name]:
             continue
         own = recorded.own.get(name, {}).get(term)
         reference = recorded.terms[term] if own is None else own
-        row = yardstick.moved(name, term, value, reference, allowed(recorded, name, term))
+        row = comparator.moved(name, term, value, reference, allowed(recorded, name, term))
         if row is None:
-            worst = max(worst, float(yardstick.errors(term, value, reference).relative.max()))
+            worst = max(worst, float(comparator.errors(term, value, reference).relative.max()))
         else:
-            rows.append(replace(row, cause=cause, reason=_righted(recorded, yardstick, name, term, value)))
+            rows.append(replace(row, cause=cause, reason=_explain_fixed(recorded, comparator, name, term, value)))
     return rows, worst
 
 
-def _righted(recorded: Baseline, yardstick: Yardstick, name: str, term: str, value: Array) -> str:
+def _explain_fixed(recorded: Baseline, comparator: Comparator, name: str, term: str, value: Array) -> str:
     """Return what to say of a term that was wrong when recorded."""
     if term not in recorded.own.get(name, {}):
         return ""
-    error = float(yardstick.errors(term, value, recorded.terms[term]).relative.max())
+    error = float(comparator.errors(term, value, recorded.terms[term]).relative.max())
     before = recorded.errors[name][term]
     if error <= ROUNDING:
         return f"right now: {error:.1e} from the oracle, which it differed from by {before:.1e} when recorded"
     return f"it differed from the oracle by {before:.1e} when recorded, and by {error:.1e} now"
 
 
-def _lost(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChange, ...]) -> Moved:
+def _engine_unavailable(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChange, ...]) -> Moved:
     """Return the failure of an engine that gives no number any more."""
     cause = tolerance.of_engine(refusal.engine, recorded.versions, moved)
     term = refusal.term or "everything"
     return Moved(term, refusal.engine, "", "", _NAN, _NAN, np.inf, 0.0, cause, f"no longer: {refusal.reason}")
 
 
-def _shared(rows: list[Moved], made: dict[str, Dynamics]) -> tuple[str, ...]:
+def _shared(rows: list[Moved], built: dict[str, Dynamics]) -> tuple[str, ...]:
     """Return what follows where all engines moved alike."""
-    if len(made) < 2 or {r.engine for r in rows} != set(made):
+    if len(built) < 2 or {r.engine for r in rows} != set(built):
         return ()
     return (
         "every engine moved while the description stands: look at what they share, mbkit itself, before any engine",
@@ -227,10 +223,10 @@ def _effect(recorded: Baseline, model: Model, found: tuple[Change, ...]) -> str:
     if all(c.section == "expressions" for c in found):
         return ""
     for name in recorded.engines:
-        made, _, _ = engines_.made(model, [name])
-        if not made:
+        built, _, _ = build_engines(model, [name])
+        if not built:
             continue
-        rows, _ = _held(recorded, Yardstick.of(recorded), name, made[name], ())
+        rows, _ = _differences(recorded, Comparator.of(recorded), name, built[name], ())
         rows = [r for r in rows if np.isfinite(r.error)]
         if not rows:
             return f"no term moves ({name})"
@@ -310,17 +306,17 @@ def _notes(a: Baseline, b: Baseline) -> list[str]:
 
 
 def _rows(a: Baseline, b: Baseline) -> list[Moved]:
-    yardstick = Yardstick.of(a)
+    comparator = Comparator.of(a)
     moved = tolerance.moved(a.versions, b.versions)
     rows = []
     for term, x in a.terms.items():
-        if term in b.terms and (row := yardstick.moved(REFERENCE, term, b.terms[term], x, FINE)):
+        if term in b.terms and (row := comparator.moved(REFERENCE, term, b.terms[term], x, FINE)):
             rows.append(row)
     for engine, terms in a.own.items():
         for term, x in terms.items():
             y = b.own.get(engine, {}).get(term)
             if y is None and term in b.errors.get(engine, {}):
                 y = b.terms[term]
-            if y is not None and (row := yardstick.moved(engine, term, y, x, OWN)):
+            if y is not None and (row := comparator.moved(engine, term, y, x, OWN)):
                 rows.append(replace(row, cause=tolerance.of_engine(engine, a.versions, moved)))
     return rows

@@ -24,12 +24,11 @@ from mbkit.studies._targets import resolved
 
 __all__ = [
     "FLAT",
+    "LINK_SECTIONS",
     "SECTIONS",
     "Change",
     "Description",
-    "Part",
     "changes",
-    "default",
     "described",
     "links_of",
     "moving_mass",
@@ -336,7 +335,7 @@ def _only_rounding(field: str, old: Array, new: Array) -> bool:
 # the name of the link or joint that was edited, their own numbers are recorded too, where it is known
 # which file a model came from.
 
-SECTIONS_LINKS: Final = ("links", "places")
+LINK_SECTIONS: Final = ("links", "places")
 _PLACE: Final = ("translation", "rotation")
 
 
@@ -387,7 +386,7 @@ def _merged(whole: Model) -> Description:
 
 def without_consequences(found: tuple[Change, ...], old: Description) -> tuple[Change, ...]:
     """Return the changes without those of merged bodies and frames that follow from a link's."""
-    if not any(c.section in SECTIONS_LINKS for c in found):
+    if not any(c.section in LINK_SECTIONS for c in found):
         return found
     hosts = {frame["body"] for frame in old.get("frames", {}).values() if "body" in frame}
     return tuple(c for c in found if not _follows(c, old, hosts))

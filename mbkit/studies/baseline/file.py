@@ -1,4 +1,9 @@
-"""The file of a baseline: whole or not there, guarded by a checksum, and no other robot's."""
+"""Baselines and their files: TOML, written as a whole and guarded by a checksum.
+
+Why TOML: the standard library reads it, a name stands beside each number, it has comments and infinities, and no text
+is taken for a number. Below a section every line is the whole path to a number or row, so that a changed line says
+what changed.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,9 @@ import hashlib
 import json
 import os
 import re
-import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,25 +23,102 @@ from mbkit import _interrupt
 from mbkit._check import Array
 from mbkit._escape import json_text
 from mbkit.errors import BaselineError, InputError, OutputError
-from mbkit.studies.baseline import file as toml
-from mbkit.studies.baseline.content import ROLLOUT, Baseline, Rollout
 from mbkit.studies.baseline.description import FLAT, SECTIONS, Description, moving_mass
 from mbkit.studies.compare.terms import States
-from mbkit.studies.results import Refusal
+from mbkit.studies.results import Refusal, write_whole
 
 __all__ = [
-    "FORMAT",
+    "ROLLOUT",
+    "Baseline",
+    "Rollout",
     "check_replaceable",
-    "dumps",
-    "from_table",
     "is_baseline",
     "path_of",
     "read",
     "store",
     "text_of",
-    "to_table",
-    "value",
 ]
+
+
+#: The name of a rollout's end among the terms: q, then v, (nq + nv,).
+ROLLOUT: Final = "rollout"
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """How far a rollout goes from the first state: `steps` of Runge-Kutta 4 of `dt` s, without forces."""
+
+    dt: float
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """What was recorded of one model, as `record` returns and `read` reads it.
+
+    Attributes
+    ----------
+    model : str
+        Name of the model.
+    digest : str
+        Its fingerprint, `Model.digest`.
+    target, options
+        What `mbkit baseline check` loads, and how; empty where a model itself was given.
+    seed : int
+    processor : str
+    versions : dict
+        Of what computes, by package.
+    description : dict
+        The model's parameters, as `mbkit.studies.baseline.description` has them.
+    coordinates, velocities : tuple of str
+    states : States
+    rollout : Rollout
+    terms : dict
+        Term -> values at the states by the oracle, rounded to double. ``"rollout"`` is the end
+        of a rollout.
+    errors : dict
+        Engine -> term -> worst error against these, as `mbkit.studies.compare.errors` defines it; zero for
+        one of less than 8 eps, which any engine may have.
+    own : dict
+        Engine -> term -> the engine's own values, where it differed by more than rounding.
+    left_out : tuple of Refusal
+        What an engine could not do when this was recorded.
+    """
+
+    model: str
+    digest: str
+    target: str
+    options: dict[str, Any]
+    seed: int
+    processor: str
+    versions: dict[str, str]
+    description: Description
+    coordinates: tuple[str, ...]
+    velocities: tuple[str, ...]
+    states: States
+    rollout: Rollout
+    terms: dict[str, Array]
+    errors: dict[str, dict[str, float]]
+    own: dict[str, dict[str, Array]] = field(default_factory=dict)
+    left_out: tuple[Refusal, ...] = ()
+
+    @property
+    def engines(self) -> tuple[str, ...]:
+        """The engines that were recorded."""
+        return tuple(self.errors)
+
+    @property
+    def disagreements(self) -> tuple[str, ...]:
+        """Where an engine differed from the oracle by more than rounding when this was recorded."""
+        return tuple(
+            f"{engine}: {term} differs from the oracle by {self.errors[engine][term]:.1e}; recorded as it is"
+            for engine, terms in self.own.items()
+            for term in terms
+        )
+
+    def __repr__(self) -> str:
+        told = f"{len(self.terms)} terms at {len(self.states.kinds)} states"
+        return f"<Baseline of {self.model!r}: {', '.join(self.engines)}; {told}>"
 
 
 # A baseline as a table of plain data, and back: one row for each joint, so that a changed line names it.
@@ -44,11 +126,11 @@ __all__ = [
 #: Of the file. Another number is another layout, which this one does not read.
 FORMAT: Final = 1
 #: Of a rollout that a file asks for; `record` writes far fewer.
-_MOST_STEPS: Final = 10_000
+_MAX_STEPS: Final = 10_000
 _VECTORS: Final = ("q", "v", "a", "tau")
 
 
-def to_table(b: Baseline) -> dict[str, Any]:
+def _to_table(b: Baseline) -> dict[str, Any]:
     """Return what is written."""
     names = {"q": b.coordinates, "v": b.velocities, "a": b.velocities, "tau": b.velocities}
     refused: dict[str, dict[str, str]] = {}
@@ -74,14 +156,8 @@ def to_table(b: Baseline) -> dict[str, Any]:
     }
 
 
-def from_table(t: Mapping[str, Any]) -> Baseline:
-    """Return what was written.
-
-    Raises
-    ------
-    ValueError, TypeError, LookupError, AttributeError, ArithmeticError
-        It is not what `to_table` writes: a part is missing, or of another kind or size, or a number is not finite.
-    """
+def _from_table(t: Mapping[str, Any]) -> Baseline:
+    """Return what was written; a part that is missing or of another kind raises some built-in error."""
     if t["format"] != FORMAT:
         raise ValueError(f"expected format {FORMAT}, got {t['format']!r}")
     states = t["states"]
@@ -123,8 +199,8 @@ def _check(b: Baseline) -> None:
     texts = [b.model, b.digest, b.target, b.processor, *b.states.kinds, *b.versions, *b.versions.values(), *b.errors]
     if not all(isinstance(x, str) for x in texts):
         raise ValueError("a name, a target or a version is no text")
-    if type(b.seed) is not int or type(b.rollout.steps) is not int or not 0 < b.rollout.steps <= _MOST_STEPS:
-        raise ValueError(f"expected a whole number as seed, and 1 to {_MOST_STEPS} steps of the rollout")
+    if type(b.seed) is not int or type(b.rollout.steps) is not int or not 0 < b.rollout.steps <= _MAX_STEPS:
+        raise ValueError(f"expected a whole number as seed, and 1 to {_MAX_STEPS} steps of the rollout")
     if not b.terms or not b.errors or "M" not in b.terms:
         raise ValueError("no terms, no mass matrix or no engines")
     n, nv = len(b.states.kinds), len(b.velocities)
@@ -142,9 +218,9 @@ def _check(b: Baseline) -> None:
             raise ValueError(f"{name}: a number is not finite")
     for section, parts in b.description.items():
         for part in parts.values():
-            for field, x in part.items():
-                if not (_is_number(x) if field == "mass" else isinstance(x, str) or _are_numbers(x)):
-                    raise ValueError(f"{section}: {field}: expected numbers or text, got {x!r}")
+            for name, x in part.items():
+                if not (_is_number(x) if name == "mass" else isinstance(x, str) or _are_numbers(x)):
+                    raise ValueError(f"{section}: {name}: expected numbers or text, got {x!r}")
     if np.shape(moving_mass(b.description)[1]) != (3,):
         raise ValueError("gravity: expected three numbers")
     errors = [x for terms in b.errors.values() for x in terms.values()]
@@ -273,7 +349,7 @@ def is_baseline(path: Path) -> bool:
 
 def text_of(baseline: Baseline) -> str:
     """Return a baseline as the text of its file; the same baseline is the same text."""
-    body = f"{_NOTE}\n{toml.dumps(to_table(baseline))}\n"
+    body = f"{_NOTE}\n{_dumps(_to_table(baseline))}\n"
     return f"{body}{_SUM}{_checksum(body)}\n"
 
 
@@ -322,7 +398,7 @@ def parsed(raw: bytes, where: Path) -> Baseline:
     if told.strip() != _checksum(body):
         raise BaselineError(f"{where}: edited or damaged: its checksum belongs to other content; {_REMEDY}")
     try:
-        return from_table(tomllib.loads(body))
+        return _from_table(tomllib.loads(body))
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         raise BaselineError(f"{where}: sound by its checksum, yet not readable ({error}); {_REMEDY}") from None
 
@@ -371,7 +447,7 @@ def check_replaceable(path: Path, model: str) -> None:
             f"{path}: a newer mbkit's baseline, of format {number}; update mbkit, or replace it with force"
         )
     named = _MODEL.search(text)
-    if named and named[1] != toml.value(model):
+    if named and named[1] != _value(model):
         raise OutputError(
             f"{path}: the baseline of {named[1]}, not of {model!r}; name another file, or replace it with force"
         )
@@ -386,36 +462,19 @@ def store(path: Path, text: str, model: str, *, force: bool) -> None:
         It cannot be written; or, unless `force` is given, another process has put another
         robot's baseline there in the meantime.
     """
-    with _interrupt.held:
-        # Where a link leads, so that it stays one.
-        _store(Path(os.path.realpath(path)), text, model, force=force)
-
-
-def _store(path: Path, text: str, model: str, *, force: bool) -> None:
-    temporary = None
+    # Where a link leads, so that it stays one.
+    path = Path(os.path.realpath(path))
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-        with os.fdopen(handle, "wb") as file:
-            file.write(text.encode("utf-8"))
-            # A name must not stand for content that a crash can still take.
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        if not force:
-            _claim(temporary, path, model)
-        os.replace(temporary, path)
+        with _interrupt.held:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, text.encode("utf-8"), None if force else lambda temporary: _claim(temporary, path, model))
     except UnicodeEncodeError as error:
-        raise InputError(
-            f"{model}: the name {error.object[error.start : error.end]!r} is no text that a file holds"
-        ) from None
-    except OutputError:
-        raise
+        name = error.object[error.start : error.end]
+        raise InputError(f"{model}: the name {name!r} is no text that a file holds") from None
     except OSError as error:
+        if isinstance(error, OutputError):
+            raise
         raise OutputError(f"cannot write {path}: {error.strerror or error}; what was there is unchanged") from error
-    finally:
-        if temporary is not None and os.path.lexists(temporary):
-            os.unlink(temporary)
 
 
 def _claim(temporary: str, path: Path, model: str) -> None:
@@ -427,28 +486,12 @@ def _claim(temporary: str, path: Path, model: str) -> None:
         check_replaceable(path, model)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-# TOML as a baseline has it: sections, and below them one line for each number or row, which says by itself what it is.
-#
-# Why TOML: the standard library reads it, a name stands beside each number, comments are allowed, there
-# are infinities, and no text is taken for a number or a truth value. JSON lines have no comments and no
-# infinities; YAML needs a library, and reads 1e5 as text and no as false.
-
 _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
 
 
-def dumps(table: Mapping[str, Any]) -> str:
-    """Return a table as text: first what is no table itself, then a section for each that is.
-
-    Below a section every line is the whole path to a number, text or row. Floats are the
-    shortest text that reads back to the same bits.
-    """
-    head = [f"{_key(k)} = {value(x)}" for k, x in table.items() if not isinstance(x, Mapping)]
+def _dumps(table: Mapping[str, Any]) -> str:
+    """Return a table as TOML: first what is no table itself, then a section for each that is."""
+    head = [f"{_key(k)} = {_value(x)}" for k, x in table.items() if not isinstance(x, Mapping)]
     sections = ["\n".join(head)]
     for name, part in table.items():
         if isinstance(part, Mapping) and part:
@@ -462,7 +505,7 @@ def _lines(part: Mapping[str, Any], before: str = "") -> Iterator[str]:
         if isinstance(x, Mapping):
             yield from _lines(x, path + ".")
         else:
-            yield f"{path} = {value(x)}"
+            yield f"{path} = {_value(x)}"
 
 
 def _key(name: str) -> str:
@@ -477,12 +520,12 @@ def _text(x: str) -> str:
     )
 
 
-def value(x: Any) -> str:
+def _value(x: Any) -> str:
     """Return a number, text or list as TOML."""
     if isinstance(x, bool):
         return "true" if x else "false"
     if isinstance(x, str):
         return _text(x)
     if isinstance(x, (list, tuple)):
-        return f"[{', '.join(value(y) for y in x)}]"
+        return f"[{', '.join(_value(y) for y in x)}]"
     return repr(x)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -18,29 +18,28 @@ from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalEr
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import results
-from mbkit.studies._targets import checked_target
-from mbkit.studies.baseline import record as engines_
-from mbkit.studies.baseline.content import ROLLOUT, Baseline, Rollout
+from mbkit.studies._checkpoint import Progress, silent
+from mbkit.studies._targets import checked_target, with_values
 from mbkit.studies.baseline.description import described, links_of
-from mbkit.studies.baseline.file import check_replaceable, path_of, store, text_of
-from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Yardstick, relevant
+from mbkit.studies.baseline.file import ROLLOUT, Baseline, Rollout, check_replaceable, path_of, store, text_of
+from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Comparator, relevant
 from mbkit.studies.compare.rollouts import quiet_simulate
 from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.results import Refusal
 
-__all__ = ["LONG", "checked_model", "checked_names", "evaluated", "made", "record", "states_of", "with_values"]
+__all__ = ["build_engines", "checked_model", "evaluate", "record"]
 
 
 # What is recorded, evaluated: the states, every term at them, and where a short rollout ends.
 
 _METHOD: Final = "rk4"
 #: Of the motion of a robot an excerpt, in which rounding does not grow.
-LONG: Final = Rollout(dt=2e-3, steps=25)
+_ROLLOUT: Final = Rollout(dt=2e-3, steps=25)
 # States are written in a file for people: of these decimals every double is its own shortest text.
 _DECIMALS: Final = 6
 
 
-def states_of(model: Model, samples: int, seed: int) -> States:
+def _states(model: Model, samples: int, seed: int) -> States:
     """Return `samples` random states, and one that is near singular."""
     drawn = states(model, samples, seed)
     # Limits act on no term, and at zero axes are aligned as they are near singular: a file is read by people.
@@ -62,7 +61,7 @@ def _rounded(model: Model, q: Array) -> Array:
     return np.asarray(out + 0.0)
 
 
-def evaluated(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Array], list[Refusal]]:
+def evaluate(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Array], list[Refusal]]:
     """Return every term that an engine gives, and why it does not give the others."""
     values: dict[str, Array] = {}
     refusals = []
@@ -73,16 +72,12 @@ def evaluated(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Ar
             try:
                 values[term.name] = term.call(dyn, at)
             except MbkitError as error:
-                refusals.append(_refusal(dyn, term.name, error))
+                refusals.append(Refusal.of(dyn.engine, error, term.name))
         try:
             values[ROLLOUT] = _rolled(dyn, at, rollout)
         except MbkitError as error:
-            refusals.append(_refusal(dyn, ROLLOUT, error))
+            refusals.append(Refusal.of(dyn.engine, error, ROLLOUT))
     return values, refusals
-
-
-def _refusal(dyn: Dynamics, term: str, error: MbkitError) -> Refusal:
-    return Refusal(dyn.engine, term, str(error).removeprefix(f"{dyn.engine}: "))
 
 
 def _rolled(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
@@ -94,9 +89,6 @@ def _rolled(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
     if run.stats.ended != "finished":
         raise NumericalError(f"{dyn.engine}: {method}: {run.stats.message}")
     return np.concatenate([run.q[-1], run.v[-1]])
-
-
-Progress = Callable[[float, str], object]
 
 
 def record(
@@ -153,23 +145,19 @@ def record(
     OutputError
         The file cannot be written, or is not this model's to replace; it stays as it was.
     """
-    model, where = engines_.checked_model(model), path_of(path)
-    names = engines_.checked_names(engines)
+    model, where = checked_model(model), path_of(path)
+    names = _engine_names(engines)
     count("samples", samples, least=1)
     count("seed", seed)
     checked_target(target, options)
     if not force:
         check_replaceable(where, model.name)
-    made = _recorded(model, names, engines is not None, samples, seed, progress or _silent)
+    recorded = _recorded(model, names, engines is not None, samples, seed, progress or silent)
     given = dict(options or {})
-    description = made.description | links_of(model, target, given, where)
-    made = replace(made, target=target, options=given, description=description)
-    store(where, text_of(made), model.name, force=force)
-    return made
-
-
-def _silent(_fraction: float, _text: str) -> None:
-    """Tell nobody."""
+    description = recorded.description | links_of(model, target, given, where)
+    recorded = replace(recorded, target=target, options=given, description=description)
+    store(where, text_of(recorded), model.name, force=force)
+    return recorded
 
 
 def _recorded(
@@ -181,26 +169,26 @@ def _recorded(
     tell: Progress,
 ) -> Baseline:
     tell(0.0, "building")
-    plain = engines_.with_values(model)
-    made, refused, missing = engines_.made(plain, names)
+    plain = with_values(model)
+    built, refused, missing = build_engines(plain, names)
     if asked and missing:
         raise UnsupportedError("; ".join(f"{m.engine}: {m.reason}" for m in missing))
-    if not made:
+    if not built:
         why = "; ".join(f"{r.engine}: {r.reason}" for r in refused)
         raise UnsupportedError(f"no engine holds {model.name}, so there is nothing to record: {why}")
-    at = states_of(plain, samples, seed)
+    at = _states(plain, samples, seed)
     tell(0.1, "34 digits")
-    terms, untold = evaluated(OracleDynamics(plain), at, LONG)
+    terms, untold = evaluate(OracleDynamics(plain), at, _ROLLOUT)
     description = described(model)
-    yardstick = Yardstick(terms, at, description, model.coordinate_names, model.velocity_names)
+    comparator = Comparator(terms, at, description, model.coordinate_names, model.velocity_names)
     errors: dict[str, dict[str, float]] = {}
     own: dict[str, dict[str, Array]] = {}
     left_out: list[Refusal] = [*refused, *untold]
-    for k, (name, dyn) in enumerate(made.items()):
-        tell(0.6 + 0.4 * k / len(made), name)
-        values, without = evaluated(dyn, at, LONG)
+    for k, (name, dyn) in enumerate(built.items()):
+        tell(0.6 + 0.4 * k / len(built), name)
+        values, without = evaluate(dyn, at, _ROLLOUT)
         left_out += [r for r in without if r.term in terms]
-        errors[name] = {t: _error(yardstick, t, x, terms[t]) for t, x in values.items() if t in terms}
+        errors[name] = {t: _error(comparator, t, x, terms[t]) for t, x in values.items() if t in terms}
         wrong = {t: values[t] for t, x in errors[name].items() if x > ROUNDING}
         if wrong:
             own[name] = wrong
@@ -217,7 +205,7 @@ def _recorded(
         coordinates=tuple(model.coordinate_names),
         velocities=tuple(model.velocity_names),
         states=at,
-        rollout=LONG,
+        rollout=_ROLLOUT,
         terms=terms,
         errors=errors,
         own=own,
@@ -225,24 +213,24 @@ def _recorded(
     )
 
 
-def _error(yardstick: Yardstick, term: str, value: Array, reference: Array) -> float:
-    error = float(np.max(yardstick.errors(term, value, reference).relative))
+def _error(comparator: Comparator, term: str, value: Array, reference: Array) -> float:
+    error = float(np.max(comparator.errors(term, value, reference).relative))
     return error if error > FINE else 0.0
 
 
 # The engines of a baseline, made; one that is not installed is told apart from one that refuses.
 
 
-def checked_model(given: object) -> Model:
+def checked_model(model: object) -> Model:
     """Return a model that has something to record."""
-    model = expect_model(given)
+    model = expect_model(model)
     if not model.nv:
         raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to record; add a joint")
     model.require_values("a baseline")
     return model
 
 
-def checked_names(engines: Sequence[str] | None) -> tuple[str, ...]:
+def _engine_names(engines: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of engines, all that there are where none were given."""
     if engines is None:
         return compared()
@@ -256,13 +244,7 @@ def checked_names(engines: Sequence[str] | None) -> tuple[str, ...]:
     return tuple(dict.fromkeys(engines))
 
 
-def with_values(model: Model) -> Model:
-    """Return the model with numbers for its named parameters, which not every engine takes."""
-    values = {name: x for name, x in model.parameters.items() if x is not None}
-    return model.with_parameters(**values) if values else model
-
-
-def made(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[Refusal], list[Refusal]]:
+def build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[Refusal], list[Refusal]]:
     """Return the engines that hold a model, those that refuse it, and those that are not installed."""
     found: dict[str, Dynamics] = {}
     refused: list[Refusal] = []
@@ -272,12 +254,10 @@ def made(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[
             found[name] = dynamics(model, name, **find_engine(name).brief)
         except UnsupportedError as error:
             absent = isinstance(error.__cause__, ModuleNotFoundError)
-            told = f"not installed; pip install {find_engine(name).package}" if absent else _plain(name, error)
-            (missing if absent else refused).append(Refusal(name, "", told))
+            if absent:
+                missing.append(Refusal(name, "", f"not installed; pip install {find_engine(name).package}"))
+            else:
+                refused.append(Refusal.of(name, error))
         except MbkitError as error:
-            refused.append(Refusal(name, "", _plain(name, error)))
+            refused.append(Refusal.of(name, error))
     return found, refused, missing
-
-
-def _plain(name: str, error: MbkitError) -> str:
-    return str(error).removeprefix(f"{name}: ")

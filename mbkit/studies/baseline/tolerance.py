@@ -19,8 +19,8 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines.registry import ENGINES
 from mbkit.studies import results
-from mbkit.studies.baseline.content import ROLLOUT, Baseline
 from mbkit.studies.baseline.description import Description, moving_mass
+from mbkit.studies.baseline.file import ROLLOUT, Baseline
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States
 
@@ -28,9 +28,9 @@ __all__ = [
     "FINE",
     "OWN",
     "ROUNDING",
+    "Comparator",
     "Moved",
     "VersionChange",
-    "Yardstick",
     "allowed",
     "moved",
     "of_engine",
@@ -98,7 +98,7 @@ def allowed(baseline: Baseline, engine: str, term: str) -> float:
     return _FACTOR * max(recorded, FINE)
 
 
-class Yardstick:
+class Comparator:
     """Measures values of any term against others.
 
     Parameters
@@ -127,7 +127,7 @@ class Yardstick:
         self.states = tuple(f"{kind} state {k + 1}" for k, kind in enumerate(at.kinds))
 
     @classmethod
-    def of(cls, baseline: Baseline) -> Yardstick:
+    def of(cls, baseline: Baseline) -> Comparator:
         """Return the one of a baseline."""
         b = baseline
         return cls(b.terms, b.states, b.description, b.coordinates, b.velocities)

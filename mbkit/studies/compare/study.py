@@ -18,6 +18,7 @@ from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalEr
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import results
+from mbkit.studies._targets import with_values
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.omissions import omissions
 from mbkit.studies.compare.result import Comparison, Row
@@ -260,8 +261,7 @@ def compare(
     """
     begun = time.perf_counter()
     names = _checked(model, engines, samples, seed, tolerance)
-    if model.parameters:
-        model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
+    model = with_values(model)
     tell = progress or _silent
     made, refusals, setup, defects = _made(model, names, tell, compile=not terms_only)
     reference = ""

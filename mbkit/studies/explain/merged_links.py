@@ -15,6 +15,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, Lump, together
 from mbkit.model import Body, Joint, Model
+from mbkit.studies._targets import with_values
 
 __all__ = ["Compact", "Member", "compact", "composite", "with_link", "with_lump", "with_matter"]
 
@@ -71,7 +72,7 @@ def compact(model: Model) -> Compact:
     """
     if model.parameters:
         model.require_values("explain")
-        model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
+        model = with_values(model)
     bodies = {b.name: b for b in model.bodies}
     at: dict[str, tuple[str, Array, Array]] = {"world": ("world", np.eye(3), np.zeros(3))}
     members: dict[str, list[Member]] = {"world": []}

@@ -15,7 +15,7 @@ from mbkit.engines.registry import DERIVED, ENGINES, INDEPENDENT, compared
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
 from mbkit.studies import results
-from mbkit.studies._checkpoint import Checkpoint, Keeper, Progress
+from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.reference import TERMS
 from mbkit.studies.stress.result import BAR, StressResult
@@ -153,7 +153,7 @@ def stress(
     memory = _MEMORY if memory is None else count("memory", memory, least=_MIN_MEMORY)
     budget = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
     jobs = min(processors(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
-    keeper = Keeper(progress, checkpoint)
+    checkpoints = Checkpointer(progress, checkpoint)
     chosen = _cases(cases)
     _check_values(values, chosen)
     methods_of = pairs(engines, _quick_methods(engines) if quick and methods is None else methods)
@@ -198,8 +198,8 @@ def stress(
             closing(run_sweeps(sweeps, Path(home), memory, width, deadline, _TICK)) as ticks,
         ):
             for _ in ticks:
-                keeper.tell(sum(sweep.done for sweep in sweeps) / size, doing[0])
-                keeper.now_and_then(lambda: result(complete=False))
+                checkpoints.report(sum(sweep.done for sweep in sweeps) / size, doing[0])
+                checkpoints.save_if_due(lambda: result(complete=False))
         whole = result(complete=True)
     except CallError as error:
         raise InputError(
@@ -207,15 +207,15 @@ def stress(
         ) from None
     except KeyboardInterrupt:
         part = result(complete=False)
-        keeper.keep(part)
+        checkpoints.save(part)
         raise InterruptedSweepError(part) from None
     except Exception:
         # Such as one of the progress function: the finished cells are not lost with it.
-        keeper.keep(result(complete=False))
+        checkpoints.save(result(complete=False))
         raise
-    keeper.keep(whole)
+    checkpoints.save(whole)
     try:
-        keeper.tell(1.0, "done")
+        checkpoints.report(1.0, "done")
     except KeyboardInterrupt:
         raise InterruptedSweepError(whole) from None
     return whole

@@ -20,7 +20,8 @@ from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
-from mbkit.studies._checkpoint import Checkpoint, Keeper, Progress
+from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
+from mbkit.studies._targets import with_values
 from mbkit.studies.compare.rollouts import free_of_mimic, start_state
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as compute_reference
@@ -171,13 +172,13 @@ def work_precision(
     budget = TimeBudget(limit, min(usual, limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     _check_executor(executor, torque)
-    keeper = Keeper(progress, checkpoint)
+    checkpoints = Checkpointer(progress, checkpoint)
     methods_of = pairs(engines, methods)
     integrated = _integrated_model(model, methods_of)
     asked = real("duration", duration, positive=True)
     steps, tolerances = _positive_numbers("steps", steps), _positive_numbers("tolerances", tolerances)
     force = _constant_torque(torque, integrated)
-    keeper.tell(0.0, "reference")
+    checkpoints.report(0.0, "reference")
     start = _start(integrated, (q0, v0), seed, reference)
     if reference is None:
         reference = _computed_reference(
@@ -186,7 +187,7 @@ def work_precision(
             asked,
             force,
             _FOR_REFERENCE * budget.usual,
-            lambda done: keeper.tell(0.1 * done, "reference"),
+            lambda done: checkpoints.report(0.1 * done, "reference"),
         )
     problem, how = _problem(integrated, start, force, asked, reference)
     if problem.motion == 0.0:
@@ -233,19 +234,19 @@ def work_precision(
 
     try:
         for fraction, text in sweep.steps():
-            keeper.tell(0.1 + 0.9 * fraction, text)
-            keeper.now_and_then(partial(result, complete=False))
+            checkpoints.report(0.1 + 0.9 * fraction, text)
+            checkpoints.save_if_due(partial(result, complete=False))
         whole = result(complete=True)
     except KeyboardInterrupt:
         part = result(complete=False)
-        keeper.keep(part)
+        checkpoints.save(part)
         raise InterruptedSweepError(part) from None
     except Exception:
         # An error of a progress function, or a fault: the finished part is not lost.
-        keeper.keep(result(complete=False))
+        checkpoints.save(result(complete=False))
         raise
-    keeper.keep(whole)
-    keeper.tell(1.0, "done")
+    checkpoints.save(whole)
+    checkpoints.report(1.0, "done")
     return whole
 
 
@@ -342,8 +343,7 @@ def _check_model(model: Model) -> None:
 
 def _integrated_model(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
     """Return the model with parameters as numbers, and mimic joints free where MuJoCo's own integrators run."""
-    if model.parameters:
-        model = model.with_parameters(**{k: x for k, x in model.parameters.items() if x is not None})
+    model = with_values(model)
     native = any(METHODS[m].kind == "native" for ms in pairs.values() for m in ms)
     return free_of_mimic(model) if model.layout.reduced and native else model
 
