@@ -170,11 +170,7 @@ def _differences(
     """Return what is not as recorded of one engine, and the worst error of what is."""
     values, refusals = evaluate(dyn, recorded.states, recorded.rollout)
     cause = tolerance.of_engine(name, recorded.versions, moved)
-    rows = [
-        replace(_engine_unavailable(recorded, r, moved), term=r.term)
-        for r in refusals
-        if r.term in recorded.errors[name]
-    ]
+    rows = [_engine_unavailable(recorded, r, moved) for r in refusals if r.term in recorded.errors[name]]
     worst = 0.0
     for term, value in values.items():
         if term not in recorded.errors[name]:
