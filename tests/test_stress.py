@@ -24,12 +24,14 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.errors import InputError, UnknownNameError
+from mbkit.report.stress_view import headline
 from mbkit.studies import InterruptedSweepError, StressResult
 from mbkit.studies.compare.rollouts import TooLongError
-from mbkit.studies.stress import Case, CaseResult, Cell, Row, stress
+from mbkit.studies.stress import Case, CaseResult, Measurement, Row, stress
 from mbkit.studies.stress.measure import Prepared, condition_number, measure, prepare
+from mbkit.studies.stress.measurements import OUT_OF_TIME
 from mbkit.studies.stress.reference import ReferenceSearch, condition, cpu_limit
-from mbkit.studies.stress.sweep import OUT_OF_TIME, CaseSweep, Limits
+from mbkit.studies.stress.sweep import CaseSweep, Limits
 from mbkit.studies.worker import WorkerDiedError, WorkerTimeoutError
 from tests import stress_cases as own
 
@@ -61,7 +63,7 @@ def study(told, tmp_path_factory) -> StressResult:
     return result
 
 
-def cells(result: StressResult, case: str, method: str) -> tuple[Cell, ...]:
+def cells(result: StressResult, case: str, method: str) -> tuple[Measurement, ...]:
     (row,) = (row for row in result.case(case).rows if row.method == method)
     return row.cells
 
@@ -194,20 +196,31 @@ def test_nothing_is_lost_on_the_way_to_json_and_back(study):
     assert "| pinocchio | rk4 | dt 0.001 s | 3 |  |  |" in study.to_markdown()
     assert "<td>died</td>" in study._repr_html_()
     assert "4 cases" in repr(study)
+    # A study that left something out says so first.
+    assert study.left_out == ""
+    late = Measurement(2.0, "not run", note=OUT_OF_TIME)
+    row = replace(study.case("gliding").rows[0], cells=(late,))
+    partial = replace(study, cases=(replace(study.case("gliding"), rows=(row,)),))
+    assert partial.left_out == "the time allowed was used up: 1 of 1 cells were not run"
+    assert partial.to_markdown().startswith(f"**Incomplete**: {partial.left_out}.")
+    assert headline(partial).endswith("nothing was run")
+    assert headline(replace(partial, complete=False)).startswith("interrupted")
     for text in ("{}", "no JSON", '{"cases": [1]}', "[" * 100_000):
         with pytest.raises(InputError, match="StressResult"):
             StressResult.from_json(text)
 
 
 def test_outcomes_by_error_floor_and_warning():
-    assert Cell(1.0, "finished", 1e-7).outcome(1e-6) == "held"
-    assert Cell(1.0, "finished", 1e-7, floor=9.5e-7).outcome(1e-6) == "unjudged"
-    assert Cell(1.0, "finished", 0.5, floor=9.5e-7).outcome(1e-6) == "silent"
-    assert Cell(1.0, "finished", 0.5, warnings=("beware",)).outcome(1e-6) == "warned"
-    assert Cell(1.0, "finished").outcome(1e-6) == "unjudged"
-    assert Cell(1.0, "finished", energy=1e-9).outcome(1e-6) == "unjudged"
-    assert Cell(1.0, "finished", energy=0.5).outcome(1e-6) == "silent"
-    row = Row("pinocchio", "rk4", (Cell(1.0, "finished", 0.0), Cell(2.0, "not run"), Cell(3.0, "died")))
+    assert Measurement(1.0, "finished", 1e-7).outcome(1e-6) == "held"
+    assert Measurement(1.0, "finished", 1e-7, floor=9.5e-7).outcome(1e-6) == "unjudged"
+    assert Measurement(1.0, "finished", 0.5, floor=9.5e-7).outcome(1e-6) == "silent"
+    assert Measurement(1.0, "finished", 0.5, warnings=("beware",)).outcome(1e-6) == "warned"
+    assert Measurement(1.0, "finished").outcome(1e-6) == "unjudged"
+    assert Measurement(1.0, "finished", energy=1e-9).outcome(1e-6) == "unjudged"
+    assert Measurement(1.0, "finished", energy=0.5).outcome(1e-6) == "silent"
+    row = Row(
+        "pinocchio", "rk4", (Measurement(1.0, "finished", 0.0), Measurement(2.0, "not run"), Measurement(3.0, "died"))
+    )
     assert (row.breaking(1e-6).held, row.breaking(1e-6).failed, row.reach(1e-6)) == (1.0, None, 1)
 
 
@@ -222,7 +235,7 @@ class FakeWorker:
 
     def call(self, function, _case, value, *args, **_limits):
         key = {prepare: "case", condition_number: "condition"}.get(function) or args[0].method
-        default = {"case": Prepared("known"), "condition": 1.0}.get(key, Cell(value, "finished", 0.0))
+        default = {"case": Prepared("known"), "condition": 1.0}.get(key, Measurement(value, "finished", 0.0))
         found = self.answers.get((key, value), default)
         self.stage = "run" if function is measure else ""
         if isinstance(found, tuple):
@@ -254,10 +267,10 @@ def ends(result: CaseResult) -> dict[str, list[str]]:
 
 
 def test_a_row_ends_where_more_would_only_cost():
-    found = ends(swept({("rk4", 2): ("run", WorkerTimeoutError(1.0)), ("rk853", 1): Cell(1, "diverged")}))
+    found = ends(swept({("rk4", 2): ("run", WorkerTimeoutError(1.0)), ("rk853", 1): Measurement(1, "diverged")}))
     assert found["rk4"] == ["finished", "slow", "not run", "not run"]
     assert found["rk853"] == ["diverged", "finished", "finished", "finished"]
-    twice = {("rk4", 1): Cell(1, "refused"), ("rk4", 2): Cell(2, "diverged")}
+    twice = {("rk4", 1): Measurement(1, "refused"), ("rk4", 2): Measurement(2, "diverged")}
     assert ends(swept(twice))["rk4"] == ["refused", "diverged", "not run", "not run"]
 
 
@@ -345,7 +358,7 @@ def test_ctrl_c_keeps_what_was_finished(tmp_path):
     assert result.cases[0].facts[0]["cond(M)"] > 1
     # Where it was quicker than the next look, the interruption came when all was done.
     assert json.loads(path.read_text())["complete"] is result.complete
-    assert ("Interrupted" in result.to_markdown()) is not result.complete
+    assert ("interrupted" in result.to_markdown()) is not result.complete
 
 
 def test_a_case_of_a_script_is_found_there(tmp_path):

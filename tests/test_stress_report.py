@@ -17,21 +17,22 @@ from mbkit.report.stress_page import section
 from mbkit.report.stress_steps import kinds, rules, stable_steps, steps
 from mbkit.report.stress_view import avoid, methods
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
-from mbkit.studies.stress.result import CaseResult, Cell, Row, StressResult, best, lines, place, recommended
+from mbkit.studies.stress.measurements import CaseResult, Measurement, Row, best, lines, place, recommended
+from mbkit.studies.stress.result import StressResult
 
 NAN, INF = math.nan, math.inf
 HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'
 
 
-def cells(values: tuple[float, ...], *ends: str | float | tuple[float, str]) -> tuple[Cell, ...]:
+def cells(values: tuple[float, ...], *ends: str | float | tuple[float, str]) -> tuple[Measurement, ...]:
     """One cell a value: an error, an error with a warning, or an end of which there is none."""
     out = []
     for value, end in zip(values, ends, strict=False):
         if isinstance(end, str):
-            out.append(Cell(value, end, seconds=0.5, note=f"{end} at t = 0.1 s"))
+            out.append(Measurement(value, end, seconds=0.5, note=f"{end} at t = 0.1 s"))
         else:
             error, warning = end if isinstance(end, tuple) else (end, "")
-            out.append(Cell(value, "finished", error, 1e-9, 0.01, 1000, (warning,) if warning else ()))
+            out.append(Measurement(value, "finished", error, 1e-9, 0.01, 1000, (warning,) if warning else ()))
     return tuple(out)
 
 
@@ -116,9 +117,15 @@ NASTY = replace(
             truths=(HOSTILE,),
             facts=({HOSTILE: NAN},),
             rows=(
-                Row(HOSTILE, HOSTILE, (Cell(1.0, "finished", NAN, INF, INF, 0, (HOSTILE,), HOSTILE),), HOSTILE, NAN),
-                Row(HOSTILE, "rk4", (Cell(1.0, "finished", INF, INF, NAN, note=HOSTILE),), HOSTILE, 3.0),
-                Row("mujoco", HOSTILE, (Cell(1.0, "refused", note=HOSTILE),)),
+                Row(
+                    HOSTILE,
+                    HOSTILE,
+                    (Measurement(1.0, "finished", NAN, INF, INF, 0, (HOSTILE,), HOSTILE),),
+                    HOSTILE,
+                    NAN,
+                ),
+                Row(HOSTILE, "rk4", (Measurement(1.0, "finished", INF, INF, NAN, note=HOSTILE),), HOSTILE, 3.0),
+                Row("mujoco", HOSTILE, (Measurement(1.0, "refused", note=HOSTILE),)),
             ),
         ),
         replace(STEP, name=HOSTILE, facts=()),
@@ -231,20 +238,21 @@ def test_numbers_are_as_short_as_a_cell():
     assert told == ["256", "0.01", "1e6", "2.5e-9", "1e-12", "0", "1.23e4", "∞"]
     outcomes = ("held", "silent", "warned", "diverged", "not run")
     texts = [
-        cell_text(Cell(1.0, "finished", x), o) for x, o in zip((3.2e-10, 0.42, 23.0, NAN, NAN), outcomes, strict=True)
+        cell_text(Measurement(1.0, "finished", x), o)
+        for x, o in zip((3.2e-10, 0.42, 23.0, NAN, NAN), outcomes, strict=True)
     ]
     assert texts == ["3e-10", "✗ 0.4", "! 23", "diverged", ""]
-    assert cell_text(Cell(1.0, "diverged"), "diverged", short=True) == "div"
+    assert cell_text(Measurement(1.0, "diverged"), "diverged", short=True) == "div"
 
 
 def test_shades_tell_digits_and_whether_it_held():
     errors = (0.0, 1e-13, 1e-10, 1e-7, 1e-4, 0.01)
-    assert [shade(Cell(1.0, "finished", x), "held") for x in errors] == ["h0", "h0", "h1", "h2", "h3", "h4"]
-    assert shade(Cell(1.0, "finished", 1e-4), "inaccurate") == "w3"
-    assert {shade(Cell(1.0, "finished", x), "silent") for x in (0.5, INF)} == {"gross"}
-    assert shade(Cell(1.0, "finished", NAN), "unjudged") == "none"
+    assert [shade(Measurement(1.0, "finished", x), "held") for x in errors] == ["h0", "h0", "h1", "h2", "h3", "h4"]
+    assert shade(Measurement(1.0, "finished", 1e-4), "inaccurate") == "w3"
+    assert {shade(Measurement(1.0, "finished", x), "silent") for x in (0.5, INF)} == {"gross"}
+    assert shade(Measurement(1.0, "finished", NAN), "unjudged") == "none"
     ends = ("diverged", "refused", "slow", "nan", "died", "not run")
-    assert [shade(Cell(1.0, "nan"), e) for e in ends] == ["end"] * 3 + ["mute"] * 2 + ["none"]
+    assert [shade(Measurement(1.0, "nan"), e) for e in ends] == ["end"] * 3 + ["mute"] * 2 + ["none"]
 
 
 def test_dark_text_reads_on_every_shade_of_paper():
@@ -414,7 +422,7 @@ def test_a_page_needs_nothing_from_elsewhere_and_is_whole(page):
 
 def test_what_was_interrupted_before_any_run_is_praised_nowhere():
     case = NASTY.cases[0]
-    cells = tuple(Cell(value=1.0, end="not run") for _ in case.values)
+    cells = tuple(Measurement(value=1.0, end="not run") for _ in case.values)
     rows = tuple(
         replace(row, method=method, engine="lagrangian", cells=cells)
         for row, method in zip(case.rows, ("auto", "rk4"), strict=False)
@@ -433,7 +441,7 @@ def test_a_result_of_nothing_still_has_a_page_a_table_and_a_figure():
     for empty in (NOTHING, replace(NOTHING, cases=NASTY.cases[2:])):
         for text in (Tags(stress_page(empty)).text, printed(summary(empty))):
             assert "interrupted; what was finished: nothing" in text
-        assert figure(empty).axes
+        assert figure(empty.cases).axes
 
 
 @pytest.mark.parametrize("width", [80, 120])
@@ -456,17 +464,17 @@ def test_the_table_is_a_line_a_case_that_fits_the_terminal(width):
 
 
 def test_figures_draw_a_case_or_all_and_refuse_what_there_is_not():
-    drawn = figure(RESULT, "joint_spring").axes[0]
+    drawn = figure(RESULT.cases, "joint_spring").axes[0]
     assert [t.get_text() for t in drawn.get_xticklabels()] == ["1", "1000", "1e6", "1e9"]
     assert "✗ 0.5" in [t.get_text() for t in drawn.texts]
-    every = figure(RESULT).axes[0]
+    every = figure(RESULT.cases).axes[0]
     assert [t.get_text() for t in every.get_yticklabels()] == ["joint_spring", "step_spring", "chain"]
     # One case alone is drawn as its map.
-    assert figure(replace(RESULT, cases=(TERMS,))).texts[0].get_text().startswith("chain: ")
+    assert figure((TERMS,)).texts[0].get_text().startswith("chain: ")
     with pytest.raises(UnknownNameError, match="joint_spring"):
-        figure(RESULT, "joint_sprin")
+        figure(RESULT.cases, "joint_sprin")
     for case in NASTY.cases[:4]:
-        figure(replace(NASTY, cases=(case,))).savefig(io.BytesIO(), format="png", dpi=20)
+        figure((case,)).savefig(io.BytesIO(), format="png", dpi=20)
 
 
 def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():

@@ -18,7 +18,8 @@ from mbkit.report.stress_steps import against_theory, kinds, rules, stable_steps
 from mbkit.report.stress_view import HOW, Overview, held_text, told, value_text
 from mbkit.studies._figure_style import engine_index
 from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
-from mbkit.studies.stress.result import CaseResult, Cell, Line, Outcome, Row, StressResult, engines_of, name_of, place
+from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, engines_of, name_of, place
+from mbkit.studies.stress.result import StressResult
 
 __all__ = ["FILTERS", "MapCell", "MapRow", "Section", "content", "section"]
 
@@ -139,7 +140,7 @@ def _first_beyond(line: Line, case: CaseResult) -> int:
     return -1 if math.isnan(at) else math.floor(at) + 1
 
 
-def _title(case: CaseResult, row: Row, cell: Cell, outcome: Outcome) -> str:
+def _title(case: CaseResult, row: Row, cell: Measurement, outcome: Outcome) -> str:
     """Return all of a cell, for whoever points at it."""
     parts = [f"{name_of(row)}, {case.parameter} = {value_text(cell.value, case)}: {HOW[outcome]}"]
     for name, x in (("error", cell.error), ("energy", cell.energy)):

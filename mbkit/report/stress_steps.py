@@ -12,7 +12,7 @@ from mbkit.report.figures import PAGE, page_style, svg
 from mbkit.report.stress_view import Overview
 from mbkit.studies._figure_style import engine_index, engine_mark, log_ticks
 from mbkit.studies.stress.figure import number_text
-from mbkit.studies.stress.result import CaseResult, Line, name_of, place
+from mbkit.studies.stress.measurements import CaseResult, Line, name_of, place
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,19 +13,19 @@ from mbkit.report.document import Bullet, Column, Document, Items, Section, Span
 from mbkit.report.formatting import time_text
 from mbkit.studies._figure_style import engine_index
 from mbkit.studies.stress.figure import number_text
-from mbkit.studies.stress.result import (
+from mbkit.studies.stress.measurements import (
     CaseResult,
-    Cell,
     Line,
+    Measurement,
     Outcome,
     Row,
-    StressResult,
     best,
     furthest,
     lines,
     name_of,
     recommended,
 )
+from mbkit.studies.stress.result import StressResult
 
 __all__ = [
     "HOW",
@@ -152,7 +152,9 @@ def held_text(line: Line, case: CaseResult) -> str:
 
 def headline(result: StressResult) -> str:
     """Return who held furthest and how much was wrong in silence, in one sentence."""
-    stopped = "" if result.complete else "interrupted; what was finished: "
+    stopped = "interrupted; what was finished: "
+    if result.complete:
+        stopped = f"{result.left_out}; " if result.left_out else ""
     if all(cell.end == "not run" for _, row in result.rows() for cell in row.cells):
         return f"{stopped}nothing was run"
     return f"{stopped}{_leaders(result)}; {_silent(result)}"
@@ -224,7 +226,7 @@ def families(cases: Sequence[Overview]) -> list[tuple[str, str, list[Overview]]]
     return [(name, _FAMILIES.get(name, name), found[name]) for name in sorted(found, key=order.index)]
 
 
-def told(cell: Cell | None) -> str:
+def told(cell: Measurement | None) -> str:
     """Return what was said of a cell beside its numbers."""
     return "" if cell is None else "; ".join(dict.fromkeys(x for x in (cell.note, *cell.warnings) if x))
 
@@ -350,10 +352,10 @@ class SilentLine:
     case: CaseResult
     anchor: str
     row: Row
-    cells: tuple[Cell, ...]
+    cells: tuple[Measurement, ...]
 
     @property
-    def worst(self) -> Cell:
+    def worst(self) -> Measurement:
         """The cell of the largest error."""
         return max(self.cells, key=lambda c: math.inf if math.isnan(c.seen) else c.seen)
 

@@ -2,18 +2,25 @@
 
 from mbkit._callable import make_callable
 from mbkit.studies.stress.case import Case, Problem, Truth
-from mbkit.studies.stress.result import Break, Breaking, CaseResult, Cell, Row, Silent, StressResult
+from mbkit.studies.stress.measurements import BreakingPoint, CaseResult, Measurement, Row
+from mbkit.studies.stress.measurements import BreakingPoint as Break
+from mbkit.studies.stress.measurements import Measurement as Cell
+from mbkit.studies.stress.result import Breaking, SilentFailure, StressResult
+from mbkit.studies.stress.result import SilentFailure as Silent
 from mbkit.studies.stress.study import stress
 
 __all__ = [
     "Break",
     "Breaking",
+    "BreakingPoint",
     "Case",
     "CaseResult",
     "Cell",
+    "Measurement",
     "Problem",
     "Row",
     "Silent",
+    "SilentFailure",
     "StressResult",
     "Truth",
     "stress",

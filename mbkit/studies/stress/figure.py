@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from mbkit._escape import one_line
 from mbkit.errors import UnknownNameError
 from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, style
-from mbkit.studies.stress.result import (
+from mbkit.studies.stress.measurements import (
     CaseResult,
-    Cell,
     Line,
+    Measurement,
     Outcome,
-    StressResult,
     best,
     engines_of,
     lines,
@@ -63,7 +63,7 @@ _WIDTH: Final = 10.4
 _LETTER: Final = 0.075
 
 
-def shade(cell: Cell, outcome: Outcome) -> str:
+def shade(cell: Measurement, outcome: Outcome) -> str:
     """Return the name of a cell's shade, a key of `SHADES`."""
     if outcome in ("warned", "silent"):
         return "gross"
@@ -77,7 +77,7 @@ def shade(cell: Cell, outcome: Outcome) -> str:
     return ("h" if outcome == "held" else "w") + str(sum(digits < d for d in _DIGITS))
 
 
-def cell_text(cell: Cell, outcome: Outcome, short: bool = False) -> str:
+def cell_text(cell: Measurement, outcome: Outcome, short: bool = False) -> str:
     """Return what a cell says: its error, with a mark where it is grossly wrong, or how it ended."""
     if outcome in WORDS:
         return WORDS[outcome][short]
@@ -107,12 +107,12 @@ def _exponent(text: str) -> str:
     return re.sub(r"e([+-])0*(?=\d)", lambda m: "e" + m.group(1).strip("+"), text)
 
 
-def figure(result: StressResult, case: str | None = None, palette: Palette = PLAIN) -> Figure:
-    """Draw a result.
+def figure(cases: Sequence[CaseResult], case: str | None = None, palette: Palette = PLAIN) -> Figure:
+    """Draw the map of one case, or how far each engine held in all of them.
 
     Parameters
     ----------
-    result : StressResult
+    cases : sequence of CaseResult
     case : str, optional
         Name of the case whose map is drawn; by default, how far each engine held in every case, or the map
         of the only one.
@@ -127,18 +127,18 @@ def figure(result: StressResult, case: str | None = None, palette: Palette = PLA
     Raises
     ------
     UnknownNameError
-        The result has no such case.
+        There is no such case.
     """
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib import rc_context
 
-    known = {c.name: c for c in result.cases}
+    known = {c.name: c for c in cases}
     if case is not None and case not in known:
         raise UnknownNameError("case", case, known)
     if case is None and len(known) == 1:
         case = next(iter(known))
     with rc_context(style(palette)):  # type: ignore[arg-type]
-        return _overview(result, palette) if case is None else _map(known[case], palette)
+        return _overview(cases, palette) if case is None else _map(known[case], palette)
 
 
 def _map(case: CaseResult, palette: Palette) -> Figure:
@@ -211,11 +211,11 @@ def _legend(fig: Figure, bar: float, palette: Palette) -> None:
     fig.legend(handles=handles, loc="lower left", ncols=len(handles), columnspacing=1.2, handlelength=1.4)
 
 
-def _overview(result: StressResult, palette: Palette) -> Figure:
+def _overview(cases: Sequence[CaseResult], palette: Palette) -> Figure:
     """Draw how much of each sweep every engine's furthest method held, and mbkit's own choice."""
     from matplotlib.figure import Figure
 
-    cases = [c for c in result.cases if c.values]
+    cases = [c for c in cases if c.values]
     height = 1.3 + 0.26 * max(len(cases), 1)
     fig = Figure(figsize=(_WIDTH, height))
     margins = {"left": 0.25, "right": 0.8, "top": 1 - 0.6 / height, "bottom": 0.55 / height}

@@ -23,6 +23,7 @@ from mbkit.simulate import Trajectory, simulate
 from mbkit.studies.compare.errors import interleaved
 from mbkit.studies.compare.rollouts import TooLongError, patience, quiet_simulate
 from mbkit.studies.stress.case import Case, Truth, problem_of, step_of, times_of
+from mbkit.studies.stress.measurements import Measurement
 from mbkit.studies.stress.reference import (
     TERMS,
     ReferenceSearch,
@@ -32,7 +33,6 @@ from mbkit.studies.stress.reference import (
     error_of,
     reference_terms,
 )
-from mbkit.studies.stress.result import Cell
 from mbkit.studies.worker import report_stage
 
 __all__ = ["Prepared", "Setting", "condition_number", "measure", "prepare"]
@@ -108,7 +108,7 @@ class _Held:
     """What the calls about one value of a case share."""
 
     def __init__(self, case: Case, value: float) -> None:
-        self.key = (case.name, value)
+        self.case, self.value = case, value
         self.problem = problem_of(case, value)
         #: Engine -> dynamics, and the warnings when it was made.
         self.engines: dict[str, tuple[Dynamics, list[str]]] = {}
@@ -134,7 +134,7 @@ def _value_of(case: Case, value: float) -> Iterator[_Held]:
     """Give what is held of a value, and let go of the value before."""
     global _held
     try:
-        if _held is None or _held.key != (case.name, value):
+        if _held is None or (_held.case.name, _held.value) != (case.name, value):
             _held = None
             _held = _Held(case, value)
         yield _held
@@ -165,24 +165,25 @@ def condition_number(case: Case, value: float) -> float:
         return condition(held.oracle, held.problem.q)
 
 
-def measure(case: Case, value: float, setting: Setting, truth: Truth | Terms | None) -> Cell:
+def measure(case: Case, value: float, setting: Setting, truth: Truth | Terms | None) -> Measurement:
     """Return one cell: a run, or the evaluation of a term, timed, and its error."""
     with _value_of(case, value) as held:
         report_stage("engine")
         dyn, heard = held.dynamics(setting.engine)
         if case.measure != "terms":
             assert not isinstance(truth, Terms)
-            cell = _integrate(case, value, setting, held, dyn, truth)
+            cell = _integrate(held, setting, dyn, truth)
         elif isinstance(truth, Terms):
             cell = _evaluate(value, setting.method, dyn, truth)
         else:
-            return Cell(value, "not run", note="not run: no truth")
+            return Measurement(value, "not run", note="not run: no truth")
         # A warning when the engine was made holds for all that it does.
         return replace(cell, warnings=(*heard, *cell.warnings)) if cell.end == "finished" else cell
 
 
-def _integrate(case: Case, value: float, setting: Setting, held: _Held, dyn: Dynamics, truth: Truth | None) -> Cell:
-    problem, method, times = held.problem, setting.method, times_of(held.problem, case.measure)
+def _integrate(held: _Held, setting: Setting, dyn: Dynamics, truth: Truth | None) -> Measurement:
+    value, problem, method = held.value, held.problem, setting.method
+    times = times_of(problem, held.case.measure)
     kind = METHODS[method]
     adaptive = kind.kind == "adaptive"
     dt = 0.0 if adaptive else step_of(problem, times, setting.dt)
@@ -206,7 +207,7 @@ def _integrate(case: Case, value: float, setting: Setting, held: _Held, dyn: Dyn
             quiet_simulate(*start, _TRIAL * dt, method, save=[_TRIAL * dt], **step)
             expected = (_clock() - begun) * steps / _TRIAL
             if expected > setting.seconds:
-                return Cell(value, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
+                return Measurement(value, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
         with heard_warnings() as heard:
             begun = _clock()
             look = patience(setting.seconds, _clock)
@@ -214,14 +215,14 @@ def _integrate(case: Case, value: float, setting: Setting, held: _Held, dyn: Dyn
                 run = simulate(*start, duration, method, save=times, progress=look, **step)
             seconds = [_clock() - begun]
     except TooLongError as error:
-        return Cell(value, "slow", note=str(error))
+        return Measurement(value, "slow", note=str(error))
     while seconds[0] < _SHORT and len(seconds) < _REPEATS:
         begun = _clock()
         quiet_simulate(*start, duration, method, save=times, doubt=False, **step)
         seconds.append(_clock() - begun)
     stats = run.stats
     note = "; ".join(x for x in (stats.message, stats.chosen) if x)
-    cell = Cell(value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
+    cell = Measurement(value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
     if not stats.finished or len(run.t) != len(times):
         return replace(cell, end="diverged", note=stats.message or f"ended at t = {run.t[-1]:g} s")
     cell = replace(cell, warnings=tuple(dict.fromkeys(heard)))
@@ -233,7 +234,7 @@ def _integrate(case: Case, value: float, setting: Setting, held: _Held, dyn: Dyn
     except MbkitError:
         energy = math.nan
     if truth is None:
-        return replace(cell, error=energy if case.measure == "energy" else math.nan, energy=energy)
+        return replace(cell, error=energy if held.case.measure == "energy" else math.nan, energy=energy)
     apart = float(np.abs(problem.model.difference(truth.q, run.q)).max()) / problem.scale
     return replace(cell, error=min(apart, _MAX_ERROR), energy=energy, floor=truth.floor / problem.scale)
 
@@ -280,7 +281,7 @@ def heard_warnings() -> Iterator[list[str]]:
     heard += [" ".join(str(w.message).split()) for w in caught if issubclass(w.category, MbkitWarning)]
 
 
-def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Cell:
+def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Measurement:
     """Return the error of a term over all states, and the time of one evaluation."""
     report_stage("method")
     arguments = [getattr(truth.at, name) for name in TERMS[term]]
@@ -291,7 +292,7 @@ def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Cell:
     # Writeable arrays, as users have them: engines have a fast path for those.
     one = [np.array(x[0]) for x in arguments]
     ns, _ = interleaved({"": lambda: function(*one)}, rounds=3)[""]
-    cell = Cell(value, "finished", seconds=1e-9 * ns, warnings=tuple(dict.fromkeys(heard)))
+    cell = Measurement(value, "finished", seconds=1e-9 * ns, warnings=tuple(dict.fromkeys(heard)))
     if not np.isfinite(computed).all():
         return replace(cell, end="nan", note="numbers that are not finite, and nothing was said")
     if term not in truth.values:

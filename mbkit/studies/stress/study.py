@@ -17,8 +17,9 @@ from mbkit.methods.registry import METHODS
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies.stress.case import Case
+from mbkit.studies.stress.measurements import BAR
 from mbkit.studies.stress.reference import TERMS
-from mbkit.studies.stress.result import BAR, StressResult
+from mbkit.studies.stress.result import StressResult
 from mbkit.studies.stress.sweep import CaseSweep, Limits, run_sweeps
 from mbkit.studies.work_precision.result import InterruptedSweepError
 from mbkit.studies.work_precision.settings import pairs

@@ -17,7 +17,7 @@ from mbkit.methods.registry import METHODS
 from mbkit.studies.compare.rollouts import TooLongError
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.measure import Prepared, Setting, condition_number, measure, prepare
-from mbkit.studies.stress.result import CaseResult, Cell, End, Row
+from mbkit.studies.stress.measurements import OUT_OF_TIME, CaseResult, End, Measurement, Row
 from mbkit.studies.worker import (
     OUT_OF_MEMORY,
     CallError,
@@ -29,10 +29,8 @@ from mbkit.studies.worker import (
     describe,
 )
 
-__all__ = ["OUT_OF_TIME", "CaseSweep", "Limits", "run_sweeps"]
+__all__ = ["CaseSweep", "Limits", "run_sweeps"]
 
-#: The note of a cell that was left out when there was no time left.
-OUT_OF_TIME: Final = "not run: the time allowed was used up"
 #: Times a run's seconds that making the problem and the engine, and compiling, may take; and at the least, s.
 _MAKING: Final = 15.0
 _MIN_MAKING: Final = 6.0
@@ -80,7 +78,7 @@ class _Row:
     method: str
     setting: str
     theory: float | None
-    cells: dict[int, Cell] = field(default_factory=dict)
+    cells: dict[int, Measurement] = field(default_factory=dict)
     stopped: str = ""
 
     @property
@@ -88,7 +86,7 @@ class _Row:
         """Seconds of the longest run."""
         return max((c.seconds for c in self.cells.values() if not math.isnan(c.seconds)), default=0.0)
 
-    def add(self, index: int, cell: Cell) -> None:
+    def add(self, index: int, cell: Measurement) -> None:
         """Keep a cell, and decide whether more are worth it."""
         self.cells[index] = cell
         last = [c.end for _, c in sorted(self.cells.items())][-_MAX_FAILURES:]
@@ -136,7 +134,7 @@ class CaseSweep:
         #: By the index of the value; where the problem itself cannot be made, the cell of every row.
         self._prepared: dict[int, Prepared] = {}
         self._facts: dict[int, dict[str, float]] = {}
-        self._unmade: dict[int, Cell] = {}
+        self._unmade: dict[int, Measurement] = {}
         self._rows = [_Row(e, m, self._setting(m), case.theory(e, m) if case.theory else None) for e, m in rows]
 
     @property
@@ -190,7 +188,7 @@ class CaseSweep:
             if worker.stage:
                 self._prepared[i] = Prepared(f"no truth: {note}")
             else:
-                self._unmade[i] = Cell(value, end, note=note)
+                self._unmade[i] = Measurement(value, end, note=note)
             return
         self._prepared[i], self._facts[i] = prepared, dict(prepared.facts)
         try:
@@ -228,7 +226,7 @@ class CaseSweep:
                 if i in self._unmade:
                     row.cells[i] = self._unmade[i]
                 elif row.stopped:
-                    row.cells[i] = Cell(value, "not run", note=row.stopped)
+                    row.cells[i] = Measurement(value, "not run", note=row.stopped)
                 elif until - self._clock() < _MIN_TIME:
                     return False
                 else:
@@ -247,7 +245,7 @@ class CaseSweep:
             raise
         except Exception as error:
             end, note = self._failure(error, worker.stage)
-            cell = Cell(value, end, note=note)
+            cell = Measurement(value, end, note=note)
         row.add(i, cell)
         if worker.stage == "engine" and cell.end in ("slow", "died"):
             # Every other method of this engine would end like this.
@@ -273,7 +271,7 @@ class CaseSweep:
 
     def _result_row(self, row: _Row) -> Row:
         unknown = row.stopped or OUT_OF_TIME
-        cells = (row.cells.get(i, Cell(value, "not run", note=unknown)) for i, value in enumerate(self.values))
+        cells = (row.cells.get(i, Measurement(value, "not run", note=unknown)) for i, value in enumerate(self.values))
         setting = row.setting
         prescribed = {p.dt for p in tuple(self._prepared.values())} - {None}
         if prescribed and setting.startswith("dt"):
