@@ -56,7 +56,8 @@ def _nan(*args: object, **more: object) -> object:
 
 def _wrong(*args: object, **more: object) -> object:
     run = SIMULATE(*args, **more)
-    return replace(run, q=run.q + 1.0)
+    # At rest, which keeps the energy too.
+    return replace(run, q=0 * run.q, v=0 * run.v)
 
 
 def _doubtful(*args: object, **more: object) -> object:

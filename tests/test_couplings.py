@@ -21,7 +21,6 @@ from mbkit.engines.mujoco import importer
 from mbkit.errors import KnownDefectWarning, ModelError, UnsupportedError
 from mbkit.model import JointCoupling, Model, ModelBuilder
 from mbkit.model.validation import sample_mass_matrix
-from mbkit.simulate.along_trajectory import is_damped
 from mbkit.studies.baseline.description import described
 from mbkit.studies.explain.terms import part
 from tests.random_trees import ALL, SOUND, random_tree
@@ -418,8 +417,8 @@ def test_features_and_identity():
     model = two_pendulums(stiffness=3.0, damping=0.5, armature=0.5).build()
     bare = replace(model, couplings=())
     needs = model.needs
-    assert is_damped(model)
-    assert not is_damped(model.without("damping"))
+    assert model.needs.damping
+    assert not model.without("damping").needs.damping
     assert needs.springs
     assert needs.damping
     assert needs.armature

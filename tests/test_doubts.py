@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import re
 import warnings
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning
 from mbkit.simulate import METHODS
-from mbkit.simulate.diagnostics.checks import idle
+from mbkit.simulate.diagnostics.checks import massless_joints
 from mbkit.simulate.diagnostics.stability import growth
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord
 from mbkit.studies.stress.cases.exact_motions import pendulum
@@ -26,14 +28,23 @@ def hinge(stiffness=0.0, damping=0.0, **kw):
 
 
 def doubts(model, method, q0, v0=None, duration=1.0, engine=None, **kw):
+    """Return a run and what its checks find; what was warned of at once is a part of that."""
     own = engine or ("mujoco" if method.startswith("mujoco") else "lagrangian")
     dyn = mb.dynamics(model, own, **({"compile": False} if own == "lagrangian" else {}))
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         run = mb.simulate(dyn, q0, np.zeros(model.nv) if v0 is None else v0, duration, method, **kw)
-    told = [str(w.message) for w in heard if issubclass(w.category, DoubtfulRunWarning)]
-    assert len(told) == len(run.stats.doubts)
-    return run, told
+    warned = [str(w.message) for w in heard if issubclass(w.category, DoubtfulRunWarning)]
+    assert warned == [f"{model.name}: {method}: {one}" for one in run.stats.doubts]
+    check = run.check()
+    if run.stats.finished:
+        assert {kind(one) for one in run.stats.doubts} <= {kind(one) for one in check.doubts}
+    return run, list(check.doubts)
+
+
+def kind(doubt):
+    """Return a doubt without its numbers, which depend on the states that were looked at."""
+    return re.sub(r"^gained|^lost|[-+]?[0-9][0-9.e+-]*", "", doubt)
 
 
 # The step of 10 ms meets a spring of 80, 500 and 1e6 rad/s: hω = 0.8, 5, 1e4.
@@ -133,10 +144,70 @@ def test_a_step_over_gimbal_lock_is_told():
     assert not doubts(b.build(), "rk4", [0.0, 1.5, 0.0], [0.0, -1.0, 0.0], dt=1e-2, duration=0.2)[1]
 
 
-def test_doubts_can_be_left_out():
-    run, told = doubts(hinge(1e8), "implicit_midpoint", [0.1], dt=1e-2, duration=0.1, doubt=False)
-    assert not told
+def test_cheap_checks_run_at_once_and_warn():
+    """Energy, condition and coordinates; no run is repeated for them, and none is linearized."""
+    dyn = mb.dynamics(mb.catalog.double_pendulum())
+    with pytest.warns(DoubtfulRunWarning, match="of its energy"):
+        run = mb.simulate(dyn, [3.0, 1.0], [3.0, -9.0], 4.0, dt=0.1)
+    assert "of its energy" in run.stats.doubts[0]
+    body = mb.catalog.free_body()
+    q = body.neutral()
+    q[0] = 1e11
+    with pytest.warns(DoubtfulRunWarning, match="nearer origin"):
+        mb.simulate(mb.dynamics(body), q, np.ones(6), 0.01)
+
+
+@pytest.mark.parametrize(("duration", "states"), [(0.01, 0), (0.06, 4), (3.0, 7)])
+def test_cheap_checks_evaluate_a_few_percent_of_what_the_run_did(duration, states, monkeypatch):
+    """At most one state for fifty evaluations from Python, and seven in all."""
+    dyn, counts = mb.dynamics(mb.catalog.double_pendulum()), []
+    for name in ("mass_matrix", "potential_energy"):
+        term = getattr(dyn, name)
+        monkeypatch.setattr(dyn, name, lambda *a, term=term: counts.append(1) or term(*a))
+    mb.simulate(dyn, [1.0, 0.5], [0.0, 0.0], duration, dt=1e-3, doubt=False)
+    assert not counts
+    mb.simulate(dyn, [1.0, 0.5], [0.0, 0.0], duration, dt=1e-3)
+    assert len(counts) == 2 * states
+
+
+@pytest.mark.parametrize("doubt", [True, False])
+def test_a_check_finds_what_the_run_was_not_checked_for(doubt):
+    dyn = mb.dynamics(hinge(1e8), "lagrangian")
+    run = mb.simulate(dyn, [0.1], [0.0], 0.1, "implicit_midpoint", dt=1e-2, doubt=doubt)
     assert run.stats.doubts == ()
+    check = run.check()
+    assert not check
+    assert not check.passed
+    assert check.doubts == pickle.loads(pickle.dumps(run)).check().doubts
+    assert check.doubts[0] in str(check)
+    assert "h|λ|" in check._repr_html_()
+    fine = mb.simulate(dyn, [0.1], [0.0], 1e-4, dt=1e-5, doubt=doubt).check()
+    assert fine
+    assert "no sign" in str(fine)
+
+
+def test_a_check_does_not_need_the_start_among_the_saved_states():
+    model = mb.catalog.double_pendulum()
+    run = mb.simulate(mb.dynamics(model), [1.5, 1.0], [0.0, 0.0], 3.0, "semi_implicit_euler", 5e-3, save=[3.0], t0=0.0)
+    later = mb.simulate(
+        mb.dynamics(model), [1.5, 1.0], [0.0, 0.0], 3.0, "semi_implicit_euler", 5e-3, save=[9.0], t0=6.0
+    )
+    assert "a step of 0.01 s" in run.check().doubts[-1]
+    assert run.check().doubts == later.check().doubts
+
+
+def test_a_run_that_ended_early_does_not_pass_its_check():
+    with pytest.warns(mb.errors.MbkitWarning):
+        run = mb.simulate(mb.dynamics(hinge(1e8)), [0.1], [0.0], 10.0, dt=1e-2)
+    assert run.check().doubts == (run.stats.message,)
+
+
+def test_a_batch_is_checked_by_its_first_trajectories():
+    dyn = mb.dynamics(mb.catalog.double_pendulum())
+    q, v = np.array([[0.1, 0.0], [3.0, 1.0]]), np.array([[0.0, 0.0], [3.0, -9.0]])
+    run = mb.simulate(dyn, q, v, 4.0, dt=0.1, doubt=False)
+    assert any("of its energy" in one for one in run.check().doubts)
+    assert run.check().title == "double_pendulum: rk4"
 
 
 @pytest.mark.parametrize("method", LINEAR)
@@ -147,9 +218,8 @@ def test_a_step_of_a_linear_system_is_the_method_s(method):
     state = np.array([0.3, -0.2])
     run = mb.simulate(dyn, state[:1], state[1:], h, method, dt=h, doubt=False)
     A, B = np.array([[-k]]), np.array([[-c]])
-    np.testing.assert_allclose(
-        METHODS[method].stability.matrix(h, A, B) @ state, [run.q[-1, 0], run.v[-1, 0]], atol=1e-14
-    )
+    matrix = METHODS[method].stability.matrix(h, A, B)
+    np.testing.assert_allclose(matrix @ state, [run.q[-1, 0], run.v[-1, 0]], atol=1e-14)
     assert growth(method, h, A, B) < 1
 
 
@@ -231,10 +301,10 @@ def test_a_joint_that_moves_no_mass_in_a_pose_is_named():
     b.add_body("rod", mass=1.0, com=(0, 0, -1))
     b.add_joint("hook", "universal", parent="world", child="rod", axis=(1, 0, 0), axis2=(0, 1, 0))
     dyn = mb.dynamics(b.build(), "lagrangian")
-    told = idle(dyn, np.array([0.3, np.pi / 2 - 1e-6]))
+    told = massless_joints(dyn, np.array([0.3, np.pi / 2 - 1e-6]))
     assert "'hook'" in told
     assert "gimbal lock" in told
-    assert not idle(dyn, np.array([0.3, 0.3]))
+    assert not massless_joints(dyn, np.array([0.3, 0.3]))
 
 
 @pytest.mark.parametrize(("reached", "ends"), [(0.5, False), (1e-5, False), (1e-8, True)])

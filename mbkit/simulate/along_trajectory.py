@@ -16,7 +16,6 @@ from mbkit.simulate.torque import Held, Sampled
 __all__ = [
     "along",
     "canonical_momentum",
-    "is_damped",
     "kinetic_energy",
     "momentum",
     "moved",
@@ -117,7 +116,7 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, tau: Array) -> Array:
     nv = v.shape[-1]
     pushed = np.broadcast_to(tau, (*v.shape[:-2], len(h), nv))
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
-    damped, turned = is_damped(dyn.model), len(plain) < nv and bool(pushed.any())
+    damped, turned = dyn.model.needs.damping, len(plain) < nv and bool(pushed.any())
     ends = [(q[..., i : len(h) + i, :], v[..., i : len(h) + i, :]) for i in (0, 1)]
     a = [np.zeros(0)] * 2
     if damped or turned:
@@ -149,25 +148,12 @@ def _damped(dyn: Dynamics, h: Array, q: Array, v: Array, a: Array) -> tuple[Arra
 
 
 def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
-    if not is_damped(dyn.model):
+    if not dyn.model.needs.damping:
         return np.zeros(v.shape)
     if not dyn.model.has_bodies:
         return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v), q, v)
     # Springs are what is left of the passive force at rest.
     return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v) - own.passive(q, np.zeros_like(v)), q, v)
-
-
-def is_damped(model: Model) -> bool:
-    """Return whether anything takes energy out."""
-    if not model.has_bodies:
-        return model.needs.damping
-    bound = any(b.field == "damping" for b in model.bindings)
-    return (
-        bound
-        or any(j.damping.any() for j in model.joints)
-        or any(s.damping for s in model.springs)
-        or any(c.damping for c in model.couplings)
-    )
 
 
 def _plain(model: Model) -> list[tuple[int, int]]:

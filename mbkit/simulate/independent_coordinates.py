@@ -22,18 +22,19 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array
 from mbkit.engines import Dynamics
-from mbkit.errors import DoubtfulRunWarning, FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
+from mbkit.errors import FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.lagrangian.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
-from mbkit.methods.registry import METHODS, Method
+from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.simulate.constraint_projection import SingularPoses, from_consistent
-from mbkit.simulate.events import Event, Hit
-from mbkit.simulate.progress import Progress
+from mbkit.simulate.events import Event, Hit, as_events
+from mbkit.simulate.integrate import integrate, times_of
+from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.result import Stats
-from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
+from mbkit.simulate.run_data import RunData
+from mbkit.simulate.time_grid import Grid, save_times
 from mbkit.simulate.torque import Force, Torque, TorqueFunction
-from mbkit.simulate.trajectory import Trajectory
 
-__all__ = ["run_on_charts"]
+__all__ = ["integrate_on_charts"]
 
 _WORN: Final = "the dependent coordinates are badly chosen"
 _NEAR: Final = "near a singular pose"
@@ -69,7 +70,7 @@ class _Run:
         self.q.append(q)
         self.v.append(v)
 
-    def count(self, part: Trajectory) -> None:
+    def count(self, part: RunData) -> None:
         self.steps += part.stats.steps
         self.evaluations += part.stats.evaluations
         self.rejected += part.stats.rejected
@@ -80,73 +81,64 @@ def _on_charts(method: Method) -> bool:
     return not method.engines and not method.jacobian
 
 
-def run_on_charts(
+def integrate_on_charts(
     system: Embedded,
-    method: Method,
     q0: ArrayLike,
     v0: ArrayLike,
-    t0: float,
     duration: float,
+    method: str,
     dt: float | None,
     rtol: float | None,
     atol: float | None,
     torque: ArrayLike | TorqueFunction | None,
     save: ArrayLike | int | None,
-    events: Sequence[Event],
-    progress: Progress,
-) -> Trajectory:
+    progress: bool | ProgressFunction | None,
+    events: Event | Sequence[Event] | None,
+    t0: float | None,
+) -> tuple[RunData, FunctionError | None]:
     """Integrate one state; arguments are those of `mbkit.simulate`, on all coordinates."""
-    model, started = system.model, time.perf_counter()
-    if not _on_charts(method):
+    model, dyn, chosen = system.model, system.dynamics, method_of(method)
+    start, duration, dt = times_of(dyn, chosen, t0, duration, dt)
+    wanted = as_events(events)
+    bar = Progress(progress, f"{model.name}: {method} on independent coordinates")
+    started = time.perf_counter()
+    if not _on_charts(chosen):
         usable = ", ".join(m.name for m in METHODS.values() if _on_charts(m))
         raise UnsupportedError(
-            f"{method.name}: not on independent coordinates, which Newton's iteration leads to; "
+            f"{method}: not on independent coordinates, which Newton's iteration leads to; "
             f"use {usable}, or the form with multipliers, lag.dynamics()"
         )
     q, v = finite_array("q0", q0, (model.nq,)), finite_array("v0", v0, (model.nv,))
-    q, v = from_consistent(system.dynamics, q, v, t0)
+    q, v = from_consistent(dyn, q, v, start)
     read = Torque(torque, model, None, None)
-    run = _Run(SingularPoses(system.dynamics))
+    run = _Run(SingularPoses(dyn))
     force = read.of_member(None)(0)
-    if method.kind == "adaptive":
+    if chosen.kind == "adaptive":
         if isinstance(save, (int, np.integer)):
             raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
-        times = None if save is None else save_times(save, t0, t0 + duration)
-        with progress:
+        times = None if save is None else save_times(save, start, start + duration)
+        with bar:
             given = {"rtol": rtol, "atol": atol}
-            _adaptive(system, run, q, v, t0, t0 + duration, method.name, given, force, times, events, progress)
+            _adaptive(system, run, q, v, start, start + duration, method, given, force, times, wanted, bar)
     else:
-        grid = Grid.of(t0, duration, DEFAULT_STEP if dt is None else dt)
-        with progress:
-            _stepped(system, run, q, v, grid, method.name, force, save, progress)
-    out = _finished(system, run, method, read, t0, t0 + duration, time.perf_counter() - started)
+        with bar:
+            _stepped(system, run, q, v, Grid.of(start, duration, dt), method, force, save, bar)
     for t, value in run.near:
         warnings.warn(
             f"{model.name}: {_NEAR} at t = {t:.6g} s: the smallest singular value there is {value:.3g} of the largest",
             MbkitWarning,
             stacklevel=3,
         )
-    for one in out.stats.doubts:
-        warnings.warn(f"{model.name}: {method.name}: {one}", DoubtfulRunWarning, stacklevel=3)
-    if run.error is not None:
-        run.error.trajectory = out
-        raise run.error
-    if run.message and run.ended != "event":
-        warnings.warn(f"{model.name}: {method.name} {run.message}", MbkitWarning, stacklevel=3)
-    return out
-
-
-def _finished(
-    system: Embedded, run: _Run, method: Method, read: Torque, start: float, end: float, seconds: float
-) -> Trajectory:
-    reached = end if run.ended == "finished" else run.t[-1] if run.t else start
-    told = (run.poses.told(),) if run.poses.times else ()
-    stats = Stats(run.steps, run.evaluations, seconds, run.ended, reached, run.message, run.rejected, doubts=told)
-    n = system.model.nq
-    t, q, v = np.array(run.t), np.array(run.q).reshape(-1, n), np.array(run.v).reshape(-1, n)
-    dyn = system.dynamics
+    end = start + duration if run.ended == "finished" else run.t[-1] if run.t else start
+    doubts = (run.poses.told(),) if run.poses.times else ()
+    seconds = time.perf_counter() - started
+    stats = Stats(run.steps, run.evaluations, seconds, run.ended, end, run.message, run.rejected, doubts=doubts)
+    states = np.array(run.t), np.array(run.q).reshape(-1, model.nq), np.array(run.v).reshape(-1, model.nq)
     hits = tuple(sorted(run.hits, key=lambda hit: hit.t))
-    return Trajectory(t, q, v, system.model, method.name, dyn.engine, stats, dyn, hits, read.applied(None))
+    return RunData(*states, model, method, dyn.engine, stats, dyn, hits, read.applied(None)), run.error
+
+
+_Part = tuple[RunData, FunctionError | None]
 
 
 @dataclass
@@ -201,17 +193,14 @@ def _at(dyn: EmbeddedDynamics, t: float) -> EmbeddedDynamics:
     return dyn.at(**{dyn.model.time_parameter: t}) if dyn.model.time_parameter else dyn
 
 
-def _part(dyn: Dynamics, q: Array, v: Array, chart: Chart | None, *given: Any, **more: Any) -> Any:
-    # The run as a whole tells how it ended.
-    from mbkit.simulate.run import simulate
-
+def _part(
+    dyn: Dynamics, q: Array, v: Array, chart: Chart | None, *given: Any, **more: Any
+) -> tuple[RunData, FunctionError | None]:
     with warnings.catch_warnings():
+        # The run as a whole tells how it ended.
         warnings.simplefilter("ignore", MbkitWarning)
         start = (q, v) if chart is None else (q[chart.independent], v[chart.independent])
-        try:
-            return simulate(dyn, *start, *given, **{"t0": 0.0, **more}), None
-        except FunctionError as error:
-            return error.trajectory, error
+        return integrate(dyn, *start, *given, **{"t0": 0.0, **more})
 
 
 def _adaptive(
@@ -318,7 +307,7 @@ def _begun(
 def _take(
     system: Embedded,
     run: _Run,
-    part: Trajectory,
+    part: RunData,
     way: _Way | _Whole,
     chart: Chart,
     begin: float,

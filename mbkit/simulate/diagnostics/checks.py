@@ -1,224 +1,188 @@
-"""What speaks against a run that finished: energy that came from nowhere, steps too long, digits that are not there.
+"""Signs that a finished run is wrong: energy drift, unstable steps, lost digits.
 
-A run that ends early says so. One that ends with plausible numbers that are wrong does not, unless
-somebody looks; this looks at a few of its states, at a cost that does not grow with the run.
+A few of the run's states are evaluated, so that the cost does not grow with the run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+import sys
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import DOUBLE_BITS, at_times
+from mbkit.engines.base import DOUBLE_BITS, at_time
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances
-from mbkit.model import Model
 from mbkit.model.integration_space import Space
-from mbkit.simulate.along_trajectory import along, is_damped, kinetic_energy, potential_energy
 from mbkit.simulate.diagnostics.eigenvalues import linearized
 from mbkit.simulate.diagnostics.stability import growth, lost
 from mbkit.simulate.solvers.vector_field import magnitude, unit_quaternions
 
-__all__ = ["doubts", "halved", "idle"]
+__all__ = ["CHECKED_TIMES", "diagnostics", "massless_joints"]
 
-_EPS: Final = float(np.finfo(float).eps)
-#: States and trajectories of a batch that are looked at.
-_TIMES: Final = 7
+_EPS: Final = sys.float_info.epsilon
+#: Times and trajectories of a batch at which the mass matrix and the energy are evaluated, at most.
+CHECKED_TIMES: Final = 7
 _MEMBERS: Final = 4
-#: Where a quantity is no longer inaccurate but wrong. A method of first or second order at a common step
-#: oscillates in energy by some parts of a thousand, and means no harm; one of higher order has lost the motion.
+#: A quick check evaluates one state for so many evaluations of the run in machine code: a few percent of its time.
+_WORK_A_STATE: Final = 2000
+#: Saved velocities among which a quick check looks for the largest kinetic energy.
+_VELOCITIES: Final = 32
+#: Change of the energy that makes a run wrong: methods of first or second order at a common step oscillate by
+#: some parts of a thousand; one of higher order has lost the motion by then.
 _ENERGY: Final = 0.01
 _ENERGY_HIGH: Final = 1e-3
 _LOW: Final = (1, 2)
 _DIGITS: Final = 1e-3
 #: h|λ| below which every method follows every mode for as long as runs are.
 _FOLLOWED: Final = 1e-3
-#: Of the motion: a hundredth is wrong, and at a few times the gap is not yet the largest.
-_OFF: Final = 0.008
-_BEYOND: Final = 3.0
-#: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by two to four times that.
+#: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by 2 to 4 times that.
 _LOST: Final = 0.02
 _SUM: Final = 1e-3
-#: Least eigenvalue of a mass matrix beside its largest, in units in which it has ones at a random configuration.
+#: Smallest eigenvalue of the mass matrix beside its largest, where a random configuration has a unit diagonal.
 _IDLE: Final = 1e-7
-#: m or rad: what engineers still call a position.
+#: m or rad: the precision that a position must have.
 _POSITION: Final = 1e-6
 
 
-def doubts(
+def diagnostics(
     dyn: Dynamics,
     method: Method,
     setting: float | Tolerances,
-    t: Array,
-    q: Array,
-    v: Array,
+    states: tuple[Array, Array, Array],
     *,
-    pushed: bool,
+    driven: bool,
     steps: int,
+    work: int | None = None,
 ) -> list[str]:
-    """Return what speaks against a run, in sentences with the measured reason and the remedy.
+    """Return the signs that a run is wrong, each with its measured reason and a remedy.
 
     Parameters
     ----------
     dyn : Dynamics
     method : Method
     setting : float or Tolerances
-        The step, s, or what an adaptive method was given.
-    t : (K,) array
-    q, v : (K, nq), (K, nv) or (N, K, nq), (N, K, nv) arrays
-        What was kept; states that are not finite are passed over.
-    pushed : bool
+        The step, s, or the tolerances of an adaptive method.
+    states : (K,), (K, nq) or (N, K, nq), (K, nv) or (N, K, nv) arrays
+        t, q and v, with the start; states that are not finite are passed over.
+    driven : bool
         Whether a generalized force acted.
     steps : int
         Of all trajectories.
+    work : int, optional
+        Evaluations of the run, each counted as the time of one in machine code. Where given, the checks take a few
+        percent of that time: the step is not checked, and energy and mass matrix only where two states are affordable.
     """
-    nv = dyn.model.nv
+    t, model, quick = states[0], dyn.model, work is not None
     # The oracle's digits are not in doubt, and its terms take long.
-    if len(t) < 2 or not nv or not v.size or dyn.bits > DOUBLE_BITS:
+    if len(t) < 2 or not model.nv or not states[2].size or dyn.bits > DOUBLE_BITS:
         return []
-    # The first trajectory's fastest state is where a step is longest for it.
-    fastest = int(np.nan_to_num(np.abs(v.reshape(-1, *v.shape[-2:])[0]).max(axis=-1), posinf=0.0).argmax())
-    ends = [_first(q, v, k) for k in sorted({0, fastest, len(t) - 1})]
-    crossed, members = q, len(q) if q.ndim == 3 else 1
-    times = np.unique(np.linspace(0, len(t) - 1, _TIMES).astype(int))
-    q, v = q[..., times, :], v[..., times, :]
-    if q.ndim == 3:
-        if dyn.samples is not None:
-            # Each has parameters of its own.
-            dyn = dyn.of_samples(list(range(min(_MEMBERS, len(q)))))
-        q, v = q[:_MEMBERS], v[:_MEMBERS]
+    q, v = (x.reshape(-1, *x.shape[-2:]) for x in states[1:])
+    most = _MEMBERS * CHECKED_TIMES if work is None else work // _WORK_A_STATE
+    members = max(1, min(_MEMBERS, len(q), most // 2))
+    count = max(2, min(CHECKED_TIMES, most // members))
+    times = sorted({k * (len(t) - 1) // (count - 1) for k in range(count)})
+    at_q, at_v = q[:members].take(times, axis=1), v[:members].take(times, axis=1)
+    samples: list[list[_Sample]] = [[] for _ in range(members)]
     try:
-        here = at_times(dyn, t[times], len(q) if q.ndim == 3 else None)
-        M = along(here, (nv, nv), lambda own, q: own.mass_matrix(q), q)
+        if most >= 2:
+            samples = [list(_samples(dyn, i, t.take(times), at_q[i], at_v[i])) for i in range(members)]
     except MbkitError:
         return []
-    looks = [
-        _pole(dyn, crossed),
-        _energy(here, M, q, v, pushed, _ENERGY if method.order in _LOW else _ENERGY_HIGH),
-        [] if _keeps_digits(dyn, method) else _condition(M),
-        _far(q, setting if isinstance(setting, Tolerances) and not method.scaled_by_start else None),
-    ]
-    if not isinstance(setting, Tolerances) and method.stability is not None:
-        # The cause is told before what came of it.
-        looks.insert(0, _step(dyn, method.name, setting, float(t[-1] - t[0]), ends))
-    if isinstance(setting, Tolerances) and method.scaled_by_start:
-        looks.append(_outgrown(q, v, setting))
-    if isinstance(setting, Tolerances) and method.fills_tolerance:
-        looks.append(_adding(method.name, setting, 2 * nv, steps / members))
+    tolerances = setting if isinstance(setting, Tolerances) else None
+    checks = [gimbal_lock(dyn, q)]
+    if not isinstance(setting, Tolerances) and not quick and method.stability is not None:
+        # The cause before its consequences.
+        checks.insert(0, step_size(dyn, method.name, setting, float(t[-1] - t[0]), q[0], v[0]))
+    # The forces of a system on paper may drive it.
+    if not (driven or model.time_parameter or (not model.has_bodies and model.needs.damping)):
+        whole = [i for i in range(members) if len(samples[i]) == len(times)]
+        fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
+        limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
+        checks.append(energy_drift([samples[i] for i in whole], fast, model.needs.damping, limit))
+    if not _keeps_digits(dyn, method):
+        matrices = [one.M for member in samples for one in member]
+        checks.append(condition(matrices[-1:] if quick else matrices))
+    checks.append(coordinate_magnitude(at_q, None if method.scaled_by_start else tolerances))
+    if tolerances and method.scaled_by_start:
+        checks.append(scale_growth(at_q, at_v, tolerances))
+    if tolerances and method.fills_tolerance:
+        checks.append(accumulated_error(method.name, tolerances, 2 * model.nv, steps / len(q)))
     found: list[str] = []
-    for look in looks:
+    for check in checks:
         try:
-            found += look
+            found += check
         except (MbkitError, np.linalg.LinAlgError):
-            # An engine that lacks a term, or has none there, has no opinion on it.
+            # The engine lacks a term, or has none there.
             continue
     return found
 
 
-def idle(dyn: Dynamics, q: Array) -> str:
-    """Return which joints move next to no mass at a configuration, to stand behind a message; empty where all do."""
-    model = dyn.model
-    if not model.has_bodies or dyn.samples is not None or not model.nv:
-        return ""
-    try:
-        there = dyn.mass_matrix(model.random_state(np.random.default_rng(0))[0])
-        scale = np.sqrt(np.diag(there))
-        values, vectors = np.linalg.eigh(dyn.mass_matrix(unit_quaternions(model, q)[0]) / scale[:, None] / scale)
-    except (MbkitError, np.linalg.LinAlgError, NotImplementedError):
-        # An engine of a user's own may lack the mass matrix.
-        return ""
-    if not values[0] < _IDLE * values[-1]:
-        return ""
-    part = np.abs(vectors[:, 0])
-    found = [j for j in model.independent_joints if part[model.layout.v[j.name]].max(initial=0.0) > 0.5 * part.max()]
-    names = " and ".join(repr(j.name) for j in found)
-    lock = " (gimbal lock)" if any(len(j.type.angular) > 1 for j in found) else ""
-    return f"; there joint {names} moves next to no mass{lock}, so that the mass matrix is nearly singular"
+class _Sample:
+    """A state of a run, and the terms of its dynamics there."""
+
+    def __init__(self, dyn: Dynamics, q: Array, v: Array) -> None:
+        self._dyn, self.q, self.v = dyn, q, v
+        self.M = self._term("mass_matrix", q)
+
+    def _term(self, name: str, *state: Array) -> Array:
+        # Calls for single states take far less time than one for a few.
+        term = getattr(self._dyn, name)
+        return np.asarray(term(*state) if self._dyn.samples is None else term(*(x[None] for x in state))[0])
+
+    def kinetic(self, v: Array) -> float:
+        """Return vᵀ M v / 2: of a system on paper T2."""
+        return 0.5 * float(v.dot(self.M.dot(v)))
+
+    def energy(self) -> tuple[float, float]:
+        """Return the kinetic and the potential energy; T2 - T0 of a system on paper, where T2 - T0 + V stays."""
+        kinetic = self.kinetic(self.v)
+        if not self._dyn.model.has_bodies:
+            kinetic -= float(self._term("kinetic_energy", self.q, np.zeros_like(self.v)))
+        return kinetic, float(self._term("potential_energy", self.q))
 
 
-def halved(
-    model: Model,
-    method: str,
-    h: float,
-    states: tuple[Array, Array, Array],
-    coarser: Callable[[Array], tuple[Array, Array] | None],
-) -> Iterator[str]:
-    """Hold a run by a method of first order against that of twice the step: the gap is about the error.
+def _samples(dyn: Dynamics, member: int, t: Array, q: Array, v: Array) -> Iterator[_Sample]:
+    """Yield the finite ones of a trajectory's states."""
+    own = dyn if dyn.samples is None else dyn.of_samples([member])
+    for k in range(len(t)):
+        if math.isfinite(q[k].sum()):
+            yield _Sample(at_time(own, float(t[k])), q[k], v[k])
 
-    Parameters
-    ----------
-    model : Model
-    method : str
-    h : float
-        s.
-    states : arrays
-        t, q and v that were kept, with the start.
-    coarser : callable
-        Returns q and v at some times with twice the step; None where that failed.
+
+def _fastest(v: Array) -> Array:
+    """Return the largest of a few of a trajectory's velocities."""
+    few = v[:: max(1, len(v) // _VELOCITIES)]
+    return np.asarray(few[np.abs(few).max(axis=1).argmax()])
+
+
+def energy_drift(samples: list[list[_Sample]], fast: list[Array], damped: bool, most: float) -> Iterator[str]:
+    """Find a change of the energy of a system that nothing drives: it is constant, or with dampers falls.
+
+    Of each trajectory a velocity is given that tells the size of its kinetic energy.
     """
-    t, q, v = states[0], *(x.reshape(-1, *x.shape[-2:])[0] for x in states[1:])
-    # A longer last step would be another run's.
-    if not np.isfinite(q).all():
-        return
-    both = np.flatnonzero(np.abs(t / (2 * h) - np.rint(t / (2 * h))) < 1e-6)[1:]
-    if not len(both):
-        return
-    both = both[np.unique(np.linspace(0, len(both) - 1, _TIMES).astype(int))]
-    motion = float(np.abs(model.difference(np.broadcast_to(q[0], q.shape), q)).max(initial=0.0))
-    found = coarser(t[both])
-    if found is None or not motion:
-        return
-    if np.abs(found[1]).max() > _BEYOND * np.abs(v).max():
-        # Unstable at twice the step: that says nothing of the step that was taken.
-        return
-    off = float(np.abs(model.difference(q[both], found[0])).max()) / motion
-    if off > _OFF:
+    worst, share = 0.0, most
+    for member, velocity in zip(samples, fast, strict=True):
+        kinetic, potential = zip(*(one.energy() for one in member), strict=True)
+        change = [T + V - kinetic[0] - potential[0] for T, V in zip(kinetic, potential, strict=True)]
+        wrong = max(change) if damped else max(change, key=abs)
+        sizes = (*map(abs, kinetic), max(potential) - min(potential), *(one.kinetic(velocity) for one in member))
+        size = max(*sizes, sys.float_info.min)
+        if abs(wrong) > 1e4 * _EPS * max(map(abs, potential)) and abs(wrong) / size > share:
+            worst, share = wrong, abs(wrong) / size
+    if worst:
         yield (
-            f"by a run with a step of {2 * h:g} s it is off by {off:.2g} of the motion, since {method} is of "
-            f"first order; take a smaller step, or method={AUTOMATIC_METHOD!r}"
+            f"{'gained' if worst > 0 else 'lost'} {share:.2g} of its energy ({abs(worst):.2g} J) with nothing that "
+            f"drives it; take a smaller step, or method={AUTOMATIC_METHOD!r}"
         )
 
 
-def _first(q: Array, v: Array, k: int) -> tuple[Array, Array]:
-    """Return the k-th state of the first trajectory."""
-    return q.reshape(-1, *q.shape[-2:])[0, k], v.reshape(-1, *v.shape[-2:])[0, k]
-
-
-def _energy(dyn: Dynamics, M: Array, q: Array, v: Array, pushed: bool, most: float) -> Iterator[str]:
-    """Hold against a run what nothing drives: its energy stays, or with dampers falls."""
-    model = dyn.model
-    if pushed or model.time_parameter is not None or (not model.has_bodies and is_damped(model)):
-        # What was written on paper may have forces that drive.
-        return
-    # Of a system on paper this is T2, and Jacobi's integral T2 - T0 + V is what stays.
-    kinetic, potential = 0.5 * np.einsum("...i,...ij,...j->...", v, M, v), potential_energy(dyn, q)
-    if not model.has_bodies:
-        kinetic = kinetic - kinetic_energy(dyn, q, 0 * v)
-    total = kinetic + potential
-    whole = np.isfinite(total).all(axis=-1)
-    if not whole.any():
-        return
-    kinetic, potential, total = (np.atleast_2d(x[whole] if x.ndim == 2 else x) for x in (kinetic, potential, total))
-    size = np.maximum(np.abs(kinetic).max(axis=1), np.ptp(potential, axis=1))
-    floor = 1e4 * _EPS * np.abs(potential).max(axis=1)
-    change = total - total[:, :1]
-    wrong = change.max(axis=1) if is_damped(model) else np.abs(change).max(axis=1)
-    share = np.where(wrong > floor, wrong / np.maximum(size, np.finfo(float).tiny), 0.0)
-    worst = int(share.argmax())
-    if share[worst] > most:
-        gained = "gained" if change[worst][np.abs(change[worst]).argmax()] > 0 or is_damped(model) else "lost"
-        yield (
-            f"{gained} {share[worst]:.2g} of its energy ({wrong[worst]:.2g} J) with nothing that drives it; "
-            f"take a smaller step, or method={AUTOMATIC_METHOD!r}"
-        )
-
-
-def _pole(dyn: Dynamics, q: Array) -> Iterator[str]:
-    """Look for steps over gimbal lock, after which three angles are those of another sheet."""
+def gimbal_lock(dyn: Dynamics, q: Array) -> Iterator[str]:
+    """Find steps over gimbal lock, after which three angles are those of another sheet."""
     if not dyn.model.has_bodies:
         return
     for joint in dyn.model.independent_joints:
@@ -231,27 +195,24 @@ def _pole(dyn: Dynamics, q: Array) -> Iterator[str]:
                 )
 
 
-def _condition(M: Array) -> Iterator[str]:
-    """Look for digits that solving with the mass matrix loses, whatever the units of its coordinates."""
-    M = M.reshape(-1, *M.shape[-2:])
-    M = M[np.isfinite(M).all(axis=(1, 2))]
-    if not len(M):
-        return
-    M = M[[0, len(M) // 2, -1]]
-    scale = np.sqrt(np.diagonal(M, axis1=1, axis2=2))
-    if not (scale > 0).all():
-        return
-    least = np.linalg.eigvalsh(M / scale[:, :, None] / scale[:, None, :])[:, 0].min()
-    if least < _EPS * M.shape[-1] / _DIGITS:
+def condition(matrices: list[Array]) -> Iterator[str]:
+    """Find digits lost in solving with the mass matrix, whatever the units of its coordinates."""
+    least, n = 1.0, 0
+    for M in matrices[:: max(1, len(matrices) // 2)]:
+        scale, n = np.sqrt(M.diagonal()), len(M)
+        if not scale.min() > 0:
+            return
+        least = min(least, float(np.linalg.eigvalsh(M / scale / scale[:, None])[0]))
+    if least < _EPS * n / _DIGITS:
         yield (
-            f"the mass matrix is singular to {max(float(least), 0.0):.1g} of its size, so that accelerations hold "
+            f"the mass matrix is singular to {max(least, 0.0):.1g} of its size, so that accelerations hold "
             f"about {max(0, int(-np.log10(_EPS / max(least, _EPS)))):d} digits; leave out what has no mass, or compute "
             f"with 34 digits: mbkit.dynamics(model, 'oracle') and method={SERIES_METHOD!r}"
         )
 
 
-def _step(dyn: Dynamics, method: str, h: float, duration: float, states: list[tuple[Array, Array]]) -> Iterator[str]:
-    """Hold the step against the modes of the motion's linearization, at its first, last and fastest state."""
+def step_size(dyn: Dynamics, method: str, h: float, duration: float, q: Array, v: Array) -> Iterator[str]:
+    """Compare the step with the modes of the linearized motion at a trajectory's first, fastest and last state."""
     model = dyn.model
     if dyn.samples is not None or model.time_parameter is not None or model.constrained:
         return
@@ -262,45 +223,44 @@ def _step(dyn: Dynamics, method: str, h: float, duration: float, states: list[tu
         return np.asarray(space.acceleration(q, v, dyn.forward_dynamics(q, v, np.zeros_like(v))))
 
     found: list[tuple[float, str]] = []
-    for q, v in states:
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
+    fastest_state = int(np.nan_to_num(np.abs(v).max(axis=-1), posinf=0.0).argmax())
+    for k in sorted({0, fastest_state, len(q) - 1}):
+        if not (np.isfinite(q[k]).all() and np.isfinite(v[k]).all()):
             continue
         # By differences on any engine: deriving would take longer than most runs.
-        J = linearized(space, q, space.enter(q, v), accelerations)
+        J = linearized(space, q[k], space.enter(q[k], v[k]), accelerations)
         A, B = J[model.nv :, : model.nv], J[model.nv :, model.nv :]
         rates = np.linalg.eigvals(J)
         fastest = float(np.abs(rates).max())
         if h * fastest < _FOLLOWED:
             continue
-        # What the motion itself does, a pendulum upside down or a chaotic one, is not the method's doing.
+        # Growth of the motion itself, as of a pendulum upside down or a chaotic one, is not the method's.
         grows = float(np.log(max(growth(method, h, A, B), 1e-300))) - h * max(0.0, float(rates.real.max()))
         if grows * duration / h > 1 and h * fastest > 1:
-            told = (
+            text = (
                 f"a step of {h:g} s is too long for the fastest mode, {fastest:.2g} 1/s (h|λ| = {h * fastest:.2g}): "
                 f"{method} makes it grow by {np.expm1(min(grows, 700.0)):.1g} a step; take a step below "
                 f"{1 / fastest:.1g} s, or method={AUTOMATIC_METHOD!r}"
             )
-            found.append((np.inf, told))
+            found.append((np.inf, text))
             continue
         part, rate = lost(method, h, A, B, duration)
         if part > _LOST:
             kind = f"an oscillation of {abs(rate.imag):.2g} rad/s" if abs(rate.imag) > abs(rate.real) else "a motion"
-            told = (
+            text = (
                 f"a step of {h:g} s is too long to follow {kind} with h|λ| = {h * abs(rate):.2g}: where it is "
                 f"excited, {min(1.0, part):.0%} of it is lost over the run; take a smaller step, "
                 f"or method={AUTOMATIC_METHOD!r}"
             )
-            found.append((part, told))
+            found.append((part, text))
     if found:
         yield max(found)[1]
 
 
-def _far(q: Array, tolerances: Tolerances | None) -> Iterator[str]:
-    """Look for coordinates so large that their last digit, or a relative tolerance, is a distance that matters."""
-    finite = q[np.isfinite(q).all(axis=-1)]
-    if not finite.size:
-        return
-    largest = float(np.abs(finite).max())
+def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[str]:
+    """Find coordinates so large that their last digit, or a relative tolerance, is a distance that matters."""
+    # Past NaN.
+    largest = float(np.fmax.reduce(np.abs(q), axis=None))
     if _EPS * largest > _POSITION:
         yield (
             f"a coordinate of {largest:.2g} is known to {_EPS * largest:.1g} in double precision; "
@@ -313,8 +273,8 @@ def _far(q: Array, tolerances: Tolerances | None) -> Iterator[str]:
         )
 
 
-def _outgrown(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
-    """Look for numbers that have outgrown those of the start, and what their tolerance allows to the others."""
+def scale_growth(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
+    """Find numbers that have outgrown those of the start, which loosens the tolerance of the others."""
     largest = max(float(np.nan_to_num(np.abs(x), posinf=0.0).max()) for x in (q, v))
     allowed = min(tolerances) * largest / magnitude(q[..., 0, :], v[..., 0, :])
     if allowed > max(1e3 * tolerances.atol, _POSITION):
@@ -324,13 +284,8 @@ def _outgrown(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
         )
 
 
-def _keeps_digits(dyn: Dynamics, method: Method) -> bool:
-    """Return whether no accelerations come from the mass matrix: not by the engine, nor by the method."""
-    return getattr(dyn, "elimination", "") == "least constraint" and not method.mass_matrix
-
-
-def _adding(method: str, tolerances: Tolerances, numbers: int, steps: float) -> Iterator[str]:
-    """Look for so many steps that the errors allowed to each add up."""
+def accumulated_error(method: str, tolerances: Tolerances, numbers: int, steps: float) -> Iterator[str]:
+    """Find so many steps that the errors allowed to each add up."""
     # The norm is a mean over the state's numbers.
     together = steps * tolerances.rtol * float(np.sqrt(numbers))
     if together > _SUM:
@@ -338,3 +293,29 @@ def _adding(method: str, tolerances: Tolerances, numbers: int, steps: float) -> 
             f"errors of {steps:.2g} steps that each use the tolerance of {tolerances.rtol:g}, as those of {method} do, "
             f"add up to {together:.1g} of the motion and more; take a smaller rtol, or method={AUTOMATIC_METHOD!r}"
         )
+
+
+def _keeps_digits(dyn: Dynamics, method: Method) -> bool:
+    """Return whether neither the engine nor the method solves with the mass matrix."""
+    return getattr(dyn, "elimination", "") == "least constraint" and not method.mass_matrix
+
+
+def massless_joints(dyn: Dynamics, q: Array) -> str:
+    """Return the end of a message that names the joints which move next to no mass at q; empty where there are none."""
+    model = dyn.model
+    if not model.has_bodies or dyn.samples is not None or not model.nv:
+        return ""
+    try:
+        there = dyn.mass_matrix(model.random_state(np.random.default_rng(0))[0])
+        scale = np.sqrt(np.diag(there))
+        values, vectors = np.linalg.eigh(dyn.mass_matrix(unit_quaternions(model, q)[0]) / scale[:, None] / scale)
+    except (MbkitError, np.linalg.LinAlgError, NotImplementedError):
+        # A user's engine may lack the mass matrix.
+        return ""
+    if not values[0] < _IDLE * values[-1]:
+        return ""
+    part = np.abs(vectors[:, 0])
+    found = [j for j in model.independent_joints if part[model.layout.v[j.name]].max(initial=0.0) > 0.5 * part.max()]
+    names = " and ".join(repr(j.name) for j in found)
+    lock = " (gimbal lock)" if any(len(j.type.angular) > 1 for j in found) else ""
+    return f"; there joint {names} moves next to no mass{lock}, so that the mass matrix is nearly singular"

@@ -14,12 +14,12 @@ from mbkit.model import Model
 from mbkit.simulate.along_trajectory import moved
 from mbkit.simulate.plotting.stick_figure import Plane, Skeleton, plane_of, skeleton
 from mbkit.simulate.plotting.time_series import ACCENT, BAD, FAINT, GHOST, INK, MUTED, drawing
+from mbkit.simulate.run_data import RunData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mbkit.simulate.trajectory import Trajectory
 
 __all__ = ["Strip", "picture"]
 
@@ -194,7 +194,7 @@ _FINE: Final = 40
 _FAR: Final = 6.0
 
 
-def picture(run: Trajectory, model: Model, figures: int, view: str | ArrayLike | None, member: int) -> Figure:
+def picture(run: RunData, model: Model, figures: int, view: str | ArrayLike | None, member: int) -> Figure:
     """Draw what `Trajectory.picture` says, of a model with numbers for its parameters."""
     from matplotlib.figure import Figure
 
@@ -223,7 +223,7 @@ def picture(run: Trajectory, model: Model, figures: int, view: str | ArrayLike |
     return figure
 
 
-def _states(run: Trajectory, member: int) -> tuple[Array, Array, Array]:
+def _states(run: RunData, member: int) -> tuple[Array, Array, Array]:
     """Return the good states of one trajectory."""
     q, v = (run.q[member], run.v[member]) if run.q.ndim == 3 else (run.q, run.v)
     good = np.isfinite(q).all(-1) & np.isfinite(v).all(-1)

@@ -13,12 +13,12 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import MbkitError
 from mbkit.model import Model
+from mbkit.simulate.run_data import RunData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mbkit.simulate.trajectory import Trajectory
 
 __all__ = ["ACCENT", "BAD", "FAINT", "GHOST", "INK", "MUTED", "drawing", "plot"]
 
@@ -99,7 +99,7 @@ def _kinds(model: Model) -> list[_Kind]:
     return [group for group in (lengths, angles, turns) if group.q]
 
 
-def plot(run: Trajectory) -> Figure:
+def plot(run: RunData) -> Figure:
     """Draw what `Trajectory.plot` says."""
     from matplotlib.figure import Figure
 
@@ -121,14 +121,14 @@ def plot(run: Trajectory) -> Figure:
     return figure
 
 
-def _title(run: Trajectory) -> str:
+def _title(run: RunData) -> str:
     title = f"{run.model.name}: {run.method} on {run.engine}"
     if run.q.ndim == 3:
         title += f", {len(run.q)} trajectories" + (f", the first {_DRAWN}" if len(run.q) > _DRAWN else "")
     return title
 
 
-def _lines(axis: Axes, run: Trajectory, values: Array, names: list[str], label: str) -> None:
+def _lines(axis: Axes, run: RunData, values: Array, names: list[str], label: str) -> None:
     """Draw one line for each name and trajectory, coloured by name."""
     colours = _colours(len(names))
     members = values[:_DRAWN] if values.ndim == 3 else values[None]
@@ -154,7 +154,7 @@ def _colours(n: int) -> list[Any]:
     return list(colormaps["tab10"].colors[:n]) if n <= 10 else list(colormaps["turbo"](np.linspace(0.05, 0.95, n)))  # type: ignore[attr-defined]
 
 
-def _within(axis: Axes, run: Trajectory, values: Array) -> None:
+def _within(axis: Axes, run: RunData, values: Array) -> None:
     # The last states of a run that diverged would flatten all the others; its growth has
     # no scale, so that of its beginning is taken.
     if run.stats.ended != "diverged" or not values.size:
@@ -165,7 +165,7 @@ def _within(axis: Axes, run: Trajectory, values: Array) -> None:
     axis.set_ylim(max(low - room, np.nanmin(values)), min(high + room, np.nanmax(values)))
 
 
-def _energies(left: Axes, right: Axes, run: Trajectory) -> None:
+def _energies(left: Axes, right: Axes, run: RunData) -> None:
     left.set_ylabel("energy (J)")
     right.set_ylabel("E − E(0) − work (J)")
     right.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3))
@@ -199,7 +199,7 @@ def _told(axis: Axes, error: MbkitError) -> None:
     axis.text(0.5, 0.5, text, transform=axis.transAxes, ha="center", va="center", color=MUTED)
 
 
-def _mark(axes: Any, run: Trajectory) -> None:
+def _mark(axes: Any, run: RunData) -> None:
     """Draw a line at each event and where the run went wrong, named above the first row."""
     marks = [(hit.t, hit.name, MUTED) for hit in run.events if (hit.member or 0) < _DRAWN]
     if run.stats.ended not in ("finished", "event"):

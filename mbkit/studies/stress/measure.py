@@ -212,7 +212,7 @@ def _integrate(held: _Held, setting: Setting, dyn: Dynamics, truth: Truth | None
             begun = _clock()
             look = patience(setting.seconds, _clock)
             with cpu_limit(_LATER * setting.seconds):
-                run = simulate(*start, duration, method, save=times, progress=look, **step)
+                run = simulate(*start, duration, method, save=times, progress=look, doubt=False, **step)
             seconds = [_clock() - begun]
     except TooLongError as error:
         return Measurement(value, "slow", note=str(error))
@@ -225,7 +225,8 @@ def _integrate(held: _Held, setting: Setting, dyn: Dynamics, truth: Truth | None
     cell = Measurement(value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
     if not stats.finished or len(run.t) != len(times):
         return replace(cell, end="diverged", note=stats.message or f"ended at t = {run.t[-1]:g} s")
-    cell = replace(cell, warnings=tuple(dict.fromkeys(heard)))
+    doubts = (f"{dyn.model.name}: {method}: {one}" for one in run.check().doubts)
+    cell = replace(cell, warnings=tuple(dict.fromkeys([*heard, *doubts])))
     if not (np.isfinite(run.q).all() and np.isfinite(run.v).all()):
         return replace(cell, end="nan", note="states that are not finite, and nothing was said")
     try:

@@ -1,0 +1,284 @@
+"""Integration of one run: check the arguments, choose the solver, return the run's data."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of, real
+from mbkit.engines import Dynamics
+from mbkit.engines.base import DOUBLE_BITS
+from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
+from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, METHODS, Method, Tolerances, method_of
+from mbkit.model import Model
+from mbkit.simulate.constraint_projection import along_constraints, from_consistent
+from mbkit.simulate.diagnostics.checks import diagnostics, massless_joints
+from mbkit.simulate.events import Event, as_events
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.progress import Progress, ProgressFunction
+from mbkit.simulate.result import SolverResult, Stats
+from mbkit.simulate.run_data import RunData, RunSettings
+from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
+from mbkit.simulate.torque import Applied, Torque, TorqueFunction
+
+__all__ = ["integrate", "times_of"]
+
+#: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
+_LEAST_EXTENDED: Final = 1e-32
+#: Time of an evaluation from Python, in those in machine code.
+_IN_PYTHON: Final = 40
+#: Evaluations in machine code that take the time of one, in a batch.
+_SIDE_BY_SIDE: Final = 8
+
+
+def integrate(
+    dyn: Dynamics,
+    q0: ArrayLike,
+    v0: ArrayLike,
+    duration: float,
+    method: str = DEFAULT_METHOD,
+    dt: float | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    torque: ArrayLike | TorqueFunction | None = None,
+    save: ArrayLike | int | None = None,
+    progress: bool | ProgressFunction | None = None,
+    events: Event | Sequence[Event] | None = None,
+    doubt: bool = False,
+    t0: float | None = None,
+) -> tuple[RunData, FunctionError | None]:
+    """Return a run's data, and the error of the torque or event function that ended it.
+
+    Arguments and other errors are those of `mbkit.simulate`.
+    """
+    chosen = method_of(method)
+    model = dyn.model
+    q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
+    if model.velocity_map is not None:
+        model.velocity_map.check_start(q, v)
+    batch = _batch(dyn, batch_of(q0=q, v0=v))
+    if batch is not None:
+        q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
+    start, duration, dt = times_of(dyn, chosen, t0, duration, dt)
+    _require_engine(dyn, chosen)
+    q, v = from_consistent(dyn, q, v, start)
+    wanted = as_events(events)
+    if wanted and not chosen.events:
+        _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
+    if callable(torque) and not chosen.callables:
+        _refuse("torque functions", chosen, [m.name for m in METHODS.values() if m.callables])
+    _warn_beyond_limits(model, q)
+    bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
+    arguments: dict[str, Any] = {"batch": batch, "torque": torque, "save": save, "bar": bar}
+    started = time.perf_counter()
+    setting: float | Tolerances
+    with bar:
+        if chosen.kind == "adaptive":
+            setting = _tolerances(dyn, chosen, rtol, atol)
+            applied, outcome = _adaptive(dyn, chosen, q, v, start, duration, setting, events=wanted, **arguments)
+        else:
+            setting = dt
+            _refuse_tolerances(chosen, rtol, atol)
+            applied, outcome = _stepped(dyn, chosen, q, v, Grid.of(start, duration, dt), **arguments)
+    seconds = time.perf_counter() - started
+    outcome = along_constraints(dyn, outcome)
+    settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
+    doubts = outcome.doubts
+    if doubt and outcome.ended in ("finished", "event"):
+        states = settings.with_start(outcome.t, outcome.q, outcome.v)
+        compiled = chosen.kind == "native" or (_compiles(dyn) and not callable(torque))
+        work = max(outcome.steps, outcome.evaluations)
+        work = work // min(batch or 1, _SIDE_BY_SIDE) if compiled else work * _IN_PYTHON
+        driven = applied is not None
+        doubts += tuple(diagnostics(dyn, chosen, setting, states, driven=driven, steps=outcome.steps, work=work))
+    stats = Stats(
+        steps=outcome.steps,
+        evaluations=outcome.evaluations,
+        seconds=seconds,
+        ended=outcome.ended,
+        reached=float(outcome.reached) if outcome.reached.ndim == 0 else tuple(outcome.reached.tolist()),
+        message=outcome.message + ("" if outcome.last is None else massless_joints(dyn, outcome.last)),
+        rejected=outcome.rejected,
+        jacobians=outcome.jacobians,
+        chosen=outcome.chosen,
+        doubts=doubts,
+    )
+    kept = outcome.t, outcome.q, outcome.v
+    data = RunData(*kept, model, chosen.name, dyn.engine, stats, dyn, outcome.events, applied, settings)
+    return data, outcome.error
+
+
+def solver_of(method: Method) -> Callable[..., SolverResult]:
+    """Return the function that runs a method, imported when it is first needed."""
+    module, function = method.solver.split(":")
+    run: Callable[..., SolverResult] = getattr(import_module(f"mbkit.simulate.solvers.{module}"), function)
+    return run
+
+
+def _compiles(dyn: Dynamics) -> bool:
+    """Return whether whole steps can be compiled: own derivation, written out, and a compiler."""
+    if not dyn.derived:
+        return False
+    # Other engines need no CasADi.
+    from mbkit.codegen.interpreter import Machine
+    from mbkit.engines.lagrangian import LagrangianDynamics
+
+    # A compiled step has one value of each parameter, the time among them.
+    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out or dyn.model.time_parameter:
+        return False
+    # Nor does it look for constraints after each step.
+    return not dyn.model.constrained and not isinstance(dyn.code("forward_dynamics"), Machine)
+
+
+@runtime_checkable
+class TakesParameters(Protocol):
+    """An engine whose parameters may have a value for each sample."""
+
+    @property
+    def parameter_values(self) -> Array:
+        """Values of the model's parameters, (p,) or one row per sample."""
+
+
+def times_of(
+    dyn: Dynamics, method: Method, t0: float | None, duration: float, dt: float | None
+) -> tuple[float, float, float]:
+    """Return the first time, the duration and the step, checked; s."""
+    duration = real("duration", duration, nonnegative=True)
+    if 0 < duration < np.finfo(float).tiny:
+        raise InputError(f"duration: expected 0 or at least {np.finfo(float).tiny:.3g} s, got {duration:g} s")
+    step = DEFAULT_STEP if dt is None else real("dt", dt, positive=True)
+    if dt is not None and method.kind == "adaptive":
+        raise InputError(f"dt: {method.name} chooses its own steps; give rtol, or method={DEFAULT_METHOD!r} with dt")
+    start = _held_time(dyn) if t0 is None else real("t0", t0)
+    shortest = duration if method.kind == "adaptive" else min(duration, step)
+    if 4 * np.finfo(float).eps * abs(start) > shortest > 0:
+        raise InputError(f"t0: expected times that differ after {shortest:g} s, got {start:g} s; shift the time's zero")
+    return start, duration, step
+
+
+def _warn_beyond_limits(model: Model, q: Array) -> None:
+    """Warn of a start beyond a joint's limits, which do not act: degrees are a common reason."""
+    low, high = model.lower, model.upper
+    room = 1e-9 * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
+    rows = np.atleast_2d(q)
+    beyond = (rows < low - room) | (rows > high + room)
+    if beyond.any():
+        row, i = np.argwhere(beyond)[0]
+        which = f"trajectory {row}: " if q.ndim == 2 else ""
+        more = np.count_nonzero(beyond) - 1
+        warnings.warn(
+            f"{model.name}: q0: {which}{model.coordinate_names[i]} = {rows[row, i]:g} is beyond its limits "
+            f"[{low[i]:g}, {high[i]:g}]"
+            + (f", and {more} more" if more else "")
+            + "; limits do not act in a run, and angles are in radians",
+            MbkitWarning,
+            stacklevel=4,
+        )
+
+
+def _held_time(dyn: Dynamics) -> float:
+    """Return the time at which the dynamics stands, s; 0 where time does not enter."""
+    clock = dyn.model.time_parameter
+    if clock is None:
+        return 0.0
+    if isinstance(dyn, TakesParameters):
+        held = np.unique(np.atleast_2d(dyn.parameter_values)[:, list(dyn.model.parameters).index(clock)])
+    else:
+        held = np.array([dyn.model.parameters[clock]])
+    if len(held) != 1:
+        raise InputError(f"t0: the samples hold {len(held)} different values of {clock}; give one start time, t0=")
+    return float(held[0])
+
+
+def _require_engine(dyn: Dynamics, method: Method) -> None:
+    if method.engines and dyn.engine not in method.engines:
+        has = " or ".join(f"mbkit.dynamics(model, {name!r})" for name in method.engines)
+        why = f", which {method.lacks}" if method.lacks else ""
+        raise UnsupportedError(
+            f"{method.name}: not on the {dyn.engine} engine{why}; use {has}, or a method that any engine has: "
+            + ", ".join(m.name for m in METHODS.values() if not m.engines)
+        )
+
+
+def _refuse(what: str, method: Method, others: Sequence[str]) -> None:
+    raise UnsupportedError(f"{method.name}: {what} are not there with this method; use {', '.join(others)}")
+
+
+def _batch(dyn: Dynamics, states: int | None) -> int | None:
+    samples = states if dyn.samples is None else dyn.samples
+    if states not in (None, samples):
+        raise InputError(f"q0, v0: a batch of {states}, but the parameters' values are {samples}")
+    return samples
+
+
+def _adaptive(
+    dyn: Dynamics,
+    method: Method,
+    q: Array,
+    v: Array,
+    start: float,
+    duration: float,
+    tolerances: Tolerances,
+    *,
+    batch: int | None,
+    torque: ArrayLike | TorqueFunction | None,
+    save: ArrayLike | int | None,
+    bar: Progress,
+    events: tuple[Event, ...],
+) -> tuple[Applied | None, SolverResult]:
+    if isinstance(save, (int, np.integer)):
+        raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
+    times = None if save is None else save_times(save, start, start + duration)
+    whole = times is not None and times[0] == start and times[-1] == start + duration
+    read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
+    given = dyn, method.name, q, v, start, duration, tolerances, read, times, events, bar
+    outcome = solver_of(method)(IntegrationProblem(*given))
+    return read.applied(times), outcome
+
+
+def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float | None) -> Tolerances:
+    rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
+    least = _LEAST_EXTENDED if dyn.bits > DOUBLE_BITS and method.extended else method.least
+    if rtol < least:
+        raise InputError(f"rtol: expected at least {least:.3g} for {method.name} on {dyn.engine}, got {rtol:g}")
+    return Tolerances(rtol, rtol if atol is None else real("atol", atol, positive=True))
+
+
+def _refuse_tolerances(method: Method, rtol: float | None, atol: float | None) -> None:
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if value is not None:
+            raise InputError(
+                f"{name}: {method.name} has a fixed step and no tolerance; give dt, or method={ADAPTIVE_METHOD!r}"
+            )
+
+
+def _stepped(
+    dyn: Dynamics,
+    method: Method,
+    q: Array,
+    v: Array,
+    grid: Grid,
+    *,
+    batch: int | None,
+    torque: ArrayLike | TorqueFunction | None,
+    save: ArrayLike | int | None,
+    bar: Progress,
+) -> tuple[Applied | None, SolverResult]:
+    model = dyn.model
+    kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
+    read = Torque(torque, model, batch, grid.steps)
+    if method.kind == "native":
+        outcome = solver_of(method)(dyn, method, q, v, grid, kept, read, bar)
+        bar.update(1.0)
+    else:
+        run = solver_of(method)
+        if method.compiled and method.formula is not None and not read.callable and _compiles(dyn):
+            from mbkit.simulate.solvers.compiled_fixed_step import run_rollout as run
+        outcome = run(dyn, method.name, q, v, grid, kept, read, bar)
+    return read.applied(grid.times), outcome
