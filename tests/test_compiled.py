@@ -83,7 +83,7 @@ def test_sine_and_cosine_are_right_to_three_quarters_of_an_ulp(angles):
 
 def test_sine_and_cosine_of_what_is_not_finite_are_not_finite():
     x = np.array([np.nan, np.inf, -np.inf, 1.0])
-    out, finite = built(sines()).watched(x[:, None])
+    out, finite = built(sines()).call_checked(x[:, None])
     assert not finite
     assert np.isnan(out[0][:3]).all()
     assert np.isfinite(out[0][3]).all()
@@ -170,9 +170,9 @@ def test_what_is_not_finite_is_found_even_if_nothing_reads_it(code, place, bad):
     for n in (1, 3, 40):
         for turn in (np.ascontiguousarray, np.asfortranarray):
             arrays = [turn(rng.standard_normal((n, k))) for k in (9, 3)]
-            assert code.watched(*arrays)[1]
+            assert code.call_checked(*arrays)[1]
             arrays[place[0]][n - 1, place[1]] = bad
-            assert not code.watched(*arrays)[1]
+            assert not code.call_checked(*arrays)[1]
 
 
 def test_threads_give_the_same_bits_as_one(code):

@@ -19,16 +19,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from mbkit.catalog import double_pendulum
-from mbkit.codegen import extended_precision, jit, simd_kernel, taylor
+from mbkit.codegen import extended_precision, jit, simd_kernel, step_loop, taylor
 from mbkit.codegen import program as program_module
-from mbkit.codegen import step_loop as lanes_module
 from mbkit.codegen.c_source import c_code
 from mbkit.codegen.compiled import aligned, compiled
 from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.llvm_ir import CALLS
 from mbkit.codegen.program import program
-from mbkit.codegen.step_loop import Lanes
+from mbkit.codegen.step_loop import CompiledStepLoop
 from mbkit.codegen.taylor import TaylorSystem, precision
 from mbkit.derivation.steps.fixed import Part
 from mbkit.errors import UnsupportedError
@@ -287,7 +286,7 @@ def test_a_value_that_is_none_is_found_and_leaves_its_neighbours_alone(name: str
     good = built(made)(*columns(points))[0]
     points[6] = x, y
     for code in (built(made), Machine(made)):
-        out, finite = code.watched(*columns(points))
+        out, finite = code.call_checked(*columns(points))
         assert not finite
         assert np.isnan(out[0][6]) if (name, x, y) in OUTSIDE else np.isinf(out[0][6])
         np.testing.assert_array_equal(np.delete(out[0], 6), np.delete(good, 6))
@@ -302,7 +301,7 @@ def test_a_value_that_is_none_is_found_and_leaves_its_neighbours_alone(name: str
 def test_no_choice_hides_what_is_no_number(hide: Any) -> None:
     made = function(hide(ca.log(X)))
     points = columns(np.array([[-1.0, 0.0], [2.0, 0.0]]))
-    out, finite = built(made).watched(*points)
+    out, finite = built(made).call_checked(*points)
     assert not finite
     assert np.isnan(out[0].ravel()).tolist() == [True, False]
     for backend in BACKENDS:
@@ -319,7 +318,7 @@ def test_what_is_read_and_not_finite_is_found_whatever_a_function_makes_of_it(ba
         for i in range(2):
             points = np.zeros((9, 2))
             points[3, i] = bad
-            assert not code.watched(*columns(points))[1], (made, i)
+            assert not code.call_checked(*columns(points))[1], (made, i)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -375,8 +374,8 @@ def test_states_side_by_side_get_the_same_bits() -> None:
     m = made.size1_out(0)
     x = ca.SX.sym("state", m)
     part = Part("f", ("state",), ("state1",), lambda: ca.Function("f", [x], [made(x[0], x[1])]))
-    code: Lanes = lanes_module._made("0" * 64, [part], ("state",))
-    w = lanes_module.width()
+    code = CompiledStepLoop(*step_loop._compile([part], ("state",)))
+    w = step_loop.width()
     points = np.random.default_rng(7).uniform(0.05, 0.95, (w, 2))
     arena, log = aligned(code.size * w).reshape(code.size, w), np.empty((m, w))
     start = np.zeros((m, w))

@@ -22,7 +22,7 @@ from mbkit.codegen.batch_loop import RUN
 from mbkit.codegen.program import program
 from mbkit.derivation.fingerprint import SOURCES
 
-__all__ = ["Call", "CallSequence", "Compiled", "aligned", "compiled", "cores", "shared_object"]
+__all__ = ["Call", "Compiled", "KernelSequence", "aligned", "compiled", "cores", "shared_object"]
 
 
 #: Operations on which a second thread is worth its start: about 100 µs.
@@ -86,9 +86,9 @@ class Compiled:
         Arguments are all vectors or all (N, n), with any strides. Results are
         coordinate-major if all arguments of more than one entry are.
         """
-        return self.watched(*arguments, threads=threads)[0]
+        return self.call_checked(*arguments, threads=threads)[0]
 
-    def watched(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
+    def call_checked(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
         """Return the results, and whether all that was read and written is finite."""
         single = arguments[0].ndim == 1
         given = [x[None] for x in arguments] if single else list(arguments)
@@ -136,30 +136,30 @@ class Compiled:
     def _part(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
         many = [sum(x.shape[1] for x in xs if x.strides[0] == 8) > _ROWS for xs in (inputs, outputs)]
         if not any(many) or last - first <= _BLOCK:
-            return self._straight(inputs, outputs, first, last)
+            return self._run_range(inputs, outputs, first, last)
         near = [[np.empty((x.shape[1], _BLOCK)).T for x in xs] for xs in (inputs, outputs)]
         finite = True
         for start in range(first, last, _BLOCK):
             n = min(_BLOCK, last - start)
             for x, y in zip(inputs, near[0], strict=True):
                 y[:n] = x[start : start + n]
-            finite &= self._straight(near[0], near[1], 0, n)
+            finite &= self._run_range(near[0], near[1], 0, n)
             for x, y in zip(outputs, near[1], strict=True):
                 x[start : start + n] = y[:n]
         return finite
 
-    def _straight(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
+    def _run_range(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
         table = self.table(inputs, outputs)
         work = self._work()
         watch = work[: jit.host().width]
         watch[:] = 0.0
-        lead = self._lead((*inputs, *outputs), first, last)
+        lead = self._cache_line_offset((*inputs, *outputs), first, last)
         for start, end in ((first, lead), (lead, last)):
             self.loaded.run(table.ctypes.data, work.ctypes.data, start, end)
         return bool(np.dot(watch, watch) == 0.0)
 
     @staticmethod
-    def _lead(arrays: Sequence[Array], first: int, last: int) -> int:
+    def _cache_line_offset(arrays: Sequence[Array], first: int, last: int) -> int:
         """Return where vectors of coordinate-major arrays begin to lie on whole cache lines.
 
         NumPy's large arrays start 16 bytes beyond one, and a vector on two lines
@@ -252,34 +252,18 @@ def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
     """
     key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, jit.host()))
     with jit.COMPILING:
-        found = None if disk.forgotten(key) else _HELD.get(key)
-        if found is None:
-            found = _HELD[key] = _from_disk(key) or _made(key, make)
-    return found
+        return disk.cached(key, _HELD, Compiled, lambda: _compile(make))
 
 
-def _from_disk(key: str) -> Compiled | None:
-    found = disk.read(key)
-    if found is None:
-        return None
-    try:
-        return Compiled(*found)
-    except (KeyError, TypeError, ValueError):
-        # Whole, and ours by its key, but not of this form: made anew.
-        return None
-
-
-def _made(key: str, make: Callable[[], ca.Function]) -> Compiled:
+def _compile(make: Callable[[], ca.Function]) -> tuple[dict[str, Any], bytes]:
     derived = program(make())
     code, work = jit.program_object(derived)
-    about = {
+    return {
         "inputs": derived.inputs,
         "shapes": derived.shapes,
         "operations": derived.arithmetic,
         "work": work,
-    }
-    disk.write(key, about, code)
-    return Compiled(about, code)
+    }, code
 
 
 #: Functions in use by anyone in this process.
@@ -325,7 +309,7 @@ class Call(NamedTuple):
     outputs: Sequence[Array]
 
 
-class CallSequence:
+class KernelSequence:
     """Calls on fixed arrays, made in order; one thread may run it at a time.
 
     Parameters

@@ -18,23 +18,32 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from platformdirs import user_cache_path
 
-__all__ = ["anew", "folder", "forgotten", "key_of", "read", "write"]
+__all__ = [
+    "cached",
+    "folder",
+    "force_recompile",
+    "is_bypassed",
+    "key_of",
+    "read",
+    "write",
+]
 
+T = TypeVar("T")
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
 _MOST: Final = 512 * 2**20
 #: Names of entries, and of those being written.
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}|\.new-.+")
-#: Entries made within a block of `anew`; None outside of one.
-_ANEW: Final[ContextVar[set[str] | None]] = ContextVar("_ANEW", default=None)
+#: Entries made within a block of `force_recompile`; None outside of one.
+_RECOMPILED: Final[ContextVar[set[str] | None]] = ContextVar("_RECOMPILED", default=None)
 
 
 def key_of(*parts: str) -> str:
@@ -65,28 +74,28 @@ def folder() -> Path | None:
 
 
 @contextmanager
-def anew() -> Iterator[None]:
+def force_recompile() -> Iterator[None]:
     """Make each entry once more within the block, in this thread, as if none had been kept.
 
     So that what a first run takes can be measured at any time. What is made is kept as ever.
     """
-    token = _ANEW.set(set())
+    token = _RECOMPILED.set(set())
     try:
         yield
     finally:
-        _ANEW.reset(token)
+        _RECOMPILED.reset(token)
 
 
-def forgotten(key: str) -> bool:
-    """Return whether an entry is to be made although it may be kept, here or in memory: see `anew`."""
-    made = _ANEW.get()
+def is_bypassed(key: str) -> bool:
+    """Return whether an entry is to be made although it may be kept, here or in memory: see `force_recompile`."""
+    made = _RECOMPILED.get()
     return made is not None and key not in made
 
 
 def read(key: str) -> tuple[dict[str, Any], bytes] | None:
     """Return the description and code of an entry, or None if there is none to be trusted."""
     at = folder()
-    if at is None or forgotten(key):
+    if at is None or is_bypassed(key):
         return None
     path = at / key
     try:
@@ -112,7 +121,7 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
 
 def write(key: str, about: dict[str, Any], code: bytes) -> None:
     """Keep an entry; where that is not possible, nothing happens."""
-    made = _ANEW.get()
+    made = _RECOMPILED.get()
     if made is not None:
         made.add(key)
     at = folder()
@@ -133,6 +142,43 @@ def write(key: str, about: dict[str, Any], code: bytes) -> None:
         _forget_oldest(at)
     except OSError:
         return
+
+
+def cached(
+    key: str,
+    held: MutableMapping[str, T],
+    restore: Callable[[dict[str, Any], bytes], T],
+    make: Callable[[], tuple[dict[str, Any], bytes]],
+) -> T:
+    """Return compiled code: held in this process, from disk, or compiled now and written.
+
+    Parameters
+    ----------
+    key : str
+    held : mutable mapping
+        What this process has in use, by key.
+    restore : callable
+        From the description and the code of an entry.
+    make : callable
+        Compiles: returns the description and the code.
+    """
+    found = None if is_bypassed(key) else held.get(key)
+    if found is None:
+        found = _restored(key, restore)
+    if found is None:
+        about, code = make()
+        write(key, about, code)
+        found = restore(about, code)
+    held[key] = found
+    return found
+
+
+def _restored(key: str, restore: Callable[[dict[str, Any], bytes], T]) -> T | None:
+    entry = read(key)
+    # An intact entry of another form is compiled again.
+    with suppress(KeyError, TypeError, ValueError):
+        return restore(*entry) if entry else None
+    return None
 
 
 def _forget_oldest(at: Path) -> None:

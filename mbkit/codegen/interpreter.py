@@ -65,7 +65,7 @@ class Machine:
             self._sizes[n] = (buffer, run, inputs, outputs)
         return self._sizes[n]
 
-    def watched(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
+    def call_checked(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
         """Return the results, and whether all that was read and written is finite."""
         results = self(*arguments, threads=threads)
         return results, all(all_finite(x) for x in (*arguments, *results))
@@ -75,7 +75,7 @@ class Machine:
         watch = np.zeros(1)
 
         def call() -> None:
-            results, finite = self.watched(*inputs)
+            results, finite = self.call_checked(*inputs)
             for out, result in zip(outputs, results, strict=True):
                 out[:] = result.reshape(out.shape)
             if not finite:

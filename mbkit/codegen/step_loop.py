@@ -36,7 +36,7 @@ from mbkit.codegen.simd_kernel import Piece, pieces_of, slots_of
 from mbkit.derivation.fingerprint import SOURCES
 from mbkit.derivation.steps.fixed import Part
 
-__all__ = ["Lanes", "lanes", "width"]
+__all__ = ["CompiledStepLoop", "compiled_step_loop", "width"]
 
 _NAME: Final = "mbkit_part"
 
@@ -46,7 +46,7 @@ def width() -> int:
     return min(4, jit.host().width)
 
 
-class Lanes:
+class CompiledStepLoop:
     """The machine code of parts, and where everything is in the arena.
 
     Attributes
@@ -68,7 +68,9 @@ class Lanes:
         self.loaded = jit.load(code)
 
 
-def lanes(name: Sequence[str], make: Callable[[], Sequence[Part]], state: Sequence[str]) -> Lanes:
+def compiled_step_loop(
+    name: Sequence[str], make: Callable[[], Sequence[Part]], state: Sequence[str]
+) -> CompiledStepLoop:
     """Return machine code of parts: kept in this process, from disk, or made now.
 
     Parameters
@@ -83,27 +85,13 @@ def lanes(name: Sequence[str], make: Callable[[], Sequence[Part]], state: Sequen
         in this order.
     """
     key = disk.key_of("lanes", *name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, (*jit.host(), width())))
-    found = None if disk.forgotten(key) else _HELD.get(key)
-    if found is None:
-        found = _HELD[key] = _from_disk(key) or _made(key, make(), state)
-    return found
+    return disk.cached(key, _HELD, CompiledStepLoop, lambda: _compile(make(), state))
 
 
-_HELD: Final[WeakValueDictionary[str, Lanes]] = WeakValueDictionary()
+_HELD: Final[WeakValueDictionary[str, CompiledStepLoop]] = WeakValueDictionary()
 
 
-def _from_disk(key: str) -> Lanes | None:
-    found = disk.read(key)
-    if found is None:
-        return None
-    try:
-        return Lanes(*found)
-    except (KeyError, TypeError, ValueError):
-        # Whole, and ours by its key, but not of this form: made anew.
-        return None
-
-
-def _made(key: str, parts: Sequence[Part], state: Sequence[str]) -> Lanes:
+def _compile(parts: Sequence[Part], state: Sequence[str]) -> tuple[dict[str, Any], bytes]:
     made = {part.name: part.make for part in parts}
     programs = {name: program(make()) for name, make in made.items()}
     rows, size = _rows(parts, programs, state)
@@ -115,11 +103,8 @@ def _made(key: str, parts: Sequence[Part], state: Sequence[str]) -> Lanes:
     text = "\n".join(
         [declarations(width()), library(width(), *programs.values()), *(f.text for f in written.values()), round_]
     )
-    code = jit.object_code(text)
     operations = sum(programs[part.name].arithmetic for part in parts)
-    about = {"rows": rows, "size": size, "operations": operations}
-    disk.write(key, about, code)
-    return Lanes(about, code)
+    return {"rows": rows, "size": size, "operations": operations}, jit.object_code(text)
 
 
 def _rows(

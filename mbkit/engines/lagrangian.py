@@ -69,7 +69,7 @@ def short_way(model: Model, code: Compiled, trim: Callable[[Array], Array], thre
             return single(given) if not starts or _unit(given[0], starts) else None
         if not _is_batch(given, sizes) or (starts and not _all_unit(given[0], starts)):
             return None
-        results, finite = code.watched(*given, threads=threads)
+        results, finite = code.call_checked(*given, threads=threads)
         return trim(results[0]) if finite else None
 
     return call

@@ -12,7 +12,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen.compiled import aligned
-from mbkit.codegen.step_loop import Lanes, lanes, width
+from mbkit.codegen.step_loop import CompiledStepLoop, compiled_step_loop, width
 from mbkit.derivation import Equations
 from mbkit.derivation.steps.adaptive import STATE, embedded_parts
 from mbkit.derivation.steps.fixed import Part
@@ -88,10 +88,10 @@ def _scheme(method: str) -> _Scheme:
     )
 
 
-def _code(dyn: LagrangianDynamics, scheme: _Scheme) -> Lanes:
-    made: dict[str, Lanes] = dyn.equations.kept.setdefault("lanes", {})
+def _code(dyn: LagrangianDynamics, scheme: _Scheme) -> CompiledStepLoop:
+    made: dict[str, CompiledStepLoop] = dyn.equations.kept.setdefault("lanes", {})
     if scheme.name not in made:
-        made[scheme.name] = lanes(
+        made[scheme.name] = compiled_step_loop(
             (dyn.form, scheme.name, disk.key_of(repr(scheme.coefficients))),
             lambda: scheme.parts(dyn.equations),
             STATE,
@@ -102,7 +102,7 @@ def _code(dyn: LagrangianDynamics, scheme: _Scheme) -> Lanes:
 class _Arena:
     """The room of one function, and its calls."""
 
-    def __init__(self, code: Lanes, tolerances: Tolerances, least: float) -> None:
+    def __init__(self, code: CompiledStepLoop, tolerances: Tolerances, least: float) -> None:
         self._code, self.width = code, width()
         self.room = aligned(code.size * self.width).reshape(code.size, self.width)
         self.room[:] = 0.0

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import Call, CallSequence, Compiled, aligned, cores
+from mbkit.codegen.compiled import Call, Compiled, KernelSequence, aligned, cores
 from mbkit.derivation.steps.fixed import Part, march, march_in_stages
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.registry import method_of
@@ -120,7 +120,7 @@ class Chunk:
         self._calls = len(plan.parts)
         period = BLOCK if all_kept or torques else 2
         steps = [call for j in range(period) for call in self._step(plan, j)]
-        self._sequence = CallSequence(steps, BLOCK // period)
+        self._sequence = KernelSequence(steps, BLOCK // period)
         self._count = self._taken = 0
 
     def begin(self, q: Array, w: Array, parameters: Array) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import Call, CallSequence, aligned
+from mbkit.codegen.compiled import Call, KernelSequence, aligned
 from mbkit.derivation.steps.midpoint import GUESS, MOST, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.simulate.time_grid import Indices
@@ -74,7 +74,7 @@ class MidpointChunk:
         rooms += [("parameters", 1 if clock is None else n, len(names))]
         self._rooms = {name: _room(places, rows, width) for name, places, rows in rooms}
         self._back = back
-        self._sequences: dict[tuple[int, int], CallSequence] = {}
+        self._sequences: dict[tuple[int, int], KernelSequence] = {}
         self._iterations, self._smooth = 2, 0
         self._taken = 0
         self.iterations = 0
@@ -96,11 +96,11 @@ class MidpointChunk:
         room[:, : self._count] = columns
         room[:, self._count :] = room[:, self._count - 1 : self._count]
 
-    def _sequence(self, iterations: int) -> CallSequence:
+    def _sequence(self, iterations: int) -> KernelSequence:
         key = iterations, self.block
         if key not in self._sequences:
             calls = [call for j in range(self.block) for call in self._step(j, iterations)]
-            self._sequences[key] = CallSequence(calls)
+            self._sequences[key] = KernelSequence(calls)
         return self._sequences[key]
 
     def _step(self, j: int, iterations: int) -> list[Call]:

@@ -19,7 +19,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit._fork import fork_safe
 from mbkit.catalog import pendulum
-from mbkit.codegen.disk_cache import anew
+from mbkit.codegen.disk_cache import force_recompile
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.registry import find_engine
 from mbkit.errors import MbkitError, UnsupportedError
@@ -90,7 +90,7 @@ def _import_for(engine: str, method: str) -> None:
 @contextlib.contextmanager
 def _empty_caches() -> Iterator[None]:
     with contextlib.ExitStack() as stack:
-        stack.enter_context(anew())
+        stack.enter_context(force_recompile())
         if "heyoka" in sys.modules:
             stack.enter_context(_without_heyoka_cache())
         yield
