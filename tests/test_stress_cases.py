@@ -20,7 +20,7 @@ from mbkit.studies.stress import cases
 from mbkit.studies.stress.case import Case, problem_of, times_of
 from mbkit.studies.stress.cases._common import largest_step, stable_steps
 from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum, precession
-from mbkit.studies.stress.cases.length import straight_inertia
+from mbkit.studies.stress.cases.mass_ratio import straight_inertia
 from mbkit.studies.stress.cases.spin import box_spin
 from mbkit.studies.work_precision.reference import gap
 from validation import closed_forms, elliptic

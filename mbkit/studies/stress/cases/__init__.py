@@ -6,16 +6,22 @@ from typing import Final
 
 from mbkit.errors import UnknownNameError
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.cases import large, length, long, mass_ratio, near_singular, spin, step, stiffness
+from mbkit.studies.stress.cases import large, mass_ratio, near_singular, spin, step, stiffness
 
 __all__ = ["CASES", "get", "names"]
 
-#: Name -> case: what is stiff first, what takes longest last.
-CASES: Final[dict[str, Case]] = {
-    case.name: case
-    for family in (stiffness, mass_ratio, length, spin, near_singular, large, step, long)
-    for case in family.CASES
-}
+_FAMILIES: Final = (
+    stiffness.CASES,
+    mass_ratio.CASES,
+    mass_ratio.LENGTH_CASES,
+    spin.CASES,
+    near_singular.CASES,
+    large.CASES,
+    step.CASES,
+    step.LONG_CASES,
+)
+#: Name -> case: stiff ones first, those that take longest last.
+CASES: Final[dict[str, Case]] = {case.name: case for family in _FAMILIES for case in family}
 
 
 def names() -> tuple[str, ...]:

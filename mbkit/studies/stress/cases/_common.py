@@ -1,29 +1,68 @@
-"""What the families share: values over decades, states to measure terms at, and exact motions as a type."""
+"""What the families of cases share: registration, values over decades, rods, states of terms, stable steps."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model import Model
-from mbkit.studies.stress.case import Problem
+from mbkit.model import Model, ModelBuilder
+from mbkit.studies.stress.case import Case, Family, Problem
 
-__all__ = ["EPS", "RK4_IMAGINARY", "RK4_REAL", "Exact", "largest_step", "powers", "stable_steps", "terms_at"]
-
+__all__ = [
+    "DOWN",
+    "EPS",
+    "RK4_IMAGINARY",
+    "RK4_REAL",
+    "SWING",
+    "Exact",
+    "Make",
+    "largest_step",
+    "powers",
+    "register",
+    "rods",
+    "stable_steps",
+    "terms_at",
+]
 
 #: From times (K,) to q (K, nq).
 Exact = Callable[[Array], Array]
+Make = Callable[[float], Problem]
 
 EPS: Final = float(np.finfo(float).eps)
+DOWN: Final = (0.0, 0.0, -1.0)
+#: The axis of a hinge about which a body that hangs down swings.
+SWING: Final = (0.0, -1.0, 0.0)
 
 #: How far along the imaginary and the negative real axis the 8th order of Dormand and Prince 8(5,3) is stable: its
 #: stability polynomial is that of exp to z⁸, with four coefficients of its own behind. From the
 #: coefficients in Hairer, Nørsett, Wanner 1993, II.10.
 _DOP853: Final = (5.96, 6.39)
+
+
+def register(
+    cases: list[Case],
+    family: Family,
+    parameter: str,
+    unit: str,
+    values: tuple[float, ...],
+    quick: tuple[float, ...],
+    **more: Any,
+) -> Callable[[Make], Make]:
+    """Return a decorator that adds a function as a case.
+
+    The function's name is the case's name, and its docstring, one sentence, says what the case is about.
+    """
+
+    def add(make: Make) -> Make:
+        about = " ".join((make.__doc__ or "").split())
+        cases.append(Case(make.__name__, about, family, parameter, unit, values, quick, make, **more))
+        return make
+
+    return add
 
 
 def powers(first: int, last: int, step: int = 1) -> tuple[float, ...]:
@@ -71,6 +110,21 @@ def terms_at(
     q, v = model.random_state(rng, samples)
     q[0] = model.neutral()
     return Problem(model, q, v, tau=force * rng.standard_normal((samples, model.nv)), facts=facts or {})
+
+
+def rods(name: str, masses: Sequence[float], load: float = 0.0) -> Model:
+    """Return thin rods of 1 m, hinged end to end, with a point mass at the last end."""
+    b = ModelBuilder(name)
+    for i, mass in enumerate(masses, start=1):
+        across = mass / 12
+        parent = f"rod{i - 1}" if i > 1 else "world"
+        b.add_body(f"rod{i}", mass=mass, com=(0.0, 0.0, -0.5), inertia=(across, across, 0.0))
+        place = (0.0, 0.0, -1.0 if i > 1 else 0.0)
+        b.add_joint(f"theta{i}", "continuous", parent=parent, child=f"rod{i}", axis=SWING, translation=place)
+    if load:
+        b.add_body("load", mass=load)
+        b.add_joint("hold", "fixed", parent=f"rod{len(masses)}", child="load", translation=DOWN)
+    return b.build()
 
 
 # The step at which linear theory lets a method break on q̈ + 2 ζ ω q̇ + ω² q = 0.

@@ -1,4 +1,4 @@
-"""Motions of a hanging chain of thin rods, however different their masses are."""
+"""Exact motions: closed forms, quadratures, and slow motions of stiff systems by collocation."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def slow_motion(residual: Residual, start: Array, duration: float, steps: int) -
 
     def motion(t: Array) -> Array:
         which = np.minimum((t / h).astype(int), steps - 1)
-        # No farther than it is asked for: making a problem costs nothing.
+        # Steps are made when a time is asked for: making a problem costs nothing.
         while len(pieces) <= int(which.max(initial=0)):
             y = pieces[-1][-1] if pieces else np.asarray(start, dtype=np.float64)
             pieces.append(_step(residual, y, pieces[-1] if pieces else None, h, points, slopes))
@@ -130,7 +130,7 @@ def _lagrange(points: Array, x: Array) -> Array:
 
 
 _GRAVITY: Final = 9.81
-#: Steps a second: what rings faster than these can follow hardly rings in a taut chain.
+#: Steps a second: a taut chain hardly rings at frequencies above.
 _STEPS: Final = 200
 
 
@@ -403,8 +403,8 @@ def free_rotor(inertia: Array, spin: Array) -> tuple[Exact, float]:
         spins, poles = jacobi(t)
         turned = momentum / C * (t + (C - A) / A * (poles - before))
         about = Rotation.from_rotvec(np.multiply.outer(turned, [0.0, 0.0, 1.0])).as_matrix()
-        told = first @ about @ np.swapaxes(_momentum_axes(inertia, spins, order[2]), 1, 2)
-        return np.asarray(Rotation.from_matrix(told).as_quat())
+        attitude = first @ about @ np.swapaxes(_momentum_axes(inertia, spins, order[2]), 1, 2)
+        return np.asarray(Rotation.from_matrix(attitude).as_quat())
 
     return motion, 4 * quarter / abs(rate)
 
@@ -521,8 +521,8 @@ def ringing_spring(square: float, radius: float, push: float, turn: float) -> tu
     first = math.atan2(pace, a - radius)
 
     def spent(phi: np.ndarray, line: float, terms: np.ndarray) -> np.ndarray:
-        told: np.ndarray = line * phi + np.sin(np.multiply.outer(phi, order)) @ terms
-        return told
+        value: np.ndarray = line * phi + np.sin(np.multiply.outer(phi, order)) @ terms
+        return value
 
     def motion(t: np.ndarray) -> np.ndarray:
         start = spent(np.array([first]), mean, waves)[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,12 +14,13 @@ from mbkit._check import Array
 from mbkit.load import load
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import EPS, powers, terms_at
+from mbkit.studies.stress.cases._common import EPS, powers, register, rods, terms_at
 from mbkit.studies.stress.cases.exact_motions import past_gimbal_lock
 
 __all__ = ["CASES"]
 
-_SWING: Final = (0.0, -1.0, 0.0)
+CASES: Final[list[Case]] = []
+_case = partial(register, CASES, "near-singular")
 
 
 def _suspended(inertia: tuple[float, float, float]) -> Model:
@@ -28,15 +30,18 @@ def _suspended(inertia: tuple[float, float, float]) -> Model:
     return b.build()
 
 
-def _gimbal_lock(distance: float) -> Problem:
-    made = terms_at(_suspended((0.1, 0.2, 0.25)))
-    q = made.q.copy()
+@_case("distance from π/2", "rad", powers(0, -12), (1.0, 1e-3, 1e-6, 1e-12), measure="terms")
+def gimbal_lock(distance: float) -> Problem:
+    """Terms of a body on a spherical-ZYX joint whose pitch is nearly a right angle."""
+    problem = terms_at(_suspended((0.1, 0.2, 0.25)))
+    q = problem.q.copy()
     q[:, 1] = np.where(np.arange(len(q)) % 2, -1, 1) * (math.pi / 2 - distance)
-    return replace(made, q=q)
+    return replace(problem, q=q)
 
 
-def _gimbal_pass(distance: float) -> Problem:
-    """Return a ball in a suspension that turns by 2.5 rad about one axis."""
+@_case("nearest distance from π/2", "rad", powers(0, -12, 2), (1.0, 1e-4, 1e-8, 1e-12))
+def gimbal_pass(distance: float) -> Problem:
+    """A ball on a spherical-ZYX joint turns steadily past gimbal lock, where two angles jump by π."""
     speed, duration = 2.5, 1.0
     motion, v = past_gimbal_lock(distance, speed)
     return Problem(
@@ -51,20 +56,20 @@ def _gimbal_pass(distance: float) -> Problem:
     )
 
 
-def _wrist(distance: float) -> Problem:
-    """Return UR5 at random poses whose last but one joint is nearly straight, so that the axes beside it align."""
-    made = terms_at(load("ur5"))
-    q = made.q.copy()
+@_case("distance", "rad", powers(0, -12, 2), (1.0, 1e-6, 1e-12), measure="terms")
+def wrist(distance: float) -> Problem:
+    """Terms of UR5 with its wrist nearly straight, where axes align: joint space does not care."""
+    problem = terms_at(load("ur5"))
+    q = problem.q.copy()
     q[:, 4] = distance
-    return replace(made, q=q)
+    return replace(problem, q=q)
 
 
-def _dead_centre(distance: float) -> Problem:
-    """Return a piston that moves without force towards the dead centre, until the crank is so far from it.
-
-    x = r cos θ + l cos φ and sin φ = (r/l) sin θ give 4 r x sin²(θ/2) = δ (2 l - δ), where δ = r + l - x is left of
-    the way.
-    """
+@_case("distance at the end", "rad", (0.5, *powers(-1, -7)), (0.5, 1e-2, 1e-4, 1e-6))
+def dead_centre(distance: float) -> Problem:
+    """A piston pushes a massless crank to its dead centre: how near can a run come?"""
+    # It moves without force. x = r cos θ + l cos φ and sin φ = (r/l) sin θ give 4 r x sin²(θ/2) = δ (2 l - δ), where
+    # δ = r + l - x is left of the way.
     r, l, first, duration = 0.1, 0.3, 1.2, 1.0
 
     def lever(theta: float) -> float:
@@ -97,69 +102,7 @@ def _dead_centre(distance: float) -> Problem:
     )
 
 
-def _massless_link(mass: float) -> Problem:
-    """Return three rods of 1 m, the outer ones of 1 kg."""
-    b = ModelBuilder("light_middle")
-    for i, m in enumerate((1.0, mass, 1.0)):
-        parent = f"rod{i}" if i else "world"
-        b.add_body(f"rod{i + 1}", mass=m, com=(0.0, 0.0, -0.5), inertia=(m / 12, m / 12, 0.0))
-        place = (0.0, 0.0, -1.0 if i else 0.0)
-        b.add_joint(f"theta{i + 1}", "continuous", parent=parent, child=f"rod{i + 1}", axis=_SWING, translation=place)
-    return terms_at(b.build())
-
-
-CASES: Final = (
-    Case(
-        "gimbal_lock",
-        "Terms of a body on a spherical-ZYX joint whose pitch is nearly a right angle.",
-        "near-singular",
-        "distance from π/2",
-        "rad",
-        powers(0, -12),
-        (1.0, 1e-3, 1e-6, 1e-12),
-        _gimbal_lock,
-        "terms",
-    ),
-    Case(
-        "gimbal_pass",
-        "A ball on a spherical-ZYX joint turns steadily past gimbal lock, where two angles jump by π.",
-        "near-singular",
-        "nearest distance from π/2",
-        "rad",
-        powers(0, -12, 2),
-        (1.0, 1e-4, 1e-8, 1e-12),
-        _gimbal_pass,
-    ),
-    Case(
-        "wrist",
-        "Terms of UR5 with its wrist nearly straight, where axes align: joint space does not care.",
-        "near-singular",
-        "distance",
-        "rad",
-        powers(0, -12, 2),
-        (1.0, 1e-6, 1e-12),
-        _wrist,
-        "terms",
-    ),
-    Case(
-        "dead_centre",
-        "A piston pushes a massless crank to its dead centre: how near can a run come?",
-        "near-singular",
-        "distance at the end",
-        "rad",
-        (0.5, *powers(-1, -7)),
-        (0.5, 1e-2, 1e-4, 1e-6),
-        _dead_centre,
-    ),
-    Case(
-        "massless_link",
-        "Terms of a chain of three rods whose middle one weighs less and less.",
-        "near-singular",
-        "mass of the middle rod",
-        "kg",
-        powers(0, -18, 2),
-        (1.0, 1e-6, 1e-12, 1e-18),
-        _massless_link,
-        "terms",
-    ),
-)
+@_case("mass of the middle rod", "kg", powers(0, -18, 2), (1.0, 1e-6, 1e-12, 1e-18), measure="terms")
+def massless_link(mass: float) -> Problem:
+    """Terms of a chain of three rods whose middle one weighs less and less."""
+    return terms_at(rods("light_middle", (1.0, mass, 1.0)))

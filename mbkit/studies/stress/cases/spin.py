@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -10,17 +11,22 @@ from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import EPS, Exact, powers
+from mbkit.studies.stress.cases._common import EPS, Exact, powers, register
 from mbkit.studies.stress.cases.exact_motions import free_rotor, precession, turning
 
 __all__ = ["CASES", "box_spin", "tumbling"]
+
+CASES: Final[list[Case]] = []
+_case = partial(register, CASES, "spin")
 
 #: Of Gazebo's "boxes" benchmark, complex case without gravity: nearly about the middle axis, rad/s.
 _BOX_SPIN: Final = (0.1, 5.0, 0.1)
 
 
-def _heavy_top(spin: float) -> Problem:
-    """Return Terze, Müller and Zlatar's top, 30 degrees below the horizontal."""
+@_case("spin", "rad/s", powers(0, 6), (1.0, 1e2, 1e4, 1e6))
+def heavy_top(spin: float) -> Problem:
+    """A heavy top precesses steadily for 1 s, 30° below the horizontal, and spins."""
+    # The top of Terze, Müller and Zlatar.
     mass, radius, g = 15.0, 1.0, 9.81
     across, along = 0.234375 + mass * radius**2, 0.46875
     motion, q, v, rate = precession(spin, 2 * np.pi / 3, mass * g * radius, across, along)
@@ -65,10 +71,6 @@ def tumbling(place: Array, velocity: Array, duration: float) -> Problem:
     )
 
 
-def _flips(count: float) -> Problem:
-    return tumbling(np.zeros(3), np.zeros(3), count * box_spin()[1] / 2)
-
-
 def _ball(spin: float, duration: float, dt: float | None = None) -> Problem:
     """Return a ball that turns steadily about an oblique axis: no torque, no gyroscopic term."""
     b = ModelBuilder("ball", gravity=(0.0, 0.0, 0.0))
@@ -88,57 +90,26 @@ def _ball(spin: float, duration: float, dt: float | None = None) -> Problem:
     )
 
 
-def _spinning_ball(spin: float) -> Problem:
+@_case("spin", "rad/s", powers(0, 6), (1.0, 1e2, 1e4, 1e6))
+def spinning_ball(spin: float) -> Problem:
+    """A ball without torque turns steadily about an oblique axis for 1 s."""
     return _ball(spin, 1.0)
 
 
-def _quaternion_drift(steps: float) -> Problem:
-    # 0.01 rad a step: far from what a step cannot follow, so that what is left is rounding.
-    return _ball(10.0, 1e-3 * steps, dt=1e-3)
+@_case("flips", "", (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0), (1.0, 10.0, 100.0), patience=3.0)
+def dzhanibekov_box(count: float) -> Problem:
+    """A box without torque turns over again and again, past its unstable axis each time."""
+    return tumbling(np.zeros(3), np.zeros(3), count * box_spin()[1] / 2)
 
 
-CASES: Final = (
-    Case(
-        "heavy_top",
-        "A heavy top precesses steadily for 1 s, 30° below the horizontal, and spins.",
-        "spin",
-        "spin",
-        "rad/s",
-        powers(0, 6),
-        (1.0, 1e2, 1e4, 1e6),
-        _heavy_top,
-    ),
-    Case(
-        "spinning_ball",
-        "A ball without torque turns steadily about an oblique axis for 1 s.",
-        "spin",
-        "spin",
-        "rad/s",
-        powers(0, 6),
-        (1.0, 1e2, 1e4, 1e6),
-        _spinning_ball,
-    ),
-    Case(
-        "dzhanibekov_box",
-        "A box without torque turns over again and again, past its unstable axis each time.",
-        "spin",
-        "flips",
-        "",
-        (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0),
-        (1.0, 10.0, 100.0),
-        _flips,
-        patience=3.0,
-    ),
-    Case(
-        "quaternion_drift",
-        "A ball turns by 0.01 rad in each of many steps: does its quaternion stay one?",
-        "spin",
-        "steps",
-        "",
-        powers(2, 6),
-        (1e2, 1e4, 1e5),
-        _quaternion_drift,
-        methods=("rk4", "semi_implicit_euler", "implicit_midpoint", "gauss4", "gauss6", "mujoco_rk4", "mujoco_euler"),
-        patience=3.0,
-    ),
+_DRIFTING: Final = (
+    *("rk4", "semi_implicit_euler", "implicit_midpoint", "gauss4", "gauss6"),
+    *("mujoco_rk4", "mujoco_euler"),
 )
+
+
+@_case("steps", "", powers(2, 6), (1e2, 1e4, 1e5), methods=_DRIFTING, patience=3.0)
+def quaternion_drift(steps: float) -> Problem:
+    """A ball turns by 0.01 rad in each of many steps: does its quaternion stay one?"""
+    # So small a step makes no error of its own: what is left is rounding.
+    return _ball(10.0, 1e-3 * steps, dt=1e-3)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,7 +13,7 @@ from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import EPS, powers, stable_steps
+from mbkit.studies.stress.cases._common import EPS, SWING, powers, register, stable_steps
 from mbkit.studies.stress.cases.exact_motions import (
     cart_pole,
     modal,
@@ -25,16 +25,19 @@ from mbkit.studies.stress.cases.exact_motions import (
 
 __all__ = ["CASES", "conical", "hinge"]
 
-_SWING: Final = (0.0, -1.0, 0.0)
-_STIFFNESS: Final = powers(0, 12, 2)
-_QUICK: Final = (1.0, 1e4, 1e8, 1e12)
+CASES: Final[list[Case]] = []
+_case = partial(register, CASES, "stiffness")
+
+_RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
+#: Of slow motions, measured against Taylor series with 34 digits.
+_SLOW_FLOOR: Final = 1e-11
 
 
 def hinge(stiffness: float, damping: float) -> Model:
     """Return a body of 1 kg m² on a hinge with a spring and a damper, without gravity."""
     b = ModelBuilder("hinge", gravity=(0.0, 0.0, 0.0))
     b.add_body("bob", mass=1.0, com=(0.0, 0.0, -1.0))
-    b.add_joint("theta", "continuous", parent="world", child="bob", axis=_SWING, stiffness=stiffness, damping=damping)
+    b.add_joint("theta", "continuous", parent="world", child="bob", axis=SWING, stiffness=stiffness, damping=damping)
     return b.build()
 
 
@@ -57,24 +60,27 @@ def _facts(frequency: float, duration: float, *, damped: bool = False) -> dict[s
     return {name: frequency, "steps of dop853 at the least": stable_steps(duration, frequency, damped=damped)}
 
 
-def _joint_spring(stiffness: float) -> Problem:
+@_case("stiffness", "N m/rad", *_RANGE)
+def joint_spring(stiffness: float) -> Problem:
+    """A body on a hinge with a spring rings for 1 s: every period of it has to be right."""
     return _spring(stiffness, 0.0)
 
 
-def _light_damping(stiffness: float) -> Problem:
-    # A tenth of its amplitude in the second, whatever the stiffness: ringing lasts.
+@_case("stiffness", "N m/rad", *_RANGE)
+def lightly_damped_joint_spring(stiffness: float) -> Problem:
+    """A body on a hinge rings for 1 s, in which a light damper takes a tenth of it."""
     return _spring(stiffness, 0.2)
 
 
-def _critical_damping(stiffness: float) -> Problem:
+@_case("stiffness", "N m/rad", *_RANGE)
+def critically_damped_joint_spring(stiffness: float) -> Problem:
+    """A body on a hinge with a spring and critical damping comes to rest, the sooner the stiffer."""
     return _spring(stiffness, 2 * math.sqrt(stiffness))
 
 
-# A stiff joint in a moving chain
-
-
-def _stiff_joint(stiffness: float) -> Problem:
-    """Return a double pendulum of unit masses and lengths, its second joint held straight by spring and damper."""
+@_case("stiffness", "N m/rad", *_RANGE)
+def stiff_joint(stiffness: float) -> Problem:
+    """A double pendulum falls from 1 rad with its second joint held straight by a spring and a damper."""
     # M22 - M12²/M11 at the straight pose, which is what the spring moves.
     inertia, g, theta = 0.2, 9.81, 1.0
     frequency = math.sqrt(stiffness / inertia)
@@ -114,13 +120,6 @@ def _stiff_joint(stiffness: float) -> Problem:
     )
 
 
-#: Found against Taylor series with 34 digits.
-_SLOW_FLOOR: Final = 1e-11
-
-
-# A point spring: a conical pendulum
-
-
 def conical(stiffness: float, damping: float) -> tuple[Problem, float]:
     """Return a mass that circles on a point spring of 1 m, without ringing, for 2 s; and its angular velocity.
 
@@ -157,22 +156,27 @@ def conical(stiffness: float, damping: float) -> tuple[Problem, float]:
     return problem, turn
 
 
-def _point_spring(stiffness: float) -> Problem:
+@_case("stiffness", "N/m", *_RANGE)
+def point_spring(stiffness: float) -> Problem:
+    """A mass circles on a point spring for 2 s and does not ring; the stiff direction turns with it."""
     return conical(stiffness, 0.0)[0]
 
 
-def _damped_point_spring(stiffness: float) -> Problem:
+@_case("stiffness", "N/m", *_RANGE)
+def damped_point_spring(stiffness: float) -> Problem:
+    """A mass circles on a critically damped point spring for 2 s."""
     return conical(stiffness, 2 * math.sqrt(stiffness))[0]
 
 
-# The elastic pendulum
-
-
-def _elastic_pendulum(stiffness: float) -> Problem:
+@_case("stiffness", "N/m", *_RANGE)
+def elastic_pendulum(stiffness: float) -> Problem:
+    """An elastic pendulum swings from 1 rad for 2 s and hardly rings."""
     return _swinging_spring(stiffness, 0.0)
 
 
-def _damped_elastic_pendulum(stiffness: float) -> Problem:
+@_case("stiffness", "N/m", *_RANGE)
+def damped_elastic_pendulum(stiffness: float) -> Problem:
+    """An elastic pendulum with critical damping along its spring swings from 1 rad for 2 s."""
     return _swinging_spring(stiffness, 2 * math.sqrt(stiffness))
 
 
@@ -209,8 +213,9 @@ def _swinging_spring(stiffness: float, damping: float) -> Problem:
     )
 
 
-def _ringing_elastic_pendulum(stiffness: float) -> Problem:
-    """Return an elastic pendulum without gravity; the bob leaves the even turning with 0.3 m/s along the spring."""
+@_case("stiffness", "N/m", *_RANGE)
+def ringing_elastic_pendulum(stiffness: float) -> Problem:
+    """An elastic pendulum turns without gravity for 2 s; its spring rings with the same energy at any stiffness."""
     push, turn, duration = 0.3, 0.5, 2.0
     radius = stiffness / (stiffness - turn**2)
     motion, period = ringing_spring(stiffness, radius, push, turn)
@@ -227,11 +232,9 @@ def _ringing_elastic_pendulum(stiffness: float) -> Problem:
     )
 
 
-# Dampers
-
-
-def _stiff_damping(damping: float) -> Problem:
-    """Return two carts of 1 kg, the first on a spring, the second behind a damper on the first."""
+@_case("damping", "N s/m", *_RANGE)
+def stiff_damping(damping: float) -> Problem:
+    """A cart on a soft spring pulls another one by a damper, for 2 s."""
     b = ModelBuilder("two_carts", gravity=(0.0, 0.0, 0.0))
     b.add_body("first", mass=1.0)
     b.add_body("second", mass=1.0)
@@ -252,10 +255,9 @@ def _stiff_damping(damping: float) -> Problem:
     )
 
 
-# The light cart-pole
-
-
-def _light_cart_pole(cart: float) -> Problem:
+@_case("cart mass", "kg", powers(0, -12, 2), (1.0, 1e-4, 1e-8, 1e-12))
+def light_cart_pole(cart: float) -> Problem:
+    """A pole falls from the horizontal for 10 s; the lighter the cart, the shorter the jerk below."""
     theta, duration = math.pi / 2, 10.0
     # θ̇ where the pole hangs down.
     peak = math.sqrt(2 * 9.81 * (cart + 1) / cart)
@@ -272,11 +274,9 @@ def _light_cart_pole(cart: float) -> Problem:
     )
 
 
-# A flexible appendage
-
-
-def _flexible_appendage(stiffness: float) -> Problem:
-    """Return a hub on a soft torsion spring with two beams of four segments, in the slowest of its modes."""
+@_case("bending stiffness", "N m²", powers(5, 15, 2), (1e5, 1e9, 1e13))
+def flexible_appendage(stiffness: float) -> Problem:
+    """A hub swings slowly on a torsion spring and bends two beams that get stiffer and stiffer."""
     soft, angle, duration = 1000.0, 0.01, 2.0
     model = catalog.flexible_spacecraft(segments=4, bending_stiffness=stiffness)
     hub = replace(model.joints[0], stiffness=np.array([0.0, 0.0, soft]))
@@ -314,93 +314,3 @@ def _antisymmetric_inertia(model: Model) -> Array:
         turns = (np.arange(n + 1) <= i).astype(float)
         M += 2 * (body.mass * np.outer(moves, moves) + body.inertia[2, 2] * np.outer(turns, turns))
     return M
-
-
-def _case(
-    name: str,
-    about: str,
-    make: Callable[[float], Problem],
-    parameter: str = "stiffness",
-    unit: str = "N/m",
-    values: tuple[float, ...] = _STIFFNESS,
-    quick: tuple[float, ...] = _QUICK,
-) -> Case:
-    return Case(name, about, "stiffness", parameter, unit, values, quick, make)
-
-
-CASES: Final = (
-    _case(
-        "joint_spring",
-        "A body on a hinge with a spring rings for 1 s: every period of it has to be right.",
-        _joint_spring,
-        unit="N m/rad",
-    ),
-    _case(
-        "lightly_damped_joint_spring",
-        "A body on a hinge rings for 1 s, in which a light damper takes a tenth of it.",
-        _light_damping,
-        unit="N m/rad",
-    ),
-    _case(
-        "critically_damped_joint_spring",
-        "A body on a hinge with a spring and critical damping comes to rest, the sooner the stiffer.",
-        _critical_damping,
-        unit="N m/rad",
-    ),
-    _case(
-        "stiff_joint",
-        "A double pendulum falls from 1 rad with its second joint held straight by a spring and a damper.",
-        _stiff_joint,
-        unit="N m/rad",
-    ),
-    _case(
-        "point_spring",
-        "A mass circles on a point spring for 2 s and does not ring; the stiff direction turns with it.",
-        _point_spring,
-    ),
-    _case(
-        "damped_point_spring",
-        "A mass circles on a critically damped point spring for 2 s.",
-        _damped_point_spring,
-    ),
-    _case(
-        "elastic_pendulum",
-        "An elastic pendulum swings from 1 rad for 2 s and hardly rings.",
-        _elastic_pendulum,
-    ),
-    _case(
-        "damped_elastic_pendulum",
-        "An elastic pendulum with critical damping along its spring swings from 1 rad for 2 s.",
-        _damped_elastic_pendulum,
-    ),
-    _case(
-        "ringing_elastic_pendulum",
-        "An elastic pendulum turns without gravity for 2 s; its spring rings with the same energy at any stiffness.",
-        _ringing_elastic_pendulum,
-    ),
-    _case(
-        "stiff_damping",
-        "A cart on a soft spring pulls another one by a damper, for 2 s.",
-        _stiff_damping,
-        parameter="damping",
-        unit="N s/m",
-    ),
-    _case(
-        "light_cart_pole",
-        "A pole falls from the horizontal for 10 s; the lighter the cart, the shorter the jerk below.",
-        _light_cart_pole,
-        parameter="cart mass",
-        unit="kg",
-        values=powers(0, -12, 2),
-        quick=(1.0, 1e-4, 1e-8, 1e-12),
-    ),
-    _case(
-        "flexible_appendage",
-        "A hub swings slowly on a torsion spring and bends two beams that get stiffer and stiffer.",
-        _flexible_appendage,
-        parameter="bending stiffness",
-        unit="N m²",
-        values=powers(5, 15, 2),
-        quick=(1e5, 1e9, 1e13),
-    ),
-)
