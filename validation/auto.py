@@ -25,9 +25,9 @@ import numpy as np
 import mbkit as mb
 from mbkit.methods.registry import METHODS
 from mbkit.simulate.solvers.auto import EXPLICIT, IMPLICIT
-from mbkit.studies.compare.rollouts import start_state
 from mbkit.studies.results import processor, versions
 from mbkit.studies.stress.cases import mass_ratio, stiffness
+from mbkit.studies.study_runs import start_state
 
 GOAL, RTOL = 1e-6, 1e-8
 #: A way that takes more s than this for one run has lost.

@@ -27,8 +27,8 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import mbkit as mb
-from mbkit.studies.compare.rollouts import start_state
 from mbkit.studies.results import processor, versions
+from mbkit.studies.study_runs import start_state
 
 ROUNDS, GOAL, TIMES = 9, 1e-9, 10
 #: A way that needs more s than this for one run has lost, and is not timed again.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from mbkit import spatial
@@ -9,7 +11,16 @@ from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model.description import Description
 
-__all__ = ["check_quaternions", "difference", "integrate", "limits_box", "neutral", "random_state"]
+__all__ = [
+    "check_quaternions",
+    "difference",
+    "integrate",
+    "limits_box",
+    "magnitude",
+    "neutral",
+    "random_state",
+    "unit_quaternions",
+]
 
 # A quaternion is data of the caller: rounding is accepted, a rotation that
 # engines would read differently is not.
@@ -113,3 +124,33 @@ def difference(model: Description, q0: Array, q1: Array) -> Array:
         a, b = model.layout.q[joint.name], model.layout.v[joint.name]
         out[..., b] = joint.type.difference(q0[..., a], q1[..., a])
     return out
+
+
+def unit_quaternions(model: Description, q: Array) -> tuple[Array, Array]:
+    """Return q with unit quaternions, and the lengths that they had."""
+    if not model.quaternions:
+        return q, np.empty(0)
+    q, lengths = q.copy(), np.empty(len(model.quaternions))
+    for i, (start, _) in enumerate(model.quaternions):
+        lengths[i] = np.linalg.norm(q[start : start + 4])
+        q[start : start + 4] /= lengths[i]
+    return q, lengths
+
+
+#: rad, m, rad/s, m/s.
+_COMMON: Final = 10.0
+
+
+def magnitude(*states: Array) -> float:
+    """Return by what a tolerance relative to a state's largest number is too loose for the others.
+
+    In whole decades, as Taylor series of each order are compiled once; below ten it is the slack that common motions
+    have.
+
+    Examples
+    --------
+    >>> magnitude(np.array([0.1, -3.0])), magnitude(np.array([0.1, 1.0]), np.array([-2e4]))
+    (1.0, 100000.0)
+    """
+    largest = max(float(np.abs(y).max(initial=0.0)) for y in states)
+    return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON else 1.0

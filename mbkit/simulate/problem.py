@@ -12,8 +12,8 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError
 from mbkit.methods.registry import Tolerances
 from mbkit.simulate.events import Event
-from mbkit.simulate.progress import Progress
-from mbkit.simulate.solvers.trajectory_record import check_save, reporter
+from mbkit.simulate.progress import Progress, reporter
+from mbkit.simulate.time_grid import check_save
 from mbkit.simulate.torque import Torque
 
 __all__ = ["IntegrationProblem"]

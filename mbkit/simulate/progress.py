@@ -9,7 +9,7 @@ from typing import Any
 
 from mbkit.errors import InputError
 
-__all__ = ["Progress", "ProgressFunction"]
+__all__ = ["Progress", "ProgressFunction", "reporter"]
 
 #: progress(fraction), from 0 to 1
 ProgressFunction = Callable[[float], object]
@@ -68,3 +68,12 @@ class Progress:
             self._bar.stop()
         elif kind is None and callable(self._wanted):
             self._wanted(self._done)
+
+
+def reporter(bar: Progress, i: int, count: int, start: float, duration: float) -> Callable[[float], None]:
+    """Return what tells how far the i-th trajectory is, by its time."""
+
+    def done(t: float) -> None:
+        bar.update((i + (t - start) / duration) / count)
+
+    return done

@@ -13,7 +13,7 @@ from mbkit.errors import InputError
 
 Indices = NDArray[np.intp]
 
-__all__ = ["DEFAULT_STEP", "Grid", "Indices", "check_room", "save_times"]
+__all__ = ["DEFAULT_STEP", "Grid", "Indices", "check_room", "check_save", "save_times"]
 
 #: s
 DEFAULT_STEP: Final = 1e-3
@@ -135,3 +135,13 @@ def check_room(states: int, numbers: int) -> None:
             f"save: {states} states of {numbers} numbers would take {states * numbers * 8 / 2**30:.3g} GiB; "
             "keep fewer with save=, an every-n-th count or a grid of times"
         )
+
+
+def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
+    """Refuse a batch without common times, and more states than a machine holds."""
+    if batch is not None and save is None:
+        raise InputError(
+            "save: expected a grid of times for a batch with an adaptive method; without it each state has its own"
+        )
+    if save is not None:
+        check_room(len(save) * (1 if batch is None else batch), numbers)

@@ -14,8 +14,8 @@ from mbkit import _check
 from mbkit._escape import csv_text, html, one_line
 from mbkit.errors import InputError, OutputError
 from mbkit.simulate.along_trajectory import record_of
-from mbkit.simulate.diagnostics.run_check import RunCheck, check_run
 from mbkit.simulate.events import Hit
+from mbkit.simulate.run_check import RunCheck, check_run
 from mbkit.simulate.run_data import RunData
 
 if TYPE_CHECKING:

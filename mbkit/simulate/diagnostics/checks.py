@@ -18,9 +18,9 @@ from mbkit.engines.base import DOUBLE_BITS, at_time
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances
 from mbkit.model.integration_space import Space
+from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.diagnostics.eigenvalues import linearized
 from mbkit.simulate.diagnostics.stability import growth, lost
-from mbkit.simulate.solvers.vector_field import magnitude, unit_quaternions
 
 __all__ = ["CHECKED_TIMES", "diagnostics", "massless_joints"]
 

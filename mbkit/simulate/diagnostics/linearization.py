@@ -20,7 +20,7 @@ from mbkit.engines.base import at_time
 from mbkit.errors import NumericalError
 from mbkit.model import Model
 from mbkit.model.joint_types import JointType
-from mbkit.simulate.solvers.vector_field import unit_quaternions
+from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.torque import Force
 
 if TYPE_CHECKING:

@@ -25,11 +25,12 @@ from mbkit.methods.one_step import (
 from mbkit.methods.registry import Tolerances
 from mbkit.methods.tableaus import dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
+from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.constraint_projection import LOOSEST
 from mbkit.simulate.diagnostics.linearization import Linearization
 from mbkit.simulate.solvers.runge_kutta import DIVERGED, DivergenceError, Field
 from mbkit.simulate.solvers.step_attempts import AcceptedSteps, first_length
-from mbkit.simulate.solvers.vector_field import Rates, unit_quaternions
+from mbkit.simulate.solvers.vector_field import Rates
 from mbkit.simulate.torque import Force, Torque
 
 __all__ = ["RosenbrockAttempts", "RungeKuttaAttempts"]

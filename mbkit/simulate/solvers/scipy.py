@@ -21,12 +21,13 @@ from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, MbkitError
 from mbkit.methods.registry import Tolerances
 from mbkit.model import Model
+from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
-from mbkit.simulate.solvers.vector_field import Rates, unit_quaternions
+from mbkit.simulate.solvers.vector_field import Rates
 from mbkit.simulate.torque import Force
 
 __all__ = ["run_scipy"]

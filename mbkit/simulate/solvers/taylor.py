@@ -19,12 +19,13 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.events import State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
-from mbkit.simulate.solvers.vector_field import Rates, magnitude, unit_quaternions
+from mbkit.simulate.solvers.vector_field import Rates
 
 __all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf
 from typing import Final
@@ -11,16 +11,14 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.errors import FunctionError, InputError
+from mbkit.errors import FunctionError
 from mbkit.model import Model
+from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.constraint_projection import SingularPoses
 from mbkit.simulate.events import Hit
-from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.solvers.vector_field import unit_quaternions
-from mbkit.simulate.time_grid import check_room
 
-__all__ = ["TrajectoryRecord", "assemble_result", "check_save", "record_of", "reporter"]
+__all__ = ["TrajectoryRecord", "assemble_result", "record_of"]
 
 #: Tried steps between two looks at the time that they covered, and the least part of the run that they must cover.
 #: A run at that pace takes 2e10 steps.
@@ -121,25 +119,6 @@ def record_of(dyn: Dynamics, which: int | None, start: float, duration: float) -
     """
     poses = SingularPoses(dyn if which is None else dyn.of_samples([which])) if dyn.model.constrained else None
     return TrajectoryRecord(reached=start, duration=duration, poses=poses, _look=(0, start))
-
-
-def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
-    """Refuse a batch without common times, and more states than a machine holds."""
-    if batch is not None and save is None:
-        raise InputError(
-            "save: expected a grid of times for a batch with an adaptive method; without it each state has its own"
-        )
-    if save is not None:
-        check_room(len(save) * (1 if batch is None else batch), numbers)
-
-
-def reporter(bar: Progress, i: int, count: int, start: float, duration: float) -> Callable[[float], None]:
-    """Return what tells how far the i-th trajectory is, by its time."""
-
-    def done(t: float) -> None:
-        bar.update((i + (t - start) / duration) / count)
-
-    return done
 
 
 def assemble_result(

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import NumericalError
-from mbkit.model import Model
+from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.constraint_projection import Approach, beside, settled
 from mbkit.simulate.solvers.runge_kutta import BOUND
 from mbkit.simulate.torque import Force
 
-__all__ = ["Rates", "magnitude", "unit_quaternions"]
+__all__ = ["Rates"]
 
 
 class Rates:
@@ -92,35 +90,3 @@ class Rates:
         for (start, _), length in zip(self._model.quaternions, lengths, strict=True):
             out[start : start + 4] *= length
         return out
-
-
-def unit_quaternions(model: Model, q: Array) -> tuple[Array, Array]:
-    """Return q with unit quaternions, and the lengths that they had."""
-    if not model.quaternions:
-        return q, np.empty(0)
-    q, lengths = q.copy(), np.empty(len(model.quaternions))
-    for i, (start, _) in enumerate(model.quaternions):
-        lengths[i] = np.linalg.norm(q[start : start + 4])
-        q[start : start + 4] /= lengths[i]
-    return q, lengths
-
-
-# How large the numbers of a state are, where a tolerance is relative to the largest of them.
-
-#: rad, m, rad/s, m/s.
-_COMMON: Final = 10.0
-
-
-def magnitude(*states: Array) -> float:
-    """Return by what a tolerance relative to a state's largest number is too loose for the others.
-
-    In whole decades, as Taylor series of each order are compiled once; below ten it is the slack that common motions
-    have.
-
-    Examples
-    --------
-    >>> magnitude(np.array([0.1, -3.0])), magnitude(np.array([0.1, 1.0]), np.array([-2e4]))
-    (1.0, 100000.0)
-    """
-    largest = max(float(np.abs(y).max(initial=0.0)) for y in states)
-    return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON else 1.0

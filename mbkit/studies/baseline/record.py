@@ -23,9 +23,9 @@ from mbkit.studies._targets import checked_target, with_values
 from mbkit.studies.baseline.description import described, links_of
 from mbkit.studies.baseline.file import ROLLOUT, Baseline, Rollout, check_replaceable, path_of, store, text_of
 from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Comparator, relevant
-from mbkit.studies.compare.rollouts import quiet_simulate
 from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.results import Refusal
+from mbkit.studies.study_runs import quiet_simulate
 
 __all__ = ["build_engines", "checked_model", "evaluate", "record"]
 

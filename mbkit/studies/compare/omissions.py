@@ -15,7 +15,7 @@ from mbkit.engines.registry import DERIVED, MUJOCO
 from mbkit.model import Model
 from mbkit.studies.compare.errors import interleaved
 from mbkit.studies.compare.result import Omission
-from mbkit.studies.compare.terms import inside
+from mbkit.studies.study_runs import state_within_limits
 
 __all__ = ["omissions"]
 
@@ -37,7 +37,7 @@ _FLAGS: Final = (
 def omissions(model: Model, made: Mapping[str, Dynamics], seed: int) -> tuple[Omission, ...]:
     """Return one row per need, measured on the engines at hand."""
     # Well within the limits, where none of them acts.
-    q, v = inside(model, np.random.default_rng([seed, 2]))
+    q, v = state_within_limits(model, np.random.default_rng([seed, 2]))
     rows: list[Omission] = []
     mujoco = made.get(MUJOCO)
     if mujoco is not None:

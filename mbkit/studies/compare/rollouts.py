@@ -10,10 +10,7 @@ multiple of it, and the comparison ends where that would say little.
 
 from __future__ import annotations
 
-import time
-import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -21,13 +18,12 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
-from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.model import Model
-from mbkit.simulate import Trajectory, simulate
+from mbkit.simulate import Trajectory
 from mbkit.studies.compare.result import RolloutRow
-from mbkit.studies.compare.terms import inside
+from mbkit.studies.study_runs import quiet_simulate, start_state
 
-__all__ = ["TooLongError", "free_of_mimic", "patience", "quiet_simulate", "rollouts", "start_state"]
+__all__ = ["rollouts"]
 
 DURATION: Final = 1.0
 STEP: Final = 1e-3
@@ -41,42 +37,6 @@ _DISTURBANCE: Final = 1e-8
 #: Steps below which a rollout says nothing.
 _FEWEST: Final = 50
 _PAIRS: Final = (("rk4", "mujoco_rk4"), ("semi_implicit_euler", "mujoco_euler"))
-
-
-def free_of_mimic(model: Model) -> Model:
-    """Return the model with its mimic joints independent: MuJoCo's own steps would make them soft."""
-    return replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))
-
-
-def start_state(model: Model, seed: int) -> tuple[Array, Array]:
-    """Return where rollouts start: near the middle of the joints' ranges, moving gently.
-
-    Wilder starts measure how fast the scene loses digits, not the integrators.
-    """
-    q, v = inside(model, np.random.default_rng([seed, 1]), 0.1)
-    return q, 0.1 * v
-
-
-class TooLongError(MbkitError):
-    """A run took longer than it is worth."""
-
-
-def patience(seconds: float, clock: Callable[[], float] = time.perf_counter) -> Callable[[float], None]:
-    """Return a progress function that ends a run after so many seconds, of the wall's or another clock."""
-    end = clock() + seconds
-
-    def look(done: float) -> None:
-        if clock() > end:
-            raise TooLongError(f"given up after {seconds:g} s, {done:.0%} done: stiff, or very fast motion")
-
-    return look
-
-
-def quiet_simulate(*args: object, **kwargs: object) -> Trajectory:
-    """Simulate without the warning of a divergence, which the caller reads from the statistics."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MbkitWarning)
-        return simulate(*args, **kwargs)  # type: ignore[arg-type]
 
 
 def rollouts(model: Model, made: Mapping[str, Dynamics], seed: int, note: str) -> tuple[RolloutRow, ...]:

@@ -22,9 +22,10 @@ from mbkit.studies._targets import with_values
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.omissions import omissions
 from mbkit.studies.compare.result import Comparison, Row
-from mbkit.studies.compare.rollouts import free_of_mimic, rollouts
+from mbkit.studies.compare.rollouts import rollouts
 from mbkit.studies.compare.terms import TERMS, States, Term, power_rows, states
 from mbkit.studies.results import Refusal, model_info
+from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.work_precision.study import work_precision
 
 __all__ = ["Judge", "announced", "compare"]

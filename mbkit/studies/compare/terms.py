@@ -24,7 +24,7 @@ from mbkit.studies.compare.errors import (
     matrix_errors,
 )
 
-__all__ = ["TERMS", "States", "Term", "inside", "power_rows", "states"]
+__all__ = ["TERMS", "States", "Term", "power_rows", "states"]
 
 
 # States at which engines are compared: random ones, and the hard ones.
@@ -79,18 +79,6 @@ def states(model: Model, samples: int, seed: int) -> States:
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
     a, tau = rng.standard_normal((2, len(q), model.nv))
     return States(q, v, a, tau, tuple(kinds))
-
-
-def inside(model: Model, rng: np.random.Generator, share: float = 0.5) -> tuple[Array, Array]:
-    """Return a random state in the middle `share` of the limits."""
-    q, v = model.random_state(rng)
-    if model.constrained:
-        return q, v
-    lower, upper = limits_box(model)
-    bounded = np.isfinite(lower)
-    middle = 0.5 * (lower[bounded] + upper[bounded])
-    q[bounded] = middle + share * (q[bounded] - middle)
-    return q, v
 
 
 def _at_limits(model: Model, rng: np.random.Generator, n: int) -> Array:

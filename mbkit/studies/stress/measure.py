@@ -21,7 +21,6 @@ from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.methods.registry import METHODS
 from mbkit.simulate import Trajectory, simulate
 from mbkit.studies.compare.errors import interleaved
-from mbkit.studies.compare.rollouts import TooLongError, patience, quiet_simulate
 from mbkit.studies.stress.case import Case, Truth, problem_of, step_of, times_of
 from mbkit.studies.stress.measurements import Measurement
 from mbkit.studies.stress.reference import (
@@ -33,6 +32,7 @@ from mbkit.studies.stress.reference import (
     error_of,
     reference_terms,
 )
+from mbkit.studies.study_runs import TooLongError, patience, quiet_simulate
 from mbkit.studies.worker import report_stage
 
 __all__ = ["Prepared", "Setting", "condition_number", "measure", "prepare"]

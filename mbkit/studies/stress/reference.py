@@ -28,9 +28,9 @@ from mbkit.engines.registry import DERIVED, INDEPENDENT, PINOCCHIO
 from mbkit.errors import MbkitError, NumericalError
 from mbkit.methods.registry import METHODS
 from mbkit.studies.compare.errors import Errors, Scales, force_errors, matrix_errors
-from mbkit.studies.compare.rollouts import TooLongError, quiet_simulate
 from mbkit.studies.compare.terms import States
 from mbkit.studies.stress.case import Problem, Truth
+from mbkit.studies.study_runs import TooLongError, quiet_simulate
 from mbkit.studies.work_precision.reference import gap, reference
 
 __all__ = ["TERMS", "ReferenceSearch", "Terms", "condition", "cpu_limit", "error_of", "reference_terms"]

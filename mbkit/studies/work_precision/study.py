@@ -22,7 +22,7 @@ from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import with_values
-from mbkit.studies.compare.rollouts import free_of_mimic, start_state
+from mbkit.studies.study_runs import free_of_mimic, start_state
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as compute_reference
 from mbkit.studies.work_precision.result import InterruptedSweepError, WorkPrecision

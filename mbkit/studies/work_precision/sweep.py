@@ -25,8 +25,8 @@ from mbkit.engines.registry import find_engine
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
-from mbkit.studies.compare.rollouts import TooLongError, patience, quiet_simulate
 from mbkit.studies.results import Refusal
+from mbkit.studies.study_runs import TooLongError, patience, quiet_simulate
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
 from mbkit.studies.work_precision.settings import Settings
 from mbkit.studies.worker import run
