@@ -73,7 +73,7 @@ def view(result: Comparison, asked: str = "") -> Document:
         good=result.passed,
         summary=f"{size} · {samples} states (seed {result.seed}) · tolerance {result.tolerance:.0e}"
         f" · {result.seconds:.1f} s",
-        opening=[Items([_failure(f) for f in found], most=_MAX_FAILURES)] if (found := failures(result)) else [],
+        opening=[Items([_failure(f) for f in failures(result)], most=_MAX_FAILURES)],
         sections=[
             Section("The model", [Facts(list(model_facts(facts, asked, result.setup)))], on="page"),
             Section("Terms: worst relative error, time per call", _terms(result) if result.rows else []),
@@ -130,11 +130,11 @@ def failures(result: Comparison) -> list[Failure]:
 
 
 def _failure(f: Failure) -> Bullet:
-    state = None
+    folded = None
     if f.row is not None:
         q, v = (", ".join(map(str, x)) for x in (f.row.worst_q, f.row.worst_v))
-        state = f"the state of the worst error ({f.row.worst_kind})", f"q = [{q}]\nv = [{v}]"
-    return Bullet(f.what, f.reason, "✗", "bad", state=state)
+        folded = f"the state of the worst error ({f.row.worst_kind})", f"q = [{q}]\nv = [{v}]"
+    return Bullet(f.what, f.reason, "✗", "bad", folded=folded)
 
 
 # Terms.
@@ -272,7 +272,7 @@ def _rollouts(result: Comparison) -> list[Block]:
         for r in result.rollouts
         if not math.isfinite(r.tolerance)
     ]
-    return [*out, Items(below)] if below else out
+    return [*out, Items(below)]
 
 
 # What was left out of the computation, and what no engine could do.
@@ -314,7 +314,7 @@ def _omissions(result: Comparison) -> list[Block]:
         Column("note", lambda o: Span(o.note, "muted"), on="page"),
     )
     chosen = [Bullet(o.need, o.note, "i") for o in result.omissions if omission_state(o) == "chosen"]
-    return [Table(columns, result.omissions), Items(chosen, on="terminal")] if result.omissions else []
+    return [Table(columns, result.omissions), Items(chosen, on="terminal")]
 
 
 def _notes(result: Comparison) -> list[Block]:
@@ -322,7 +322,7 @@ def _notes(result: Comparison) -> list[Block]:
     bullets += [Bullet("", note) for note in result.facts.get("notes", ())]
     bodies = "; ".join(result.facts.get("nonphysical", ()))
     bullets += [Bullet("bodies with inconsistent inertia", bodies)] if bodies else []
-    return [Items(bullets)] if bullets else []
+    return [Items(bullets)]
 
 
 # Many robots.
@@ -363,7 +363,7 @@ def robots_view(result: Sweep) -> Document:
         opening=[Figure(lambda: figures.robots(result), about)] if compared else [],
         sections=[
             Section("Robot by robot", [Table(columns, result.outcomes, dense=True)]),
-            Section("Reasons", [Items(reasons)] if reasons else []),
+            Section("Reasons", [Items(reasons)]),
         ],
         result=result,
         basis={

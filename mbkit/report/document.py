@@ -1,6 +1,7 @@
 """What people are shown of a result: sections of paragraphs, tables, lists, facts and figures.
 
-A view makes one document of a result; `terminal` and `page` render it.
+A view makes one document of a result; `terminal` and `page` render it. A terminal has room for the verdict and what
+leads to it, a page for everything: `on` says where a part is shown.
 """
 
 from __future__ import annotations
@@ -9,32 +10,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-__all__ = [
-    "Block",
-    "Bullet",
-    "Column",
-    "Details",
-    "Document",
-    "Facts",
-    "Figure",
-    "Items",
-    "Paragraph",
-    "Section",
-    "Span",
-    "Style",
-    "Table",
-    "Text",
-    "spans",
-]
-
-#: Where a part is shown. A terminal has room for the verdict and what leads to it, a page for everything.
 On = Literal["both", "terminal", "page"]
 Style = Literal["", "good", "bad", "allowed", "muted", "bold", "mono"]
 
 
 @dataclass(frozen=True)
 class Span:
-    """A piece of text in one style; of a table on a page also its cell's own class."""
+    """A piece of text in one style; `cell` is a class of the style sheet for its cell of a table."""
 
     text: str
     style: Style = ""
@@ -61,35 +43,20 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table: its head, in which a line feed breaks it, and the text of a row's cell.
 
-    Attributes
-    ----------
-    head : str
-        A line feed breaks it.
-    cell : callable
-        Row -> Text.
-    right : bool
-        Whether it holds numbers.
-    on : str
-    width : int
-        On a terminal, at least so many characters, which are never folded.
-    most : int
-        On a terminal, longer texts are cut.
-    fill : bool
-        On a terminal, takes what is left of the width, and what is too long is cut.
-    group : bool
-        Shown only where it differs from the row before, which begins a group.
+    `group` is shown only where it differs from the row before, which begins a group. On a terminal, `width` is the
+    least width and is never folded, texts longer than `most` are cut, and `fill` takes what is left of the line.
     """
 
     head: str
     cell: Callable[[Any], Text]
     right: bool = False
     on: On = "both"
+    group: bool = False
     width: int = 0
     most: int = 0
     fill: bool = False
-    group: bool = False
 
 
 @dataclass(frozen=True)
@@ -127,25 +94,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Bullet:
-    """An entry of a list.
-
-    Attributes
-    ----------
-    head, text : str
-    mark, style : str
-        What stands before it.
-    aside : str
-        More, for a page.
-    state : (str, str) or None
-        For a page: what is folded away, and its title.
-    """
+    """An entry of a list; on a page also `aside`, and the title and text of what is folded away."""
 
     head: str
     text: str
     mark: str = "·"
     style: Style = "muted"
     aside: str = ""
-    state: tuple[str, str] | None = None
+    folded: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -187,9 +143,13 @@ class Details:
 Block = Paragraph | Table | Items | Facts | Figure | Details
 
 
+def _is_empty(block: Block) -> bool:
+    return (isinstance(block, Table) and not block.rows) or (isinstance(block, Items) and not block.bullets)
+
+
 @dataclass(frozen=True)
 class Section:
-    """Blocks under a title; one of level 3 stands below the one before it. Without blocks it is not shown."""
+    """Blocks under a title; one of level 3 belongs to the one before it. Blocks without content are left out."""
 
     title: str
     blocks: Sequence[Block]
@@ -198,35 +158,17 @@ class Section:
 
     def shown(self, where: On) -> list[Block]:
         """Return the blocks that are shown there."""
-        return [b for b in self.blocks if b.on in ("both", where)] if self.on in ("both", where) else []
+        places = ("both", where)
+        return [b for b in self.blocks if b.on in places and not _is_empty(b)] if self.on in places else []
 
 
 @dataclass(frozen=True)
 class Document:
     """All that is shown of a result.
 
-    Attributes
-    ----------
-    name : str
-        Of the model or file, as a terminal has it before the verdict.
-    heading, title : str
-        Of the page, and in the browser's bar.
-    verdict : str
-        One sentence.
-    good : bool
-    marked : bool
-        Whether the verdict is a judgement, with ✓ or ✗ before it.
-    summary : str
-        What a terminal shows below the verdict.
-    opening : sequence of Block
-        What stands before the first section.
-    sections : sequence of Section
-    result : object
-        With `versions`, `processor` and `seconds`, for the foot of the page.
-    basis : mapping
-        What the numbers rest on, for the foot of the page.
-    last : bool
-        Whether a terminal has the verdict at the end.
+    A terminal has `name` before the verdict and `summary` below it, or the verdict at the end (`last`); a page has a
+    heading and, in the browser's bar, a title. `marked` is a verdict that is a judgement, with ✓ or ✗. At the foot of
+    the page stand `basis` and the result's `versions`, `processor` and `seconds`.
     """
 
     name: str

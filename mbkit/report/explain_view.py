@@ -38,10 +38,10 @@ def explanation_view(result: Explanation) -> Document:
         verdict=result.verdict,
         good=result.agree,
         sections=[
-            Section("Terms, by joint name", [Table(gaps, result.gaps)] if result.gaps else []),
+            Section("Terms, by joint name", [Table(gaps, result.gaps)]),
             Section("Causes", _causes(result.causes)),
-            Section(f"Joints: {by_name} matched by name, and", [Items(joints)] if joints else []),
-            Section("Notes", [Items([Bullet("", note) for note in result.notes])] if result.notes else []),
+            Section(f"Joints: {by_name} matched by name, and", [Items(joints)]),
+            Section("Notes", [Items([Bullet("", note) for note in result.notes])]),
         ],
         result=result,
     )
@@ -56,7 +56,7 @@ def _causes(causes: Iterable[Cause]) -> list[Block]:
             # What a kind means is told once.
             again = any(b.head == kind for b in bullets)
             bullets.append(Bullet(kind, f"{says} ({what})", mark, style, "" if again else meaning(kind)))  # type: ignore[arg-type]
-    return [Items(bullets)] if bullets else []
+    return [Items(bullets)]
 
 
 # One file through several importers.
@@ -100,6 +100,7 @@ def importers_view(result: ParserComparison) -> Document:
         *(_importer(p) for p in read),
     ]
     plural = "s" * (result.samples != 1)
+    refused = [Bullet(f"{p.engine} {p.version}", p.refused, "✗", "bad") for p in result.importers if p.refused]
     notes = [Bullet("the file", note) for note in (*([result.faults] if result.faults else []), *result.notes)]
     notes += [Bullet(p.engine, note) for p in (*read, *alone) for note in p.notes]
     fused = (
@@ -128,12 +129,16 @@ def importers_view(result: ParserComparison) -> Document:
             Section(
                 "Refused",
                 [
-                    Items([Bullet(f"{p.engine} {p.version}", p.refused, "✗", "bad") for p in refusing])
-                    for refusing in [[p for p in result.importers if p.refused]]
-                    if refusing
+                    Items(
+                        [
+                            Bullet(f"{p.engine} {p.version}", p.refused, "✗", "bad")
+                            for p in result.importers
+                            if p.refused
+                        ]
+                    )
                 ],
             ),
-            Section("Notes", [Items(notes)] if notes else []),
+            Section("Notes", [Items(notes)]),
         ],
         result=result,
         basis={
@@ -218,7 +223,7 @@ def baseline_view(result: BaselineResult, again: str = "") -> Document:
         title=result.model,
         verdict=result.verdict,
         good=result.passed,
-        opening=[Items(bullets)] if bullets else [],
+        opening=[Items(bullets)],
         sections=[],
         result=result,
     )

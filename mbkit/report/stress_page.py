@@ -21,7 +21,7 @@ from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_te
 from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, engines_of, name_of, place
 from mbkit.studies.stress.result import StressResult
 
-__all__ = ["FILTERS", "MapCell", "MapRow", "Section", "content", "section"]
+__all__ = ["FILTERS", "content", "section"]
 
 _MEASURES: Final = {
     "motion": "the largest difference of q along the run, over the size of the motion",
@@ -43,17 +43,7 @@ class MapCell:
 
 @dataclass(frozen=True)
 class MapRow:
-    """A row of a map.
-
-    Attributes
-    ----------
-    line : Line
-    series : int
-        Of the engine's colour.
-    cells : tuple of MapCell
-    theory : str
-        How its breaking point stands to linear theory's.
-    """
+    """A row of a map: `series` is its engine's colour, `theory` how its breaking point stands to linear theory's."""
 
     line: Line
     series: int
@@ -63,23 +53,7 @@ class MapRow:
 
 @dataclass(frozen=True)
 class Section:
-    """A case with all that the page tells of it.
-
-    Attributes
-    ----------
-    case : CaseResult
-    anchor : str
-    heads : list of str
-        The values.
-    rows : list of MapRow
-        The furthest first, without those that never ran.
-    left_out : list of (str, str)
-        Those, and why.
-    facts : list of (str, list of float)
-    truths : list of (str, str)
-    measured : str
-        What an error is here.
-    """
+    """A case with all that the page tells of it: rows that ran, the furthest first, and what was left out and why."""
 
     case: CaseResult
     anchor: str

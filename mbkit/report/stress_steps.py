@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Bound", "Rule", "StepCase", "StepLine", "against_theory", "kinds", "rules", "stable_steps", "steps"]
+__all__ = ["against_theory", "kinds", "rules", "stable_steps", "steps"]
 
 
 #: What a fact's name begins with that a step is to be short against: "fastest frequency", "fastest rate".
@@ -48,14 +48,8 @@ class StepCase:
 class Bound:
     """What steps times the fastest frequency or rate ω showed over all cases that tell one.
 
-    Attributes
-    ----------
-    held : float
-        Up to which it held in every case; 0 where it held nowhere.
-    failed : float
-        The least that did not; NaN where all held.
-    theory : float
-        Linear theory's least; infinite where it has no limit, NaN where none is known.
+    Up to `held` it held in every case (0: nowhere), from `failed` on it did not (NaN: all held); `theory` is linear
+    theory's least limit, infinite where it has none and NaN where none is known.
     """
 
     held: float

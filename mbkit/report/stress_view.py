@@ -29,12 +29,7 @@ from mbkit.studies.stress.result import StressResult
 
 __all__ = [
     "HOW",
-    "Avoid",
-    "AvoidAt",
-    "MethodLine",
     "Overview",
-    "SilentLine",
-    "anchor",
     "avoid",
     "bars",
     "families",
@@ -80,21 +75,8 @@ _NAMED: Final = 3
 
 @dataclass(frozen=True)
 class Overview:
-    """A case in one line.
-
-    Attributes
-    ----------
-    case : CaseResult
-    anchor : str
-        Where on the page it stands.
-    lines : tuple of Line
-        Its rows, the furthest first.
-    best : dict of str to Line
-        What speaks for each engine.
-    choice : Line or None
-        Of mbkit's own choice of method.
-    furthest : int
-        How many values the best held.
+    """A case in one line: its rows (`lines`, the furthest first), the row that speaks for each engine (`best`), that of
+    mbkit's own choice of method, and how many values the best held. `anchor` is its place on the page.
     """
 
     case: CaseResult
@@ -244,25 +226,11 @@ def bars(result: StressResult) -> list[tuple[float, str, list[str]]]:
 
 @dataclass(frozen=True)
 class MethodLine:
-    """One engine and method over the families.
+    """One engine and method over the families of cases.
 
-    Attributes
-    ----------
-    name : str
-        Engine and method.
-    series : int
-        Of the engine's colour.
-    families : dict of str to (int, int)
-        Cases where none held further, and cases where it was asked.
-    ahead, cases : int
-        The same of all families.
-    held : float
-        Part of a sweep that held, the mean over the cases.
-    silent : int
-        Cases where it was wrong in silence.
-    factor : float
-        Run time over the least of those that held as far, the median over the cases where none held further;
-        NaN where there is none.
+    `families` has the cases where none held further and those where it was asked, `ahead` and `cases` the same of
+    all; `held` is the mean part of a sweep that held, `silent` the cases where it was wrong in silence, and `factor`
+    the median of its run time over the least of those that held as far, NaN where it was never ahead.
     """
 
     name: str
@@ -429,9 +397,9 @@ def view(result: StressResult) -> Document:
         marked=False,
         summary=f"{len(cases)} cases · {runs} runs · {time_text(result.seconds)}",
         sections=[
-            Section("Who holds furthest, and what breaks first", [Table(columns, cases)] if cases else []),
-            Section("Where another held further than auto", [Items(behind)] if behind else []),
-            Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)] if silent else []),
+            Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
+            Section("Where another held further than auto", [Items(behind)]),
+            Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
         ],
         result=result,
     )

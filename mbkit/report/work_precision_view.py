@@ -29,20 +29,7 @@ from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import USEFUL, figure
 from mbkit.studies.work_precision.result import WorkPrecision
 
-__all__ = [
-    "CurveLine",
-    "Lead",
-    "Level",
-    "curve_lines",
-    "error_against_time",
-    "front_names",
-    "headline",
-    "leads",
-    "levels",
-    "picture",
-    "sections",
-    "view",
-]
+__all__ = ["error_against_time", "picture", "sections", "view"]
 
 #: An observed order farther than this from the method's own is flagged.
 ORDER_TOLERANCE: Final = 0.2
@@ -52,15 +39,7 @@ _DOTS_PER_INCH: Final = 160
 
 @dataclass(frozen=True)
 class Level:
-    """Who reaches an error in the least time, and who is first among the other engines.
-
-    Attributes
-    ----------
-    error : float
-    curve, point : Curve, PrecisionPoint
-    next : (Curve, PrecisionPoint) or None
-        The fastest of another engine that reaches this error.
-    """
+    """The fastest run that reaches an error, and the fastest of another engine that does (`next`)."""
 
     error: float
     curve: Curve
@@ -116,15 +95,8 @@ class Lead:
 class CurveLine:
     """One engine and method in one line.
 
-    Attributes
-    ----------
-    curve : Curve
-    best : PrecisionPoint or None
-        With the least error, the fastest of several that are as good as the reference
-        can tell.
-    off : bool
-        Whether the observed order is not the method's own.
-    on_front : bool
+    `best` has the least error, the fastest of several that are as good as the reference can tell; `off` says that the
+    observed order is not the method's own.
     """
 
     curve: Curve
@@ -230,7 +202,7 @@ def view(result: WorkPrecision, asked: str = "") -> Document:
             *sections(result, whole=True),
             Section(
                 "The model",
-                [Facts(list(model_facts(facts, asked, {}))), *([Items(notes)] if notes else [])],
+                [Facts(list(model_facts(facts, asked, {}))), Items(notes)],
                 on="page",
             ),
         ],
@@ -275,7 +247,7 @@ def sections(result: WorkPrecision, whole: bool) -> list[Section]:
         ),
         Section(
             "What could not be measured",
-            [Items(unable)] if unable else [],
+            [Items(unable)],
             on="both" if whole else "page",
             level=3,
         ),
