@@ -126,18 +126,7 @@ def importers_view(result: ParserComparison) -> Document:
                 else [],
             ),
             *_differences(read),
-            Section(
-                "Refused",
-                [
-                    Items(
-                        [
-                            Bullet(f"{p.engine} {p.version}", p.refused, "✗", "bad")
-                            for p in result.importers
-                            if p.refused
-                        ]
-                    )
-                ],
-            ),
+            Section("Refused", [Items(refused)]),
             Section("Notes", [Items(notes)]),
         ],
         result=result,

@@ -27,22 +27,8 @@ from mbkit.studies.stress.measurements import (
 )
 from mbkit.studies.stress.result import StressResult
 
-__all__ = [
-    "HOW",
-    "Overview",
-    "avoid",
-    "bars",
-    "families",
-    "headline",
-    "held_text",
-    "methods",
-    "overview",
-    "ranks",
-    "silences",
-    "told",
-    "value_text",
-    "view",
-]
+__all__ = ["HOW", "Overview", "avoid", "bars", "families", "headline", "held_text", "methods", "overview", "ranks"]
+__all__ += ["silences", "told", "value_text", "view"]
 
 
 #: Outcomes in words that follow "then".
@@ -75,8 +61,10 @@ _NAMED: Final = 3
 
 @dataclass(frozen=True)
 class Overview:
-    """A case in one line: its rows (`lines`, the furthest first), the row that speaks for each engine (`best`), that of
-    mbkit's own choice of method, and how many values the best held. `anchor` is its place on the page.
+    """A case in one line.
+
+    `lines` are its rows, the furthest first; `best` speaks for each engine, `choice` for mbkit's own choice of method;
+    `furthest` is how many values the best held, and `anchor` the case's place on the page.
     """
 
     case: CaseResult
