@@ -13,9 +13,13 @@ from mbkit.errors import InputError, OutputError
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.result import BaselineResult
 from mbkit.studies.baseline.tolerance import Moved, VersionChange
+from mbkit.studies.explain.joint_matching import Match
+from mbkit.studies.explain.result import Cause, Explanation
+from mbkit.studies.explain.terms import Gap
 from mbkit.studies.importers.result import Parsed, ParserComparison, Stage
 from mbkit.studies.results import Column, Refusal, Table, from_plain, to_plain
-from tests.test_report import AGREEING, DIFFERING, EMPTY
+from tests.test_report import AGREEING, DIFFERING, EMPTY, STUDY
+from tests.test_stress_report import RESULT
 
 IMPORTED = ParserComparison(
     source="arm.urdf",
@@ -47,12 +51,37 @@ CHECKED = BaselineResult(
     processors=("x", "y"),
     skipped=(Refusal("drake", "", "not installed"),),
 )
-RESULTS = {"agreeing": AGREEING, "differing": DIFFERING, "empty": EMPTY, "importers": IMPORTED, "baseline": CHECKED}
+EXPLAINED = Explanation(
+    a="one",
+    b="other",
+    agree=False,
+    gaps=(Gap("M", 0.5, "j"),),
+    comparable=True,
+    matches=(Match("j", "j", "name"),),
+    only_a=(),
+    only_b=("k",),
+    causes=(Cause("mass", "body", "other has mass 2 for 1", 1.0, 2.0, {"M": 0.5}, acts=True),),
+    notes=("frames",),
+    explained=True,
+    left=(),
+    subtree=(),
+    samples=3,
+    seed=0,
+    tolerance=1e-9,
+)
+RESULTS = {
+    "explained": EXPLAINED,
+    "agreeing": AGREEING,
+    "differing": DIFFERING,
+    "empty": EMPTY,
+    "importers": IMPORTED,
+    "baseline": CHECKED,
+}
 
 
-@pytest.mark.parametrize("name", RESULTS)
+@pytest.mark.parametrize("name", [*RESULTS, "study", "stress"])
 def test_json_holds_all_of_a_result(name, tmp_path):
-    result = RESULTS[name]
+    result = {**RESULTS, "study": STUDY, "stress": RESULT}[name]
     text = result.to_json(tmp_path / "r.json")
     again = type(result).from_json((tmp_path / "r.json").read_text())
     assert again.to_json() == text
@@ -72,7 +101,9 @@ def test_csv_has_a_line_for_each_row_and_all_digits(name, tmp_path):
     text = result.to_csv(tmp_path / "r.csv")
     assert (tmp_path / "r.csv").read_text() == text
     rows = list(csv.DictReader(io.StringIO(text)))
-    table = {"importers": IMPORTED.importers[0].stages, "baseline": CHECKED.moved}.get(name)
+    table = {"explained": EXPLAINED.causes, "importers": IMPORTED.importers[0].stages, "baseline": CHECKED.moved}.get(
+        name
+    )
     wanted = list(getattr(result, "rows", table))
     assert len(rows) == len(wanted)
     for row, of in zip(rows, wanted, strict=True):

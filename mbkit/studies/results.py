@@ -38,11 +38,9 @@ __all__ = [
     "Table",
     "Title",
     "columns_of",
-    "csv_number",
     "from_plain",
     "model_info",
     "processor",
-    "remade",
     "to_plain",
     "versions",
     "write",
@@ -101,17 +99,6 @@ def from_plain(kind: Any, value: Any) -> Any:
     if origin in (types.UnionType, typing.Union) and value is not None:
         return from_plain(args[0], value)
     return value
-
-
-def remade(kind: type[Any], told: dict[str, Any]) -> Any:
-    """Return a dataclass from plain data; null is NaN, and what it does not have is left out."""
-    names = [f.name for f in fields(kind) if f.name in told]
-    return kind(**{n: math.nan if told[n] is None else told[n] for n in names})
-
-
-def csv_number(x: float) -> str:
-    """Return a number with all its digits for CSV, empty for NaN."""
-    return "" if math.isnan(x) else repr(x)
 
 
 # Tables, as Markdown and HTML.

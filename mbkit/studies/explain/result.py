@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, Final
 
-import numpy as np
-
-from mbkit._escape import html, markdown, one_line
-from mbkit.errors import OutputError
+from mbkit._escape import one_line
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.terms import Gap
+from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
 
-__all__ = ["Cause", "Explanation", "effect", "grouped", "plain", "saved"]
+__all__ = ["Cause", "Explanation", "effect", "grouped"]
 
 #: More causes of one kind than this are told in one line.
 _FEW: Final = 3
@@ -57,7 +54,7 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Explanation:
+class Explanation(ResultTable):
     """Why two descriptions or engines differ, or that they do not.
 
     Attributes
@@ -149,34 +146,19 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        return asdict(self) | {"verdict": self.verdict}
+        return super().to_dict() | {"verdict": self.verdict}
 
-    def to_json(self, path: str | Path | None = None) -> str:
-        """Return the result as JSON, and write it to `path` if given. Infinity and NaN become null."""
-        return saved(self.to_dict(), path)
+    _csv_columns = (*columns_of(Cause), Column("effect", lambda cause: effect(cause)))
 
-    def to_markdown(self) -> str:
-        """Return verdict, causes and notes in Markdown."""
-        lines = [f"**{markdown(self.a)} and {markdown(self.b)}**: {markdown(self.verdict)}", ""]
+    def _csv_rows(self) -> tuple[Cause, ...]:
+        return self.causes
+
+    def _blocks(self) -> Iterator[Block]:
+        yield Title(f"{self.a} and {self.b}", f": {self.verdict}")
         if self.causes:
-            lines += ["| cause | what | effect |", "|---|---|---|"]
-            lines += [f"| {' | '.join(map(markdown, line))} |" for line in grouped(self.causes)]
-            lines.append("")
-        lines += [f"- {markdown(note)}" for note in self.notes]
-        return "\n".join(lines).rstrip() + "\n"
-
-    def _repr_html_(self) -> str:
-        cells = "".join(
-            f"<tr><td>{html(kind)}</td><td>{html(says)}</td><td>{html(what)}</td></tr>"
-            for kind, says, what in grouped(self.causes)
-        )
-        head = "".join(f"<th>{h}</th>" for h in ("cause", "what", "effect"))
-        notes = "".join(f"<li>{html(n)}</li>" for n in self.notes)
-        return (
-            f"<p><b>{html(self.a)} and {html(self.b)}</b>: {html(self.verdict)}</p>"
-            + (f"<table><tr>{head}</tr>{cells}</table>" if cells else "")
-            + (f"<ul>{notes}</ul>" if notes else "")
-        )
+            columns = [Column(head, itemgetter(k)) for k, head in enumerate(("cause", "what", "effect"))]
+            yield Table(columns, grouped(self.causes))
+        yield Items(self.notes)
 
     def __repr__(self) -> str:
         return f"<Explanation: {one_line(self.verdict)}>"
@@ -211,27 +193,3 @@ def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:
         most = f"up to {effect(largest)}" if largest.acts and largest.effects else effect(largest)
         out.append((kind, f"{len(some)} times, first {some[0].says}; in all: {names}", most))
     return out
-
-
-def plain(value: Any) -> Any:
-    """Return numbers of a description as JSON takes them."""
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (np.floating, np.integer)):
-        return value.item()
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def saved(data: dict[str, Any], path: str | Path | None) -> str:
-    """Return data as JSON, and write it if a path is given."""
-    text = json.dumps(plain(data), indent=1, allow_nan=False)
-    if path is not None:
-        try:
-            Path(path).write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror}; the result itself is kept") from error
-    return text

@@ -21,9 +21,10 @@ from mbkit.studies.explain.engine_differences import engine_causes
 from mbkit.studies.explain.hypotheses import Guess, Hypothesis, told, with_joint
 from mbkit.studies.explain.joint_matching import Aligned, Match, Matching, aligned, renamed, settled
 from mbkit.studies.explain.merged_links import Compact, compact, with_link, with_matter
-from mbkit.studies.explain.result import Cause, Explanation, plain
+from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gaps, gaps, model_terms, part, smallest, states_of
 from mbkit.studies.explain.tolerance import Near
+from mbkit.studies.results import to_plain
 
 __all__ = ["explain"]
 
@@ -195,7 +196,7 @@ class _Descriptions:
     def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
         acts = h.kind in whole.CONSTRAINTS or any(not x <= self.tolerance for x in effects.values())
         head = f"{h.subject}: " if h.subject else ""
-        return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", plain(h.a), plain(h.b), effects, acts)
+        return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), effects, acts)
 
     def _name_causes(self, one: Compact, other: Compact, matching: Matching, by_name: Gaps | None) -> list[Cause]:
         """Return causes in what joints are called and where they stand in q."""
