@@ -47,10 +47,10 @@ def instead_of_writing(model: Model) -> str:
     features = [f for f in ("loops", "prescribed") if getattr(model, f)]
     if not features:
         return 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
-    told = ", ".join(map(repr, features))
+    names = ", ".join(map(repr, features))
     return (
         f"leave out bodies, as engines do not take its {' and '.join(features)}; "
-        f'mbkit.dynamics(model.without({told}), "lagrangian") computes the tree without them'
+        f'mbkit.dynamics(model.without({names}), "lagrangian") computes the tree without them'
     )
 
 
@@ -222,11 +222,11 @@ class SymbolicKinematics:
                     if i <= j:
                         M[i][j] = M[i][j] + values.armature * x * y
         self.drop_dust([x for row in M for x in row])
-        made: dict[tuple[int, int], sp.Expr] = {}
+        entries: dict[tuple[int, int], sp.Expr] = {}
         for i in range(n):
             self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
-            made.update({(i, j): self.shown(M[i][j]) for j in range(i, n)})
-        return [[made[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
+            entries.update({(i, j): self.shown(M[i][j]) for j in range(i, n)})
+        return [[entries[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
 
     @cached_property
     def gravity_energy(self) -> sp.Expr:
@@ -466,10 +466,10 @@ def _carried(kin: SymbolicKinematics, way: _Way, x: list[Any], weight: int) -> l
 
 
 def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
-    told = f"loop {loop.name!r}: its frames are never parallel"
+    message = f"loop {loop.name!r}: its frames are never parallel"
     axes = [axis for way in ends for axis in _axes(way)]
     if all(np.linalg.norm(np.cross(axis, axes[0])) < _DEPENDENT for axis in axes):
-        return _in_plane(kin, loop, ends, axes[0] if axes else None, told)
+        return _in_plane(kin, loop, ends, axes[0] if axes else None, message)
     values = kin.values["loops", loop.name]
     frames = [
         [_carried(kin, way, [row[k] for row in R], 0) for k in range(3)]
@@ -477,11 +477,11 @@ def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> li
     ]
     half = kin.space.number(Fraction(1, 2))
     turned = [cross3(y, x) for x, y in zip(*frames, strict=True)]
-    return _independent(kin, [half * (turned[0][i] + turned[1][i] + turned[2][i]) for i in range(3)], told)
+    return _independent(kin, [half * (turned[0][i] + turned[1][i] + turned[2][i]) for i in range(3)], message)
 
 
 def _in_plane(
-    kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way], axis: Array | None, told: str
+    kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way], axis: Array | None, message: str
 ) -> list[sp.Expr]:
     """Return the row of the angle about the axis that all joints share."""
     a, b = (_at_rest(way) @ R for way, R in zip(ends, (loop.rotation_a, loop.rotation_b), strict=True))
@@ -492,7 +492,7 @@ def _in_plane(
     start = atan2(about, (np.trace(E) - 1) / 2)
     # Whatever turns about the axis leaves the rest as it is.
     if np.abs(E @ axis - axis).max() > _MEETS or (not axis.any() and np.abs(E - np.eye(3)).max() > _MEETS):
-        raise InputError(f"{kin.model.name}: {told}, whatever the joints do; turn one of them by rotation_a")
+        raise InputError(f"{kin.model.name}: {message}, whatever the joints do; turn one of them by rotation_a")
     total = angle(start)
     for sign, way in zip((1, -1), ends, strict=True):
         # An axis that points the other way turns back.
@@ -503,7 +503,7 @@ def _in_plane(
     if not total.free_symbols & set(kin.coordinates):
         if abs(sp.sin(total / 2).evalf()) < _MEETS:
             return []
-        raise InputError(f"{kin.model.name}: {told}: between them stays an angle of {total}")
+        raise InputError(f"{kin.model.name}: {message}: between them stays an angle of {total}")
     return [2 * sp.sin(total / 2)]
 
 
@@ -522,7 +522,7 @@ def _at_rest(way: _Way) -> Array:
     return R
 
 
-def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], told: str) -> list[sp.Expr]:
+def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], message: str) -> list[sp.Expr]:
     """Return those of three sums that the others do not imply."""
     # This loads SciPy.
     from scipy.linalg import qr
@@ -543,5 +543,5 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], told: str)
         if np.abs(left[~moving]).max(initial=0.0) > _MEETS * largest:
             rest = kin.shown(TrigPolynomial(kin.space, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
             why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
-            raise InputError(f"{kin.model.name}: {told}, whatever the joints do{'' if weights.any() else why}")
+            raise InputError(f"{kin.model.name}: {message}, whatever the joints do{'' if weights.any() else why}")
     return [kin.shown(sums[i]) for i in kept]

@@ -189,10 +189,10 @@ def _check_kept(model: Model, kept: set[sp.Symbol], rows: Iterable[tuple[str, sp
 
 
 def _coordinates(model: Model, names: Sequence[str] | None) -> list[sp.Symbol]:
-    told = list(model.coordinate_names if names is None else names)
-    if len(told) != model.nq or not all(isinstance(n, str) and n for n in told) or len(set(told)) != len(told):
+    chosen = list(model.coordinate_names if names is None else names)
+    if len(chosen) != model.nq or not all(isinstance(n, str) and n for n in chosen) or len(set(chosen)) != len(chosen):
         raise InputError(f"coordinates: expected {model.nq} different names, got {names!r}")
-    return [sp.Symbol(n) for n in told]
+    return [sp.Symbol(n) for n in chosen]
 
 
 def _kinetic(M: list[list[Any]], v: list[sp.Symbol]) -> sp.Expr:

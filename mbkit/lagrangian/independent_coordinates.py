@@ -137,7 +137,7 @@ class EmbeddedDynamics(Dynamics):
         if not sign:
             raise InputError(
                 f"{self.model.name}: {', '.join(self.model.coordinate_names)} do not determine the other coordinates "
-                f"at {self._told(q[self._chart.independent])}, a singular pose; choose others, or leave the choice open"
+                f"at {self._at(q[self._chart.independent])}, a singular pose; choose others, or leave the choice open"
             )
         self._memory.places.clear()
         self._memory.places.append((q.copy(), J))
@@ -166,27 +166,27 @@ class EmbeddedDynamics(Dynamics):
             if size <= _SOLVED * (1 + float(np.abs(q).max())):
                 if self._sign(J) != memory.sign:
                     # On the other side of a singular pose another branch begins.
-                    raise NumericalError(f"{self.model.name}: beyond a singular pose at {self._told(u)}")
+                    raise NumericalError(f"{self.model.name}: beyond a singular pose at {self._at(u)}")
                 if np.linalg.norm(J - before) > _BENT * np.linalg.norm(before):
                     raise NumericalError(
-                        f"{self.model.name}: too long a step to {self._told(u)} to tell the dependent coordinates"
+                        f"{self.model.name}: too long a step to {self._at(u)} to tell the dependent coordinates"
                     )
                 memory.places.append((q.copy(), J))
                 return q
         raise NumericalError(
-            f"{self.model.name}: Newton's iteration finds no dependent coordinates at {self._told(u)}; "
+            f"{self.model.name}: Newton's iteration finds no dependent coordinates at {self._at(u)}; "
             "perhaps beyond a singular pose"
         )
 
-    def _told(self, u: Array) -> str:
+    def _at(self, u: Array) -> str:
         return ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, u, strict=True))
 
     def _solved(self, J: Array, right: Array, q: Array) -> Array:
         try:
             return np.asarray(np.linalg.solve(J[:, self._chart.dependent], right))
         except np.linalg.LinAlgError:
-            told = self._told(q[self._chart.independent])
-            raise NumericalError(f"{self.model.name}: singular pose at {told}") from None
+            place = self._at(q[self._chart.independent])
+            raise NumericalError(f"{self.model.name}: singular pose at {place}") from None
 
     def state(self, u: Array, w: Array) -> tuple[Array, Array]:
         """Return q and v, (n,) each."""

@@ -18,7 +18,7 @@ from sympy.printing.pretty.pretty_symbology import pretty_symbol
 
 from mbkit._escape import latex, one_line
 
-__all__ = ["Abbreviations", "ExpressionPrinter", "folded", "matrix", "spread", "written"]
+__all__ = ["Abbreviations", "ExpressionPrinter", "Printable", "aligned", "folded", "matrix", "spread", "written"]
 
 
 _FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
@@ -27,6 +27,25 @@ _MASS: Final = re.compile(r"[mM](\d*|_\w+)")
 #: Denominators that are read as such; longer fractions are decimals.
 _READ: Final = 10_000
 _INERTIA: Final = re.compile(r"[A-CIJ](\d*|_\w+)|EI")
+
+
+class Printable:
+    """A result with `latex()` and `str()`, shown as such by notebooks and in a terminal."""
+
+    def latex(self) -> str:
+        """Return LaTeX."""
+        raise NotImplementedError
+
+    def _repr_latex_(self) -> str:
+        return f"${self.latex()}$"
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {one_line(str(self))}>"
+
+
+def aligned(pairs: Iterable[tuple[str, str]]) -> str:
+    """Return equations as an aligned LaTeX block, from their sides."""
+    return "\\begin{aligned}" + r" \\ ".join(f"{left} &= {right}" for left, right in pairs) + "\\end{aligned}"
 
 
 class ExpressionPrinter:
@@ -113,8 +132,8 @@ class ExpressionPrinter:
         out = ""
         for term in terms:
             minus, size = _signed(term)
-            told = self._product(size)
-            out += (("-" if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
+            text = self._product(size)
+            out += (("-" if minus else "") + text) if not out else (f" - {text}" if minus else f" + {text}")
         return out or "0"
 
     def _product(self, x: sp.Expr) -> str:
@@ -124,10 +143,10 @@ class ExpressionPrinter:
         below = sp.Mul(*(1 / f for f in sp.Mul.make_args(rest) if _below(f)))
         above = sp.Mul(*(f for f in sp.Mul.make_args(rest) if not _below(f)))
         factors = self._factors(above) if above != 1 else []
-        told = [self._atom(f) for f in factors]
-        if number != 1 or not told:
-            told.insert(0, _number(number))
-        line = " ".join(told)
+        parts = [self._atom(f) for f in factors]
+        if number != 1 or not parts:
+            parts.insert(0, _number(number))
+        line = " ".join(parts)
         if below == 1:
             return line
         under = self._factors(below)
@@ -146,15 +165,15 @@ class ExpressionPrinter:
         if x.is_Pow and x.exp.is_Rational:
             high = str(x.exp).translate(_HIGH)
             if isinstance(x.base, (sp.sin, sp.cos, sp.tan)) and x.exp.is_Integer:
-                told = self._argument(x.base.args[0])
-                return f"{x.base.func.__name__}{high}{'' if told.startswith('(') else ' '}{told}"
+                text = self._argument(x.base.args[0])
+                return f"{x.base.func.__name__}{high}{'' if text.startswith('(') else ' '}{text}"
             return f"{self._atom(x.base) if x.base.is_Symbol or x.base.is_Add else f'({self.text(x.base)})'}{high}"
         if isinstance(x, sp.Abs):
             return f"|{self.text(x.args[0])}|"
         if isinstance(x, sp.Function) and len(x.args) == 1:
             space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
-            told = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
-            return f"{x.func.__name__}{space if not told.startswith('(') else ''}{told}"
+            text = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
+            return f"{x.func.__name__}{space if not text.startswith('(') else ''}{text}"
         if x.is_Mul:
             return self._product(x)
         return one_line(str(x))
@@ -182,8 +201,8 @@ class ExpressionPrinter:
         out = ""
         for term in terms:
             minus, size = _signed(term)
-            told = printer.doprint(self._arranged(size))
-            out += (("- " if minus else "") + told) if not out else (f" - {told}" if minus else f" + {told}")
+            text = printer.doprint(self._arranged(size))
+            out += (("- " if minus else "") + text) if not out else (f" - {text}" if minus else f" + {text}")
         return out or "0"
 
     def _arranged(self, x: sp.Expr) -> sp.Expr:
@@ -207,9 +226,9 @@ class _Latex(LatexPrinter):  # type: ignore[misc]
         number = expr.args[0]
         if number.is_Rational and number.q != 1 and len(expr.args) > 1 and not any(_below(f) for f in expr.args):
             rest = sp.Mul(*expr.args[1:], evaluate=False) if len(expr.args) > 2 else expr.args[1]
-            told = self._print(rest)
-            told = rf"\left({told}\right)" if rest.is_Add else told
-            return rf"\tfrac{{{number.p}}}{{{number.q}}} {told}"
+            text = self._print(rest)
+            text = rf"\left({text}\right)" if rest.is_Add else text
+            return rf"\tfrac{{{number.p}}}{{{number.q}}} {text}"
         return str(super()._print_Mul(expr))
 
 
@@ -233,8 +252,8 @@ def written(name: str) -> str:
     stem, mark, index = name.partition("_")
     split = mark and index[:1].isalpha() and stem
     # One letter with its dot where there is such a letter.
-    told = f"{pretty_symbol(stem)}_{pretty_symbol(index)}" if split else str(pretty_symbol(name))
-    return unicodedata.normalize("NFC", told)
+    text = f"{pretty_symbol(stem)}_{pretty_symbol(index)}" if split else str(pretty_symbol(name))
+    return unicodedata.normalize("NFC", text)
 
 
 def _below(x: sp.Expr) -> bool:
@@ -340,15 +359,15 @@ class Abbreviations:
 
     def __init__(self, expressions: Iterable[sp.Expr], taken: Iterable[sp.Symbol]) -> None:
         counts: Counter[sp.Expr] = Counter()
-        found: set[sp.Expr] = set()
+        roots: set[sp.Expr] = set()
         for x in expressions:
             for part in sp.preorder_traversal(x):
                 if part.is_Pow and part.base.is_Add and part.base.count_ops() >= _LONG:
                     counts[part.base] += 1
                     if part.exp.is_Rational and part.exp.q == 2:
-                        found.add(part.base)
+                        roots.add(part.base)
         # In the order in which they were met.
-        bases = [base for base, n in counts.items() if base in found and n >= _OFTEN]
+        bases = [base for base, n in counts.items() if base in roots and n >= _OFTEN]
         names = {s.name for s in taken}
         letter = next(name for name in ("rho", "varrho", "rho_") if name not in names)
         letters = [letter] if len(bases) == 1 else [f"{letter}{k + 1}" for k in range(len(bases))]

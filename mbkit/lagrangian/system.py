@@ -271,17 +271,17 @@ class Lagrangian(EnergyForm):
         q, v = np.broadcast_arrays(self.model.check_q(q), self.model.check_v(v))
         if q.ndim == 1:
             return self._projected(manifold, q, v)
-        found = [self._projected(manifold, *pair) for pair in zip(q, v, strict=True)]
-        return np.array([pair[0] for pair in found]), np.array([pair[1] for pair in found])
+        states = [self._projected(manifold, *pair) for pair in zip(q, v, strict=True)]
+        return np.array([pair[0] for pair in states]), np.array([pair[1] for pair in states])
 
     def _projected(self, manifold: Manifold, q: Array, v: Array) -> tuple[Array, Array]:
         try:
-            found = manifold.project(q, v)
+            states = manifold.project(q, v)
         except InputError:
             refuse_unreachable(manifold.dyn, q)
             raise
-        require_independent(manifold.dyn, found[0], everywhere=True)
-        return found
+        require_independent(manifold.dyn, states[0], everywhere=True)
+        return states
 
     def embedded(self, independent: Sequence[Any] | None = None, **values: float) -> Embedded:
         """Return the system on independent coordinates alone, for `mbkit.simulate`.
@@ -419,12 +419,12 @@ class QuasiLagrangian(Lagrangian):
     def _map(self, name: str, q: ArrayLike, x: ArrayLike, values: dict[str, float]) -> tuple[Array, Array, Array]:
         n = len(self.coordinates)
         q, x = rows("q", q, n, self.name, "nq"), rows(name, x, n, self.name, "nv")
-        told = (
+        numbers = (
             parameter_values(self, values, name)
             if self.D.free_symbols & set(self.parameters)
             else np.zeros(len(self.parameters))
         )
-        both = self._maps(q, told)
+        both = self._maps(q, numbers)
         return both[..., :n, :], both[..., n:, :], x
 
     def to_velocity(self, q: ArrayLike, w: ArrayLike, **values: float) -> Array:

@@ -29,10 +29,10 @@ _TWIN: Final = "_constrained_twin"
 # The functions that are compiled.
 
 
-def _function(eq: EnergyEquations, name: str, given: dict[str, Any], made: dict[str, Any]) -> ca.Function:
-    given = {**given, **eq.trailing}
-    dense = [ca.densify(x) for x in made.values()]
-    return ca.Function(name, list(given.values()), dense, list(given), list(made), {"cse": True})
+def _function(eq: EnergyEquations, name: str, inputs: dict[str, Any], outputs: dict[str, Any]) -> ca.Function:
+    inputs = {**inputs, **eq.trailing}
+    dense = [ca.densify(x) for x in outputs.values()]
+    return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs), {"cse": True})
 
 
 def _rows(eq: EnergyEquations) -> ca.Function:
@@ -42,12 +42,12 @@ def _rows(eq: EnergyEquations) -> ca.Function:
 
 def _terms(eq: EnergyEquations) -> ca.Function:
     c, M = eq.constraints, eq.mass_matrix
-    made = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": c.weight(M), "M": M}
-    return _function(eq, "constraint", {"q": eq.q, "v": eq.v}, made)
+    outputs = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": c.weight(M), "M": M}
+    return _function(eq, "constraint", {"q": eq.q, "v": eq.v}, outputs)
 
 
 def _step(eq: EnergyEquations) -> ca.Function:
-    """(q, v) -> q after a step of Newton's, v made consistent there, f before it and its scale."""
+    """(q, v) -> q after a step of Newton's, v outputs consistent there, f before it and its scale."""
     c, m = eq.constraints, eq.constraints.value.shape[0]
     W = c.weight(eq.mass_matrix)
     Y = solve(W, c.jacobian.T, eq.elimination_order)
@@ -65,8 +65,8 @@ def _multipliers(eq: EnergyEquations) -> ca.Function:
 
 def _embedded(eq: EnergyEquations) -> ca.Function:
     c = eq.constraints
-    made = {"J": c.jacobian, "by_time": c.by_time, "gamma": c.gamma, "M": eq.mass_matrix, "force": eq.applied}
-    return _function(eq, "embedded", {"q": eq.q, "v": eq.v}, made)
+    outputs = {"J": c.jacobian, "by_time": c.by_time, "gamma": c.gamma, "M": eq.mass_matrix, "force": eq.applied}
+    return _function(eq, "embedded", {"q": eq.q, "v": eq.v}, outputs)
 
 
 def _curvature(eq: EnergyEquations) -> ca.Function:
@@ -175,9 +175,9 @@ class Manifold:
             ):
                 if not (np.abs(residual) <= limit).all():
                     where = "" if q.ndim == 1 else f" of state {k}"
-                    told = ", ".join(f"{x:.3g}" for x in residual)
+                    residuals = ", ".join(f"{x:.3g}" for x in residual)
                     raise InputError(
-                        f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is [{told}]"
+                        f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is [{residuals}]"
                         f"{where}; lag.project(q0, v0) returns the nearest consistent state"
                     )
 
@@ -243,9 +243,9 @@ class Manifold:
                 break
             x, terms, best = x + 2 * length * step, tried, size
         if not best <= 1e-10 * (1 + float(np.abs(x).max())):
-            told = ", ".join(f"{e:.3g}" for e in terms.f)
+            residuals = ", ".join(f"{e:.3g}" for e in terms.f)
             raise InputError(
-                f"q: no consistent state of {self.dyn.model.name} found near it; f = [{told}] is the least reached"
+                f"q: no consistent state of {self.dyn.model.name} found near it; f = [{residuals}] is the least reached"
             )
         return np.asarray(x)
 

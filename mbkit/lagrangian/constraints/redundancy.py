@@ -37,7 +37,7 @@ _ROUNDED: Final = 1e-14
 _HOLDS: Final = 1e-10
 _MOST: Final = 100
 #: Characters of a constraint in a message: of a loop in space it has thousands.
-_TOLD: Final = 100
+_SHOWN: Final = 100
 
 #: Values of the parameters with which a system was independent at some pose.
 _JUDGED: Final[WeakKeyDictionary[EnergyForm, set[tuple[float, ...]]]] = WeakKeyDictionary()
@@ -131,21 +131,21 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
         if np.linalg.norm(f) < best[0]:
             best = float(np.linalg.norm(f)), f
     against = np.flatnonzero(np.abs(best[1]) > 1e-6 * np.abs(best[1]).max())
-    told = "contradict each other" if len(against) > 1 else "cannot hold"
+    verdict = "contradict each other" if len(against) > 1 else "cannot hold"
     raise InputError(
         f"constraints: no configuration that satisfies them all was found from {len(starts)} starts; it seems that "
-        f"{_named(against, written)} {told}: the least that is left of them is {best[0]:.3g}"
+        f"{_named(against, written)} {verdict}: the least that is left of them is {best[0]:.3g}"
     )
 
 
 def _explain(manifold: Manifold, written: list[str], q: Array, beside: list[Array], scale: Array, sizes: Array) -> None:
     """Raise why J has dependent rows at and around q; return where it has full rank nearby."""
     reached = [_nearest(manifold, start, scale) for start in (q, *beside)]
-    found = [x for x, f in reached if np.linalg.norm(f) < _HOLDS]
-    if not found:
+    consistent = [x for x, f in reached if np.linalg.norm(f) < _HOLDS]
+    if not consistent:
         refuse_unreachable(manifold.dyn, q)
         return
-    slopes = [manifold.jacobian(x) / scale[:, None] for x in found]
+    slopes = [manifold.jacobian(x) / scale[:, None] for x in consistent]
     flat = np.flatnonzero((np.max([np.linalg.norm(J, axis=1) for J in slopes], axis=0) < _FLAT) & (sizes > _ROUNDED))
     if len(flat):
         raise InputError(
@@ -197,5 +197,5 @@ def _dependent(J: Array) -> tuple[Array, Array]:
 
 
 def _named(which: Iterable[int], written: list[str]) -> str:
-    told = {k: written[k] if len(written[k]) <= _TOLD else f"{written[k][:_TOLD]} ..." for k in which}
-    return ", ".join(f"constraints[{k}] ({text})" for k, text in told.items())
+    texts = {k: written[k] if len(written[k]) <= _SHOWN else f"{written[k][:_SHOWN]} ..." for k in which}
+    return ", ".join(f"constraints[{k}] ({text})" for k, text in texts.items())

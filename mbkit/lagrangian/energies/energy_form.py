@@ -278,15 +278,15 @@ def _forces(into: PlainSymbols, given: Any) -> dict[sp.Symbol, sp.Expr]:
     if not isinstance(given, Mapping):
         raise InputError(f"forces: expected {{coordinate: force}}, got {given!r}")
     out: dict[sp.Symbol, sp.Expr] = dict.fromkeys(into.coordinates, sp.Integer(0))
-    told = set()
+    seen = set()
     for key, value in given.items():
         coordinate = into("forces", key)
         if coordinate not in out:
             names = ", ".join(map(str, into.coordinates))
             raise InputError(f"forces: {key} is no coordinate; the coordinates are {names}")
-        if coordinate in told:
+        if coordinate in seen:
             raise InputError(f"forces: {coordinate} stands twice; add the forces along it")
-        told.add(coordinate)
+        seen.add(coordinate)
         out[coordinate] = into(f"forces[{key}]", value)
     return out
 
@@ -346,15 +346,15 @@ def _check_declared(d: EnergyForm) -> None:
         return
     where = [name for name, x in parts.items() if x.free_symbols & unknown]
     first = min(unknown, key=lambda s: s.name)
-    told = f"parameters: {plain(unknown)} stands in {', '.join(where)} and is not declared; "
-    told += f"add {first}=... to it as parameters={{{first}: 1.0}}, or with None for no value yet"
+    message = f"parameters: {plain(unknown)} stands in {', '.join(where)} and is not declared; "
+    message += f"add {first}=... to it as parameters={{{first}: 1.0}}, or with None for no value yet"
     if all(name.startswith("forces") for name in where):
-        told += " (an input is a symbol that is all of one force, and stands nowhere else)"
+        message += " (an input is a symbol that is all of one force, and stands nowhere else)"
     elif "t" in {s.name for s in unknown} and d.time is None:
-        told += " (the time is given as time=t)"
+        message += " (the time is given as time=t)"
     else:
-        told += f" (the velocities are {', '.join(map(str, d.velocities))})"
-    raise InputError(told)
+        message += f" (the velocities are {', '.join(map(str, d.velocities))})"
+    raise InputError(message)
 
 
 def _check_velocities(d: EnergyForm) -> None:

@@ -11,18 +11,18 @@ from typing import Any
 import sympy as sp
 from sympy.matrices.exceptions import NonInvertibleMatrixError
 
-from mbkit._escape import one_line, terminal
+from mbkit._escape import terminal
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm
-from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, spread
+from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, Printable, aligned, spread
 from mbkit.lagrangian.trig.shortest_form import complexity
 from mbkit.lagrangian.trig.simplify import gradient, slope, tidy, tidy_matrix
 
 __all__ = ["EquationsOfMotion", "christoffel", "equations_of_motion", "printed_equations"]
 
 
-@dataclass(frozen=True)
-class EquationsOfMotion:
+@dataclass(frozen=True, repr=False)
+class EquationsOfMotion(Printable):
     """M v̇ + C v + d + ∂V/∂q = Q (+ Jᵀ λ), with q̇ = D v.
 
     Attributes
@@ -125,14 +125,7 @@ class EquationsOfMotion:
         short = Abbreviations(shown, set().union(*(x.free_symbols for x in shown)))
         pairs = printed_equations(self, board, short, latex=True)
         pairs += [(board.latex(letter), board.latex(root)) for letter, root in short.roots.items()]
-        rows = (f"{left} &= {right}" for left, right in pairs)
-        return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
-
-    def _repr_latex_(self) -> str:
-        return f"${self.latex()}$"
-
-    def __repr__(self) -> str:
-        return f"<EquationsOfMotion: {one_line(str(self))}>"
+        return aligned(pairs)
 
     def __str__(self) -> str:
         return terminal("\n".join(f"{_joined(terms, str)} = {force}" for terms, force in self._rows()))

@@ -1,4 +1,4 @@
-"""T as a polynomial of the velocities: its degree is checked, and its parts are told apart."""
+"""T as a polynomial of the velocities: its degree is checked, and its parts are separated."""
 
 from __future__ import annotations
 
@@ -93,10 +93,10 @@ def _check(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> None:
     if _quadratic(T, velocities):
         return
     terms = sp.Add.make_args(sp.expand_mul(T) if T.count_ops() <= LARGE else T)
-    told = next((x for x in terms if not _quadratic(x, velocities)), T)
+    term = next((x for x in terms if not _quadratic(x, velocities)), T)
     raise InputError(
         f"T: expected at most the second degree in the velocities {', '.join(map(str, velocities))}, "
-        f"but its term {told} is not"
+        f"but its term {term} is not"
     )
 
 
@@ -120,8 +120,8 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
 # Whether every motion has kinetic energy, or is bound by a constraint.
 
 _PLACES: Final = 3
-#: Letters of a matrix that is told.
-_TOLD: Final = 200
+#: Letters of a matrix that a message shows.
+_SHOWN: Final = 200
 
 
 def require_inertia(
@@ -166,9 +166,9 @@ def require_inertia(
             sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
             if abs(mpmath.det(scaled)) > _ROUNDED * mpmath.fprod(sizes):
                 return
-    told = f" {M.tolist()}" if len(str(M)) <= _TOLD else ""
+    matrix = f" {M.tolist()}" if len(str(M)) <= _SHOWN else ""
     raise InputError(
-        f"T: its mass matrix{told} is singular everywhere: {_unmoved(A, velocities)} can change without kinetic "
+        f"T: its mass matrix{matrix} is singular everywhere: {_unmoved(A, velocities)} can change without kinetic "
         "energy; a velocity is missing, or there is a coordinate too many"
     )
 

@@ -70,7 +70,7 @@ class VelocityMap:
         read = Conversion({c: q[i] for i, c in enumerate(quasi.coordinates)}, float)
         D, W = (ca.reshape(read.matrix(list(A.T)), n, n) for A in (quasi.D, quasi.W))
         moving = ca.mtimes(D, x)
-        made = {
+        outputs = {
             "enter": ([q, x], moving),
             "leave": ([q, x], ca.mtimes(W, x)),
             "enter_force": ([q, x], ca.mtimes(W.T, x)),
@@ -79,7 +79,7 @@ class VelocityMap:
             "linear": ([q, x], ca.horzcat(ca.jacobian(moving, q), D, W)),
         }
         self._functions = {
-            name: ca.Function(name, given, [ca.densify(out)], {"cse": True}) for name, (given, out) in made.items()
+            name: ca.Function(name, given, [ca.densify(out)], {"cse": True}) for name, (given, out) in outputs.items()
         }
         self._machines = {name: Machine(f) for name, f in self._functions.items()}
 

@@ -98,16 +98,16 @@ class PlainSymbols:
             raise InputError(f"time: {time} is given, but the coordinates are functions of {own}")
         self.time = time if own is None else own
         self._map: dict[Any, sp.Symbol] = {}
-        made = []
+        own_coordinates = []
         for c in given:
             if isinstance(c, AppliedUndef):
                 self._map[c] = sp.Symbol(c.func.__name__)
-                made.append(self._map[c])
+                own_coordinates.append(self._map[c])
             elif isinstance(c, sp.Symbol):
-                made.append(c)
+                own_coordinates.append(c)
             else:
                 raise InputError(f"coordinates: expected SymPy symbols or dynamicsymbols, got {c!r}")
-        self.coordinates = tuple(made)
+        self.coordinates = tuple(own_coordinates)
         self.velocities = self._velocities(given, velocities, among)
         own_time = [self.time] if self.time else []
         _differ((*self.coordinates, *self.velocities, *own_time))
@@ -122,12 +122,12 @@ class PlainSymbols:
             named = {s.name: s for s in among}
             own = [named.get(velocity_of(c).name, velocity_of(c)) for c in self.coordinates]
         else:
-            told = listed("velocities", velocities)
-            if len(told) != len(given):
-                what = f"{len(told)} velocities for {len(given)} coordinates"
+            rates = listed("velocities", velocities)
+            if len(rates) != len(given):
+                what = f"{len(rates)} velocities for {len(given)} coordinates"
                 raise InputError(f"velocities: {what}; give each coordinate one, in the same order")
             own = []
-            for c, w in zip(given, told, strict=True):
+            for c, w in zip(given, rates, strict=True):
                 if isinstance(w, sp.Symbol):
                     own.append(w)
                 elif isinstance(w, AppliedUndef):
@@ -225,9 +225,9 @@ def fits(what: str, s: sp.Symbol) -> None:
     if not s.name.strip():
         raise InputError(f"{what}: expected symbols with names, got {s!r}")
     wrong = ["commutative"] if not s.is_commutative else []
-    wrong += [told for told in ("integer", "imaginary", "zero") if getattr(s, f"is_{told}")]
+    wrong += [word for word in ("integer", "imaginary", "zero") if getattr(s, f"is_{word}")]
     if what == "velocities":
-        wrong += [told for told in ("nonnegative", "nonpositive") if getattr(s, f"is_{told}")]
+        wrong += [word for word in ("nonnegative", "nonpositive") if getattr(s, f"is_{word}")]
     if wrong:
-        told = "not commutative" if wrong[0] == "commutative" else wrong[0]
-        raise InputError(f"{what}: {s} is assumed to be {told}; what moves takes every real value on its way")
+        assumption = "not commutative" if wrong[0] == "commutative" else wrong[0]
+        raise InputError(f"{what}: {s} is assumed to be {assumption}; what moves takes every real value on its way")

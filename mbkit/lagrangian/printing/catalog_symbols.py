@@ -74,15 +74,15 @@ def in_symbols(model: Model) -> Model | None:
         return None
     for counts in _counts(catalog.systems()[system], model.nv):
         try:
-            made = _with_parameters(system, counts)
+            symbolic = _with_parameters(system, counts)
         except (MbkitError, TypeError):
             # A system of another size, or one that takes no parameters.
             continue
-        if _form(made) != _form(model):
+        if _form(symbolic) != _form(model):
             continue
-        values = _solved(made, model)
+        values = _solved(symbolic, model)
         try:
-            moved = made.with_nominal(values)
+            moved = symbolic.with_nominal(values)
         except MbkitError:
             return None
         if not _same(moved, model):
@@ -168,11 +168,11 @@ def _form(model: Model) -> Any:
     )
 
 
-def _solved(made: Model, model: Model) -> dict[str, float]:
+def _solved(symbolic: Model, model: Model) -> dict[str, float]:
     """Return the values of parameters that give a model's numbers, as far as they can be told."""
     values: dict[str, float] = {}
     # Frames move nothing, and a model may be without them.
-    left = [(b.expression, _number(model, b)) for b in made.bindings if b.where != "frames"]
+    left = [(b.expression, _number(model, b)) for b in symbolic.bindings if b.where != "frames"]
     progress = True
     while progress:
         progress = False

@@ -42,13 +42,13 @@ def python_code(system: Lagrangian) -> str:
     upper = [e.mass_matrix[i, j] for i in range(n) for j in range(i, n)]
     clock = ", t=0.0" if system.time else ""
     take = _lines(system, names)
-    told = python_docstring(", ".join(s.name for s in e.coordinates))
+    coordinates = python_docstring(", ".join(s.name for s in e.coordinates))
     values = "".join(f"    {names[s]!r}: {x!r},\n" for s, x in system.parameters.items())
     unpack = f"{take}    {', '.join(names[s] for s in e.coordinates)}, = q\n"
     moving = unpack + f"    {', '.join(names[s] for s in e.velocities)}, = v\n"
     return f'''"""Equations of motion of {python_docstring(system.name)}: M(q) a + h(q, v) = tau, in SI units.
 
-Coordinates q: {told}. Written by mbkit {__version__}; needs NumPy only.
+Coordinates q: {coordinates}. Written by mbkit {__version__}; needs NumPy only.
 """
 
 import numpy as np

@@ -91,7 +91,7 @@ class SystemSummary:
             "d": (e.drift, "drift: what time and T1, T0 add"),
         }
         out["Q"] = (e.forces, "forces")
-        return {n: (A, told) for n, (A, told) in out.items() if n == "M" or any(x != 0 for x in A)}
+        return {n: (A, meaning) for n, (A, meaning) in out.items() if n == "M" or any(x != 0 for x in A)}
 
     @cached_property
     def _kept(self) -> list[tuple[str, sp.Expr, str]]:
@@ -115,11 +115,11 @@ class SystemSummary:
             out += self._sum("R", s.dissipation, width)
         for letter, root in self._short.roots.items():
             out.append(f"with {board.text(letter)} = {board.text(root)}")
-        for name, (A, told) in self._matrices.items():
+        for name, (A, meaning) in self._matrices.items():
             if name == "M" and self._size > _WRITTEN:
                 out += ["", f"M is too long for a page as well; its size is {A.rows} by {A.cols}."]
                 continue
-            out += ["", f"{name}, {told}:", *matrix(name, A.applyfunc(self._short), board.text, width)]
+            out += ["", f"{name}, {meaning}:", *matrix(name, A.applyfunc(self._short), board.text, width)]
         out.append("")
         if self.long:
             out.append("The equations are too long for a page; --python and --c write them.")
@@ -131,8 +131,8 @@ class SystemSummary:
         return "\n".join(out)
 
     def _named(self, coordinate: sp.Symbol) -> str:
-        told, own = written(coordinate.name), self._names.get(coordinate.name, coordinate.name)
-        return f"{told}" if own == coordinate.name else f"{told} ({one_line(own)})"
+        text, own = written(coordinate.name), self._names.get(coordinate.name, coordinate.name)
+        return f"{text}" if own == coordinate.name else f"{text} ({one_line(own)})"
 
     def _sum(self, name: str, x: sp.Expr, width: int) -> list[str]:
         return folded(f"{name} = {self._board.text(self._short(x))}", width)
@@ -144,11 +144,11 @@ class SystemSummary:
             return [*out, "Conserved: nothing that is told by the coordinates or the time"]
         for name, x, meaning in self._kept:
             # T and V stand above.
-            told = "T + V" if x == self.system.T + self.system.V else self._board.text(self._short(x))
+            text = "T + V" if x == self.system.T + self.system.V else self._board.text(self._short(x))
             note = f" ({meaning})" if name == "h" else ""
-            if len(told) > _LONG:
-                told, note = "∂T/∂v" if name != "h" else "T2 - T0 + V", ", too long for a page"
-            out += folded(f"Conserved: {written(name)} = {told}{note}", width)
+            if len(text) > _LONG:
+                text, note = "∂T/∂v" if name != "h" else "T2 - T0 + V", ", too long for a page"
+            out += folded(f"Conserved: {written(name)} = {text}{note}", width)
         return out
 
     # LaTeX

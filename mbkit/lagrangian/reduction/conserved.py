@@ -15,9 +15,9 @@ from typing import Final
 
 import sympy as sp
 
-from mbkit._escape import one_line, terminal
+from mbkit._escape import terminal
 from mbkit.lagrangian.energies.energy_form import EnergyForm, acting_forces, vanish
-from mbkit.lagrangian.printer import ExpressionPrinter
+from mbkit.lagrangian.printer import ExpressionPrinter, Printable
 
 __all__ = [
     "JACOBI",
@@ -33,8 +33,8 @@ __all__ = [
 JACOBI: Final = "Jacobi's integral T2 - T0 + V, not the energy T + V"
 
 
-@dataclass(frozen=True)
-class ConservedQuantity:
+@dataclass(frozen=True, repr=False)
+class ConservedQuantity(Printable):
     """What stays as it is along every motion.
 
     Attributes
@@ -54,9 +54,6 @@ class ConservedQuantity:
     meaning: str
     moving: tuple[tuple[sp.Symbol, ...], ...] = field(default=(), repr=False, compare=False)
 
-    def __repr__(self) -> str:
-        return f"<ConservedQuantity: {one_line(str(self))}>"
-
     def __str__(self) -> str:
         return terminal(f"{self.name} = {self.expression} ({self.meaning})")
 
@@ -64,9 +61,6 @@ class ConservedQuantity:
         """Return name = expression."""
         board = ExpressionPrinter(*self.moving)
         return f"{board.latex(sp.Symbol(self.name))} = {board.latex(self.expression)}"
-
-    def _repr_latex_(self) -> str:
-        return f"${self.latex()}$"
 
 
 def conserved_momenta(system: EnergyForm) -> dict[sp.Symbol, sp.Expr]:

@@ -20,7 +20,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, rows
-from mbkit._escape import one_line, terminal
+from mbkit._escape import terminal
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import (
     EnergyForm,
@@ -33,7 +33,7 @@ from mbkit.lagrangian.energies.energy_form import (
 from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import free_name, velocity_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
-from mbkit.lagrangian.printer import ExpressionPrinter
+from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction import conserved
 from mbkit.lagrangian.reduction.conserved import ConservedQuantity
 from mbkit.lagrangian.trig.simplify import slope, tidy
@@ -76,8 +76,8 @@ def shorter(x: sp.Expr) -> sp.Expr:
     return tidy(x) if x.count_ops() <= _SHORT else x
 
 
-@dataclass(frozen=True)
-class CanonicalEquations:
+@dataclass(frozen=True, repr=False)
+class CanonicalEquations(Printable):
     """q̇ = ∂H/∂p and ṗ = -∂H/∂q + Q.
 
     Attributes
@@ -105,21 +105,14 @@ class CanonicalEquations:
     def latex(self) -> str:
         """Return the equations as an aligned LaTeX block."""
         board = ExpressionPrinter(self.coordinates, self.momenta)
-        rows = (f"{board.latex(e.lhs)} &= {board.latex(e.rhs)}" for e in self.equations())
-        return "\\begin{aligned}" + r" \\ ".join(rows) + "\\end{aligned}"
-
-    def _repr_latex_(self) -> str:
-        return f"${self.latex()}$"
-
-    def __repr__(self) -> str:
-        return f"<CanonicalEquations: {one_line(str(self))}>"
+        return aligned((board.latex(e.lhs), board.latex(e.rhs)) for e in self.equations())
 
     def __str__(self) -> str:
         return terminal("\n".join(f"{e.lhs} = {e.rhs}" for e in self.equations()))
 
 
-@dataclass(frozen=True, eq=False)
-class Hamiltonian:
+@dataclass(frozen=True, eq=False, repr=False)
+class Hamiltonian(Printable):
     """H of a system and what it says; made by `Lagrangian.hamiltonian`.
 
     Attributes
@@ -233,8 +226,8 @@ class Hamiltonian:
         return Numeric(sp.Matrix.vstack(eq.qdot, eq.pdot), *names)
 
     def _behind(self, t: float, values: dict[str, float], what: str) -> Array:
-        told = parameter_values(self.system, values, what)
-        return told if self.system.time is None else np.array([real("t", t), *told])
+        numbers = parameter_values(self.system, values, what)
+        return numbers if self.system.time is None else np.array([real("t", t), *numbers])
 
     def _mass(self, q: ArrayLike, other: ArrayLike, name: str, t: float, values: dict[str, float]) -> Any:
         n = len(self.coordinates)
@@ -291,11 +284,11 @@ class Hamiltonian:
         idle = [q.name for q, x in zip(s.coordinates, force, strict=True) if q not in s.inputs and x]
         if idle:
             raise InputError(f"tau: {s.name} has no input along {', '.join(idle)}; add forces={{{idle[0]}: tau}} to it")
-        told, timed = parameter_values(s, values, "field"), s.time is not None
+        numbers, timed = parameter_values(s, values, "field"), s.time is not None
 
         def f(t: float, y: ArrayLike) -> Array:
             y = rows("y", y, 2 * n, s.name, "nq + nv")
-            behind = np.concatenate([acting, [real("t", t)] if timed else [], told])
+            behind = np.concatenate([acting, [real("t", t)] if timed else [], numbers])
             return self._rates(y[..., :n], y[..., n:], behind)[..., 0]
 
         return f
@@ -305,12 +298,6 @@ class Hamiltonian:
     def latex(self) -> str:
         """Return H = ... ."""
         return f"H = {ExpressionPrinter(self.coordinates, self.momenta, time=self.system.time).latex(self.H)}"
-
-    def _repr_latex_(self) -> str:
-        return f"${self.latex()}$"
-
-    def __repr__(self) -> str:
-        return f"<Hamiltonian: {one_line(str(self))}>"
 
     def __str__(self) -> str:
         return terminal(f"H = {self.H}")

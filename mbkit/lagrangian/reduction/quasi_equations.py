@@ -33,7 +33,7 @@ from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
 __all__ = ["QuasiEquationsOfMotion", "in_quasi_velocities", "quasi_equations"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class QuasiEquationsOfMotion(EquationsOfMotion):
     """M ẇ + C w + d + Dᵀ ∂V/∂q = Dᵀ Q, with q̇ = D w.
 

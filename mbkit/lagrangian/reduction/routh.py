@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from mbkit._check import Array, finite_array, real, require_finite, rows
-from mbkit._escape import one_line, terminal
+from mbkit._escape import terminal
 from mbkit.codegen.interpreter import Machine
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
@@ -34,7 +34,7 @@ from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.energy_model import EnergyModel
-from mbkit.lagrangian.printer import ExpressionPrinter
+from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction.hamilton import momentum_symbols
 from mbkit.lagrangian.trig.simplify import tidy
 
@@ -58,8 +58,8 @@ class ReducedState(NamedTuple):
     values: dict[str, Any]
 
 
-@dataclass(frozen=True, eq=False)
-class Routhian(Generic[FormT]):
+@dataclass(frozen=True, eq=False, repr=False)
+class Routhian(Printable, Generic[FormT]):
     """A system less its cyclic coordinates; made by `Lagrangian.routhian`.
 
     Attributes
@@ -124,12 +124,12 @@ class Routhian(Generic[FormT]):
         """
         s, n = self.system, len(self.system.coordinates)
         q, v = rows("q", q, n, s.name, "nq"), rows("v", v, n, s.name, "nv")
-        told = parameter_values(s, values, "reduce")
-        behind = told if s.time is None else np.array([real("t", t), *told])
+        numbers = parameter_values(s, values, "reduce")
+        behind = numbers if s.time is None else np.array([real("t", t), *numbers])
         p = self._momenta(q, v, behind)[..., 0]
         kept, _ = self._places
-        found = {x.name: p[..., k] if p.ndim > 1 else float(p[k]) for k, x in enumerate(self.momenta)}
-        return ReducedState(q[..., kept].copy(), v[..., kept].copy(), found)
+        momenta = {x.name: p[..., k] if p.ndim > 1 else float(p[k]) for k, x in enumerate(self.momenta)}
+        return ReducedState(q[..., kept].copy(), v[..., kept].copy(), momenta)
 
     def reconstruct(self, run: Any, q0: ArrayLike, **values: float) -> Motion:
         """Return the motion of the whole system, with the ignored coordinates by quadrature.
@@ -167,15 +167,8 @@ class Routhian(Generic[FormT]):
         whole, s = self.system, self.lagrangian
         board = ExpressionPrinter(whole.coordinates, whole.velocities, tuple(self.momenta), time=whole.time)
         named = dict(zip(whole.coordinates, whole.velocities, strict=True))
-        told = [(sp.Symbol("R"), s.L), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
-        lines = (f"{board.latex(left)} &= {board.latex(right)}" for left, right in told)
-        return "\\begin{aligned}" + r" \\ ".join(lines) + "\\end{aligned}"
-
-    def _repr_latex_(self) -> str:
-        return f"${self.latex()}$"
-
-    def __repr__(self) -> str:
-        return f"<Routhian: {one_line(str(self))}>"
+        pairs = [(sp.Symbol("R"), s.L), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
+        return aligned((board.latex(left), board.latex(right)) for left, right in pairs)
 
     def __str__(self) -> str:
         named = dict(zip(self.system.coordinates, self.system.velocities, strict=True))
@@ -235,7 +228,7 @@ def _quadratic(M: Any, v: list[sp.Symbol]) -> sp.Expr:
 
 def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
     free = system.cyclic_coordinates()
-    found = system.forced_cyclic_coordinates() | dict.fromkeys(free, sp.Integer(0))
+    ignorable = system.forced_cyclic_coordinates() | dict.fromkeys(free, sp.Integer(0))
     if cyclic is None:
         wanted: Iterable[Any] = free
     else:
@@ -246,14 +239,16 @@ def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
         q = by_name.get(name_of(given))
         if q is None:
             raise InputError(f"cyclic: {given} is no coordinate; the coordinates are {', '.join(by_name)}")
-        if q not in found:
+        if q not in ignorable:
             raise InputError(f"cyclic: L holds {q}; cyclic are {plain(free) or 'none'}")
         if q not in free:
-            raise InputError(f"cyclic: L does not hold {q}, but the force {found[q]} acts along it, so p_{q} changes")
+            raise InputError(
+                f"cyclic: L does not hold {q}, but the force {ignorable[q]} acts along it, so p_{q} changes"
+            )
         if q not in out:
             out.append(q)
     if not out:
-        forced = "; ".join(f"{q} is in no energy, but {x} acts along it" for q, x in found.items() if x != 0)
+        forced = "; ".join(f"{q} is in no energy, but {x} acts along it" for q, x in ignorable.items() if x != 0)
         raise InputError(f"cyclic: no coordinate of {system.name} can be ignored" + (f": {forced}" if forced else ""))
     if len(out) == len(system.coordinates):
         raise InputError(
@@ -285,9 +280,9 @@ def _dissipation(system: EnergyForm, ignored: list[sp.Symbol], put: Mapping[sp.S
 
 
 def _need_not(ignored: list[sp.Symbol], x: sp.Expr, what: str) -> None:
-    told = x.free_symbols & set(ignored)
-    if told:
-        raise InputError(f"cyclic: {what} holds {plain(told)}, which can therefore not be ignored")
+    held = x.free_symbols & set(ignored)
+    if held:
+        raise InputError(f"cyclic: {what} holds {plain(held)}, which can therefore not be ignored")
 
 
 # The ignored coordinates of a reduced motion, by quadrature along it.
@@ -355,15 +350,15 @@ def _read(routhian: Routhian[Any], run: Any, values: Mapping[str, float]) -> tup
         raise InputError("run: expected one trajectory, got a batch; reconstruct them one by one")
     require_finite("run: t", t)
     q, v = (finite_array(f"run: {name}", x, (len(t), model.nq)) for name, x in (("q", q), ("v", v)))
-    told = {**model.parameters, **{n: x for n, x in held.items() if n in model.parameters}}
+    numbers = {**model.parameters, **{n: x for n, x in held.items() if n in model.parameters}}
     for name, x in values.items():
-        if name not in told:
-            raise UnknownNameError("parameter", name, told)
-        told[name] = real(f"parameter {name!r}", x)
-    require_values(told, "reconstruct")
-    parameters = np.tile(np.array(list(told.values()), dtype=np.float64), (len(t), 1))
+        if name not in numbers:
+            raise UnknownNameError("parameter", name, numbers)
+        numbers[name] = real(f"parameter {name!r}", x)
+    require_values(numbers, "reconstruct")
+    parameters = np.tile(np.array(list(numbers.values()), dtype=np.float64), (len(t), 1))
     if model.time_parameter is not None:
-        parameters[:, list(told).index(model.time_parameter)] = t
+        parameters[:, list(numbers).index(model.time_parameter)] = t
     return t, q, v, parameters
 
 
@@ -402,8 +397,8 @@ def _increments(routhian: Routhian[Any], t: Array, q: Array, v: Array, parameter
     model = routhian._model
     equations = EnergyEquations(model, routhian.lagrangian)
     forward = ca.substitute(equations.forward_dynamics, equations.tau, ca.SX.zeros(model.nv))
-    given = [equations.q, equations.v, equations.parameters]
-    machine = Machine(ca.Function("reduced", given, [ca.densify(forward)], {"cse": True}))
+    arguments = [equations.q, equations.v, equations.parameters]
+    machine = Machine(ca.Function("reduced", arguments, [ca.densify(forward)], {"cse": True}))
     clock = None if model.time_parameter is None else list(model.parameters).index(model.time_parameter)
     r, behind = model.nq, parameters[:-1].copy()
 

@@ -150,11 +150,11 @@ class Equilibrium:
             object.__setattr__(self, name, array)
 
     @property
-    def _told(self) -> str:
+    def _verdict(self) -> str:
         return {True: "stable", False: "unstable", None: "stability not decided by small motions"}[self.stable]
 
     def __str__(self) -> str:
-        lines = [f"{self.name}: equilibrium, {self._told}; residual {self.residual:.2g}"]
+        lines = [f"{self.name}: equilibrium, {self._verdict}; residual {self.residual:.2g}"]
         lines += [f"  {n} = {x:.9g}" for n, x in zip(self.coordinates, self.q, strict=True)]
         lines += [f"  tau of {n} = {x:.9g}" for n, x in zip(self.velocities, self.tau, strict=True) if x]
         lines += [f"  lambda{k + 1} = {x:.9g}" for k, x in enumerate(self.multipliers)]
@@ -163,7 +163,7 @@ class Equilibrium:
         return terminal("\n".join(lines))
 
     def _repr_html_(self) -> str:
-        head = f"<p><b>{html(self.name)}</b>: equilibrium, {self._told}; residual {self.residual:.2g}</p>"
+        head = f"<p><b>{html(self.name)}</b>: equilibrium, {self._verdict}; residual {self.residual:.2g}</p>"
         rows = [(n, f"{x:.9g}") for n, x in zip(self.coordinates, self.q, strict=True)]
         rows += [(f"τ of {n}", f"{x:.9g}") for n, x in zip(self.velocities, self.tau, strict=True) if x]
         rows += [(f"λ{k + 1}", f"{x:.9g}") for k, x in enumerate(self.multipliers)]
@@ -246,7 +246,7 @@ def equilibrium(
     if holding is not None:
         q = dyn.model.check_q(finite_array("holding", holding, (dyn.model.nq,)), "holding")
         balance.check_constraints(q)
-        return _told(balance, q, *balance.held(q))
+        return _equilibrium_at(balance, q, *balance.held(q))
     tau = np.zeros(dyn.model.nv) if tau is None else finite_array("tau", tau, (dyn.model.nv,))
     if q0 is not None:
         starts = [balance.allowed(dyn.model.check_q(finite_array("q0", q0, (dyn.model.nq,)), "q0"))]
@@ -256,11 +256,11 @@ def equilibrium(
         # From the neutral configuration there need be no way to the constraints.
         starts[:0] = [] if dyn.model.constrained else [dyn.model.neutral()]
     q, multipliers = find_equilibrium(balance, starts, tau)
-    return _told(balance, q, tau, multipliers)
+    return _equilibrium_at(balance, q, tau, multipliers)
 
 
-def _told(balance: Balance, q: Array, tau: Array, multipliers: Array) -> Equilibrium:
-    """Return what was found, with the small motions about it."""
+def _equilibrium_at(balance: Balance, q: Array, tau: Array, multipliers: Array) -> Equilibrium:
+    """Return the equilibrium with the small motions about it."""
     balance.require_independent(q)
     if balance.changes(q, tau, multipliers):
         # Mathieu's equation and its kind: no instant says whether the whole motion stays small.

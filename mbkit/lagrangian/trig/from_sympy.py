@@ -163,11 +163,11 @@ class _Reading:
         written = root if root in self._powers else 1 / x.base
         generator = self._powers[written]
         if generator not in self._known:
-            made = _Power(x.base, written == root, self._read(x.base))
+            power = _Power(x.base, written == root, self._read(x.base))
             # The same may be written in several ways.
-            twins = (g for g, p in self._known.items() if p.root == made.root and p.sum.terms == made.sum.terms)
+            twins = (g for g, p in self._known.items() if p.root == power.root and p.sum.terms == power.sum.terms)
             generator = self._powers[written] = next(twins, generator)
-            self._known.setdefault(generator, made)
+            self._known.setdefault(generator, power)
         return self._space.power(generator, int(2 * x.exp) if written == root else -int(x.exp))
 
     # Writing

@@ -83,8 +83,8 @@ def _gather(out: Form, key: FormKey, value: Fraction) -> None:
 def combine_angles(x: TrigPolynomial) -> Iterator[TrigPolynomial]:
     """Yield a sum with an angle more, such as θ₁ - θ₂, where twice that angle stands in it."""
     space = x.space
-    found = dict.fromkeys(_direction(key[1]) for key in x.terms if gcd(*key[1]) > 1 and sum(map(bool, key[1])) > 1)
-    for direction in list(found)[:_COMBINED]:
+    directions = dict.fromkeys(_direction(key[1]) for key in x.terms if gcd(*key[1]) > 1 and sum(map(bool, key[1])) > 1)
+    for direction in list(directions)[:_COMBINED]:
         angle = sp.Add(*(k * a for k, a in zip(direction, space.angles, strict=True)))
         # SymPy writes sin(b - a) as -sin(a - b).
         sign = -1 if sp.sin(angle).is_Mul else 1
@@ -129,8 +129,8 @@ def product(poly: Poly, x: sp.Expr) -> list[sp.Expr]:
             for atoms, v in poly.items()
         )
     )
-    found = sp.factor(named)
-    return [] if found.is_Add else [found.xreplace({symbol: a for a, symbol in symbols.items()})]
+    factored = sp.factor(named)
+    return [] if factored.is_Add else [factored.xreplace({symbol: a for a, symbol in symbols.items()})]
 
 
 def _irreducible(poly: Poly) -> bool:

@@ -70,8 +70,8 @@ def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = Tru
     forms += [(other, form) for other in map(writer.like, combine_angles(x)) for form in other.squares()]
     forms.sort(key=lambda pair: len(pair[1]))
     near = [(w, form) for w, form in forms[:_TRIED] if len(form) <= len(forms[0][1]) + 2]
-    made = [w.expression(form) for w, form in near]
-    return min(made, key=lambda e: (complexity(e), made.index(e)))
+    candidates = [w.expression(form) for w, form in near]
+    return min(candidates, key=lambda e: (complexity(e), candidates.index(e)))
 
 
 class _Writer:
@@ -125,14 +125,14 @@ class _Writer:
         poly = paired(dict(self._term(key, value) for key, value in form.items()))
         by_angle = self._by_angle(poly)
         if not self._whole or len(by_angle) == len(poly):
-            made = [sp.Add(*map(self._written, by_angle))]
+            candidates = [sp.Add(*map(self._written, by_angle))]
         else:
             shared, scale, left = content(poly)
             inside = sp.Add(*map(self._written, self._by_angle(left)))
-            made = [sp.Mul(self._number(scale), *(a**e for a, e in shared), inside)]
+            candidates = [sp.Mul(self._number(scale), *(a**e for a, e in shared), inside)]
         if self._whole:
-            made.append(self._written(poly))
-        return min(made, key=lambda e: (complexity(e), made.index(e)))
+            candidates.append(self._written(poly))
+        return min(candidates, key=lambda e: (complexity(e), candidates.index(e)))
 
     def _by_angle(self, poly: Poly) -> list[Poly]:
         """Return the terms of each cosine and sine."""
