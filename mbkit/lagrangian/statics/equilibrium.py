@@ -20,8 +20,7 @@ from mbkit._check import Array, finite_array
 from mbkit._escape import html, terminal
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError, NumericalError
-from mbkit.lagrangian.statics.force_balance import BALANCED, Balance
-from mbkit.lagrangian.statics.small_motion import SmallMotion
+from mbkit.lagrangian.statics.force_balance import BALANCED, Balance, SmallMotion
 from mbkit.lagrangian.system import Lagrangian
 
 __all__ = ["Equilibrium", "equilibrium", "find_equilibrium"]
