@@ -1,6 +1,6 @@
-"""Mechanics on paper, and the own derivation's expressions and C code to take out.
+"""Mechanics on paper, and the expressions and C code of mbkit's own derivation.
 
-What is written with SymPy loads when it is first used.
+Modules that need SymPy load at their first use.
 """
 
 from __future__ import annotations

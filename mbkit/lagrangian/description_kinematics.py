@@ -38,12 +38,12 @@ _FIELDS: Final = {
     "couplings": ("factors", "armature"),
     "loops": ("rotation_a", "translation_a", "rotation_b", "translation_b"),
 }
-#: What rounded rotations leave of a term that is zero.
+#: Relative size of a zero term that rounded rotations leave.
 _DUST: Final = Fraction(1, 10**15)
 
 
 def instead_of_writing(model: Model) -> str:
-    """Return what computes a model that is too large to be written out, for a message."""
+    """Return the advice of a message for a model that is too large to be written out."""
     features = [f for f in ("loops", "prescribed") if getattr(model, f)]
     if not features:
         return 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
@@ -301,7 +301,7 @@ class SymbolicKinematics:
         return [self._back(x) for x in self._q[joint.name]]
 
     def written(self, where: str, part: Any, field: str, *index: int) -> sp.Expr:
-        """Return a number as it is shown, for what is written down as it stands."""
+        """Return a number of a part as the equations show it."""
         x = self.value(where, part.name, field, part, *index)
         return number(Fraction(int(x.p), int(x.q))) if x.is_Rational else self._back(x)
 
@@ -387,7 +387,7 @@ def motion(kin: SymbolicKinematics, given: Prescribed, t: sp.Symbol) -> sp.Expr:
 
 
 def angle(x: float) -> sp.Expr:
-    """Return a number as people write an angle: a twelfth of π, and its multiples, where it is one to rounding."""
+    """Return an angle, as a multiple of π/12 where it is one to rounding."""
     twelfths = round(12 * x / pi)
     if abs(x - twelfths * pi / 12) <= 2 * _EPS * abs(x):
         return sp.Rational(twelfths, 12) * sp.pi
@@ -400,18 +400,17 @@ def _read(x: sp.Expr) -> sp.Expr:
 
 # Loop closures of a model as holonomic constraints, in SymPy.
 #
-# Both ends are written in the axes of the body that carries both, the last one that their ways to
-# the ground share. So only the joints of the loop stand in the rows, and a mechanism in a plane has
-# no row across it, whatever carries the plane. Rows that say nothing of their own are left out.
+# Both ends are written in the axes of the last body that their ways to the ground share. So the rows hold the joints of
+# the loop only, and a plane mechanism has no row across its plane. Dependent rows are left out.
 
-#: Of the largest coefficient: what rounded rotations leave where one row is made of the others.
+#: Remainder that rounded rotations leave of a dependent row, relative to the largest coefficient.
 _DEPENDENT: Final = 1e-12
 #: Of the largest number, or rad: what a few typed digits leave where ends can meet.
 _MEETS: Final = 1e-9
 
 
 def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
-    """Return what is zero where a loop is closed.
+    """Return expressions that are zero where a loop is closed.
 
     Of points, and of the frames' origins: r_a - r_b, three rows or those that are independent, so that their
     multipliers are the force on body a. Of orientations, where all axes in the loop are parallel:

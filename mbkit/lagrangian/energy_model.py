@@ -38,11 +38,11 @@ def energies_latex(form: EnergyForm) -> str:
     return f"$T = {board.latex(form.T)},\\quad V = {board.latex(form.V)}$"
 
 
-# Bodies and joints for a model of which nothing but its coordinates is known.
+# Bodies and joints of a model that has coordinates only
 
 
 def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint, ...]]:
-    """Return what gives a model coordinates of these names, and nothing else."""
+    """Return massless bodies and prismatic joints of these names."""
     # One coordinate a joint, each on the one before: the pattern of a full mass matrix.
     joints = tuple(_coordinate(name, before) for name, before in zip(names, ["world", *names], strict=False))
     return tuple(_massless(name) for name in names), joints
@@ -75,7 +75,7 @@ def _massless(name: str) -> Body:
     return Body(name=name, mass=0.0, com=np.zeros(3), inertia=np.zeros((3, 3)))
 
 
-#: Random states that are tried, of which each may be too far from the constraints.
+#: Random states that are drawn, each of which may be too far from the constraints.
 _DRAWS = 50
 
 
@@ -148,12 +148,12 @@ class EnergyModel(Model):
 
     @property
     def mass(self) -> float:
-        """Not known: energies do not tell."""
+        """Unknown for energies."""
         raise UnsupportedError(f"mass: {self.name} was written as energies and has no bodies")
 
     @cached_property
     def needs(self) -> Needs:
-        """Damping where a force or dissipation stands; energies tell nothing else apart."""
+        """Damping where there is a force or dissipation; energies do not separate other features."""
         s = self.form
         flags = dict.fromkeys(Needs.__dataclass_fields__, False)
         return Needs(**{**flags, "damping": any(x != 0 for x in (s.dissipation, *s.forces))})
@@ -198,7 +198,7 @@ class EnergyModel(Model):
         return EnergyModel(self.form.substituted(numbers))
 
     def without(self, *features: str) -> Model:
-        """Return the same system less its damping; energies do not tell what else there is."""
+        """Return the same system less its damping; energies do not separate other features."""
         if set(features) == {"damping"}:
             return EnergyModel(self.form.conservative())
         raise UnsupportedError(

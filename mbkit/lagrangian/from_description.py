@@ -1,4 +1,4 @@
-"""A model's equations to read: its energies in SymPy, its loops as constraints, and what is moved in time."""
+"""A model as a `Lagrangian`: energies in SymPy, loops as constraints, prescribed coordinates as functions of time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mbkit.model import Model
 
 __all__ = ["from_model"]
 
-#: Velocities up to which anybody reads a matrix.
+#: Velocities up to which equations are written out.
 _MOST: Final = 24
 #: The same with loops or motions in time. A row of 40 four-bars has 81 coordinates.
 _MOST_BOUND: Final = 100
@@ -64,7 +64,7 @@ def from_model(
     Raises
     ------
     UnsupportedError
-        Ball or free joints, more terms than anybody reads, or no coordinate that is left to move.
+        Ball or free joints, too many terms to read, or no coordinate that is left to move.
     InputError
         `symbols` asked for of a model that is no system of the catalog, names that do not fit, or
         a loop whose ends never meet or do not move against each other.

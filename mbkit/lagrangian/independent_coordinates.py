@@ -32,10 +32,8 @@ from mbkit.model import Model
 __all__ = ["SINGULAR", "Chart", "Embedded", "EmbeddedDynamics", "ReducedModel"]
 
 
-# The equation on the independent coordinates of one chart; see `mbkit.lagrangian.independent_coordinates`.
-
 _MOST: Final = 25
-#: Places from which the next one is sought: more than a step has stages.
+#: Places from which the next one is searched: more than a step has stages.
 _PLACES: Final = 32
 # Beyond such a change of J, relative to its size, Newton's iteration may end on another
 # branch; a link that turns by half a radian changes it by half.
@@ -125,7 +123,7 @@ class EmbeddedDynamics(Dynamics):
         return out
 
     def remember(self, q: Array) -> None:
-        """Take a consistent configuration as the place from which the next one is sought.
+        """Take a consistent configuration as the place from which the next one is searched.
 
         Raises
         ------
@@ -162,7 +160,7 @@ class EmbeddedDynamics(Dynamics):
             size = float(np.abs(step).max())
             if not np.isfinite(size):
                 break
-            # The iteration squares what is left.
+            # The iteration squares the error.
             if size <= _SOLVED * (1 + float(np.abs(q).max())):
                 if self._sign(J) != memory.sign:
                     # On the other side of a singular pose another branch begins.
@@ -209,7 +207,7 @@ class EmbeddedDynamics(Dynamics):
         return N, drift
 
     def _reduced(self, u: Array, w: Array) -> tuple[Array, Array, Array]:
-        """Return N, Nᵀ M N and what stands on the right without τ."""
+        """Return N, Nᵀ M N and the right side without τ."""
         q = self.configuration(u)
         N, drift = self._null(q)
         J, _, gamma, M, force = self._manifold.call("embedded", q, N @ w + drift)
@@ -272,7 +270,7 @@ class Embedded:
     ----------
     manifold : Manifold
     independent : tuple of str, optional
-        A choice that stays; else the best one, chosen anew when it no longer is.
+        A fixed choice; else the best one, chosen again when it no longer is.
 
     Attributes
     ----------

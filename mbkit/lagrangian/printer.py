@@ -67,7 +67,7 @@ class ExpressionPrinter:
     # Order
 
     def _rank(self, x: sp.Expr) -> tuple[Any, ...]:
-        """Return what a factor is ordered by: its kind, its place among the coordinates, what is Greek, its name."""
+        """Return a factor's sort key: its kind, its place among the coordinates, whether it is Greek, its name."""
         base = x.base if x.is_Pow and x.exp.is_number else x
         if base.is_Number:
             return (0, 0, False, "")
@@ -87,7 +87,7 @@ class ExpressionPrinter:
         return (11, 0, False, str(base))
 
     def _place(self, x: sp.Expr) -> tuple[int, str]:
-        """Return what the argument of a function is ordered by: how many coordinates stand in it, and which."""
+        """Return the sort key of a function's argument: how many coordinates it holds, and which."""
         order = list(self._moving)
         places = sorted(order.index(s) if s in self._moving else -1 for s in x.free_symbols)
         return len(places), " ".join(f"{k:4d}" for k in places) + str(x)
@@ -122,7 +122,7 @@ class ExpressionPrinter:
         return self.text_of([sp.sympify(x)])
 
     def text_of(self, parts: Iterable[sp.Expr]) -> str:
-        """Return a sum on one line, each part of which is ordered by itself."""
+        """Return a sum on one line, each part in its own order."""
         return self._joined(self._terms(parts))
 
     def _terms(self, parts: Iterable[sp.Expr]) -> list[sp.Expr]:
@@ -193,7 +193,7 @@ class ExpressionPrinter:
         return self.latex_of([sp.sympify(x)])
 
     def latex_of(self, parts: Iterable[sp.Expr]) -> str:
-        """Return a sum in LaTeX, each part of which is ordered by itself."""
+        """Return a sum in LaTeX, each part in its own order."""
         return self._latex(self._terms(parts))
 
     def _latex(self, terms: list[sp.Expr]) -> str:
@@ -217,7 +217,7 @@ class ExpressionPrinter:
 
 
 class _Latex(LatexPrinter):  # type: ignore[misc]
-    """SymPy's, with ½ before what it halves, and with names that are no TeX."""
+    """SymPy's printer, with ½ in front of a product, and with names that are not TeX escaped."""
 
     def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
         return latex(expr.name, lambda name: str(super(_Latex, self)._print_Symbol(sp.Symbol(name), style)))
@@ -337,7 +337,7 @@ def folded(text: str, width: int) -> list[str]:
 
 # Letters for roots that an equation holds in many places: ρ = √(l² - r² sin² θ).
 
-#: Operations of a root, and how often it stands somewhere, from which a letter is worth it.
+#: A root gets a letter from this many operations and occurrences on.
 _LONG: Final = 4
 _OFTEN: Final = 3
 

@@ -1,4 +1,4 @@
-"""`Lagrangian`: a system written down as energies, and all that mechanics says about it."""
+"""`Lagrangian`: a system of energies T and V, its equations, reductions and dynamics."""
 
 from __future__ import annotations
 
@@ -114,14 +114,14 @@ class Lagrangian(EnergyForm):
         """Return the equation of motion, frozen: its matrices, and `latex()` and `explicit()`."""
         return self._equations
 
-    # What it keeps, and other forms of it
+    # Conserved quantities, and other forms
 
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return p = ∂L/∂v of each cyclic coordinate, by coordinate."""
         return conserved.conserved_momenta(self)
 
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
-        """Return what is constant along every motion: those momenta, and the energy or Jacobi's integral."""
+        """Return the constants of every motion: those momenta, and the energy or Jacobi's integral."""
         return conserved.conserved_quantities(self, self.conserved_momenta(), self.energy_function, self.velocities)
 
     @property
@@ -322,12 +322,11 @@ class Lagrangian(EnergyForm):
 
 
 class QuasiLagrangian(Lagrangian):
-    """A system in quasi-velocities; made by `Lagrangian.quasi_velocities`.
+    """A system in quasi-velocities, the result of `Lagrangian.quasi_velocities`.
 
     It reads and runs as a `Lagrangian` does, with the velocities w: states are (q, w), and
-    ``tau`` is the force on each w, Dᵀ times that on each coordinate (`to_force`). What only
-    coordinates' rates have, momenta of cyclic coordinates, Routh's and Hamilton's functions,
-    are those of `system`.
+    ``tau`` is the force on each w, Dᵀ times that on each coordinate (`to_force`). Momenta of
+    cyclic coordinates, Routh's and Hamilton's functions need coordinates' rates and are those of `system`.
 
     Attributes
     ----------
@@ -381,7 +380,7 @@ class QuasiLagrangian(Lagrangian):
         """Return the system in other quasi-velocities u, with q̇ = D u again."""
         return QuasiLagrangian(self.system, D, names)
 
-    # What coordinates' rates alone have
+    # Reductions in coordinates' rates
 
     def cyclic_coordinates(self) -> tuple[sp.Symbol, ...]:
         """Return those of `system`."""
@@ -397,7 +396,7 @@ class QuasiLagrangian(Lagrangian):
         return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
 
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
-        """Return what is constant along every motion, in quasi-velocities."""
+        """Return the constants of every motion, in quasi-velocities."""
         return conserved.conserved_quantities(
             self.system, self.conserved_momenta(), self.energy_function, self.velocities
         )

@@ -121,7 +121,7 @@ class Manifold:
         """Return the states at a time."""
         return Manifold(at_time(self.dyn, t)) if self.dyn.model.time_parameter else self
 
-    # What is compiled
+    # Compiled functions
 
     @property
     def equations(self) -> EnergyEquations:

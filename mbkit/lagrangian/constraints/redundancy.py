@@ -27,7 +27,7 @@ _STARTS: Final = 12
 #: Configurations near a pose at which J is evaluated too, and how far they are away, rad or m.
 _BESIDE: Final = 4
 _ASIDE: Final = 0.05
-#: Of a row's size: what is left of a row that follows from the others.
+#: Remainder of a row that follows from the others, relative to the row's size.
 _DEPENDENT: Final = 1e-7
 #: Of a row's size beside the pose: its slope where a square is nearly zero.
 _FLAT: Final = 1e-4

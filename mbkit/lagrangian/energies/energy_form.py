@@ -73,7 +73,7 @@ class EnergyForm:
         self.constraints = tuple(_row(into, f"constraints[{k}]", c) for k, c in enumerate(_rows(constraints)))
         self.coordinates, self.velocities = into.coordinates, into.velocities
         others = (self.T, self.V, self.dissipation, *self.constraints)
-        # Dynamicsymbols bring a time that need not enter by itself.
+        # The time of dynamicsymbols need not enter by itself.
         self.time = into.time if any(into.time in x.free_symbols for x in (*others, *acting.values())) else None
         moving = {*self.coordinates, *self.velocities, *([self.time] if self.time else [])}
         self.inputs = _inputs(acting, moving | set(self.parameters), others)
@@ -116,7 +116,7 @@ class EnergyForm:
 
     @cached_property
     def _ignorable(self) -> dict[sp.Symbol, sp.Expr]:
-        """Each coordinate that L does not hold -> what acts along it beside V, constraints with their λ included."""
+        """Each coordinate that L does not hold -> the force along it beside V's, constraints with their λ included."""
         multipliers = list(zip(self.multiplier_symbols, self.constraints, strict=True))
         forces = {
             q: tidy(x + sum((sp.diff(f, q) * symbol for symbol, f in multipliers), sp.Integer(0)))
@@ -301,7 +301,7 @@ def _rows(given: Any) -> Sequence[Any]:
 
 
 def _row(into: PlainSymbols, what: str, given: Any) -> sp.Expr:
-    """Return what is zero; of an equation its left side less its right side."""
+    """Return f of f = 0; of an equation its left side less its right side."""
     if isinstance(given, sp.Equality):
         return into(what, given.lhs) - into(what, given.rhs)
     return into(what, given)
@@ -320,7 +320,7 @@ def _inputs(
 
 
 def _parts(d: EnergyForm) -> dict[str, sp.Expr]:
-    """Return every expression by what it is called in a message."""
+    """Return every expression by its name in messages."""
     out = {"T": d.T, "V": d.V, "dissipation": d.dissipation}
     out |= {f"forces[{q}]": x for q, x in zip(d.coordinates, d.forces, strict=True)}
     return out | {f"constraints[{k}]": x for k, x in enumerate(d.constraints)}
@@ -358,7 +358,7 @@ def _check_declared(d: EnergyForm) -> None:
 
 
 def _check_velocities(d: EnergyForm) -> None:
-    """Refuse velocities where there can be none, and what says nothing without one."""
+    """Refuse velocities in V and constraints, and expressions that hold no coordinate or velocity."""
     moving = set(d.velocities)
     for name, x in _parts(d).items():
         held = x.free_symbols & moving

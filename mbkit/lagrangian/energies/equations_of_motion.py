@@ -78,7 +78,7 @@ class EquationsOfMotion(Printable):
         return sp.ImmutableMatrix(out)
 
     def _rows(self) -> list[tuple[list[sp.Expr], sp.Expr]]:
-        """Return the terms of each left side in the order of a blackboard, and its right side."""
+        """Return the terms of each left side in the order of textbooks, and its right side."""
         right = self.forces
         if self.multipliers:
             right += self.constraint_jacobian.T * sp.Matrix(self.multipliers)
@@ -118,7 +118,7 @@ class EquationsOfMotion(Printable):
         return tuple(sp.Eq(a, shorter(x), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True))
 
     def latex(self) -> str:
-        """Return the equations as an aligned LaTeX block, in the order of a blackboard."""
+        """Return the equations as an aligned LaTeX block, in the order of textbooks."""
         board = ExpressionPrinter(self.coordinates, self.velocities, self.accelerations, self.multipliers)
         shown = (*self.mass_matrix, *self.coriolis_force, *self.drift, *self.potential_gradient, *self.forces)
         shown = (*shown, *self.constraints)
@@ -168,7 +168,7 @@ def printed_equations(
 
 
 def _by_speeds(x: sp.Expr, velocities: tuple[sp.Symbol, ...]) -> sp.Expr:
-    """Return what is quadratic in the velocities term by term, where that is shorter or frees cosines from brackets."""
+    """Return a form quadratic in the velocities term by term, where that is shorter or frees cosines from brackets."""
     moving = [v for v in velocities if x.has(v)]
     if len(moving) < 2 or not x.has(sp.sin, sp.cos):
         return x

@@ -78,7 +78,7 @@ def _moves(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
 
 
 def _at_rest(x: sp.Expr, velocities: Sequence[sp.Symbol], gained: sp.Expr) -> sp.Expr:
-    """Return an expression at rest; where it has no value there, at other velocities and less what it gains by them."""
+    """Return an expression at rest; where it has no value there, at other velocities less its gain."""
     n = len(velocities)
     for speeds in ((0,) * n, range(1, n + 1), range(2, 2 * n + 1, 2)):
         put = dict(zip(velocities, map(sp.Integer, speeds), strict=True))
@@ -89,7 +89,7 @@ def _at_rest(x: sp.Expr, velocities: Sequence[sp.Symbol], gained: sp.Expr) -> sp
 
 
 def _check(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> None:
-    """Refuse T where it is no polynomial of second degree, with the first term that is none either."""
+    """Refuse T that is not of second degree, with the first term that is not."""
     if _quadratic(T, velocities):
         return
     terms = sp.Add.make_args(sp.expand_mul(T) if T.count_ops() <= LARGE else T)
@@ -127,7 +127,7 @@ _SHOWN: Final = 200
 def require_inertia(
     M: sp.ImmutableMatrix, coordinates: Sequence[sp.Symbol], velocities: Sequence[sp.Symbol], constraints: Sequence[Any]
 ) -> None:
-    """Refuse a mass matrix that is singular everywhere, unless constraints bind what it leaves without mass.
+    """Refuse a mass matrix that is singular everywhere, unless constraints bind its massless directions.
 
     M + Jᵀ J has an inverse exactly where M v̇ - Jᵀ λ = f, J v̇ = -γ determines v̇.
 
@@ -304,7 +304,7 @@ def _tried(M: sp.ImmutableMatrix, what: str) -> list[_Inverse]:
 
 
 def _shorter(x: sp.Expr) -> sp.Expr:
-    """Return an expression tidied; one that nobody reads as it is."""
+    """Return an expression tidied; a long one as it is."""
     return tidy(x) if x.count_ops() <= _LONG else x
 
 

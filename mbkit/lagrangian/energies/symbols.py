@@ -1,4 +1,4 @@
-"""The symbols of mechanics on paper: coordinates, their velocities and accelerations, by name.
+"""Symbols of coordinates, velocities and accelerations, by name.
 
 Inside, a coordinate is a plain symbol and so is its velocity, so that ∂T/∂v is a plain
 derivative. `sympy.physics.mechanics.dynamicsymbols` and their derivatives are replaced
@@ -44,7 +44,7 @@ def acceleration_of(coordinate: sp.Symbol) -> sp.Symbol:
 def _dotted(symbol: sp.Symbol, dots: str) -> sp.Symbol:
     # SymPy's printers read the modifier from the name, before its digits and indices.
     stem, rest = re.fullmatch(r"(.*?)(_.*|\d*)", symbol.name, flags=re.S).groups()  # type: ignore[union-attr]
-    # What is positive changes with a velocity of any sign.
+    # A positive coordinate has velocities of any sign.
     return sp.Symbol(f"{stem}{dots}{rest}", **({"real": True} if symbol.is_real else {}))
 
 
@@ -56,7 +56,7 @@ def free_name(name: str, taken: Collection[str]) -> str:
 
 
 class PlainSymbols:
-    """What stands for what: dynamic symbols and their derivatives, and plain symbols.
+    """The plain symbols of coordinates, velocities and time, and their dynamicsymbols.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class PlainSymbols:
     coordinates, velocities, time
         As `Lagrangian` takes them.
     among : iterable of sympy.Symbol
-        Where velocities that are not given may stand already, by their names.
+        Symbols that velocities which are not given may have already, by their names.
     named : iterable of sympy.Symbol
         Others that are known by their names.
 
@@ -118,7 +118,7 @@ class PlainSymbols:
 
     def _velocities(self, given: Sequence[Any], velocities: Any, among: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
         if velocities is None:
-            # One of that name that stands there already may have assumptions of its own.
+            # A symbol of that name in T may have assumptions of its own.
             named = {s.name: s for s in among}
             own = [named.get(velocity_of(c).name, velocity_of(c)) for c in self.coordinates]
         else:
@@ -180,7 +180,7 @@ def by_name(x: Any, named: Mapping[str, sp.Symbol]) -> Any:
 
 
 def expression(what: str, given: Any, named: Mapping[str, sp.Symbol] = MappingProxyType({})) -> sp.Expr:
-    """Return a scalar SymPy expression, or say what came instead; text is read with the symbols of these names."""
+    """Return a scalar SymPy expression; text is read with the symbols of these names."""
     try:
         out = sp.sympify(given, locals=dict(named))
     except (sp.SympifyError, TypeError, AttributeError) as error:
@@ -221,7 +221,7 @@ def _differ(symbols: Sequence[sp.Symbol]) -> None:
 
 
 def fits(what: str, s: sp.Symbol) -> None:
-    """Refuse what is assumed of a symbol that moves, where that cannot be."""
+    """Refuse assumptions that a symbol of motion cannot have."""
     if not s.name.strip():
         raise InputError(f"{what}: expected symbols with names, got {s!r}")
     wrong = ["commutative"] if not s.is_commutative else []

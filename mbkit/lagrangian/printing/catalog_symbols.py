@@ -63,10 +63,10 @@ _SAME: Final = 1e-13
 
 
 def in_symbols(model: Model) -> Model | None:
-    """Return a catalog system with a parameter for each argument, at the values of a model; None if it is none.
+    """Return a catalog system with a parameter for each argument, at the values of a model; None of other models.
 
-    Nothing has to be known of how the model was made: a system of the same form is made with
-    parameters, its numbers are solved for theirs, and every number is compared.
+    It does not matter how the model was built: a system of the same form is built with
+    parameters, their values are solved from the model's numbers, and every number is compared.
     An argument of zero stays the number zero.
     """
     system = next((n for n in catalog.systems() if model.name == n or _numbered(model.name, n)), None)
@@ -158,7 +158,7 @@ def _usual(name: str) -> str:
 
 
 def _form(model: Model) -> Any:
-    """Return what a description has beside numbers."""
+    """Return a description's structure, without numbers."""
     joints = [(j.name, j.kind, j.parent, j.child, j.mimic is None) for j in model.joints]
     return (
         [b.name for b in model.bodies],
@@ -169,7 +169,7 @@ def _form(model: Model) -> Any:
 
 
 def _solved(symbolic: Model, model: Model) -> dict[str, float]:
-    """Return the values of parameters that give a model's numbers, as far as they can be told."""
+    """Return the values of parameters that give a model's numbers, as far as they follow from them."""
     values: dict[str, float] = {}
     # Frames move nothing, and a model may be without them.
     left = [(b.expression, _number(model, b)) for b in symbolic.bindings if b.where != "frames"]
@@ -182,7 +182,7 @@ def _solved(symbolic: Model, model: Model) -> dict[str, float]:
                 (name,) = unknown
                 at = [_evaluated(expression, {**values, name: x}) for x in (0.0, 1.0, 2.0)]
                 slope = at[1] - at[0]
-                # Only what is linear can be read off.
+                # Linear expressions only are solved.
                 if slope and np.isfinite(at).all() and abs(at[2] - at[1] - slope) <= 1e-9 * abs(slope):
                     values[name], progress = _rounded((target - at[0]) / slope), True
     return values

@@ -1,4 +1,4 @@
-"""All that is told of a system on one page: energies, matrices, equations, and what it keeps."""
+"""`SystemSummary`: energies, matrices, equations and conserved quantities of a system on one page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SystemSummary:
     ----------
     system : Lagrangian
     names : mapping of str to str, optional
-        What each coordinate was called where it came from.
+        Name of each coordinate in its model.
     progress : callable, optional
         Gets the fraction done and the part that is next.
     """
@@ -80,7 +80,7 @@ class SystemSummary:
 
     @cached_property
     def _matrices(self) -> dict[str, tuple[sp.ImmutableMatrix, str]]:
-        """Name -> matrix and what it is; of those that are not zero."""
+        """Name -> matrix and its meaning, of those that are not zero."""
         self._progress(0.0, "mass matrix and Coriolis matrix")
         e = self.equations
         out = {"M": (e.mass_matrix, "mass matrix")}
@@ -202,7 +202,7 @@ class SystemSummary:
         out["drift"] = [text(x) for x in e.drift]
         out["forces"] = [text(x) for x in e.forces]
         out["constraints"] = [text(x) for x in s.constraints]
-        # Each by itself: no letter is explained elsewhere.
+        # Each equation alone: no letter is explained elsewhere.
         plain = Abbreviations((), ())
         rows = [] if self.long else self._lines(plain, latex=True)
         out["equations"] = [] if self.long else [f"{text(x.lhs)} = {text(x.rhs)}" for x in e.equations()]

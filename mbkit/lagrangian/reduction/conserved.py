@@ -1,4 +1,4 @@
-"""What a system keeps: the momenta of cyclic coordinates, and Jacobi's integral.
+"""Conserved quantities: the momenta of cyclic coordinates, and Jacobi's integral.
 
 A coordinate is cyclic where L does not hold it. Its momentum p = ∂L/∂v is then constant,
 provided that no force, input, dissipation or constraint acts along it (Goldstein,
@@ -35,7 +35,7 @@ JACOBI: Final = "Jacobi's integral T2 - T0 + V, not the energy T + V"
 
 @dataclass(frozen=True, repr=False)
 class ConservedQuantity(Printable):
-    """What stays as it is along every motion.
+    """A constant of every motion.
 
     Attributes
     ----------

@@ -84,7 +84,7 @@ class CanonicalEquations(Printable):
     ----------
     coordinates, momenta : tuple of sympy.Symbol
     velocities, momentum_rates : tuple of sympy.Symbol
-        What stands on the left: q̇ and ṗ.
+        The left sides, q̇ and ṗ.
     qdot : (n, 1) sympy.Matrix
     pdot : (n, 1) sympy.Matrix
         With the generalized forces, in coordinates and momenta.
@@ -113,7 +113,7 @@ class CanonicalEquations(Printable):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Hamiltonian(Printable):
-    """H of a system and what it says; made by `Lagrangian.hamiltonian`.
+    """H of a system and its canonical equations, the result of `Lagrangian.hamiltonian`.
 
     Attributes
     ----------

@@ -60,7 +60,7 @@ class ReducedState(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Routhian(Printable, Generic[FormT]):
-    """A system less its cyclic coordinates; made by `Lagrangian.routhian`.
+    """A system less its cyclic coordinates, the result of `Lagrangian.routhian`.
 
     Attributes
     ----------
@@ -69,9 +69,9 @@ class Routhian(Printable, Generic[FormT]):
     lagrangian : Lagrangian
         The reduced one, whose parameters hold the constant momenta: to read, and to run.
     cyclic : tuple of sympy.Symbol
-        The coordinates that were ignored.
+        The ignored coordinates.
     momenta : mapping of sympy.Symbol to sympy.Expr
-        Symbol of each constant momentum -> what it is in the whole system's velocities.
+        Symbol of each constant momentum -> its expression in the whole system's velocities.
     rates : mapping of sympy.Symbol to sympy.Expr
         Ignored coordinate -> its velocity, in what remains.
     """
@@ -92,7 +92,7 @@ class Routhian(Printable, Generic[FormT]):
 
     @property
     def effective_potential(self) -> sp.Expr:
-        """Vₑ: V and what the constant momenta add."""
+        """Vₑ: V and the part of the constant momenta."""
         return self.lagrangian.V
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Statics by virtual work: where a system rests, what holds it there, and whether it stays.
+"""Statics by virtual work: configurations at rest, the forces that hold them, and their stability.
 
 No virtual displacement does work at rest::
 
@@ -59,7 +59,7 @@ def find_equilibrium(balance: Balance, starts: list[Array], tau: Array) -> tuple
 
 
 def _solved(balance: Balance, q: Array, tau: Array) -> tuple[Array, Array, float]:
-    """Return q, λ and what is left over, relative to what rounding would leave."""
+    """Return q, λ and the residual, relative to its rounding."""
     multipliers = balance.multipliers(q, tau)
     r = balance.residual(q, multipliers, tau)
     damping, size = 0.0, float(np.linalg.norm(r))
@@ -181,7 +181,7 @@ def equilibrium(
     forces: Mapping[str, ArrayLike] | None = None,
     seed: int = 0,
 ) -> Equilibrium:
-    """Return where a system rests under given forces, or what holds it where it is.
+    """Return where a system rests under given forces, or the forces that hold it in a configuration.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def equilibrium(
         Of any engine. The own derivation differentiates the forces exactly; of others
         differences are taken.
     q0 : (nq,) array_like, optional
-        Where to look from; the neutral configuration and then random ones when not given.
+        Start of the search; the neutral configuration and then random ones when not given.
     tau : (nv,) array_like, optional
         Generalized force that acts; zero when not given.
     holding : (nq,) array_like, optional

@@ -64,14 +64,14 @@ class Balance:
         return np.asarray(out)
 
     def scale(self, q: Array, tau: Array) -> float:
-        """Return how large the forces are that balance, so that rounding can be told from a residual."""
+        """Return the size of the forces that balance, which scales the residual's rounding."""
         sizes = [np.abs(tau).max(initial=0.0), np.abs(self.load(q)).max(initial=0.0)]
         # Where all is balanced, how the forces change over a unit of the coordinates.
         sizes.append(np.abs(self.stiffness(q)).max(initial=0.0))
         return float(max(*sizes, np.finfo(float).tiny))
 
     def residual(self, q: Array, multipliers: Array, tau: Array) -> Array:
-        """Return what is left over, (nv,) of forces and (m,) of constraints."""
+        """Return the residual, (nv,) of forces and (m,) of constraints."""
         left = self.load(q) - tau
         if not self.rows:
             return np.asarray(left)
@@ -205,7 +205,7 @@ class Balance:
         if isinstance(self.dyn, LagrangianDynamics):
             return np.asarray(self.dyn.inverse_dynamics_derivatives(q, self._zero, self._zero).v)
         zero, h = self._zero, 1.0
-        # Quadratic in v but for what is looked for, which central differences then give exactly.
+        # Central differences of a quadratic are exact.
         columns = [
             (self.dyn.inverse_dynamics(q, h * e, zero) - self.dyn.inverse_dynamics(q, -h * e, zero)) / (2 * h)
             for e in np.eye(self.model.nv)
@@ -229,7 +229,7 @@ class SmallMotion:
 
 
 def small_motion(M: Array, D: Array, K: Array, scale: float = 0.0) -> SmallMotion:
-    """Return the eigenvalues of a linear system and what they say.
+    """Return the eigenvalues of a linear system and its stability.
 
     Parameters
     ----------
@@ -237,8 +237,7 @@ def small_motion(M: Array, D: Array, K: Array, scale: float = 0.0) -> SmallMotio
         M may be singular, as of coordinates that move no mass there: those eigenvalues
         are left out.
     scale : float
-        How large K is round about, where that is more than here: what is rounding beside
-        it is taken for zero.
+        Size of K in the neighbourhood: entries that are rounding beside it count as zero.
 
     References
     ----------
@@ -260,7 +259,7 @@ _ROOT: Final = 1e-6
 
 
 def _cleaned(K: Array, scale: float) -> Array:
-    """Return K without what rounding left of directions that have no stiffness."""
+    """Return K with the rounding of directions without stiffness removed."""
     if not _symmetric(K) and np.abs(K).max() > _ZERO * scale:
         return K
     values, vectors = np.linalg.eigh((K + K.T) / 2)
@@ -310,5 +309,5 @@ def _symmetric(K: Array) -> bool:
 
 
 def _is_zero(D: Array, M: Array, K: Array) -> bool:
-    """Return whether D is nothing beside the geometric mean of what stands around it."""
+    """Return whether D is negligible beside the geometric mean of M and K."""
     return bool(np.abs(D).max() <= 1e-12 * np.sqrt(np.abs(M).max() * np.abs(K).max()))

@@ -1,4 +1,4 @@
-"""Generalized forces by virtual work: what given forces do along each coordinate."""
+"""Generalized forces by virtual work: the work of given forces along each coordinate."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def from_particles(
             V.append(-mass * sp.Add(*(a * x for a, x in zip(down, place, strict=True))))
     Q = {into("generalized", key): into(f"generalized[{key}]", x) for key, x in (generalized or {}).items()}
     for q, work in _work(forces or [], R, into).items():
-        # What is zero must not hide an input that stands alone.
+        # A zero must not hide an input that is a force of its own.
         if work != 0:
             Q[q] = Q.get(q, 0) + work
     return Lagrangian(

@@ -1,8 +1,7 @@
 """SymPy's expressions as exact sums of cosines and sines, and back in short forms.
 
-Roots, and what stands below a line, are generators of the sum; each knows the sum that it is a power of. So
-terms come over one denominator, even powers of a root become what is under it, and what divides is cancelled, all
-modulo sin² + cos² = 1 and without a search.
+Roots and denominators are generators of the sum, each with the sum that it is a power of. So terms come over one
+denominator, even powers of a root become its radicand, and common factors cancel, modulo sin² + cos² = 1.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ __all__ = ["forms", "shortened"]
 #: Products of terms that one expression may cost: about half a second.
 _MOST: Final = 40_000
 _HIGHEST: Final = 12
-#: Terms of a sum that anybody reads, and up to which quotients are put over one denominator.
+#: Terms of a readable sum, and up to which quotients are put over one denominator.
 _LONG: Final = 300
 _SHORT: Final = 60
 
-#: What is read as quotients of cosines and sines.
+#: Functions that are quotients of cosines and sines.
 _QUOTIENTS: Final[dict[Any, Callable[[sp.Expr], sp.Expr]]] = {
     sp.tan: lambda a: sp.sin(a) / sp.cos(a),
     sp.cot: lambda a: sp.cos(a) / sp.sin(a),
@@ -38,10 +37,10 @@ _QUOTIENTS: Final[dict[Any, Callable[[sp.Expr], sp.Expr]]] = {
 
 
 def shortened(x: sp.Expr) -> sp.Expr | None:
-    """Return a short form of a sum, with roots and denominators as they stand; None of what is long.
+    """Return a short form of a sum, with roots and denominators as they stand; None of a long one.
 
-    Cosines and sines of sums are combined, and cancel where they do: what
-    `sympy.trigsimp` searches for is found without a search.
+    Cosines and sines of sums are combined, and cancel where they do, without the search of
+    `sympy.trigsimp`.
     """
     try:
         return _Reading(x).as_it_stands()
@@ -50,7 +49,7 @@ def shortened(x: sp.Expr) -> sp.Expr | None:
 
 
 def forms(x: sp.Expr) -> list[sp.Expr]:
-    """Return short forms of an expression: as it stands, and over one denominator; none of what is long."""
+    """Return short forms of an expression: as it stands, and over one denominator; none of a long one."""
     out: list[sp.Expr] = []
     with suppress(UnsupportedError):
         reading = _Reading(x)
@@ -71,7 +70,7 @@ def _plain(x: sp.Expr) -> sp.Expr:
 
 @dataclass
 class _Power:
-    """What a generator stands for: a root of a sum, or one over it.
+    """The meaning of a generator: a root of a sum, or one over it.
 
     Attributes
     ----------
@@ -98,7 +97,7 @@ class _Power:
 
 
 class _Reading:
-    """An expression as a sum, and what its generators stand for."""
+    """An expression as a sum, with the meaning of its generators."""
 
     def __init__(self, x: sp.Expr) -> None:
         self._angles: dict[sp.Expr, None] = {}

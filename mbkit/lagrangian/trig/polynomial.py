@@ -26,19 +26,19 @@ Key = tuple[int, tuple[int, ...], tuple[int, ...]]
 
 
 class TrigRing:
-    """Angles and generators that a system's terms are made of.
+    """The angles and generators of a system's terms.
 
     Parameters
     ----------
     name : str
         The system's, for messages.
     angles, generators : sequence of sympy.Expr
-        What stands inside cosines and sines, and what coefficients are polynomials of: parameters, whatever
-        else is not a number, and coordinates.
+        Arguments of cosines and sines, and the variables of the coefficients: parameters, coordinates and other
+        expressions.
     most : int
         Products of terms that are not too many.
     instead : str
-        What to do where there are more, for the message.
+        Advice of the message where there are more.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class TrigRing:
 
 
 class TrigPolynomial:
-    """One sum; adds, multiplies and is asked for its terms. Numbers mix with it."""
+    """A sum of cosines and sines with polynomial coefficients; it adds and multiplies, also with numbers."""
 
     __slots__ = ("space", "terms")
 
@@ -216,7 +216,7 @@ def _rational(x: Fraction) -> sp.Rational:
 # generators with exponents of either sign. Such polynomials factor in one way only: whether one divides another is
 # found term by term, modulo sin² + cos² = 1 and without a search.
 
-#: Terms of a quotient that is worth having.
+#: Terms of a quotient that is useful.
 _MOST: Final = 400
 
 #: Exponents of the z's and the generators -> real and imaginary part.

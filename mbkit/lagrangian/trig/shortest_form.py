@@ -1,4 +1,4 @@
-"""Exact sums of cosines and sines as a teacher would write them: the shortest of several equal forms.
+"""The shortest of several equal forms of an exact sum of cosines and sines.
 
 A form has powers of the cosines and sines of single angles in place of multiples of angles: sin² θ for ½ - ½ cos 2θ.
 """
@@ -20,14 +20,14 @@ __all__ = ["complexity", "number", "shortest_form"]
 
 #: Terms up to which products of cosines and sines are looked for.
 _SMALL: Final = 60
-#: Forms of fewest terms that are made into SymPy's expressions, to count their operations.
+#: Forms of fewest terms whose operations are counted.
 _TRIED: Final = 4
 #: Terms up to which a sum is tried to be a product of sums.
 _FACTORED: Final = 10
 
 
 def complexity(x: sp.Expr) -> int:
-    """Return how long an expression reads: its operations, more for a sum that begins with a minus or stands deep."""
+    """Return the operations of an expression, more for a sum that begins with a minus or is nested deep."""
     sums = x.atoms(sp.Add)
     minus = sum(bool(e.could_extract_minus_sign()) for e in sums)
     return int(x.count_ops()) + minus + 2 * max(_depth(x) - 2, 0)
@@ -41,7 +41,7 @@ def _depth(x: sp.Expr) -> int:
 
 
 def number(x: Fraction) -> sp.Expr:
-    """Return a fraction where people write one: 1/2, 1/12; a decimal for 9.81 and what is longer."""
+    """Return a fraction such as 1/2 or 1/12, a decimal for 9.81 and longer numbers."""
     # A decimal that ends after few digits reads better as one, unless it is a half, a quarter or an eighth.
     ends = _without(_without(x.denominator, 2), 5) == 1
     if x.denominator in (1, 2, 4, 8) or (x.denominator <= 1000 and not ends):
@@ -166,7 +166,7 @@ class _Writer:
         return number(x) if self._decimals else sp.Rational(x.numerator, x.denominator)
 
     def _written(self, poly: Poly) -> sp.Expr:
-        """Return a polynomial with what its terms share taken out, most shared first."""
+        """Return a polynomial with the shared factors of its terms taken out, most shared first."""
         if len(poly) == 1:
             ((atoms, value),) = poly.items()
             return sp.Mul(self._number(value), *(a**e for a, e in atoms))
@@ -218,7 +218,7 @@ _COMBINED: Final = 2
 
 #: Powers (angle, of cos, of sin) of single angles.
 _Powers = tuple[tuple[int, int, int], ...]
-#: Those, the kind and multiples of what is left, exponents of the generators.
+#: Those, the kind and multiples of the rest, exponents of the generators.
 FormKey = tuple[_Powers, int, tuple[int, ...], tuple[int, ...]]
 Form = dict[FormKey, Fraction]
 
@@ -279,7 +279,7 @@ def _gather(out: Form, key: FormKey, value: Fraction) -> None:
 
 
 def combine_angles(x: TrigPolynomial) -> Iterator[TrigPolynomial]:
-    """Yield a sum with an angle more, such as θ₁ - θ₂, where twice that angle stands in it."""
+    """Yield a sum with one more angle, such as θ₁ - θ₂, where it holds twice that angle."""
     space = x.space
     directions = dict.fromkeys(_direction(key[1]) for key in x.terms if gcd(*key[1]) > 1 and sum(map(bool, key[1])) > 1)
     for direction in list(directions)[:_COMBINED]:
@@ -332,7 +332,7 @@ def product(poly: Poly, x: sp.Expr) -> list[sp.Expr]:
 
 
 def _irreducible(poly: Poly) -> bool:
-    """Return whether a sum is surely no product: what is Q a + R has no factor but those that Q and R share.
+    """Return whether a sum surely has no factors: those of Q a + R are the ones that Q and R share.
 
     At random whole numbers for the other atoms Q and R share no factor either, most of the time.
     """
@@ -357,7 +357,7 @@ def _irreducible(poly: Poly) -> bool:
 
 
 def content(poly: Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, Poly]:
-    """Return the powers and the number that all terms share, and what is left."""
+    """Return the powers and the number that all terms share, and the rest."""
     first, *others = (dict(atoms) for atoms in poly)
     powers = {a: [e, *(o.get(a, 0) for o in others)] for a, e in first.items()}
     # k/r² - p/r³ stays as it is.
@@ -366,7 +366,7 @@ def content(poly: Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, Poly]:
     scale = min(map(abs, values))
     if any(v.denominator > 1 or abs(v) > 100 for v in (x / scale for x in values)):
         scale = Fraction(gcd(*(v.numerator for v in values)), lcm(*(v.denominator for v in values)))
-        # Decimals share many numbers by accident; a common factor of a sum is read where it is a small one.
+        # Decimals share many numbers by accident; a common factor is useful where it is small.
         if scale.numerator > 100 or scale.denominator > 100:
             scale = Fraction(1)
     # ½ (2 a + b) reads worse than a + ½ b.

@@ -14,9 +14,9 @@ from mbkit.lagrangian.trig.shortest_form import complexity
 __all__ = ["LARGE", "gradient", "slope", "tidy", "tidy_matrix"]
 
 
-#: Operations up to which an expression is simplified unasked.
+#: Operations up to which an expression is simplified.
 LARGE: Final = 2000
-# Roots of cosines: what multiplies them is often better left as it was.
+# Roots of cosines: their factors often read better as they were.
 _WORTH: Final = 0.7
 
 
@@ -41,19 +41,19 @@ def tidy_matrix(x: Any) -> sp.ImmutableMatrix:
     return sp.ImmutableMatrix(x).applyfunc(tidy)
 
 
-# Derivatives that keep the products they are made of.
+# Derivatives that stay products
 
 #: Operations up to which the derivative is multiplied out too.
 _SMALL: Final = 60
-#: Operations up to which what stands in brackets is tidied.
+#: Operations up to which the contents of brackets are tidied.
 _LONG: Final = 150
 
 
 def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
     """Return ∂x/∂q, tidied: of a product of powers, what all terms share is in front.
 
-    A slider-crank's inertia m r² λ² sin² θ has the slope 2 m r² λ (λ cos θ + λ′ sin θ) sin θ, which nobody finds
-    again once it is multiplied out.
+    A slider-crank's inertia m r² λ² sin² θ has the slope 2 m r² λ (λ cos θ + λ′ sin θ) sin θ, a form that is lost
+    once it is multiplied out.
     """
     broken = [f for f in x.atoms(sp.Pow) if f.base.has(q) and (not f.exp.is_Integer or f.exp.is_negative)]
     if all(f.base.is_Symbol for f in broken):

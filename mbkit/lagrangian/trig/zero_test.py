@@ -1,7 +1,7 @@
-"""What is told of expressions by their values at random places, in a time that is bounded.
+"""Zero tests of expressions by their values at random places, in a time that is bounded.
 
-An expression that is zero by some identity need not look so, and `sympy.simplify` may search for the identity for
-ever. Its values say it: computed in more digits what is zero gets smaller, and what is not stays.
+`sympy.simplify` may search for an identity for ever. Values decide instead: with more digits the value of a zero gets
+smaller, and any other stays.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from numpy.random import default_rng
 
 __all__ = ["DIGITS", "RandomEvaluation", "is_zero"]
 
-#: That values have, and that they have where it is asked whether they are zero.
+#: Digits of values, and of the second evaluation of a zero test.
 DIGITS: Final = 30
 _MORE: Final = 60
-#: What is left of zero with the second number of digits, relative to what the first left.
+#: Remainder of zero at the second evaluation, relative to the first.
 _LESS: Final = 1e-15
-#: Beside terms of the order of 1 it is nothing at all.
+#: Negligible beside terms of the order of 1.
 _NOTHING: Final = 1e-50
 #: Places that must agree; more of them where signs decide.
 _PLACES: Final = 2
@@ -65,9 +65,9 @@ class RandomEvaluation:
 
 
 def is_zero(x: sp.Expr) -> bool:
-    """Return whether an expression is zero everywhere, whatever it looks like.
+    """Return whether an expression is zero everywhere.
 
-    What is put together of pieces may be zero in some of them: it is zero only where it says so itself.
+    A piecewise expression may be zero in some pieces only; it counts as zero where SymPy knows it.
     """
     if not x.free_symbols or x.is_zero is not None or x.has(sp.Piecewise, sp.Max, sp.Min):
         return bool(x == 0 or x.is_zero)
