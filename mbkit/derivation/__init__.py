@@ -3,15 +3,11 @@
 from mbkit.derivation.equations import (
     FUNCTIONS,
     Equations,
-    ForwardDynamicsDerivatives,
-    InverseDynamicsDerivatives,
     equations_of,
 )
 
 __all__ = [
     "FUNCTIONS",
     "Equations",
-    "ForwardDynamicsDerivatives",
-    "InverseDynamicsDerivatives",
     "equations_of",
 ]

@@ -15,12 +15,11 @@ same accelerations come from Gauss's principle (`mbkit.derivation.least_squares_
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import casadi as ca
 import numpy as np
 
-from mbkit._check import Array
 from mbkit.derivation import equations
 from mbkit.derivation import kinematics as energies
 from mbkit.derivation.conditioning import loses_digits
@@ -36,12 +35,9 @@ from mbkit.model.joint_types import cross3
 __all__ = [
     "FUNCTIONS",
     "Equations",
-    "ForwardDynamicsDerivatives",
-    "InverseDynamicsDerivatives",
     "equations_of",
     "forward_dynamics",
     "inverse_dynamics",
-    "through_inverse",
 ]
 
 
@@ -324,42 +320,6 @@ class Equations:
 #     ∂FD/∂q = -M⁻¹ ∂ID/∂q      ∂FD/∂v = -M⁻¹ ∂ID/∂v      ∂FD/∂τ = M⁻¹
 
 
-class InverseDynamicsDerivatives(NamedTuple):
-    """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv).
-
-    Attributes
-    ----------
-    q : array
-        ∂τ/∂q along the manifold: column k is that of q ⊕ t e_k.
-    v : array
-        ∂τ/∂v.
-    a : array
-        ∂τ/∂a, the mass matrix.
-    """
-
-    q: Array
-    v: Array
-    a: Array
-
-
-class ForwardDynamicsDerivatives(NamedTuple):
-    """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv).
-
-    Attributes
-    ----------
-    q : array
-        ∂v̇/∂q along the manifold: column k is that of q ⊕ t e_k.
-    v : array
-        ∂v̇/∂v.
-    tau : array
-        ∂v̇/∂τ, the inverse of the mass matrix.
-    """
-
-    q: Array
-    v: Array
-    tau: Array
-
-
 def inverse_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
     """Return ∂ID/∂q, ∂ID/∂v and ∂ID/∂a as expressions of (q, v, a)."""
     tangent = ca.jacobian(eq.kin.qdot, eq.v)
@@ -375,21 +335,3 @@ def forward_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
     out = eq.over_mass(ca.horzcat(-by_q, -by_v, ca.SX.eye(n)))
     by_q, by_v, by_tau = ca.horzsplit(out, [0, n, 2 * n, 3 * n])
     return by_q, by_v, by_tau
-
-
-def through_inverse(inverse_derivatives: Array) -> Array:
-    """Return the three derivatives of forward dynamics from those of inverse dynamics.
-
-    Parameters
-    ----------
-    inverse_derivatives : (nv, 3 nv) or (N, nv, 3 nv) array
-        ∂ID/∂q, ∂ID/∂v and M side by side, at a = FD(q, v, τ).
-
-    Returns
-    -------
-    (nv, 3 nv) or (N, nv, 3 nv) array
-        ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ side by side.
-    """
-    by_q, by_v, M = np.split(inverse_derivatives, 3, axis=-1)
-    unit = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
-    return np.asarray(np.linalg.solve(M, np.concatenate([-by_q, -by_v, unit], axis=-1)))

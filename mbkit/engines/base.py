@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,11 +22,14 @@ __all__ = [
     "DOUBLE_BITS",
     "QUANTITIES",
     "Dynamics",
+    "ForwardDynamicsDerivatives",
+    "InverseDynamicsDerivatives",
     "at_time",
     "at_times",
     "no_dynamics",
     "per_sample",
     "require_tree",
+    "through_inverse",
     "unknown_joint",
 ]
 
@@ -65,6 +68,42 @@ def require_tree(model: Model, who: str) -> None:
                 "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
                 f"and model.without({feature!r}) is the tree without them"
             )
+
+
+class InverseDynamicsDerivatives(NamedTuple):
+    """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv).
+
+    Attributes
+    ----------
+    q : array
+        ∂τ/∂q along the manifold: column k is that of q ⊕ t e_k.
+    v : array
+        ∂τ/∂v.
+    a : array
+        ∂τ/∂a, the mass matrix.
+    """
+
+    q: Array
+    v: Array
+    a: Array
+
+
+class ForwardDynamicsDerivatives(NamedTuple):
+    """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv).
+
+    Attributes
+    ----------
+    q : array
+        ∂v̇/∂q along the manifold: column k is that of q ⊕ t e_k.
+    v : array
+        ∂v̇/∂v.
+    tau : array
+        ∂v̇/∂τ, the inverse of the mass matrix.
+    """
+
+    q: Array
+    v: Array
+    tau: Array
 
 
 class Dynamics(ABC):
@@ -249,6 +288,37 @@ class Dynamics(ABC):
         self._require("function")
         return self._function(name)
 
+    # Derivatives
+
+    @property
+    def lacks_derivatives(self) -> str:
+        """Why there are no derivatives of this model; empty where there are."""
+        return "it has none; mbkit.dynamics(model, 'lagrangian') has"
+
+    def inverse_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> InverseDynamicsDerivatives:
+        """Return the partial derivatives of inverse dynamics: fields q, v and a, each (nv, nv) or (N, nv, nv).
+
+        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
+        with v and a held fixed. That by a is M.
+        """
+        self._require_derivatives("inverse_dynamics_derivatives")
+        out = self._evaluate("inverse_dynamics_derivatives", self._inverse_dynamics_derivatives, q=q, v=v, a=a)
+        return InverseDynamicsDerivatives(*np.split(out, 3, axis=-1))
+
+    def forward_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> ForwardDynamicsDerivatives:
+        """Return the partial derivatives of forward dynamics: fields q, v and tau, each (nv, nv) or (N, nv, nv).
+
+        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
+        with v and tau held fixed. That by tau is M⁻¹.
+        """
+        self._require_derivatives("forward_dynamics_derivatives")
+        out = self._evaluate("forward_dynamics_derivatives", self._forward_dynamics_derivatives, q=q, v=v, tau=tau)
+        return ForwardDynamicsDerivatives(*np.split(out, 3, axis=-1))
+
+    def _require_derivatives(self, quantity: str) -> None:
+        if self.lacks_derivatives:
+            raise UnsupportedError(f"{self.engine} cannot give {quantity}: {self.lacks_derivatives}")
+
     def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:  # noqa: ARG002  # for the engines that override it
         """Return how far the engine's own formula amplifies rounding in M, per sample.
 
@@ -298,6 +368,13 @@ class Dynamics(ABC):
 
     def _function(self, name: str) -> Any:
         raise NotImplementedError
+
+    def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the three matrices side by side, (nv, 3 nv) or (N, nv, 3 nv)."""
+        raise NotImplementedError
+
+    def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
+        return through_inverse(self._inverse_dynamics_derivatives(q, v, self._forward_dynamics(q, v, tau)))
 
     # Shared by all
 
@@ -376,6 +453,24 @@ def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:
     if not len(arguments[0]):
         return np.empty((0, *np.shape(method(*(np.zeros(a.shape[1]) for a in arguments)))))
     return np.array([np.array(method(*row)) for row in zip(*arguments, strict=True)])
+
+
+def through_inverse(inverse_derivatives: Array) -> Array:
+    """Return the three derivatives of forward dynamics from those of inverse dynamics.
+
+    Parameters
+    ----------
+    inverse_derivatives : (nv, 3 nv) or (N, nv, 3 nv) array
+        ∂ID/∂q, ∂ID/∂v and M side by side, at a = FD(q, v, τ).
+
+    Returns
+    -------
+    (nv, 3 nv) or (N, nv, 3 nv) array
+        ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ side by side.
+    """
+    by_q, by_v, M = np.split(inverse_derivatives, 3, axis=-1)
+    unit = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
+    return np.asarray(np.linalg.solve(M, np.concatenate([-by_q, -by_v, unit], axis=-1)))
 
 
 # What was expected to be a system on an engine, and is not: told with the way to one.

@@ -15,13 +15,7 @@ from mbkit._check import Array, count, finite_array
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.conditioning import loses_digits
-from mbkit.derivation.equations import (
-    Equations,
-    ForwardDynamicsDerivatives,
-    InverseDynamicsDerivatives,
-    equations_of,
-    through_inverse,
-)
+from mbkit.derivation.equations import Equations, equations_of
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError, UnknownNameError
@@ -273,6 +267,7 @@ class LagrangianDynamics(Dynamics):
     derived = True
     takes_parameters = True
     takes_written = True
+    lacks_derivatives = ""
 
     def __init__(self, model: Model, *, compile: bool | None = None, threads: int | None = None) -> None:  # noqa: A002  # the word that users look for
         super().__init__(model)
@@ -400,31 +395,13 @@ class LagrangianDynamics(Dynamics):
     def _nle(self, q: Array, v: Array) -> Array:
         return self._vector("nle", q, v)
 
-    def inverse_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> InverseDynamicsDerivatives:
-        """Return the partial derivatives of inverse dynamics: fields q, v and a, each (nv, nv) or (N, nv, nv).
-
-        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
-        with v and a held fixed. That by a is M.
-        """
-        out = self._evaluate("inverse_dynamics_derivatives", self._inverse_dynamics_derivatives, q=q, v=v, a=a)
-        return InverseDynamicsDerivatives(*np.split(out, 3, axis=-1))
-
-    def forward_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> ForwardDynamicsDerivatives:
-        """Return the partial derivatives of forward dynamics: fields q, v and tau, each (nv, nv) or (N, nv, nv).
-
-        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
-        with v and tau held fixed. That by tau is M⁻¹.
-        """
-        out = self._evaluate("forward_dynamics_derivatives", self._forward_dynamics_derivatives, q=q, v=v, tau=tau)
-        return ForwardDynamicsDerivatives(*np.split(out, 3, axis=-1))
-
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
         return self._machine("side_by_side", "inverse_dynamics_derivatives")(q, v, a)[0]
 
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
         if self.written_out:
             return self._machine("side_by_side", "forward_dynamics_derivatives")(q, v, tau)[0]
-        return through_inverse(self._inverse_dynamics_derivatives(q, v, self._forward_dynamics(q, v, tau)))
+        return super()._forward_dynamics_derivatives(q, v, tau)
 
     def _passive(self, q: Array, v: Array) -> Array:
         return self._vector("passive", q, v)

@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of
 from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digits, product, solve
 from mbkit.codegen.program import program
-from mbkit.derivation.equations import ForwardDynamicsDerivatives, InverseDynamicsDerivatives, equations_of
-from mbkit.engines.base import Dynamics
+from mbkit.derivation.equations import equations_of
+from mbkit.engines.base import Dynamics, ForwardDynamicsDerivatives, InverseDynamicsDerivatives
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 
@@ -80,6 +80,7 @@ class OracleDynamics(Dynamics):
     engine = "oracle"
     bits = 113
     takes_written = True
+    lacks_derivatives = ""
     refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 
     def __init__(

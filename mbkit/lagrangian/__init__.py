@@ -9,7 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mbkit.codegen.c_source import CSource, export_c
-from mbkit.derivation import FUNCTIONS, Equations, ForwardDynamicsDerivatives, InverseDynamicsDerivatives
+from mbkit.derivation import FUNCTIONS, Equations
+from mbkit.engines.base import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
 
 if TYPE_CHECKING:
     from mbkit.lagrangian import systems as systems

@@ -210,6 +210,10 @@ def _forward_dynamics(bare: Call, checked: Call, sound: Sound) -> Call:
 _SHORT: Final = ("mass_matrix", "gravity", "nle", "inverse_dynamics", "forward_dynamics")
 
 
+#: Joint types of which computeRNEADerivatives and computeABADerivatives of 4.1.0 are wrong (pinocchio#2053).
+_WRONG_DERIVATIVES: Final = ("universal", "spherical_zyx")
+
+
 class PinocchioDynamics(Dynamics):
     """Pinocchio's algorithms on a description.
 
@@ -353,6 +357,41 @@ class PinocchioDynamics(Dynamics):
 
     def _passive(self, q: Array, v: Array) -> Array:
         return per_sample(lambda q, v: self._force(self._full_passive(self._full_q(q), self._full_v(v))), q, v)
+
+    @cached_property
+    def lacks_derivatives(self) -> str:
+        """Why there are no derivatives of this model; empty where there are."""
+        instead = "mbkit.dynamics(model, 'lagrangian') has them"
+        if self.model.springs:
+            return f"springs between points are not part of Pinocchio's model; {instead}"
+        wrong = [j for j in self.model.joints if j.kind in _WRONG_DERIVATIVES]
+        if wrong:
+            names = ", ".join(f"{j.name!r} ({j.kind})" for j in wrong[:3])
+            return f"Pinocchio {pin.__version__} differentiates joint {names} wrongly; {instead}"
+        return ""
+
+    def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
+        return per_sample(self._one_inverse_dynamics_derivatives, q, v, a)
+
+    def _one_inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
+        passive, rotors = self._joint_passive, self._joint_passive.armature
+        q, v, a = self._full_q(q), self._full_v(v), self._full_v(a)
+        by_q, by_v, M = pin.computeRNEADerivatives(self._m, self._d, q, v, a)
+        by_q, by_v = by_q + passive.stiffness_matrix, by_v + passive.damping_matrix
+        return np.hstack([self._matrix(x) for x in (by_q, by_v, M if rotors is None else M + rotors)])
+
+    def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
+        if self._reduced or self._joint_passive.armature is not None:
+            return super()._forward_dynamics_derivatives(q, v, tau)
+        return per_sample(self._one_forward_dynamics_derivatives, q, v, tau)
+
+    def _one_forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
+        passive = self._joint_passive
+        q, v = self._full_q(q), self._full_v(v)
+        force = self._full_v(tau) + passive.force(q, v)
+        by_q, by_v, inverse = pin.computeABADerivatives(self._m, self._d, q, v, force)
+        by_q, by_v = by_q - inverse @ passive.stiffness_matrix, by_v - inverse @ passive.damping_matrix
+        return np.hstack([self._matrix(x) for x in (by_q, by_v, inverse)])
 
     def _coriolis_matrix(self, q: Array, v: Array) -> Array:
         if self._coriolis_fault:

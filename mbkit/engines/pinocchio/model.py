@@ -191,6 +191,8 @@ class JointPassive:
     ----------
     armature : (n, n) array or None
         What the couplings' rotors add to M; None where there are none.
+    stiffness_matrix, damping_matrix : (n, n) arrays
+        Derivatives of the force by q and by v, with the other sign.
     """
 
     def __init__(self, model: Model, q_order: np.ndarray, v_order: np.ndarray) -> None:
@@ -225,6 +227,9 @@ class JointPassive:
         )
         self._coupled = (stiffness, rest, damping)
         self.armature = (self._rates.T * armature) @ self._rates if armature.any() else None
+        self.damping_matrix = np.diag(self.damping) + (self._rates.T * damping) @ self._rates
+        self.stiffness_matrix = (self._rates.T * stiffness) @ self._rates
+        self.stiffness_matrix[self._spring_v, self._spring_v] += self._stiffness
 
     def force(self, q: Array, v: Array) -> Array:
         """Return the generalized force."""

@@ -1,40 +1,30 @@
 """The exact Jacobian of q̇ = D(q) v, v̇ = forward_dynamics on y = (q, v), for implicit methods.
 
-The derivatives of the acceleration come from the own derivation, whatever engine
-evaluates the dynamics (`mbkit.derivation.equations`). They are along the manifold;
-for a quaternion x of any length the tangent of a change dx is 2 Eᵀ dx / |x|², with
+The derivatives of the acceleration come from the engine, or from the lagrangian engine where the engine has none.
+They are along the manifold; for a quaternion x of any length the tangent of a change dx is 2 Eᵀ dx / |x|², with
 ẋ = ½ E(x) ω, since Eᵀ E = |x|².
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time
+from mbkit.engines.registry import DERIVED
 from mbkit.errors import NumericalError
 from mbkit.model import Model
 from mbkit.model.joint_types import JointType
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.torque import Force
 
-if TYPE_CHECKING:
-    from mbkit.derivation.equations import ForwardDynamicsDerivatives
-
 __all__ = ["Linearization"]
 
 _TWIN = "_derived_twin"
-
-
-class _Differentiable(Protocol):
-    def forward_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> ForwardDynamicsDerivatives:
-        """Return ∂v̇/∂q along the manifold, ∂v̇/∂v and ∂v̇/∂τ."""
-        ...
 
 
 class Linearization:
@@ -43,7 +33,7 @@ class Linearization:
     Parameters
     ----------
     dyn : Dynamics
-        Another engine than lagrangian gets a twin on it, made once.
+        An engine without derivatives gets a twin on the lagrangian one, made once.
 
     Attributes
     ----------
@@ -75,7 +65,7 @@ class Linearization:
         q, lengths = unit_quaternions(self._model, y[:nq])
         v = y[nq:]
         tau = force if isinstance(force, np.ndarray) else force(t, q, v)
-        own = cast("_Differentiable", at_time(self._own, t))
+        own = at_time(self._own, t)
         try:
             by_q, by_v, by_tau = (x.reshape(nv, nv) for x in own.forward_dynamics_derivatives(q, v, tau))
         except NumericalError:
@@ -146,9 +136,9 @@ def _differences(
 
 
 def _twin(dyn: Dynamics) -> Dynamics:
-    if dyn.engine == "lagrangian":
+    if not dyn.lacks_derivatives:
         return dyn
     # Deriving and compiling costs more than most runs: once for each engine's object.
     if _TWIN not in vars(dyn):
-        vars(dyn)[_TWIN] = dynamics(dyn.model, "lagrangian")
+        vars(dyn)[_TWIN] = dynamics(dyn.model, DERIVED)
     return cast("Dynamics", vars(dyn)[_TWIN])
