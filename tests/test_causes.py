@@ -18,7 +18,7 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.model import Body, Joint, Loop, Mimic, Model
-from mbkit.studies.explain.merged_links import compact
+from mbkit.studies.explain.merged_model import merge
 from mbkit.studies.importers.study import written
 from tests.random_trees import random_tree
 
@@ -356,7 +356,7 @@ def test_two_robots_are_explained_to_the_last_digit(one: str, two: str, read: Ca
     # The numbers are those of the files, and of links that are fixed to each other as one.
     for c in found.causes:
         if c.kind == "centre of mass" and c.subject.startswith("body"):
-            assert any(np.allclose(c.b, x.com) for x in compact(b).model.bodies)
+            assert any(np.allclose(c.b, x.com) for x in merge(b).model.bodies)
 
 
 _PART = ("body", "link")

@@ -1,9 +1,14 @@
-"""A difference between two descriptions, as something that can be put into one and taken out of the other."""
+"""Differences between two descriptions as tables of usual mistakes: kind, sentence, changed fields.
+
+A mistake is compared with the other side, field by field. Each field belongs to one difference alone, so that any of
+them can be put into the first description or taken out of the second without the others.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from itertools import permutations, product
 from typing import Any, Final
 
@@ -13,56 +18,50 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, Lump
 from mbkit.model import Joint, Mimic, Model
-from mbkit.studies.explain.merged_links import Compact, Member, composite
-from mbkit.studies.explain.tolerance import Near
+from mbkit.studies.explain.merged_model import LinkInBody, MergedModel, Tolerances, composite
 
 __all__ = [
     "CONSTRAINTS",
-    "Guess",
     "Hypothesis",
+    "Mistake",
     "angle_of",
-    "blind",
-    "by_link",
-    "gravities",
-    "misread",
-    "named",
-    "paired",
-    "reordered",
-    "told",
-    "with_gravity",
-    "with_joint",
+    "body_mistakes",
+    "differences",
+    "joint_mistakes",
+    "link_differences",
+    "links_in_common_axes",
+    "number_text",
+    "rotation_mistakes",
 ]
+
+#: Kinds that act on the motion through no term, but through constraints.
+CONSTRAINTS: Final = frozenset({"loop", "prescribed motion"})
+_WATER: Final = 1000.0  # kg/m³
+_DEGREE: Final = np.pi / 180
+#: URDF's order of an inertia's six numbers, and MuJoCo's.
+_URDF: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+#: Numbers per velocity, and what they are called.
+_NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "friction", "stiffness": "spring"}
+_LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
 @dataclass(frozen=True)
-class Guess:
-    """What a part would be after a mistake.
-
-    Attributes
-    ----------
-    kind : str
-        The mistake's name.
-    says : str
-        What whoever made it did, beginning with a verb.
-    value : Any
-        The part as it would then be: a `Lump`, or some fields of a `Joint` or of a `Lump`.
-    """
+class Mistake:
+    """A named difference of one part: its kind, a sentence that begins with a verb, and the changed fields."""
 
     kind: str
     says: str
-    value: Any
+    fields: Mapping[str, Any]
 
 
-def _unchanged(x: Compact, _: Mapping[str, Any]) -> Compact:
+def _unchanged(x: MergedModel, _: Mapping[str, Any]) -> MergedModel:
     return x
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A difference between two descriptions: fields of one part, and a name for it.
-
-    Each hypothesis owns its fields alone, so that any of them can be put into the first description or
-    taken out of the second without the others.
+    """A difference between two descriptions: fields of one part, with a name.
 
     Attributes
     ----------
@@ -70,7 +69,7 @@ class Hypothesis:
     put : callable
         (description, fields) -> the description with these fields in the part.
     ours, theirs : mapping
-        The fields as the first and the second description have them.
+        The fields in the first and in the second description.
     a, b : Any
         The numbers of the two sides, where they are numbers.
     """
@@ -78,184 +77,189 @@ class Hypothesis:
     kind: str
     subject: str
     says: str
-    put: Callable[[Compact, Mapping[str, Any]], Compact] = field(default=_unchanged, compare=False)
+    put: Callable[[MergedModel, Mapping[str, Any]], MergedModel] = field(default=_unchanged, compare=False)
     ours: Mapping[str, Any] = field(default_factory=dict, compare=False)
     theirs: Mapping[str, Any] = field(default_factory=dict, compare=False)
     a: Any = None
     b: Any = None
 
-    def apply(self, x: Compact) -> Compact:
+    def apply(self, x: MergedModel) -> MergedModel:
         """Put the difference into a description."""
         return self.put(x, self.theirs)
 
-    def revert(self, x: Compact) -> Compact:
+    def revert(self, x: MergedModel) -> MergedModel:
         """Take the difference out of a description that has it."""
         return self.put(x, self.ours)
 
     def without(self, fields: Container[str]) -> Hypothesis:
-        """Return the hypothesis with less fields."""
+        """Return the hypothesis with fewer fields."""
         ours, theirs = ({k: x for k, x in side.items() if k not in fields} for side in (self.ours, self.theirs))
         return replace(self, ours=ours, theirs=theirs)
 
 
-def with_joint(model: Model, name: str, **changes: Any) -> Model:
-    """Return the description with other fields in one joint."""
-    return replace(model, joints=tuple(replace(j, **changes) if j.name == name else j for j in model.joints))
-
-
 def angle_of(R: Array) -> float:
     """Return the angle of a rotation, rad."""
-    off = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.arctan2(np.linalg.norm(off), np.trace(R) - 1))
+    return float(np.arctan2(np.linalg.norm(_axis_times_sine(R)), np.trace(R) - 1))
 
 
-def told(value: Any) -> str:
-    """Return a number, vector or matrix of a description as a person writes it."""
-    if isinstance(value, Lump):
-        return f"{told(value.mass)} kg at {told(value.com)} m, inertia {told(value.inertia)}"
-    if isinstance(value, Joint):
-        return value.kind
+def _axis_times_sine(R: Array) -> Array:
+    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+
+
+def number_text(value: Any) -> str:
+    """Return a number, vector or matrix of a description as text."""
     if isinstance(value, np.ndarray):
         if value.shape == (3, 3):
-            i, j = np.triu_indices(3)
             if np.array_equal(value, value.T):
-                return f"[{', '.join(told(x) for x in value[i, j])}]"
-            return f"[{'; '.join(told(row) for row in value)}]"
+                return f"[{', '.join(map(number_text, value[np.triu_indices(3)]))}]"
+            return f"[{'; '.join(map(number_text, value))}]"
         if value.size == 1:
-            return told(float(value.ravel()[0]))
-        return f"({', '.join(told(x) for x in value.ravel().tolist())})"
-    # Rounding that nobody wrote is not worth a dozen digits.
-    return f"{0.0 if abs(value) < 1e-15 else value:.6g}" if isinstance(value, (int, float)) else str(value)
+            return number_text(float(value.ravel()[0]))
+        return f"({', '.join(map(number_text, value.ravel().tolist()))})"
+    # Below this it is rounding.
+    return f"{0.0 if abs(value) < 1e-15 else value:.6g}"
 
 
-# Ways to get a rotation wrong.
+def _is_identity(R: Array) -> bool:
+    return np.array_equal(R, np.eye(3))
 
 
-def reordered(R: Array) -> tuple[Array, Array]:
-    """Return the rotation with its quaternion written w first and read w last, and the other way round."""
+# Rotations.
+
+
+def _reordered(R: Array) -> list[Array]:
+    """Return the rotation with its quaternion written w first and read w last, and the reverse."""
     x, y, z, w = spatial.quaternion_from_matrix(R)
-    first = spatial.matrix_from_quaternion(np.array([w, x, y, z]))
-    return first, spatial.matrix_from_quaternion(np.array([y, z, w, x]))
+    return [spatial.matrix_from_quaternion(np.array(q)) for q in ([w, x, y, z], [y, z, w, x])]
 
 
-def misread(R: Array) -> Iterator[tuple[str, str, Array]]:
-    """Yield kind of mistake, what was done, and the rotation that comes of it."""
-    for other in reordered(R):
-        yield "quaternion order", "reads the joint's quaternion in the wrong order", other
-    if angle_of(R) < 1e-12:
-        return
-    yield "inverse rotation", "has the joint's rotation the wrong way round", R.T
-    yield "rotation left out", "has no rotation at the joint", np.eye(3)
-    roll, pitch, yaw = spatial.rpy_from_matrix(R)
-    about = [spatial.matrix_from_rpy(*x) for x in ((roll, 0, 0), (0, pitch, 0), (0, 0, yaw))]
-    yield "order of angles", "turns by roll, pitch, yaw in the other order", about[0] @ about[1] @ about[2]
-    for factor, says in ((180 / np.pi, "degrees for radians"), (np.pi / 180, "radians for degrees")):
-        angles = factor * np.array([roll, pitch, yaw])
-        yield "unit of angle", f"takes {says} in the joint's rotation", spatial.matrix_from_rpy(*angles)
+def rotation_mistakes(R: Array) -> Iterator[Mistake]:
+    """Yield the usual mistakes with a joint's rotation."""
+    says = "reads the joint's quaternion in the wrong order"
+    rows: list[tuple[str, str, Array]] = [("quaternion order", says, x) for x in _reordered(R)]
+    if angle_of(R) >= 1e-12:
+        angles = np.array(spatial.rpy_from_matrix(R))
+        about = [spatial.matrix_from_rpy(*x) for x in np.diag(angles)]
+        rows += [
+            ("inverse rotation", "has the joint's rotation the wrong way round", R.T),
+            ("rotation left out", "has no rotation at the joint", np.eye(3)),
+            ("order of angles", "turns by roll, pitch, yaw in the other order", about[0] @ about[1] @ about[2]),
+        ]
+        for factor, says in ((180 / np.pi, "degrees for radians"), (np.pi / 180, "radians for degrees")):
+            turned = spatial.matrix_from_rpy(*(factor * angles))
+            rows.append(("unit of angle", f"takes {says} in the joint's rotation", turned))
+    return (Mistake(kind, says, {"rotation": x}) for kind, says, x in rows)
 
 
-# Usual mistakes with a body: lost, fused wrongly, weighed about the wrong point or in the wrong axes.
-
-_UNITS: Final = ((1e3, "1000 times too large, as grams or millimetres"), (1e-3, "1000 times too small"))
-#: kg/m³.
-_WATER: Final = 1000.0
-#: URDF's order of an inertia's six numbers, and MuJoCo's.
-_URDF: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+# Bodies.
 
 
-def blind(members: Sequence[Member], R_PJ: Array, *, base: bool = False) -> Iterator[Guess]:
-    """Yield what a body could be after each mistake that needs no knowledge of the other side.
+def body_mistakes(links: Sequence[LinkInBody], R_PJ: Array, *, base: bool = False) -> list[Mistake]:
+    """Return the usual mistakes with a body, found without the other side.
 
     Parameters
     ----------
-    members : sequence of Member
+    links : sequence of LinkInBody
         The body's links, its own first.
     R_PJ : (3, 3) array
-        How the joint that carries it is turned.
+        Rotation of the joint that carries the body.
     base : bool
         Whether it is a base that moves freely.
     """
-    at = composite(members)
-    yield Guess("base mass" if base else "lost body", "has no matter in it", NOTHING)
-    yield from _fused(members)
-    yield from _about(at)
+    at = composite(links)
+    m, c, I = at.mass, at.com, at.inertia
+    rows: list[tuple[str, str, dict[str, Any]]] = [
+        ("base mass" if base else "lost body", "has no matter in it", vars(NOTHING)),
+        *_merge_mistakes(links),
+    ]
+    if m and c.any():
+        d = spatial.skew(c)
+        steiner, kind = -m * d @ d, "inertia about the wrong point"
+        rows += [
+            (
+                kind,
+                "has the inertia about the body's origin for that about the centre of mass",
+                {"inertia": I + steiner},
+            ),
+            (
+                kind,
+                "takes the inertia to be about the body's origin, and moves it to the centre of mass",
+                {"inertia": I - steiner},
+            ),
+        ]
     for R, whose in ((R_PJ, "the parent's axes"), (R_PJ.T, "axes turned against its own")):
-        if not np.array_equal(R, np.eye(3)):
-            yield Guess("inertia axes", f"has the inertia in {whose}", Lump(at.mass, at.com, R @ at.inertia @ R.T))
-    yield from _products(at)
-    for com, says in ((np.zeros(3), "at the origin"), (-at.com, "on the other side of the origin")):
-        yield Guess("centre of mass", f"has the centre of mass {says}", Lump(at.mass, com, at.inertia))
-    yield from _places(at, R_PJ)
-    yield from _balls(at)
-    for factor, says in _UNITS:
-        yield Guess("unit of mass", f"has a mass {says}", Lump(factor * at.mass, at.com, at.inertia))
-        yield Guess("unit of length", f"has the centre of mass {says}", Lump(at.mass, factor * at.com, at.inertia))
-        yield Guess("unit of inertia", f"has an inertia {says}", Lump(at.mass, at.com, factor * at.inertia))
+        if not _is_identity(R):
+            rows.append(("inertia axes", f"has the inertia in {whose}", {"inertia": R @ I @ R.T}))
+    rows += [(kind, says, {"inertia": x}) for kind, says, x in _product_mistakes(I)]
+    kind = "centre of mass"
+    rows.append((kind, "has the centre of mass at the origin", {"com": np.zeros(3)}))
+    rows.append((kind, "has the centre of mass on the other side of the origin", {"com": -c}))
+    if not _is_identity(R_PJ) and c.any():
+        rows += [(kind, "has the centre of mass in other axes", {"com": R @ c}) for R in (R_PJ, R_PJ.T)]
+    for mass, says in (
+        (m, "has the inertia of a ball of water of its mass"),
+        (1.0, "has a ball of water of 1 kg in its place"),
+    ):
+        # Drake's substitute for inconsistent matter.
+        if mass > 0:
+            radius = (mass / (4 / 3 * np.pi * _WATER)) ** (1 / 3)
+            rows.append(("replaced inertia", says, {"mass": mass, "inertia": 0.4 * mass * radius**2 * np.eye(3)}))
+    for factor, says in ((1e3, "1000 times too large, as grams or millimetres"), (1e-3, "1000 times too small")):
+        rows += [
+            ("unit of mass", f"has a mass {says}", {"mass": factor * m}),
+            ("unit of length", f"has the centre of mass {says}", {"com": factor * c}),
+            ("unit of inertia", f"has an inertia {says}", {"inertia": factor * I}),
+        ]
     for factor in (1e6, 1e-6):
         says = f"has an inertia {factor:g} times as large, as of millimetres"
-        yield Guess("unit of inertia", says, Lump(at.mass, at.com, factor * at.inertia))
+        rows.append(("unit of inertia", says, {"inertia": factor * I}))
+    return [Mistake(*row) for row in rows]
 
 
-def _fused(members: Sequence[Member]) -> Iterator[Guess]:
-    """Yield what goes wrong where links are fixed to each other."""
-    own, *fixed = members
-    heavy = [m for m in fixed if m.matter.mass or m.matter.inertia.any()]
-    for m in heavy:
-        rest = composite([x for x in members if x is not m])
-        yield Guess("lost body", f"leaves out link {m.name!r}, which is fixed to it", rest)
+def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield mistakes with links that are fixed to each other."""
+    own, *fixed = links
+    heavy = [x for x in fixed if x.massive]
+    for one in heavy:
+        rest = composite([x for x in links if x is not one])
+        yield "lost body", f"leaves out link {one.name!r}, which is fixed to it", vars(rest)
     if len(heavy) > 1:
-        yield Guess("lost body", "leaves out every link that is fixed to it", composite([own]))
-    groups = [(f"link {m.name!r}", [m]) for m in heavy] + ([("its links", heavy)] if len(heavy) > 1 else [])
-    for who, some in groups:
-        turned = [m for m in some if not np.array_equal(m.R, np.eye(3))]
+        yield "lost body", "leaves out every link that is fixed to it", vars(composite([own]))
+    groups = [(f"link {x.name!r}", [x]) for x in heavy] + ([("its links", heavy)] if len(heavy) > 1 else [])
+    for which, some in groups:
+        turned = [x for x in some if not _is_identity(x.R)]
         if turned:
             for how, change in (
-                ("without turning it", lambda m: replace(m, R=np.eye(3))),
-                ("turned the wrong way", lambda m: replace(m, R=m.R.T)),
-                ("without turning its inertia", _inertia_as_written),
+                ("without turning it", lambda x: replace(x, R=np.eye(3))),
+                ("turned the wrong way", lambda x: replace(x, R=x.R.T)),
+                ("without turning its inertia", _with_unturned_inertia),
             ):
-                with_change = [change(m) if m in turned else m for m in members]
-                yield Guess("fused with a rotated frame", f"fuses {who} {how}", composite(with_change))
-        if any(m.p.any() for m in some):
-            put = [replace(m, p=np.zeros(3)) if m in some else m for m in members]
-            yield Guess("fused at the wrong place", f"fuses {who} at the origin", composite(put))
+                changed = composite([change(x) if x in turned else x for x in links])
+                yield "fused with a rotated frame", f"fuses {which} {how}", vars(changed)
+        if any(x.p.any() for x in some):
+            changed = composite([replace(x, p=np.zeros(3)) if x in some else x for x in links])
+            yield "fused at the wrong place", f"fuses {which} at the origin", vars(changed)
     if heavy:
-        whole = composite(members)
-        there = sum((m.lump.inertia for m in members), np.zeros((3, 3)))
+        total = sum((x.lump.inertia for x in links), np.zeros((3, 3)))
         says = "adds the inertias of its links, each about its own centre of mass"
-        yield Guess("inertia about the wrong point", says, Lump(whole.mass, whole.com, there))
+        yield "inertia about the wrong point", says, {"inertia": total}
 
 
-def _inertia_as_written(m: Member) -> Member:
-    # Turned back, so that it stands in the body's axes as it stands in its own.
-    return replace(m, matter=Lump(m.matter.mass, m.matter.com, m.R.T @ m.matter.inertia @ m.R))
+def _with_unturned_inertia(x: LinkInBody) -> LinkInBody:
+    return replace(x, matter=replace(x.matter, inertia=x.R.T @ x.matter.inertia @ x.R))
 
 
-def _about(at: Lump) -> Iterator[Guess]:
-    if not (at.mass and at.com.any()):
-        return
-    d = spatial.skew(at.com)
-    steiner = -at.mass * d @ d
-    for sign, says in (
-        (1, "has the inertia about the body's origin for that about the centre of mass"),
-        (-1, "takes the inertia to be about the body's origin, and moves it to the centre of mass"),
-    ):
-        yield Guess("inertia about the wrong point", says, Lump(at.mass, at.com, at.inertia + sign * steiner))
-
-
-def _products(at: Lump) -> Iterator[Guess]:
-    I = at.inertia
+def _product_mistakes(I: Array) -> Iterator[tuple[str, str, Array]]:
     diagonal = np.diag(np.diag(I))
     if np.array_equal(I, diagonal):
         return
     kind = "products of inertia"
-    yield Guess(kind, "has the products of inertia with the other sign", Lump(at.mass, at.com, 2 * diagonal - I))
-    yield Guess(kind, "has no products of inertia", Lump(at.mass, at.com, diagonal))
+    yield kind, "has the products of inertia with the other sign", 2 * diagonal - I
+    yield kind, "has no products of inertia", diagonal
     for i, j in ((0, 1), (0, 2), (1, 2)):
         flipped = I.copy()
         flipped[i, j] = flipped[j, i] = -I[i, j]
-        yield Guess(kind, f"has I{'xyz'[i]}{'xyz'[j]} with the other sign", Lump(at.mass, at.com, flipped))
+        yield kind, f"has I{'xyz'[i]}{'xyz'[j]} with the other sign", flipped
     for written, read, says in (
         (_URDF, _MJCF, "URDF's order read in MJCF's"),
         (_MJCF, _URDF, "MJCF's order read in URDF's"),
@@ -263,275 +267,210 @@ def _products(at: Lump) -> Iterator[Guess]:
         other = np.zeros((3, 3))
         for (i, j), (k, l) in zip(written, read, strict=True):
             other[k, l] = other[l, k] = I[i, j]
-        yield Guess(
-            "order of the inertia's numbers", f"has the inertia's six numbers in {says}", Lump(at.mass, at.com, other)
-        )
+        yield "order of the inertia's numbers", f"has the inertia's six numbers in {says}", other
 
 
-def _places(at: Lump, R_PJ: Array) -> Iterator[Guess]:
-    if np.array_equal(R_PJ, np.eye(3)) or not at.com.any():
-        return
-    for R in (R_PJ, R_PJ.T):
-        yield Guess("centre of mass", "has the centre of mass in other axes", Lump(at.mass, R @ at.com, at.inertia))
+def _body_differences(
+    links: Sequence[LinkInBody], R_PJ: Array, b: Lump, near: Tolerances, *, base: bool = False
+) -> list[Mistake]:
+    """Return the mistakes that turn a body's matter into that of the other side, named as exactly as possible.
 
-
-def _balls(at: Lump) -> Iterator[Guess]:
-    """Yield what Drake puts in the place of matter that it finds impossible."""
-    for mass, says in (
-        (at.mass, "has the inertia of a ball of water of its mass"),
-        (1.0, "has a ball of water of 1 kg in its place"),
-    ):
-        if mass > 0:
-            radius = (mass / (4 / 3 * np.pi * _WATER)) ** (1 / 3)
-            yield Guess("replaced inertia", says, Lump(mass, at.com, 0.4 * mass * radius**2 * np.eye(3)))
-
-
-def named(members: Sequence[Member], R_PJ: Array, b: Lump, near: Near, *, base: bool = False) -> list[Guess]:
-    """Return the mistakes that make a body's matter that of the other side, with names as exact as can be.
-
-    One mistake for all of it is sought first, then one each for mass, centre of mass and inertia. The value of
-    each has the fields of the matter that it concerns, as the other side has them, and no two share a field.
+    First one mistake for all of it, then one each for mass, centre of mass and inertia, with the other side's values.
     """
-    a = composite(members)
-    everything = {"mass": b.mass, "com": b.com, "inertia": b.inertia}
-    guesses = list(blind(members, R_PJ, base=base))
-    for guess in guesses:
-        if near.lump(guess.value, b):
-            return [replace(guess, value=everything)]
-    if _fits(_scaled(a, b), b, near):
-        says = f"has {told(b.mass / a.mass)} times the mass, and the inertia with it"
-        return [Guess("mass", says, everything)]
+    a = composite(links)
+    everything = vars(b)
+    mistakes = body_mistakes(links, R_PJ, base=base)
+    for mistake in mistakes:
+        if near.lump(replace(a, **mistake.fields), b):
+            return [replace(mistake, fields=everything)]
+    if a.mass and b.mass and b.mass != a.mass and near.lump(a.scaled(b.mass / a.mass), b):
+        says = f"has {number_text(b.mass / a.mass)} times the mass, and the inertia with it"
+        return [Mistake("mass", says, everything)]
     if not a.mass and not a.inertia.any():
-        return [Guess("added body", "has matter in it", everything)]
+        return [Mistake("added body", "has matter in it", everything)]
     out = []
-    if not near.number(a.mass, b.mass):
-        found = _first(guesses, Lump(b.mass, a.com, a.inertia), near)
-        kind, says = (found.kind, found.says) if found else ("mass", _change("mass", a.mass, b.mass, "kg"))
-        out.append(Guess(kind, says, {"mass": b.mass}))
-    if not near.point(a.com, b.com):
-        found = _first(guesses, Lump(a.mass, b.com, a.inertia), near)
-        what = "centre of mass"
-        kind, says = (found.kind, found.says) if found else (what, _change(what, a.com, b.com, "m"))
-        out.append(Guess(kind, says, {"com": b.com}))
-    if not near.inertia(a.inertia, b.inertia, a.mass):
-        kind, says = _inertia(a, b, guesses, near)
-        out.append(Guess(kind, says, {"inertia": b.inertia}))
+    same = {
+        "mass": near.number(a.mass, b.mass),
+        "com": near.point(a.com, b.com),
+        "inertia": near.inertia(a.inertia, b.inertia, a.mass),
+    }
+    for name, what, unit in (("mass", "mass", "kg"), ("com", "centre of mass", "m")):
+        if not same[name]:
+            ours, theirs = getattr(a, name), getattr(b, name)
+            wanted = replace(a, **{name: theirs})
+            says = f"has the {what} {number_text(theirs)} {unit} for {number_text(ours)}"
+            fitting = (x for x in mistakes if near.lump(replace(a, **x.fields), wanted))
+            out.append(replace(next(fitting, Mistake(what, says, {})), fields={name: theirs}))
+    if not same["inertia"]:
+        kind, says = _inertia_difference(a, b, mistakes, near)
+        out.append(Mistake(kind, says, {"inertia": b.inertia}))
     return out
 
 
-def by_link(ours: Sequence[Member], theirs: Sequence[Member], near: Near) -> list[tuple[str, Guess]] | None:
-    """Return (link, mistake) where both sides still know the links that a body was made of; else None.
-
-    The members are those that `paired` returns.
-    """
-    there = {m.name: m for m in theirs}
-    if len(ours) < 2 or there.keys() != {m.name for m in ours}:
-        return None
-    out = []
-    for m in ours:
-        wanted = there[m.name].matter
-        if not near.lump(m.matter, wanted):
-            alone = replace(m, R=np.eye(3), p=np.zeros(3))
-            out += [(m.name, guess) for guess in named([alone], np.eye(3), wanted, near)]
-    return out
-
-
-def paired(one: Compact, other: Compact, near: Near) -> tuple[Compact, Compact]:
-    """Return both descriptions with the links that they share in the same axes.
-
-    A link whose frame stands elsewhere in the second description is given in its body's axes in both.
-    """
-    sides: tuple[dict[str, tuple[Member, ...]], ...] = (dict(one.members), dict(other.members))
-    for name in sides[0].keys() & sides[1].keys():
-        there = {m.name: m for m in sides[1][name]}
-        apart = {
-            m.name
-            for m in sides[0][name]
-            if m.name in there and not (near.vector(m.R, there[m.name].R) and near.point(m.p, there[m.name].p))
-        }
-        for side in sides:
-            side[name] = tuple(_in_body_axes(m) if m.name in apart else m for m in side[name])
-    return Compact(one.model, sides[0]), Compact(other.model, sides[1])
-
-
-def _in_body_axes(m: Member) -> Member:
-    return Member(m.name, np.eye(3), np.zeros(3), m.lump)
-
-
-def _first(guesses: Sequence[Guess], value: Lump, near: Near) -> Guess | None:
-    return next((g for g in guesses if near.lump(g.value, value)), None)
-
-
-def _fits(a: Lump | None, b: Lump, near: Near) -> bool:
-    return a is not None and near.lump(a, b)
-
-
-def _scaled(a: Lump, b: Lump) -> Lump | None:
-    return a.scaled(b.mass / a.mass) if a.mass and b.mass and b.mass != a.mass else None
-
-
-def _change(what: str, a: object, b: object, unit: str) -> str:
-    return f"has the {what} {told(b)} {unit} for {told(a)}"
-
-
-def _inertia(a: Lump, b: Lump, guesses: Sequence[Guess], near: Near) -> tuple[str, str]:
-    """Return the name of a changed inertia, whatever else of the body changed."""
-    for guess in guesses:
-        if near.inertia(guess.value.inertia, b.inertia, a.mass) and not near.inertia(
-            guess.value.inertia, a.inertia, a.mass
-        ):
-            return guess.kind, guess.says
+def _inertia_difference(a: Lump, b: Lump, mistakes: Sequence[Mistake], near: Tolerances) -> tuple[str, str]:
+    """Return kind and sentence of another inertia, whatever else of the body differs."""
+    for mistake in mistakes:
+        I = mistake.fields.get("inertia", a.inertia)
+        if near.inertia(I, b.inertia, a.mass) and not near.inertia(I, a.inertia, a.mass):
+            return mistake.kind, mistake.says
     moments = np.linalg.eigvalsh(a.inertia), np.linalg.eigvalsh(b.inertia)
     if near.inertia(np.diag(moments[0]), np.diag(moments[1]), a.mass):
-        if _misread(a.inertia, b.inertia, a.mass, near):
+        if _has_reordered_axes(a.inertia, b.inertia, a.mass, near):
             return "quaternion order", "has the inertia in axes whose quaternion was read in the wrong order"
-        return "inertia axes", f"has the same principal moments in other axes: {told(b.inertia)} for {told(a.inertia)}"
+        axes = f"{number_text(b.inertia)} for {number_text(a.inertia)}"
+        return "inertia axes", f"has the same principal moments in other axes: {axes}"
     factor = np.trace(b.inertia) / np.trace(a.inertia) if np.trace(a.inertia) else 0.0
     if near.inertia(factor * a.inertia, b.inertia, a.mass):
-        return "inertia", f"has {told(float(factor))} times the inertia"
-    return "inertia", f"has the inertia {told(b.inertia)} kg m² for {told(a.inertia)}"
+        return "inertia", f"has {number_text(float(factor))} times the inertia"
+    return "inertia", f"has the inertia {number_text(b.inertia)} kg m² for {number_text(a.inertia)}"
 
 
-def _misread(a: Array, b: Array, mass: float, near: Near) -> bool:
+def _has_reordered_axes(a: Array, b: Array, mass: float, near: Tolerances) -> bool:
     """Return whether b is a in principal axes whose quaternion was read in another order."""
     moments, axes = np.linalg.eigh(a)
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            Q = axes[:, order] * signs
-            if np.linalg.det(Q) < 0:
-                continue
-            for R in reordered(Q):
-                if angle_of(R.T @ Q) > near.tolerance and near.inertia(
-                    R @ np.diag(moments[list(order)]) @ R.T, b, mass
-                ):
-                    return True
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        Q = axes[:, order] * signs
+        if np.linalg.det(Q) < 0:
+            continue
+        for R in _reordered(Q):
+            turned = R @ np.diag(moments[list(order)]) @ R.T
+            if angle_of(R.T @ Q) > near.relative and near.inertia(turned, b, mass):
+                return True
     return False
 
 
-# Usual mistakes with a joint: where it stands, what it turns about, what it carries along.
+def link_differences(
+    ours: Sequence[LinkInBody], theirs: Sequence[LinkInBody], near: Tolerances
+) -> list[tuple[str, Mistake]] | None:
+    """Return (link, mistake) where both sides know the same links of a body, in common axes; else None."""
+    there = {x.name: x for x in theirs}
+    if len(ours) < 2 or there.keys() != {x.name for x in ours}:
+        return None
+    out = []
+    for x in ours:
+        wanted = there[x.name].matter
+        if not near.lump(x.matter, wanted):
+            alone = replace(x, R=np.eye(3), p=np.zeros(3))
+            out += [(x.name, mistake) for mistake in _body_differences([alone], np.eye(3), wanted, near)]
+    return out
 
-_TURN: Final = 2 * np.pi
-_DEGREE: Final = np.pi / 180
-#: Numbers per velocity, by the name of what they are; those without a say in the smooth motion below.
-_NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "friction", "stiffness": "spring"}
-_LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
+
+def links_in_common_axes(one: MergedModel, other: MergedModel, near: Tolerances) -> tuple[MergedModel, MergedModel]:
+    """Return both descriptions with their common links in the same axes.
+
+    A link whose frame differs between the two is given in its body's axes in both.
+    """
+    sides: tuple[dict[str, tuple[LinkInBody, ...]], ...] = (dict(one.links), dict(other.links))
+    for name in sides[0].keys() & sides[1].keys():
+        there = {x.name: x for x in sides[1][name]}
+        apart = {
+            x.name
+            for x in sides[0][name]
+            if x.name in there and not (near.vector(x.R, there[x.name].R) and near.point(x.p, there[x.name].p))
+        }
+        for side in sides:
+            side[name] = tuple(
+                LinkInBody(x.name, np.eye(3), np.zeros(3), x.lump) if x.name in apart else x for x in side[name]
+            )
+    return MergedModel(one.model, sides[0]), MergedModel(other.model, sides[1])
 
 
-def blind_joints(joint: Joint) -> Iterator[Guess]:
-    """Yield what a joint could be after each mistake that needs no knowledge of the other side; fields of it."""
+# Joints.
+
+
+def joint_mistakes(joint: Joint) -> list[Mistake]:
+    """Return the usual mistakes with a joint, found without the other side."""
+    R, p = joint.rotation, joint.translation
+    rows: list[tuple[str, str, dict[str, Any]]] = []
     for name, kind in _NUMBERS.items():
         if np.any(getattr(joint, name)):
-            yield Guess(kind, f"has no {kind}", {name: np.zeros(joint.type.nv)})
+            rows.append((kind, f"has no {kind}", {name: np.zeros(joint.type.nv)}))
     if joint.mimic is not None:
-        yield Guess("mimic", f"leaves it free, which follows {joint.mimic.joint!r}", {"mimic": None})
+        rows.append(("mimic", f"leaves it free, which follows {joint.mimic.joint!r}", {"mimic": None}))
         if joint.mimic.offset:
             mimic = Mimic(joint.mimic.joint, joint.mimic.ratio)
-            yield Guess("mimic", "leaves out the offset at which it follows", {"mimic": mimic})
+            rows.append(("mimic", "leaves out the offset at which it follows", {"mimic": mimic}))
     if joint.type.pitched:
-        yield from _pitches(joint)
-    yield from _axes(joint)
-    yield from _places_joints(joint)
-
-
-def _pitches(joint: Joint) -> Iterator[Guess]:
-    for factor, says in (
-        (_TURN, "takes a pitch per radian for one per turn"),
-        (1 / _TURN, "takes a pitch per turn for one per radian"),
-    ):
-        yield Guess("unit of pitch", says, {"pitch": factor * joint.pitch})
-    yield Guess("pitch", "has the pitch with the other sign", {"pitch": -joint.pitch})
-    yield Guess("pitch", "has no pitch", {"pitch": 0.0})
-
-
-def _axes(joint: Joint) -> Iterator[Guess]:
-    if not joint.axes.size:
-        return
-    yield Guess("axis sign", "has the axis the other way round", {"axes": -joint.axes})
-    if not np.array_equal(joint.rotation, np.eye(3)):
-        for R, whose in ((joint.rotation.T, "the parent's"), (joint.rotation, "other")):
-            yield Guess("axis", f"has the axis in {whose} axes", {"axes": joint.axes @ R.T})
-
-
-def _places_joints(joint: Joint) -> Iterator[Guess]:
-    R, p = joint.rotation, joint.translation
-    for kind, says, other in misread(R):
-        yield Guess(kind, says, {"rotation": other})
+        turn = 2 * np.pi
+        rows += [
+            ("unit of pitch", "takes a pitch per radian for one per turn", {"pitch": turn * joint.pitch}),
+            ("unit of pitch", "takes a pitch per turn for one per radian", {"pitch": 1 / turn * joint.pitch}),
+            ("pitch", "has the pitch with the other sign", {"pitch": -joint.pitch}),
+            ("pitch", "has no pitch", {"pitch": 0.0}),
+        ]
+    if joint.axes.size:
+        rows.append(("axis sign", "has the axis the other way round", {"axes": -joint.axes}))
+        if not _is_identity(R):
+            rows.append(("axis", "has the axis in the parent's axes", {"axes": joint.axes @ R}))
+            rows.append(("axis", "has the axis in other axes", {"axes": joint.axes @ R.T}))
+    rows += [(x.kind, x.says, dict(x.fields)) for x in rotation_mistakes(R)]
     if p.any():
-        for factor, kind, says in (
-            (-1.0, "joint origin", "has the joint's origin on the other side"),
-            (0.0, "joint origin", "has the joint at the parent's origin"),
-            (1e3, "unit of length", "has the joint's origin 1000 times too far, as of millimetres"),
-            (1e-3, "unit of length", "has the joint's origin 1000 times too near"),
-        ):
-            yield Guess(kind, says, {"translation": factor * p})
-        if not np.array_equal(R, np.eye(3)):
-            yield Guess("joint origin", "has the joint's origin in the joint's axes", {"translation": R @ p})
-            yield Guess("joint origin", "has the joint's origin in other axes", {"translation": R.T @ p})
+        rows += [
+            ("joint origin", "has the joint's origin on the other side", {"translation": -p}),
+            ("joint origin", "has the joint at the parent's origin", {"translation": 0.0 * p}),
+            (
+                "unit of length",
+                "has the joint's origin 1000 times too far, as of millimetres",
+                {"translation": 1e3 * p},
+            ),
+            ("unit of length", "has the joint's origin 1000 times too near", {"translation": 1e-3 * p}),
+        ]
+        if not _is_identity(R):
             inverse = {"rotation": R.T, "translation": -R.T @ p}
-            yield Guess("inverse placement", "has the joint's placement the wrong way round", inverse)
+            rows += [
+                ("joint origin", "has the joint's origin in the joint's axes", {"translation": R @ p}),
+                ("joint origin", "has the joint's origin in other axes", {"translation": R.T @ p}),
+                ("inverse placement", "has the joint's placement the wrong way round", inverse),
+            ]
+    return [Mistake(*row) for row in rows]
 
 
-def named_joints(a: Joint, b: Joint, near: Near) -> list[Guess]:
-    """Return the mistakes that make joint `a` joint `b`, with names as exact as can be."""
-    out: list[Guess] = []
+def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
+    """Return the mistakes that turn joint `a` into joint `b`, named as exactly as possible."""
+    out: list[Mistake] = []
     if a.parent != b.parent:
-        out.append(Guess("parent", f"hangs it on {b.parent!r} and not on {a.parent!r}", {"parent": b.parent}))
+        out.append(Mistake("parent", f"hangs it on {b.parent!r} and not on {a.parent!r}", {"parent": b.parent}))
     if a.type.motion != b.type.motion:
-        # Nothing of one kind's numbers means anything to the other.
+        # The numbers of one joint type mean nothing to the other.
         whole = {f.name: getattr(b, f.name) for f in fields(b) if f.name not in ("name", "child", "parent")}
-        return [*out, Guess("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)]
-    guesses = list(blind_joints(a))
-    out += _placed(a, b, guesses, near)
+        return [*out, Mistake("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)]
+    mistakes = joint_mistakes(a)
+
+    def named(wanted: dict[str, Any], otherwise: Mistake | None = None) -> Mistake | None:
+        for x in mistakes:
+            if x.fields.keys() == wanted.keys() and all(_same(near, n, x.fields[n], y) for n, y in wanted.items()):
+                return replace(x, fields=wanted)
+        return otherwise
+
+    placement = {
+        n: getattr(b, n) for n in ("rotation", "translation") if not _same(near, n, getattr(a, n), getattr(b, n))
+    }
+    each: list[Mistake | None] = [named(placement) if placement else None]
+    if each == [None]:
+        each = [named({n: x}, _moved(n, a, b, near)) for n, x in placement.items()]
     if not near.vector(a.axes, b.axes):
-        out.append(_fitting(guesses, {"axes": b.axes}, near) or _turned_axis(a, b))
+        says = f"has the axis {number_text(b.axes)}, not {number_text(a.axes)}"
+        each.append(named({"axes": b.axes}, Mistake("axis", says, {"axes": b.axes})))
     if not near.number(a.pitch, b.pitch):
-        says = f"has the pitch {told(b.pitch)} m/rad for {told(a.pitch)}"
-        out.append(_fitting(guesses, {"pitch": b.pitch}, near) or Guess("pitch", says, {"pitch": b.pitch}))
-    out += _mimics(a, b, near)
+        says = f"has the pitch {number_text(b.pitch)} m/rad for {number_text(a.pitch)}"
+        each.append(named({"pitch": b.pitch}, Mistake("pitch", says, {"pitch": b.pitch})))
+    each.append(_mimic_difference(a.mimic, b.mimic, near))
+    out += [x for x in each if x is not None]
     for name, kind in _NUMBERS.items():
         ours, theirs = getattr(a, name), getattr(b, name)
         if not near.numbers(ours, theirs):
             rest = {"rest": b.rest} if name == "stiffness" else {}
-            out.append(Guess(kind, _number(name, ours, theirs), {name: theirs} | rest))
+            out.append(Mistake(kind, _other_number(name, ours, theirs), {name: theirs} | rest))
     if a.stiffness.any() and near.numbers(a.stiffness, b.stiffness) and not near.vector(a.rest, b.rest):
-        out.append(Guess("spring", f"has the spring at rest at {told(b.rest)}, not {told(a.rest)}", {"rest": b.rest}))
+        says = f"has the spring at rest at {number_text(b.rest)}, not {number_text(a.rest)}"
+        out.append(Mistake("spring", says, {"rest": b.rest}))
     limits = {n: getattr(b, n) for n in _LIMITS if not near.numbers(getattr(a, n), getattr(b, n))}
     if limits:
-        out.append(Guess("limits", _limits(a, limits), limits))
+        out.append(Mistake("limits", _other_limits(a, limits), limits))
     return out
 
 
-def _placed(a: Joint, b: Joint, guesses: Sequence[Guess], near: Near) -> list[Guess]:
-    fields_: dict[str, Any] = {}
-    if not near.vector(a.rotation, b.rotation):
-        fields_["rotation"] = b.rotation
-    if not near.point(a.translation, b.translation):
-        fields_["translation"] = b.translation
-    if not fields_:
-        return []
-    # One mistake for both, else one for each.
-    whole = _fitting(guesses, fields_, near)
-    if whole:
-        return [whole]
-    out = []
-    if "rotation" in fields_:
-        only = {"rotation": b.rotation}
-        out.append(_fitting(guesses, only, near) or _turned(a, b))
-    if "translation" in fields_:
-        only = {"translation": b.translation}
-        out.append(_fitting(guesses, only, near) or _shifted(a, b, near))
-    return out
-
-
-def _fitting(guesses: Sequence[Guess], wanted: dict[str, Any], near: Near) -> Guess | None:
-    """Return the first mistake that makes these fields so, and no others."""
-    for guess in guesses:
-        if guess.value.keys() == wanted.keys() and all(_same(near, n, guess.value[n], x) for n, x in wanted.items()):
-            return replace(guess, value=wanted)
-    return None
-
-
-def _same(near: Near, name: str, a: Any, b: Any) -> bool:
+def _same(near: Tolerances, name: str, a: Any, b: Any) -> bool:
     if name == "translation":
         return near.point(a, b)
     if name in ("rotation", "axes"):
@@ -539,137 +478,162 @@ def _same(near: Near, name: str, a: Any, b: Any) -> bool:
     return near.number(float(a), float(b))
 
 
-def _turned(a: Joint, b: Joint) -> Guess:
-    R = a.rotation.T @ b.rotation
-    value = {"rotation": b.rotation}
-    angle = angle_of(R)
-    about = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    if a.type.axial and a.type.rotates and np.allclose(R @ a.axes[0], a.axes[0], atol=1e-9):
-        angle = float(np.copysign(angle, about @ a.axes[0]))
-        return Guess("zero position", f"counts from {told(angle)} rad ({told(angle / _DEGREE)}°) further on", value)
-    return Guess("joint rotation", f"has it turned by {told(angle)} rad ({told(angle / _DEGREE)}°)", value)
-
-
-def _shifted(a: Joint, b: Joint, near: Near) -> Guess:
-    value = {"translation": b.translation}
+def _moved(name: str, a: Joint, b: Joint, near: Tolerances) -> Mistake:
+    """Return the difference in rotation or translation, as another zero position where it is along the axis."""
+    value = {name: getattr(b, name)}
+    if name == "rotation":
+        R = a.rotation.T @ b.rotation
+        angle = angle_of(R)
+        zero = a.type.axial and a.type.rotates and np.allclose(R @ a.axes[0], a.axes[0], atol=1e-9)
+        if zero:
+            angle = float(np.copysign(angle, _axis_times_sine(R) @ a.axes[0]))
+        amount = f"{number_text(angle)} rad ({number_text(angle / _DEGREE)}°)"
+        if zero:
+            return Mistake("zero position", f"counts from {amount} further on", value)
+        return Mistake("joint rotation", f"has it turned by {amount}", value)
     d = a.rotation.T @ (b.translation - a.translation)
     if a.type.axial and not a.type.rotates and near.point(np.cross(d, a.axes[0]), np.zeros(3)):
-        return Guess("zero position", f"counts from {told(float(d @ a.axes[0]))} m further on", value)
-    return Guess("joint origin", f"has the joint at {told(b.translation)} m, not at {told(a.translation)}", value)
+        return Mistake("zero position", f"counts from {number_text(float(d @ a.axes[0]))} m further on", value)
+    says = f"has the joint at {number_text(b.translation)} m, not at {number_text(a.translation)}"
+    return Mistake("joint origin", says, value)
 
 
-def _turned_axis(a: Joint, b: Joint) -> Guess:
-    return Guess("axis", f"has the axis {told(b.axes)}, not {told(a.axes)}", {"axes": b.axes})
+def _mimic_difference(a: Mimic | None, b: Mimic | None, near: Tolerances) -> Mistake | None:
+    if a is None and b is None:
+        return None
+    if a is None or b is None:
+        says = f"lets it follow {b.joint!r}, which is free" if b else f"leaves it free, which follows {a.joint!r}"  # type: ignore[union-attr]
+        return Mistake("mimic", says, {"mimic": b})
+    if a.joint == b.joint and near.number(a.ratio, b.ratio) and abs(a.offset - b.offset) <= near.relative:
+        return None
+    one, other = (f"{number_text(m.ratio)} {m.joint} + {number_text(m.offset)}" for m in (b, a))
+    return Mistake("mimic", f"lets it follow {one}, not {other}", {"mimic": b})
 
 
-def _mimics(a: Joint, b: Joint, near: Near) -> list[Guess]:
-    if a.mimic is None and b.mimic is None:
-        return []
-    if a.mimic is None:
-        assert b.mimic is not None
-        return [Guess("mimic", f"lets it follow {b.mimic.joint!r}, which is free", {"mimic": b.mimic})]
-    if b.mimic is None:
-        return [Guess("mimic", f"leaves it free, which follows {a.mimic.joint!r}", {"mimic": None})]
-    same = a.mimic.joint == b.mimic.joint and near.number(a.mimic.ratio, b.mimic.ratio)
-    if same and abs(a.mimic.offset - b.mimic.offset) <= near.tolerance:
-        return []
-    one, other = (f"{told(m.ratio)} {m.joint} + {told(m.offset)}" for m in (b.mimic, a.mimic))
-    return [Guess("mimic", f"lets it follow {one}, not {other}", {"mimic": b.mimic})]
-
-
-def _number(name: str, a: Array, b: Array) -> str:
+def _other_number(name: str, a: Array, b: Array) -> str:
     what = "spring of stiffness" if name == "stiffness" else name
     unit = ""
     for factor, says in ((_DEGREE, "per degree for per radian"), (1 / _DEGREE, "per radian for per degree")):
         if a.any() and np.allclose(b, factor * a, rtol=1e-9):
             unit = f" ({says})"
-    return f"has {what} {told(b)} for {told(a)}{unit}"
+    return f"has {what} {number_text(b)} for {number_text(a)}{unit}"
 
 
-def _limits(a: Joint, limits: dict[str, Array]) -> str:
+def _other_limits(a: Joint, limits: dict[str, Array]) -> str:
+    names = {n: f"{n} limit" if n in ("lower", "upper") else n.replace("_", " ") for n in limits}
     lost = [n for n, x in limits.items() if not np.isfinite(x).any()]
-    kept = [n for n in limits if n not in lost]
-    parts = [f"{_told_limit(n)} {told(limits[n])} for {told(getattr(a, n))}" for n in kept]
-    parts += [f"no {_told_limit(n)} ({told(getattr(a, n))})" for n in lost]
+    parts = [
+        f"{names[n]} {number_text(x)} for {number_text(getattr(a, n))}" for n, x in limits.items() if n not in lost
+    ]
+    parts += [f"no {names[n]} ({number_text(getattr(a, n))})" for n in lost]
     return f"has {', '.join(parts)}"
 
 
-def _told_limit(name: str) -> str:
-    return f"{name} limit" if name in ("lower", "upper") else name.replace("_", " ")
+# The whole description.
 
 
-# Usual mistakes with what belongs to no single body or joint: gravity, point springs, joint couplings, the ground.
-
-#: What acts on the motion through no term, but through constraints.
-CONSTRAINTS: Final = frozenset({"loop", "prescribed motion"})
-
-
-def with_gravity(model: Model, gravity: Array) -> Model:
-    """Return the description under another gravity."""
-    return replace(model, gravity=gravity)
-
-
-def gravities(a: Array) -> Iterator[Guess]:
-    """Yield what gravity could be after each mistake."""
-    if a.any():
-        yield Guess("gravity", "has no gravity", np.zeros(3))
-        yield Guess("gravity", "has gravity with the other sign", -a)
+def differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
+    """Return the differences that turn `one` into `other`, part by part."""
+    out = _global_differences(one.model, other.model, near)
+    theirs = {j.name: j for j in other.model.joints}
+    for a in one.model.joints:
+        b = theirs.get(a.name)
+        if b is None:
+            continue
+        put = partial(_put_joint, a.name)
+        out += [_hypothesis(x, f"joint {a.name!r}", put, a, b) for x in _joint_differences(a, b, near)]
+        out += _matter_differences(one, a, other, near)
+    return out
 
 
-def named_whole(a: Model, b: Model, near: Near) -> list[Hypothesis]:
-    """Return what makes gravity, springs, couplings, loops and prescribed motions of `a` those of `b`."""
+def _put_joint(name: str, x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
+    return x.with_joint(name, values)
+
+
+def _put_body(name: str, x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
+    return x.with_body(name, values)
+
+
+def _put_link(body: str, link: str, x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
+    return x.with_link(body, link, values)
+
+
+def _put_fields(x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
+    return x.with_fields(**values)
+
+
+def _put_parts(section: str, key: str, x: MergedModel, parts: Mapping[str, Any]) -> MergedModel:
+    """Exchange springs, couplings, loops or prescribed motions by name; None takes one away."""
+    kept = [p for p in getattr(x.model, section) if getattr(p, key) not in parts]
+    return x.with_fields(**{section: (*kept, *(p for p in parts.values() if p is not None))})
+
+
+def _hypothesis(x: Mistake, subject: str, put: Callable[..., MergedModel], a: object, b: object) -> Hypothesis:
+    ours, theirs = ({name: getattr(side, name) for name in x.fields} for side in (a, b))
+    numbers: tuple[Any, Any] = (None, None)
+    if len(ours) == 1:
+        values = next(iter(ours.values())), next(iter(theirs.values()))
+        if all(isinstance(v, (float, np.ndarray)) for v in values):
+            numbers = values
+    return Hypothesis(x.kind, subject, x.says, put, ours, theirs, *numbers)
+
+
+def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
+    body = joint.child
+    a, b = one.lump(body), other.lump(body)
+    if near.lump(a, b):
+        return []
+    ours, theirs = ({x.name: x.matter for x in side.links[body]} for side in (one, other))
+    links = link_differences(one.links[body], other.links[body], near)
+    if links:
+        return [
+            _hypothesis(
+                x,
+                f"link {name!r}, fixed to {body!r}" if name != body else f"link {name!r}",
+                partial(_put_link, body, name),
+                ours[name],
+                theirs[name],
+            )
+            for name, x in links
+        ]
+    base = joint.type.floating and joint.parent == "world"
+    mistakes = _body_differences(one.links[body], joint.rotation, b, near, base=base)
+    return [_hypothesis(x, f"body {body!r}", partial(_put_body, body), a, b) for x in mistakes]
+
+
+def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis]:
+    """Return the differences in gravity, springs, couplings, loops and prescribed motions."""
     out = []
     if not near.vector(a.gravity, b.gravity, max(1.0, float(np.abs(a.gravity).max()))):
-        says = next((g.says for g in gravities(a.gravity) if near.vector(g.value, b.gravity)), None)
-        says = says or f"has the gravity {told(b.gravity)} m/s² for {told(a.gravity)}"
-        sides = {"gravity": a.gravity}, {"gravity": b.gravity}
-        out.append(Hypothesis("gravity", "", says, _with_fields, *sides, a.gravity, b.gravity))
+        says = f"has the gravity {number_text(b.gravity)} m/s² for {number_text(a.gravity)}"
+        if a.gravity.any() and near.vector(np.zeros(3), b.gravity):
+            says = "has no gravity"
+        elif a.gravity.any() and near.vector(-a.gravity, b.gravity):
+            says = "has gravity with the other sign"
+        out.append(_hypothesis(Mistake("gravity", says, {"gravity": b.gravity}), "", _put_fields, a, b))
     for section, kind, what in (
         ("springs", "point spring", "spring"),
         ("couplings", "joint coupling", "coupling"),
         ("loops", "loop", "loop"),
         ("prescribed", "prescribed motion", "motion of"),
     ):
-        out += _parts(a, b, section, kind, what, near)
+        key = "joint" if section == "prescribed" else "name"
+        ours, theirs = ({getattr(x, key): x for x in getattr(m, section)} for m in (a, b))
+        for name in dict.fromkeys([*ours, *theirs]):
+            one, other = ours.get(name), theirs.get(name)
+            if one is not None and other is not None and _alike(one, other, near):
+                continue
+            says = "lacks it" if other is None else "has it besides" if one is None else "has other numbers for it"
+            put = partial(_put_parts, section, key)
+            out.append(Hypothesis(kind, f"{what} {name!r}", says, put, {name: one}, {name: other}))
     return out
 
 
-def _parts(a: Model, b: Model, field: str, kind: str, what: str, near: Near) -> list[Hypothesis]:
-    key = "joint" if field == "prescribed" else "name"
-    ours, theirs = ({getattr(x, key): x for x in getattr(m, field)} for m in (a, b))
-    out = []
-    for name in dict.fromkeys([*ours, *theirs]):
-        one, other = ours.get(name), theirs.get(name)
-        if one is not None and other is not None and _alike(one, other, near):
-            continue
-        says = "lacks it" if other is None else "has it besides" if one is None else "has other numbers for it"
-        put = _exchange(field, key)
-        out.append(Hypothesis(kind, f"{what} {name!r}", says, put, {name: one}, {name: other}))
-    return out
-
-
-def _with_fields(x: Compact, fields: Mapping[str, Any]) -> Compact:
-    return replace(x, model=replace(x.model, **fields))
-
-
-def _exchange(field: str, key: str) -> Callable[[Compact, Mapping[str, Any]], Compact]:
-    """Return what exchanges springs, loops or prescribed motions by name; None takes one away."""
-
-    def put(x: Compact, parts: Mapping[str, Any]) -> Compact:
-        kept = [p for p in getattr(x.model, field) if getattr(p, key) not in parts]
-        return _with_fields(x, {field: (*kept, *(p for p in parts.values() if p is not None))})
-
-    return put
-
-
-def _alike(a: Any, b: Any, near: Near) -> bool:
+def _alike(a: Any, b: Any, near: Tolerances) -> bool:
     for x, y in zip(a._values(), b._values(), strict=True):
         if isinstance(x, np.ndarray):
             if not near.point(x, y):
                 return False
-        elif isinstance(x, float):
-            if not near.number(x, y):
-                return False
-        elif x != y:
+        elif not (near.number(x, y) if isinstance(x, float) else x == y):
             return False
     return True

@@ -1,38 +1,36 @@
-"""Which joint of one description is which of the other: by structure, names being a hint.
+"""Which joint of one description is which of the other: by structure, with names as a hint.
 
-Trees are laid over each other from the world outwards, and by names. Two joints cost what differs between
-them that no choice of frames can change (kind, mass, principal moments, distance), a little
-for what frames can change, and less for another name; siblings are assigned so that the whole
-costs least (Kuhn's algorithm). The cheaper of the two counts. So equal robots with exchanged or other names
-still fit, and so do robots that share names and not their whole shape.
+The trees are compared from the world outwards. A pair of joints costs what differs between them whatever the choice of
+frames (type, mass, principal moments, distance), a little for differences of frames, and less for another name.
+Siblings are assigned at the least total cost, and a match by names alone is used if it costs no more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model import Body, Joint, JointCoupling, Mimic, Model
+from mbkit.model import Body, Joint, Mimic, Model
 from mbkit.model.joint_types import FIXED
 from mbkit.studies.explain.hypotheses import Hypothesis
-from mbkit.studies.explain.merged_links import Compact, Member, compact
-from mbkit.studies.explain.tolerance import Near
+from mbkit.studies.explain.merged_model import FrameChange, MergedModel, Tolerances, merge, reattached
+from mbkit.studies.explain.terms import restricted, trimmed_couplings
 
-__all__ = ["Aligned", "Match", "Matching", "aligned", "match", "renamed", "settled"]
+__all__ = ["Match", "Matching", "align_frames", "match", "reconcile_joint_sets", "rename_joints"]
 
-
-# Beyond this depth the recursion would end; such chains are compared by name.
-_DEEPEST: Final = 150
+#: Deeper chains are compared by name, because the assignment is recursive.
+_MAX_DEPTH: Final = 150
 _NAME, _FRAME, _NUMBER, _KIND, _ALONE = 0.1, 0.25, 1.0, 3.0, 2.0
+_Pairs = list[tuple[Joint, Joint]]
 
 
 @dataclass(frozen=True)
 class Match:
-    """One joint of each description, and whether their names or their places say that they are the same."""
+    """One joint of each description, and ``how`` they were matched: by "name" or by "structure"."""
 
     a: str
     b: str
@@ -41,15 +39,7 @@ class Match:
 
 @dataclass(frozen=True)
 class Matching:
-    """What fits what, and what fits nothing.
-
-    Attributes
-    ----------
-    pairs : tuple of Match
-        In the first description's order.
-    only_a, only_b : tuple of str
-        Joints without a counterpart.
-    """
+    """Matched joints, in the first description's order, and joints without a counterpart."""
 
     pairs: tuple[Match, ...]
     only_a: tuple[str, ...]
@@ -61,26 +51,24 @@ class Matching:
         return {m.a: m.b for m in self.pairs}
 
 
-def match(a: Model, b: Model, near: Near) -> Matching:
-    """Lay two fused descriptions over each other."""
-    overlay = _Overlay(a, b, near)
+def match(a: Model, b: Model, near: Tolerances) -> Matching:
+    """Match the joints of two merged descriptions."""
+    assignment = _Assignment(a, b, near)
     names = {j.name for j in b.joints}
-    found = {j.name: j.name for j in a.joints if j.name in names}
-    if max(_depth(a), _depth(b)) <= _DEEPEST:
-        by_place = overlay.run()
-        for name in found:
-            if name not in by_place and name not in by_place.values():
-                by_place[name] = name
-        if overlay.cost(by_place) < overlay.cost(found):
-            found = by_place
-    taken = set(found.values())
-    pairs = [
-        Match(j.name, found[j.name], "name" if found[j.name] == j.name else "structure")
-        for j in a.joints
-        if j.name in found
-    ]
-    alone = [j.name for j in a.joints if j.name not in found], [j.name for j in b.joints if j.name not in taken]
-    return Matching(tuple(pairs), *map(tuple, alone))
+    to_b = {j.name: j.name for j in a.joints if j.name in names}
+    if max(_depth(a), _depth(b)) <= _MAX_DEPTH:
+        by_structure = assignment.solve()
+        for name in to_b:
+            if name not in by_structure and name not in by_structure.values():
+                by_structure[name] = name
+        if assignment.cost(by_structure) < assignment.cost(to_b):
+            to_b = by_structure
+    matched = [j.name for j in a.joints if j.name in to_b]
+    return Matching(
+        tuple(Match(n, to_b[n], "name" if to_b[n] == n else "structure") for n in matched),
+        tuple(j.name for j in a.joints if j.name not in to_b),
+        tuple(j.name for j in b.joints if j.name not in set(to_b.values())),
+    )
 
 
 def _depth(model: Model) -> int:
@@ -90,132 +78,111 @@ def _depth(model: Model) -> int:
     return max(depth.values())
 
 
-class _Overlay:
-    def __init__(self, a: Model, b: Model, near: Near) -> None:
-        self.near = near
-        self.joints = {j.name: j for j in a.joints}, {j.name: j for j in b.joints}
-        self.children = _children(a), _children(b)
-        self.bodies = {x.name: x for x in a.bodies}, {x.name: x for x in b.bodies}
-        self.sizes = _sizes(a), _sizes(b)
-        self.costs: dict[tuple[str, str], tuple[float, list[tuple[Joint, Joint]]]] = {}
+class _Tree:
+    """A description by name: joints, bodies, the joints on each body, and the size of each joint's subtree."""
 
-    def run(self) -> dict[str, str]:
-        found: dict[str, str] = {}
-        waiting = self._assigned("world", "world")[1]
+    def __init__(self, model: Model) -> None:
+        self.joints = {j.name: j for j in model.joints}
+        self.bodies = {x.name: x for x in model.bodies}
+        self.children: dict[str, list[Joint]] = {}
+        for joint in model.joints:
+            self.children.setdefault(joint.parent, []).append(joint)
+        self.carrier = {j.child: j.name for j in model.joints}
+        self.sizes: dict[str, int] = {}
+        for joint in reversed(model.tree):
+            self.sizes[joint.name] = 1 + sum(self.sizes[c.name] for c in self.children.get(joint.child, ()))
+
+
+class _Assignment:
+    """The assignment of least cost between two trees."""
+
+    def __init__(self, a: Model, b: Model, near: Tolerances) -> None:
+        self.near, self.a, self.b = near, _Tree(a), _Tree(b)
+        self._known: dict[tuple[str, str], tuple[float, _Pairs]] = {}
+
+    def solve(self) -> dict[str, str]:
+        out: dict[str, str] = {}
+        waiting = self._children("world", "world")[1]
         while waiting:
             a, b = waiting.pop()
-            found[a.name] = b.name
+            out[a.name] = b.name
             waiting += self._pair(a, b)[1]
-        return found
+        return out
 
-    def cost(self, found: Mapping[str, str]) -> float:
-        """Return what it costs that joints of a are joints of b, however they were found."""
-        total = _ALONE * (len(self.joints[0]) + len(self.joints[1]) - 2 * len(found))
-        carrier = [{j.child: j.name for j in joints.values()} for joints in self.joints]
-        for name, other in found.items():
-            a, b = self.joints[0][name], self.joints[1][other]
-            above, below = carrier[0].get(a.parent), carrier[1].get(b.parent)
-            total += self._own(a, b) + (0.0 if found.get(above or "") == below else _NUMBER)
+    def cost(self, to_b: Mapping[str, str]) -> float:
+        """Return the cost of any assignment."""
+        total = _ALONE * (len(self.a.joints) + len(self.b.joints) - 2 * len(to_b))
+        for name, other in to_b.items():
+            a, b = self.a.joints[name], self.b.joints[other]
+            above, below = self.a.carrier.get(a.parent, ""), self.b.carrier.get(b.parent)
+            total += self._own(a, b) + (0.0 if to_b.get(above) == below else _NUMBER)
         return total
 
-    def _pair(self, a: Joint, b: Joint) -> tuple[float, list[tuple[Joint, Joint]]]:
-        """Return what it costs that a and all below it are b and all below it, and who is who there."""
+    def _pair(self, a: Joint, b: Joint) -> tuple[float, _Pairs]:
+        """Return the cost of a and its subtree as b and its subtree, and the pairs of their children."""
         key = a.name, b.name
-        if key not in self.costs:
-            below, pairs = self._assigned(a.child, b.child)
-            self.costs[key] = self._own(a, b) + below, pairs
-        return self.costs[key]
+        if key not in self._known:
+            below, pairs = self._children(a.child, b.child)
+            self._known[key] = self._own(a, b) + below, pairs
+        return self._known[key]
 
-    def _assigned(self, a: str, b: str) -> tuple[float, list[tuple[Joint, Joint]]]:
+    def _children(self, a: str, b: str) -> tuple[float, _Pairs]:
         from scipy.optimize import linear_sum_assignment
 
-        ours, theirs = self.children[0].get(a, []), self.children[1].get(b, [])
-        if not ours or not theirs:
-            return _ALONE * (sum(self.sizes[0][j.name] for j in ours) + sum(self.sizes[1][j.name] for j in theirs)), []
+        ours, theirs = self.a.children.get(a, []), self.b.children.get(b, [])
         n, k = len(ours), len(theirs)
-        # Everybody may stay alone.
-        cost = np.zeros((n + k, n + k))
-        cost[:n, k:] = cost[n:, :k] = np.inf
-        for i, x in enumerate(ours):
-            cost[i, k + i] = _ALONE * self.sizes[0][x.name]
-            for j, y in enumerate(theirs):
-                cost[i, j] = self._pair(x, y)[0]
-                cost[n + j, j] = _ALONE * self.sizes[1][y.name]
-        cost[np.isinf(cost)] = 1e12
+        alone = [self.a.sizes[j.name] for j in ours], [self.b.sizes[j.name] for j in theirs]
+        if not n or not k:
+            return _ALONE * (sum(alone[0]) + sum(alone[1])), []
+        # Beside the pairs, each joint may stay alone.
+        cost = np.full((n + k, n + k), 1e12)
+        cost[n:, k:] = 0.0
+        cost[range(n), range(k, n + k)] = _ALONE * np.array(alone[0])
+        cost[range(n, n + k), range(k)] = _ALONE * np.array(alone[1])
+        cost[:n, :k] = [[self._pair(x, y)[0] for y in theirs] for x in ours]
         rows, columns = linear_sum_assignment(cost)
         pairs = [(ours[i], theirs[j]) for i, j in zip(rows, columns, strict=True) if i < n and j < k]
         return float(cost[rows, columns].sum()), pairs
 
     def _own(self, a: Joint, b: Joint) -> float:
-        body_a, body_b, near = self.bodies[0][a.child], self.bodies[1][b.child], self.near
-        cost = 0.0 if a.name == b.name else _NAME
-        if a.kind != b.kind:
-            cost += _FRAME if a.type.motion == b.type.motion else _KIND
-        far = np.linalg.norm(a.translation), np.linalg.norm(b.translation)
-        cost += 0.0 if near.point(np.array([far[0]]), np.array([far[1]])) else _NUMBER
-        cost += 0.0 if near.number(body_a.mass, body_b.mass) else _NUMBER
-        cost += 0.0 if near.inertia(_moments(body_a), _moments(body_b), body_a.mass) else _NUMBER
-        cost += 0.0 if near.vector(a.axes, b.axes) else _FRAME
-        cost += 0.0 if near.vector(a.rotation, b.rotation) else _FRAME
-        cost += 0.0 if near.point(a.translation, b.translation) else _FRAME
-        return cost + (0.0 if near.point(body_a.com, body_b.com) else _FRAME)
+        x, y, near = self.a.bodies[a.child], self.b.bodies[b.child], self.near
+        far = np.array([[np.linalg.norm(a.translation)], [np.linalg.norm(b.translation)]])
+        same_motion = a.type.motion == b.type.motion
+        differing = (
+            (a.name != b.name, _NAME),
+            (a.kind != b.kind, _FRAME if same_motion else _KIND),
+            (not near.point(*far), _NUMBER),
+            (not near.number(x.mass, y.mass), _NUMBER),
+            (not near.inertia(_moments(x), _moments(y), x.mass), _NUMBER),
+            (not near.vector(a.axes, b.axes), _FRAME),
+            (not near.vector(a.rotation, b.rotation), _FRAME),
+            (not near.point(a.translation, b.translation), _FRAME),
+            (not near.point(x.com, y.com), _FRAME),
+        )
+        return sum(cost for differs, cost in differing if differs)
 
 
-def _moments(body: Body) -> np.ndarray:
-    return np.asarray(np.linalg.eigvalsh(body.inertia))
+def _moments(body: Body) -> Array:
+    return np.asarray(np.linalg.eigvalsh(body.inertia), dtype=np.float64)
 
 
-def _children(model: Model) -> Mapping[str, list[Joint]]:
-    out: dict[str, list[Joint]] = {}
-    for joint in model.joints:
-        out.setdefault(joint.parent, []).append(joint)
-    return out
+# The second description with names, order and frames of the first.
 
 
-def _sizes(model: Model) -> dict[str, int]:
-    """Return the number of joints in each joint's subtree, itself among them."""
-    below = {j.child: 1 for j in model.joints}
-    for joint in reversed(model.tree):
-        if joint.parent != "world":
-            below[joint.parent] += below[joint.child]
-    return {j.name: below[j.child] for j in model.joints}
-
-
-# One description in the names, the order and the frames of another, its motion being the same.
-#
-# Where a body's frame is drawn is nobody's physics: a frame may turn freely about whatever its
-# joint is, and slide along the joint's axis. Importers and converters make use of that. A frame
-# is moved to where the other description has it, if nothing of its joint and body differs then, or at least
-# two parts less. One part less is no evidence: of two different robots, a frame can always be slid to where the
-# other's stands, and its centre of mass and the next joint then have numbers that are in neither file.
-
-
-@dataclass(frozen=True)
-class Aligned:
-    """The other description in the first one's words, and which frames were moved for that."""
-
-    compact: Compact
-    reframed: tuple[str, ...]
-
-
-def renamed(b: Compact, a: Model, matching: Matching) -> Compact:
+def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
     """Return `b` with the names and the order of `a` where joints match."""
     own = {j.name: j for j in b.model.joints}
-    # Joints that were held still or taken away are told as alone, and are there no more.
-    alone = [n for n in matching.only_b if n in own]
-    order = {m.a: k for k, m in enumerate(matching.pairs)}
-    joints = {m.b: m.a for m in matching.pairs}
-    taken = {j.name for j in a.joints}
     theirs = {j.name: j.child for j in a.joints}
+    joints = {m.b: m.a for m in matching.pairs}
     bodies = {own[m.b].child: theirs[m.a] for m in matching.pairs}
-    used = {x.name for x in a.bodies} | {"world"}
-    for name in alone:
-        joints[name] = _unused(name, taken)
-        taken.add(joints[name])
-        bodies[own[name].child] = _unused(own[name].child, used)
-        used.add(bodies[own[name].child])
+    used = set(theirs), {x.name for x in a.bodies} | {"world"}
+    # Joints that were held still or removed are in the matching, but not in the description.
+    for name in (n for n in matching.only_b if n in own):
+        joints[name] = _unused(name, used[0])
+        bodies[own[name].child] = _unused(own[name].child, used[1])
     bodies["world"] = "world"
-    made = [
+    order = {m.a: k for k, m in enumerate(matching.pairs)}
+    renamed = [
         replace(
             j,
             name=joints[j.name],
@@ -225,108 +192,95 @@ def renamed(b: Compact, a: Model, matching: Matching) -> Compact:
         )
         for j in b.model.joints
     ]
-    made.sort(key=lambda j: order.get(j.name, len(order)))
+    renamed.sort(key=lambda j: order.get(j.name, len(order)))
     matter = {bodies[x.name]: x for x in b.model.bodies}
     model = replace(
         b.model,
-        joints=tuple(made),
-        bodies=tuple(replace(matter[j.child], name=j.child) for j in made),
+        joints=tuple(renamed),
+        bodies=tuple(replace(matter[j.child], name=j.child) for j in renamed),
         springs=tuple(replace(s, body_a=bodies[s.body_a], body_b=bodies[s.body_b]) for s in b.model.springs),
         couplings=tuple(replace(c, joints=tuple(joints.get(n, n) for n in c.joints)) for c in b.model.couplings),
         loops=tuple(replace(x, body_a=bodies[x.body_a], body_b=bodies[x.body_b]) for x in b.model.loops),
         prescribed=tuple(replace(p, joint=joints.get(p.joint, p.joint)) for p in b.model.prescribed),
     )
-    return Compact(model, {bodies[name]: some for name, some in b.members.items()})
+    return MergedModel(model, {bodies[name]: some for name, some in b.links.items()})
 
 
-def _unused(name: str, taken: set[str]) -> str:
-    while name in taken:
+def _unused(name: str, used: set[str]) -> str:
+    while name in used:
         name += "_"
+    used.add(name)
     return name
 
 
-def aligned(b: Compact, a: Model, near: Near) -> Aligned:
-    """Return `b`, whose names are those of `a`, with its frames where `a` has them."""
+def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedModel, tuple[str, ...]]:
+    """Return `b`, in the names of `a`, with its frames where `a` has them, and the joints of moved frames.
+
+    A frame may turn freely about its joint's axis and slide along it; importers and converters make use of that.
+    It is moved if then nothing of its joint and body differs, or at least two parts less. One part less is no
+    evidence: between different robots a frame can always slide to the other's place, and its centre of mass and
+    the next joint then have numbers that are in neither file.
+    """
     joints = {j.name: j for j in a.joints}
     matter = {x.name: x for x in a.bodies}
     own = {x.name: x for x in b.model.bodies}
-    # R and p of each body's new frame in its old one.
-    moved: dict[str, tuple[Array, Array]] = {"world": (np.eye(3), np.zeros(3))}
-    made: dict[str, tuple[Joint, Body]] = {}
-    reframed = []
-    carried: dict[str, list[tuple[Joint, Joint]]] = {}
-    for joint in b.model.joints:
-        if joint.name in joints:
-            carried.setdefault(joint.parent, []).append((joint, joints[joint.name]))
+    changes = {"world": FrameChange.none("world")}
+    out: dict[str, tuple[Joint, Body]] = {}
+    moved = []
     for joint in b.model.tree:
-        R, p = moved[joint.parent]
-        there = _seen_joint(joint, R, p)
+        there = changes[joint.parent].joint(joint)
         body = own[joint.child]
-        moved[joint.child] = np.eye(3), np.zeros(3)
-        made[joint.name] = there, body
+        changes[joint.child] = FrameChange.none(joint.child)
+        out[joint.name] = there, body
         like = joints.get(joint.name)
         if like is None or not joint.type.axial or like.type.motion != joint.type.motion:
             continue
         turn, shift = there.rotation.T @ like.rotation, there.rotation.T @ (like.translation - there.translation)
-        # Exact ones and zeros stay what they are.
+        # Exact ones and zeros stay exact.
         turn = np.eye(3) if near.vector(turn, np.eye(3)) else turn
         shift = np.zeros(3) if near.point(shift, np.zeros(3)) else shift
-        axis = joint.axes[0]
         if joint.type.rotates:
+            axis = joint.axes[0]
             shift = axis * (axis @ shift)
         if not shift.any() and np.array_equal(turn, np.eye(3)):
             continue
+        change = FrameChange(joint.child, turn.T, shift, np.zeros(3))
         other = _moved(there, body, turn, shift)
-        own_before = _differing(there, body, like, matter[like.child], near)
-        own_after = _differing(*other, like, matter[like.child], near)
-        gain = own_before - own_after
-        for child, like_child in carried.get(joint.child, ()):
-            gain += _misplaced(child, like_child, near) - _misplaced(_seen_joint(child, turn, shift), like_child, near)
-        if gain > 0 and (gain > 1 or not own_after):
-            made[joint.name] = other
-            moved[joint.child] = turn, shift
-            reframed.append(joint.name)
+        after = _differing(*other, like, matter[like.child], near)
+        gain = _differing(there, body, like, matter[like.child], near) - after
+        for child in b.model.joints:
+            if child.parent == joint.child and child.name in joints:
+                fixed = joints[child.name]
+                gain += _misplaced(child, fixed, near) - _misplaced(change.joint(child), fixed, near)
+        if gain > 0 and (gain > 1 or not after):
+            out[joint.name] = other
+            changes[joint.child] = change
+            moved.append(joint.name)
     model = replace(
-        b.model,
-        joints=tuple(made[j.name][0] for j in b.model.joints),
-        bodies=tuple(made[j.name][1] for j in b.model.joints),
-        springs=tuple(
-            replace(s, point_a=_seen(moved, s.body_a, s.point_a), point_b=_seen(moved, s.body_b, s.point_b))
-            for s in b.model.springs
-        ),
-        loops=tuple(
-            replace(
-                x,
-                rotation_a=moved[x.body_a][0].T @ x.rotation_a,
-                translation_a=_seen(moved, x.body_a, x.translation_a),
-                rotation_b=moved[x.body_b][0].T @ x.rotation_b,
-                translation_b=_seen(moved, x.body_b, x.translation_b),
-            )
-            for x in b.model.loops
-        ),
+        reattached(b.model, changes),
+        joints=tuple(out[j.name][0] for j in b.model.joints),
+        bodies=tuple(out[j.name][1] for j in b.model.joints),
     )
-    members = {name: tuple(_seen_member(moved, name, m) for m in some) for name, some in b.members.items()}
-    return Aligned(Compact(model, members), tuple(reframed))
+    links = {
+        name: tuple(replace(x, R=changes[name].A @ x.R, p=changes[name].point(x.p)) for x in some)
+        for name, some in b.links.items()
+    }
+    return MergedModel(model, links), tuple(moved)
 
 
 def _moved(joint: Joint, body: Body, R: Array, p: Array) -> tuple[Joint, Body]:
     """Return a joint and its body with both frames moved by R, p."""
     placed = replace(
-        joint,
-        rotation=joint.rotation @ R,
-        translation=joint.translation + joint.rotation @ p,
-        axes=joint.axes @ R,
+        joint, rotation=joint.rotation @ R, translation=joint.translation + joint.rotation @ p, axes=joint.axes @ R
     )
-    # What has no mass has no centre of mass.
     com = R.T @ (body.com - p) if body.mass else body.com
     inertia = R.T @ body.inertia @ R
     return placed, Body(body.name, body.mass, com, 0.5 * (inertia + inertia.T))
 
 
-def _differing(joint: Joint, body: Body, like: Joint, matter: Body, near: Near) -> int:
-    return sum(
+def _differing(joint: Joint, body: Body, like: Joint, matter: Body, near: Tolerances) -> int:
+    return _misplaced(joint, like, near) + sum(
         (
-            _misplaced(joint, like, near),
             not near.vector(joint.axes, like.axes),
             not near.point(body.com, matter.com),
             not near.inertia(body.inertia, matter.inertia, matter.mass),
@@ -334,79 +288,48 @@ def _differing(joint: Joint, body: Body, like: Joint, matter: Body, near: Near) 
     )
 
 
-def _misplaced(joint: Joint, like: Joint, near: Near) -> int:
+def _misplaced(joint: Joint, like: Joint, near: Tolerances) -> int:
     return (not near.vector(joint.rotation, like.rotation)) + (not near.point(joint.translation, like.translation))
 
 
-def _seen_joint(joint: Joint, R: Array, p: Array) -> Joint:
-    """Return a joint as it stands in its parent's frame after that was moved by R, p."""
-    return replace(joint, rotation=R.T @ joint.rotation, translation=R.T @ (joint.translation - p))
+# Joints that only one of the descriptions has.
 
 
-def _seen(moved: dict[str, tuple[Array, Array]], body: str, point: Array) -> Array:
-    R, p = moved[body]
-    return np.asarray(R.T @ (point - p))
+def reconcile_joint_sets(
+    a: Model, b: Model, near: Tolerances
+) -> tuple[MergedModel, MergedModel, Matching, list[Hypothesis]]:
+    """Return both descriptions with the same joints, their matching, and the differences that were removed for that.
 
-
-def _seen_member(moved: dict[str, tuple[Array, Array]], body: str, member: Member) -> Member:
-    R, p = moved[body]
-    return replace(member, R=R.T @ member.R, p=R.T @ (member.p - p))
-
-
-# Joints that only one of two descriptions has: standing still in the other, or lost there.
-
-
-def settled(a: Model, b: Model, near: Near) -> tuple[Compact, Compact, Matching, list[Hypothesis]]:
-    """Return both descriptions with the same joints, who is who, and what was done for that.
-
-    A joint without a counterpart is held still or taken away with all that it carries, on the
-    side that has it, whichever leaves fewer differences. The `Matching` is that of what is left,
-    with those joints told as alone.
+    A joint without a counterpart is held still, or removed with everything it carries, on the side that has it,
+    whichever leaves fewer differences. The matching names these joints as without counterpart.
     """
-    done: list[Hypothesis] = []
+    causes: list[Hypothesis] = []
     alone: tuple[list[str], list[str]] = ([], [])
     while True:
-        one, other = compact(a), compact(b)
+        one, other = merge(a), merge(b)
         matching = match(one.model, other.model, near)
         if not matching.only_a and not matching.only_b:
-            return one, other, Matching(matching.pairs, tuple(alone[0]), tuple(alone[1])), done
+            return one, other, Matching(matching.pairs, tuple(alone[0]), tuple(alone[1])), causes
         side = 0 if matching.only_a else 1
-        model = (a, b)[side]
-        name = _topmost(model, (matching.only_a, matching.only_b)[side])
-        options = sorted(
-            (_differing_structure(*((x, b) if side == 0 else (a, x)), near), k, how, x)
-            for k, (how, x) in enumerate(_options(model, name))
-        )
-        _, _, how, chosen = options[0]
-        done.append(_said(how, name, model, side))
+        model, names = ((a, matching.only_a), (b, matching.only_b))[side]
+        name = next(j.name for j in model.tree if j.name in names)
+        options = {"still": _held(model, name)}
+        below = _subtree(model, name)
+        if len(below) < len(model.joints):
+            options["lost"] = restricted(model, {j.name for j in model.joints} - below)
+        costs = {how: _count_differences(*((x, b) if side == 0 else (a, x)), near) for how, x in options.items()}
+        how = min(options, key=costs.__getitem__)
+        causes.append(_structural_cause(how, name, model, below, side))
         alone[side].append(name)
-        a, b = (chosen, b) if side == 0 else (a, chosen)
-
-
-def _topmost(model: Model, names: tuple[str, ...]) -> str:
-    return next(j.name for j in model.tree if j.name in names)
-
-
-def _options(model: Model, name: str) -> Iterator[tuple[str, Model]]:
-    yield "still", _held(model, name)
-    below = _below(model, name)
-    if len(below) < len(model.joints):
-        yield "lost", _without(model, below)
+        a, b = (options[how], b) if side == 0 else (a, options[how])
 
 
 def _held(model: Model, name: str) -> Model:
-    """Return the description with a joint fixed at zero; what follows it stands still too."""
+    """Return the description with a joint fixed at zero, and those that follow it."""
     held = {name} | {j.name for j in model.joints if j.mimic is not None and j.mimic.joint == name}
+    kept = {j.name for j in model.joints} - held
     joints = tuple(_fixed(j) if j.name in held else j for j in model.joints)
-    return replace(model, joints=joints, couplings=tuple(_left(model, held)))
-
-
-def _left(model: Model, lost: set[str]) -> Iterator[JointCoupling]:
-    """Yield the couplings without some joints, which stay at zero."""
-    for c in model.couplings:
-        kept = [k for k, name in enumerate(c.joints) if name not in lost]
-        if kept:
-            yield replace(c, joints=tuple(c.joints[k] for k in kept), factors=c.factors[kept])
+    return replace(model, joints=joints, couplings=tuple(trimmed_couplings(model, kept)))
 
 
 def _fixed(joint: Joint) -> Joint:
@@ -416,7 +339,7 @@ def _fixed(joint: Joint) -> Joint:
     return replace(joint, kind=FIXED.name, axes=joint.axes[:0], pitch=0.0, mimic=None, **empty)
 
 
-def _below(model: Model, name: str) -> set[str]:
+def _subtree(model: Model, name: str) -> set[str]:
     joints, bodies = set(), set()
     for joint in model.tree:
         if joint.name == name or joint.parent in bodies:
@@ -425,49 +348,29 @@ def _below(model: Model, name: str) -> set[str]:
     return joints
 
 
-def _without(model: Model, joints: set[str]) -> Model:
-    kept = [j for j in model.joints if j.name not in joints]
-    lost = {j.child for j in model.joints if j.name in joints}
-    kept = [replace(j, mimic=None) if j.mimic is not None and j.mimic.joint in joints else j for j in kept]
-    bodies: tuple[Body, ...] = tuple(b for b in model.bodies if b.name not in lost)
-    return replace(
-        model,
-        joints=tuple(kept),
-        bodies=bodies,
-        frames=tuple(f for f in model.frames if f.body not in lost),
-        springs=tuple(s for s in model.springs if not {s.body_a, s.body_b} & lost),
-        couplings=tuple(_left(model, joints)),
-        loops=tuple(x for x in model.loops if not {x.body_a, x.body_b} & lost),
-        prescribed=tuple(p for p in model.prescribed if p.joint not in joints),
-        nonphysical=tuple(x for x in model.nonphysical if x[0] not in lost),
-    )
-
-
-def _differing_structure(a: Model, b: Model, near: Near) -> float:
-    """Return in how many numbers two descriptions differ."""
-    one, other = compact(a), compact(b)
+def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
+    one, other = merge(a), merge(b)
     matching = match(one.model, other.model, near)
-    drawn = aligned(renamed(other, one.model, matching), one.model, near).compact
-    there = drawn.model
-    own = {j.name: j for j in there.joints}
-    count = 2.0 * (len(matching.only_a) + len(matching.only_b)) + (not near.number(one.ground.mass, drawn.ground.mass))
+    there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
+    own = {j.name: j for j in there.model.joints}
+    count = 2.0 * (len(matching.only_a) + len(matching.only_b)) + (not near.number(one.ground.mass, there.ground.mass))
     for joint in one.model.joints:
         if joint.name in own:
-            x, y = one.model.body(joint.child), there.body(joint.child)
+            x, y = one.model.body(joint.child), there.model.body(joint.child)
             count += not near.number(x.mass, y.mass)
             count += not near.point(x.com, y.com)
             count += not near.inertia(x.inertia, y.inertia, x.mass)
-            count += not near.point(joint.translation, own[joint.name].translation)
-            count += not near.vector(joint.rotation, own[joint.name].rotation)
+            count += _misplaced(joint, own[joint.name], near)
     return count
 
 
-def _said(how: str, name: str, model: Model, side: int) -> Hypothesis:
+def _structural_cause(how: str, name: str, model: Model, below: Collection[str], side: int) -> Hypothesis:
     subject = f"joint {name!r}"
     if how == "still":
         says = "holds it still" if side == 0 else "lets it move, which stands still on the other side"
         return Hypothesis("joint held still", subject, says)
-    below = len([j for j in model.joints if j.name in _below(model, name) and j.type.nv])
-    more = f" and the {below - 1} joints below it" if below > 1 else ""
-    says = f"lacks it{more}" if side == 0 else f"has it{more} besides"
-    return Hypothesis("lost joint" if side == 0 else "added joint", subject, says)
+    count = sum(1 for j in model.joints if j.name in below and j.type.nv)
+    more = f" and the {count - 1} joints below it" if count > 1 else ""
+    if side == 0:
+        return Hypothesis("lost joint", subject, f"lacks it{more}")
+    return Hypothesis("added joint", subject, f"has it{more} besides")

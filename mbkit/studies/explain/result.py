@@ -1,4 +1,4 @@
-"""What an explanation is: frozen data, and ways to read it."""
+"""The result of `explain`: causes with their measured effects, and a verdict."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Titl
 
 __all__ = ["Cause", "Explanation", "effect", "grouped"]
 
-#: More causes of one kind than this are told in one line.
-_FEW: Final = 3
+#: More causes of one kind than this are one line.
+_MAX_LINES: Final = 3
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One thing that makes the second side differ from the first.
+    """A difference between two sides.
 
     Attributes
     ----------
     kind : str
-        The usual mistake's name, such as ``"armature"`` or ``"inertia about the wrong point"``.
+        Name of the usual mistake, such as ``"armature"`` or ``"inertia about the wrong point"``.
     subject : str
-        The body, the joint or the whole.
+        The body or joint; empty for the whole.
     says : str
-        What the second side did, as a sentence.
+        A sentence about the second side.
     a, b : float, list or None
         The numbers of the two sides, where they are numbers.
     effects : dict
-        Term -> relative difference that this cause alone makes: the larger of two, where it is put into the
-        first side, and where it is taken out of the second. Infinite where the coordinates are then others.
+        Term -> relative difference of this cause alone: the larger of two, where it is put into the
+        first side, and where it is taken out of the second. Infinite where the coordinates then differ.
         Empty where no term can show it: other names, matter that stands still, a constraint.
     acts : bool
-        Whether any of that is above the tolerance, or it is a constraint.
+        Whether an effect is above the tolerance, or the cause is a constraint.
     """
 
     kind: str
@@ -60,26 +60,26 @@ class Explanation(ResultTable):
     Attributes
     ----------
     a, b : str
-        What the two sides are called.
+        Names of the two sides.
     agree : bool
         Whether all terms agree by joint name, and all joints and constraints are there.
     gaps : tuple of Gap
-        How far each term is apart, joints matched by name where they have the same names.
+        Difference of each term, joints matched by name where they have the same names.
     comparable : bool
         Whether both have the same coordinates, so that terms can be compared.
     matches : tuple of Match
-        Who is who, and whether by name or by structure.
+        Matched joints, by name or by structure.
     only_a, only_b : tuple of str
         Joints without a counterpart.
     causes : tuple of Cause
     notes : tuple of str
-        Differences that are none, such as frames drawn elsewhere.
+        Differences without effect, such as frames drawn elsewhere.
     explained : bool
-        Whether the difference vanishes once all causes are applied to one side.
+        Whether the difference vanishes with all causes applied to one side.
     left : tuple of Gap
-        What remains of each term then; empty where the coordinates are not the same.
+        The remaining difference of each term; empty where the coordinates differ.
     subtree : tuple of str
-        Where something remains: the joints of the smallest part that still differs.
+        If a difference remains, the joints of the smallest part that still differs.
     samples, seed : int
     tolerance : float
         Relative difference of a term above which two sides differ.
@@ -112,7 +112,7 @@ class Explanation(ResultTable):
 
     @property
     def worst(self) -> float:
-        """The largest relative difference of a term; infinite where the coordinates are not the same."""
+        """The largest relative difference of a term; infinite where the coordinates differ."""
         return max((g.relative for g in self.gaps), default=0.0) if self.comparable else math.inf
 
     @property
@@ -169,7 +169,7 @@ def _counted(n: int, what: str) -> str:
 
 
 def effect(cause: Cause) -> str:
-    """Return what a cause does, in a few words."""
+    """Return the effect of a cause, in a few words."""
     if not cause.acts:
         return "changes no term"
     if not cause.effects:
@@ -179,13 +179,13 @@ def effect(cause: Cause) -> str:
 
 
 def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:
-    """Return kind, sentence and effect of each cause, many of one kind and effect taken together."""
+    """Return kind, sentence and effect of each cause; more than three of one kind are one line."""
     by_kind: dict[tuple[str, bool], list[Cause]] = {}
     for c in causes:
         by_kind.setdefault((c.kind, c.acts), []).append(c)
     out = []
     for (kind, _), some in by_kind.items():
-        if len(some) <= _FEW:
+        if len(some) <= _MAX_LINES:
             out += [(kind, c.says, effect(c)) for c in some]
             continue
         largest = max(some, key=lambda c: max(c.effects.values(), default=0.0))

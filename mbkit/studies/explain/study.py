@@ -2,34 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from typing import Final
 
 import numpy as np
 
 from mbkit._check import count, real
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.load.shapes import Lump
-from mbkit.model import Joint, Model
-from mbkit.studies.explain import hypotheses as bodies
-from mbkit.studies.explain import hypotheses as joints
-from mbkit.studies.explain import hypotheses as whole
+from mbkit.model import Model
 from mbkit.studies.explain.engine_differences import engine_causes
-from mbkit.studies.explain.hypotheses import Guess, Hypothesis, told, with_joint
-from mbkit.studies.explain.joint_matching import Aligned, Match, Matching, aligned, renamed, settled
-from mbkit.studies.explain.merged_links import Compact, compact, with_link, with_matter
+from mbkit.studies.explain.hypotheses import (
+    CONSTRAINTS,
+    Hypothesis,
+    differences,
+    link_differences,
+    links_in_common_axes,
+    number_text,
+)
+from mbkit.studies.explain.joint_matching import (
+    Match,
+    Matching,
+    align_frames,
+    reconcile_joint_sets,
+    rename_joints,
+)
+from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import Gaps, gaps, model_terms, part, smallest, states_of
-from mbkit.studies.explain.tolerance import Near
+from mbkit.studies.explain.terms import (
+    Gaps,
+    gaps,
+    minimal_differing_subtree,
+    model_terms,
+    part,
+    states_of,
+    velocity_joints,
+)
 from mbkit.studies.results import to_plain
 
 __all__ = ["explain"]
 
-#: Numbers that differ by less are as if written with five digits.
-_ROUNDED = 2e-5
+#: Relative difference of numbers written with five digits.
+_ROUNDED: Final = 2e-5
+#: More differences than this may be summarized as rounding.
+_MAX_LISTED: Final = 4
 
 
 def explain(
@@ -41,26 +58,26 @@ def explain(
     tolerance: float = 1e-9,
     names: tuple[str, str] | None = None,
 ) -> Explanation:
-    """Say why two descriptions, or two engines, differ.
+    """Explain why two descriptions, or two engines, differ.
 
     Every difference between the descriptions is named: armature, damping, friction, springs, gravity, a
     lost, fused or changed body, inertia about the wrong point or in the wrong axes, a joint's place, axis,
     zero or pitch, quaternion and joint order, mimic joints, velocity frames, a known defect of an engine.
-    Joints are matched by structure and name, and frames that are only drawn elsewhere are no difference.
+    Joints are matched by structure and name, and a mere choice of frames is no difference.
 
-    What each difference does is measured: it is put alone into the first description, and taken alone out of
-    the second. What remains with all of them put into the first is measured too.
+    The effect of each difference is measured: it is put alone into the first description, and taken alone out
+    of the second. The remainder with all of them put into the first is measured too.
 
     Parameters
     ----------
     a, b : Model or Dynamics
-        Descriptions, or what an engine makes of one (`mbkit.dynamics`).
+        Descriptions, or engines on a description (`mbkit.dynamics`).
     samples, seed : int
         Random states at which terms are compared.
     tolerance : float
         Relative difference that counts, of numbers in the descriptions and of terms.
     names : (str, str), optional
-        What the two sides are called; by default by their models' or engines' names.
+        Names of the two sides; by default those of their models or engines.
 
     Returns
     -------
@@ -78,8 +95,7 @@ def explain(
     count("samples", samples, least=1)
     count("seed", seed)
     real("tolerance", tolerance, positive=True)
-    labels = names or _labels(a, b, model_a, model_b)
-    out = _Descriptions(model_a, model_b, labels, samples, seed, tolerance).run()
+    out = _Descriptions(model_a, model_b, names or _names(a, b), samples, seed, tolerance).explain()
     if not isinstance(a, Dynamics) and not isinstance(b, Dynamics):
         return out
     return engine_causes(a, b, out)
@@ -89,7 +105,7 @@ def _model(x: Model | Dynamics, which: str) -> Model:
     model = x.model if isinstance(x, Dynamics) else x
     if not isinstance(model, Model):
         raise InputError(
-            f"{which}: expected a Model or a Dynamics, got {type(x).__name__}; mbkit.load(...) makes a Model"
+            f"{which}: expected a Model or a Dynamics, got {type(x).__name__}; mbkit.load(...) returns a Model"
         )
     if not model.has_bodies:
         raise UnsupportedError(f"explain: {model.name} was written as energies and has no bodies to compare")
@@ -98,14 +114,14 @@ def _model(x: Model | Dynamics, which: str) -> Model:
     return model
 
 
-def _labels(a: Model | Dynamics, b: Model | Dynamics, model_a: Model, model_b: Model) -> tuple[str, str]:
-    one, other = (x.engine if isinstance(x, Dynamics) else m.name for x, m in ((a, model_a), (b, model_b)))
+def _names(a: Model | Dynamics, b: Model | Dynamics) -> tuple[str, str]:
+    one, other = (x.engine if isinstance(x, Dynamics) else x.name for x in (a, b))
     return (one, other) if one != other else ("first", "second")
 
 
 @dataclass
 class _Descriptions:
-    """Two descriptions, and the steps of comparing them."""
+    """Two descriptions, and the steps of their comparison."""
 
     a: Model
     b: Model
@@ -114,24 +130,29 @@ class _Descriptions:
     seed: int
     tolerance: float
 
-    def run(self) -> Explanation:
-        near = Near.of(self.a, self.tolerance)
-        one, other = compact(self.a), compact(self.b)
-        by_name = self._by_name(one, other)
-        one, other, matching, structural = settled(self.a, self.b, near)
-        theirs = renamed(other, one.model, matching)
-        found = self._aligned(theirs, one.model, near)
+    def explain(self) -> Explanation:
+        near = Tolerances.of(self.a, self.tolerance)
+        by_name = self._gaps_by_name(merge(self.a), merge(self.b))
+        one, other, matching, structural = reconcile_joint_sets(self.a, self.b, near)
+        theirs = rename_joints(other, one.model, matching)
+        target, moved_frames = align_frames(theirs, one.model, near)
+        if moved_frames and self._gaps(theirs.model, target.model).worst > self.tolerance:
+            target, moved_frames = theirs, ()
         before = by_name or self._gaps(one.model, theirs.model)
-        one, target = bodies.paired(one, found.compact, near)
-        hypotheses = _hypotheses(one, target, near) if one.model.nv else []
-        made = _applied(one, hypotheses)
+        one, target = links_in_common_axes(one, target, near)
+        hypotheses = _summarized_differences(one, target, near) if one.model.nv else []
+        made = one
+        for h in hypotheses:
+            made = h.apply(made)
         after = self._gaps(made.model, target.model)
-        causes = [self._cause(h, {"M": np.inf}) for h in structural]
-        causes += self._name_causes(one, other, matching, by_name)
-        causes += [self._measured(h, one, target) for h in hypotheses]
-        causes += self._ground(one, target, near)
-        constrained = any(c.kind in whole.CONSTRAINTS for c in causes)
-        massless = bool(one.model.nv) and self._massless(one.model) and self._massless(target.model)
+        causes = (
+            *(self._cause(h, {"M": np.inf}) for h in structural),
+            *self._naming_causes(one, other, matching, by_name),
+            *(self._measured_cause(h, one, target) for h in hypotheses),
+            *self._ground_causes(one, target, near),
+        )
+        constrained = any(c.kind in CONSTRAINTS for c in causes)
+        massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
         agree = not (structural or constrained or massless) and before.worst <= self.tolerance
         explained = after.worst <= self.tolerance and (agree or massless or any(c.acts for c in causes))
         return Explanation(
@@ -143,8 +164,8 @@ class _Descriptions:
             matches=matching.pairs,
             only_a=matching.only_a,
             only_b=matching.only_b,
-            causes=tuple(causes),
-            notes=tuple(self._notes(one, found.reframed, matching)),
+            causes=causes,
+            notes=tuple(_notes(one, moved_frames, matching)),
             explained=explained,
             left=after.terms,
             subtree=() if explained else self._subtree(made.model, target.model),
@@ -154,23 +175,32 @@ class _Descriptions:
             massless=massless,
         )
 
-    def _massless(self, model: Model) -> bool:
+    def _is_massless(self, model: Model) -> bool:
         M = model_terms(model, states_of(model, self.samples, self.seed)).get("M")
         return M is not None and not M.any()
 
-    def _aligned(self, theirs: Compact, like: Model, near: Near) -> Aligned:
-        """Return a description with its frames where the other has them, if no term changes with that."""
-        found = aligned(theirs, like, near)
-        if not found.reframed or self._gaps(theirs.model, found.compact.model).worst <= self.tolerance:
-            return found
-        return Aligned(theirs, ())
+    def _gaps(self, a: Model, b: Model) -> Gaps:
+        if a.velocity_names != b.velocity_names or not a.nv:
+            return Gaps((), comparable=False)
+        at = states_of(b, self.samples, self.seed)
+        return gaps(model_terms(a, at), model_terms(b, at), at.v, velocity_joints(a))
 
-    def _measured(self, h: Hypothesis, one: Compact, target: Compact) -> Cause:
-        """Return a difference as a cause, with the larger of its effects on the two descriptions.
+    def _gaps_by_name(self, one: MergedModel, other: MergedModel) -> Gaps | None:
+        """Return the differences of terms with joints matched by name, where the names are the same."""
+        ours, theirs = ([j.name for j in x.model.joints] for x in (one, other))
+        if sorted(ours) != sorted(theirs):
+            return None
+        pairs = tuple(Match(n, n, "name") for n in ours)
+        return self._gaps(one.model, rename_joints(other, one.model, Matching(pairs, (), ())).model)
 
-        It is put alone into the first description, and taken alone out of the second.
-        """
-        if h.kind in whole.CONSTRAINTS:
+    def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
+        acts = h.kind in CONSTRAINTS or any(not x <= self.tolerance for x in effects.values())
+        head = f"{h.subject}: " if h.subject else ""
+        return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), effects, acts)
+
+    def _measured_cause(self, h: Hypothesis, one: MergedModel, target: MergedModel) -> Cause:
+        """Return a difference with the larger of its two effects, put alone into one side or taken out of the other."""
+        if h.kind in CONSTRAINTS:
             return self._cause(h, {})
         effects: dict[str, float] = {}
         for model, changed in ((one.model, h.apply(one).model), (target.model, h.revert(target).model)):
@@ -178,183 +208,84 @@ class _Descriptions:
                 effects[term] = max(relative, effects.get(term, 0.0))
         return self._cause(h, effects)
 
-    def _gaps(self, a: Model, b: Model) -> Gaps:
-        if a.velocity_names != b.velocity_names or not a.nv:
-            return Gaps((), comparable=False)
-        at = states_of(b, self.samples, self.seed)
-        owners = [j.name for j in a.independent_joints for _ in range(j.type.nv)]
-        return gaps(model_terms(a, at), model_terms(b, at), at.v, owners)
-
-    def _by_name(self, one: Compact, other: Compact) -> Gaps | None:
-        """Return how far the terms are apart by name, where the names are the same."""
-        ours, theirs = ([j.name for j in x.model.joints] for x in (one, other))
-        if sorted(ours) != sorted(theirs):
-            return None
-        pairs = tuple(Match(n, n, "name") for n in ours)
-        return self._gaps(one.model, renamed(other, one.model, Matching(pairs, (), ())).model)
-
-    def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
-        acts = h.kind in whole.CONSTRAINTS or any(not x <= self.tolerance for x in effects.values())
-        head = f"{h.subject}: " if h.subject else ""
-        return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), effects, acts)
-
-    def _name_causes(self, one: Compact, other: Compact, matching: Matching, by_name: Gaps | None) -> list[Cause]:
-        """Return causes in what joints are called and where they stand in q."""
-        out = []
+    def _naming_causes(
+        self, one: MergedModel, other: MergedModel, matching: Matching, by_name: Gaps | None
+    ) -> Iterator[Cause]:
+        """Yield differences in the names of joints and in their order in q."""
         ours = {j.name for j in one.model.joints}
-        exchanged = [m for m in matching.pairs if m.how == "structure" and m.b in ours]
-        other_names = [m for m in matching.pairs if m.how == "structure" and m.b not in ours]
+        by_structure = [m for m in matching.pairs if m.how == "structure"]
+        exchanged = ", ".join(f"{m.a!r} is {m.b!r}" for m in by_structure if m.b in ours)
         if exchanged:
-            says = "calls joints by each other's names: " + ", ".join(f"{m.a!r} is {m.b!r}" for m in exchanged)
-            h = Hypothesis("names exchanged", "", says)
-            out.append(self._cause(h, _effects(by_name) if by_name else {"M": np.inf}))
-        if other_names:
-            says = "calls joints otherwise: " + ", ".join(f"{m.a!r} is {m.b!r}" for m in other_names)
-            out.append(self._cause(Hypothesis("renamed", "", says), {}))
-        places = {n: k for k, n in enumerate(j.name for j in other.model.independent_joints)}
+            h = Hypothesis("names exchanged", "", f"calls joints by each other's names: {exchanged}")
+            yield self._cause(h, _effects(by_name) if by_name else {"M": np.inf})
+        others = ", ".join(f"{m.a!r} is {m.b!r}" for m in by_structure if m.b not in ours)
+        if others:
+            yield self._cause(Hypothesis("renamed", "", f"calls joints otherwise: {others}"), {})
+        places = {j.name: k for k, j in enumerate(other.model.independent_joints)}
         order = [m.b for m in matching.pairs if m.b in places]
         there = sorted(order, key=places.__getitem__)
         if order != there:
             moved = [x for x, y in zip(order, there, strict=True) if x != y]
+            says = f"has q and v in another order: {', '.join(there)}"
             if len(moved) == 2:
                 says = f"has joints {moved[0]!r} and {moved[1]!r} in each other's place in q and v"
-            else:
-                says = f"has q and v in another order: {', '.join(there)}"
-            out.append(self._cause(Hypothesis("joint order", "", says), {}))
-        return out
+            yield self._cause(Hypothesis("joint order", "", says), {})
 
-    def _ground(self, one: Compact, other: Compact, near: Near) -> list[Cause]:
-        """Return what differs in the matter that stands still."""
+    def _ground_causes(self, one: MergedModel, other: MergedModel, near: Tolerances) -> Iterator[Cause]:
+        """Yield the difference in the matter that stands still."""
         a, b = one.ground, other.ground
         if near.lump(a, b):
-            return []
+            return
         if not b.mass and a.mass:
-            says = f"has no mass in what stands still, where {self.names[0]} has {told(a.mass)} kg"
+            says = f"has no mass in what stands still, where {self.names[0]} has {number_text(a.mass)} kg"
         elif near.number(a.mass, b.mass):
-            some = bodies.by_link(one.members["world"], other.members["world"], near)
-            links = [f"link {name!r} {g.says}" for name, g in some or ()]
-            says = f"has other matter of the same mass standing still{': ' if links else ''}{', '.join(links)}"
+            some = link_differences(one.links["world"], other.links["world"], near)
+            links = ", ".join(f"link {name!r} {x.says}" for name, x in some or ())
+            says = f"has other matter of the same mass standing still{': ' if links else ''}{links}"
         else:
-            says = f"has {told(b.mass)} kg standing still for {told(a.mass)} kg"
-        return [self._cause(Hypothesis("base mass", "the base", says, a=a.mass, b=b.mass), {})]
-
-    def _notes(self, one: Compact, reframed: Sequence[str], matching: Matching) -> list[str]:
-        out = []
-        if reframed:
-            frames = f"{len(reframed)} of {len(one.model.joints)} frames" if len(reframed) > 3 else ", ".join(reframed)
-            out.append(f"frames drawn elsewhere, which changes no term: {frames}")
-        if any(m.how == "structure" for m in matching.pairs):
-            by_place = sum(m.how == "structure" for m in matching.pairs)
-            out.append(f"{by_place} of {len(matching.pairs)} joints were matched by structure, the others by name")
-        return out
+            says = f"has {number_text(b.mass)} kg standing still for {number_text(a.mass)} kg"
+        yield self._cause(Hypothesis("base mass", "the base", says, a=a.mass, b=b.mass), {})
 
     def _subtree(self, a: Model, b: Model) -> tuple[str, ...]:
-        def differs(names: set[str]) -> bool:
-            return self._gaps(part(a, names), part(b, names)).worst > self.tolerance
+        def differs(joints: set[str]) -> bool:
+            return self._gaps(part(a, joints), part(b, joints)).worst > self.tolerance
 
-        return smallest(a, differs)
-
-
-def _applied(x: Compact, hypotheses: Iterable[Hypothesis]) -> Compact:
-    for h in hypotheses:
-        x = h.apply(x)
-    return x
+        return minimal_differing_subtree(a, differs)
 
 
 def _effects(found: Gaps) -> dict[str, float]:
     return {g.term: g.relative for g in found.terms} if found.comparable else {"M": np.inf}
 
 
-def _hypotheses(one: Compact, other: Compact, near: Near) -> list[Hypothesis]:
-    """Return the differences that make one description the other; many small ones are one, called rounding."""
-    fine = _differences(one, other, near)
-    if len(fine) <= 4:
+def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) -> Iterator[str]:
+    if moved_frames:
+        frames = ", ".join(moved_frames)
+        if len(moved_frames) > 3:
+            frames = f"{len(moved_frames)} of {len(one.model.joints)} frames"
+        yield f"frames drawn elsewhere, which changes no term: {frames}"
+    by_structure = sum(m.how == "structure" for m in matching.pairs)
+    if by_structure:
+        yield f"{by_structure} of {len(matching.pairs)} joints were matched by structure, the others by name"
+
+
+def _summarized_differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
+    """Return the differences between two descriptions; many small ones are one, called rounding."""
+    fine = differences(one, other, near)
+    if len(fine) <= _MAX_LISTED:
         return fine
-    coarse = _differences(one, other, replace(near, tolerance=max(_ROUNDED, near.tolerance)))
+    coarse = differences(one, other, replace(near, relative=max(_ROUNDED, near.relative)))
     if len(coarse) > len(fine) // 2:
         return fine
     large = {(h.subject, field) for h in coarse for field in h.theirs}
     less = [h.without({field for subject, field in large if subject == h.subject}) for h in fine]
     small = [h for h in less if h.theirs]
     says = f"has rounded numbers: {len(small)} of them differ, by less than {_ROUNDED:.0e} of their size"
-
-    def put(x: Compact, sides: Mapping[str, Sequence[Hypothesis]]) -> Compact:
-        for h in sides.get("in", ()):
-            x = h.apply(x)
-        for h in sides.get("out", ()):
-            x = h.revert(x)
-        return x
-
-    return [*coarse, Hypothesis("rounding", "", says, put, {"out": small}, {"in": small})]
+    return [*coarse, Hypothesis("rounding", "", says, _put_all, {"revert": small}, {"apply": small})]
 
 
-def _differences(one: Compact, other: Compact, near: Near) -> list[Hypothesis]:
-    """Return what makes `one` `other`, part by part."""
-    out = whole.named_whole(one.model, other.model, near)
-    theirs = {j.name: j for j in other.model.joints}
-    for joint in one.model.joints:
-        if joint.name in theirs:
-            out += _joint(joint, theirs[joint.name], near)
-            out += _body(one, joint, other, near)
-    return out
-
-
-def _joint(a: Joint, b: Joint, near: Near) -> list[Hypothesis]:
-    def put(x: Compact, fields: Mapping[str, Any]) -> Compact:
-        return replace(x, model=with_joint(x.model, a.name, **fields))
-
-    out = []
-    for g in joints.named_joints(a, b, near):
-        ours = {field: getattr(a, field) for field in g.value}
-        theirs = {field: getattr(b, field) for field in g.value}
-        out.append(Hypothesis(g.kind, f"joint {a.name!r}", g.says, put, ours, theirs, *_numbers(ours, theirs)))
-    return out
-
-
-def _numbers(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return the numbers of the two sides, where a difference is in one field of numbers."""
-    if len(ours) != 1:
-        return None, None
-    sides = next(iter(ours.values())), next(iter(theirs.values()))
-    return sides if all(isinstance(x, (float, np.ndarray)) for x in sides) else (None, None)
-
-
-def _body(one: Compact, joint: Joint, other: Compact, near: Near) -> list[Hypothesis]:
-    body = joint.child
-    members, (a, b) = one.members[body], (_lump(x.model, body) for x in (one, other))
-    if near.lump(a, b):
-        return []
-    links = bodies.by_link(members, other.members[body], near)
-    if links:
-        own = {m.name: m.matter for m in members}
-        there = {m.name: m.matter for m in other.members[body]}
-        return [
-            _matter(
-                g,
-                f"link {name!r}, fixed to {body!r}" if name != body else f"link {name!r}",
-                partial(_put_link, body, name),
-                own[name],
-                there[name],
-            )
-            for name, g in links
-        ]
-    guesses = bodies.named(members, joint.rotation, b, near, base=_base(joint))
-    return [_matter(g, f"body {body!r}", lambda x, fields: with_matter(x, body, fields), a, b) for g in guesses]
-
-
-def _put_link(body: str, link: str, x: Compact, fields: Mapping[str, Any]) -> Compact:
-    return with_link(x, body, link, fields)
-
-
-def _matter(g: Guess, subject: str, put: Callable[[Compact, Any], Compact], a: Lump, b: Lump) -> Hypothesis:
-    ours, theirs = ({field: getattr(x, field) for field in g.value} for x in (a, b))
-    return Hypothesis(g.kind, subject, g.says, put, ours, theirs, *_numbers(ours, theirs))
-
-
-def _lump(model: Model, name: str) -> Lump:
-    body = model.body(name)
-    return Lump(body.mass, body.com, body.inertia)
-
-
-def _base(joint: Joint) -> bool:
-    return joint.type.floating and joint.parent == "world"
+def _put_all(x: MergedModel, sides: Mapping[str, Sequence[Hypothesis]]) -> MergedModel:
+    for h in sides.get("apply", ()):
+        x = h.apply(x)
+    for h in sides.get("revert", ()):
+        x = h.revert(x)
+    return x

@@ -1,9 +1,9 @@
-"""How far the terms of two descriptions or engines are apart, joint by joint."""
+"""Differences between the terms of two descriptions or engines, and the smallest part that still differs."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -12,13 +12,27 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, NonPhysicalWarning
-from mbkit.model import Joint, Model
+from mbkit.model import JointCoupling, Model
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
 
-__all__ = ["TERMS", "Gap", "Gaps", "States", "evaluated", "gaps", "model_terms", "part", "smallest", "states_of"]
+__all__ = [
+    "TERMS",
+    "Gap",
+    "Gaps",
+    "States",
+    "Values",
+    "evaluated",
+    "gaps",
+    "minimal_differing_subtree",
+    "model_terms",
+    "part",
+    "restricted",
+    "states_of",
+    "trimmed_couplings",
+    "velocity_joints",
+]
 
-
-#: What is compared: name in tables, quantity, arguments.
+#: Compared terms: name in tables, quantity, arguments.
 TERMS: Final = (
     ("M", "mass_matrix", "q"),
     ("g", "gravity", "q"),
@@ -44,7 +58,7 @@ class Gap:
     ----------
     term : str
     relative : float
-        Measured as `mbkit.studies.compare.errors` says; infinite where one side has no value.
+        Scaled as in `mbkit.studies.compare.errors`; infinite for NaN.
     joint : str
         Where it is largest.
     """
@@ -56,7 +70,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Gaps:
-    """The largest difference of each term; `comparable` is False where the coordinates are not the same."""
+    """The largest difference of each term; `comparable` is False where the coordinates differ."""
 
     terms: tuple[Gap, ...]
     comparable: bool = True
@@ -68,15 +82,20 @@ class Gaps:
 
     @property
     def joint(self) -> str:
-        """Where the largest is."""
+        """The joint of the largest."""
         return max(self.terms, key=lambda g: g.relative).joint if self.terms else ""
 
 
 def states_of(model: Model, samples: int, seed: int) -> States:
     """Return random states of a model."""
-    # An importer may hold limits in which nothing fits.
+    # An importer may give limits with lower > upper.
     fits = all(np.all(j.lower <= j.upper) for j in model.joints)
     return States(*(model if fits else model.without("limits")).random_state(np.random.default_rng(seed), samples))
+
+
+def velocity_joints(model: Model) -> list[str]:
+    """Return the joint of each velocity."""
+    return [j.name for j in model.independent_joints for _ in range(j.type.nv)]
 
 
 def model_terms(model: Model, at: States) -> Values:
@@ -88,7 +107,7 @@ def model_terms(model: Model, at: States) -> Values:
 
 
 def evaluated(dyn: Dynamics, at: States) -> Values:
-    """Return all terms that an engine can give."""
+    """Return all terms that an engine can compute."""
     out: Values = {}
     for term, quantity, arguments in TERMS:
         with warnings.catch_warnings():
@@ -96,13 +115,12 @@ def evaluated(dyn: Dynamics, at: States) -> Values:
             try:
                 out[term] = getattr(dyn, quantity)(*(getattr(at, x) for x in arguments))
             except MbkitError:
-                # A term that one side cannot give is none to compare.
                 continue
     return out
 
 
 def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
-    """Return how far values are apart, by what `a` has.
+    """Return the differences of values, scaled by those of `a`.
 
     Parameters
     ----------
@@ -113,7 +131,7 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
     joints : sequence of str
         The joint of each velocity.
     """
-    # An engine that refuses the state, or has another number of velocities.
+    # An engine may refuse the state, or have another number of velocities.
     if "M" not in a or "M" not in b or a["M"].shape != b["M"].shape:
         return Gaps((), comparable=False)
     scales = _scales(a, v)
@@ -126,7 +144,7 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
         per = measured.per_velocity
         joint = joints[int(np.argmax(per))] if per.size and per.max() > 0 else ""
         largest = float(measured.relative.max(initial=0.0))
-        # NaN passes no comparison, and would be lost in a maximum.
+        # A NaN would be lost in a maximum.
         out.append(Gap(term, np.inf if np.isnan(largest) else largest, joint))
     return Gaps(tuple(out))
 
@@ -139,71 +157,74 @@ def _scales(a: Values, v: Array) -> Scales:
     return Scales(M, diagonal, inertial, nothing, np.zeros_like(diagonal), nothing, nothing)
 
 
-# The smallest part of a robot that still differs.
+# Parts of a description.
 
 
-def part(model: Model, joints: set[str]) -> Model:
-    """Return some joints of a fused description, with what they carry; what is above them stands still.
-
-    A joint whose parent is left out stands in the world as it stands on its parent. Mimic joints follow
-    only what is there.
-    """
+def restricted(model: Model, joints: Collection[str]) -> Model:
+    """Return the description with some joints alone and the bodies on them; mimic joints follow only these."""
     kept = [j for j in model.joints if j.name in joints]
     bodies = {j.child for j in kept}
-    made = [_grounded(j, bodies, joints) for j in kept]
-    springs = [s for s in model.springs if {s.body_a, s.body_b} <= bodies | {"world"}]
+    here = bodies | {"world"}
     return replace(
         model,
-        joints=tuple(made),
+        joints=tuple(
+            replace(j, mimic=None) if j.mimic is not None and j.mimic.joint not in joints else j for j in kept
+        ),
         bodies=tuple(b for b in model.bodies if b.name in bodies),
-        springs=tuple(springs),
-        couplings=tuple(c for c in model.couplings if set(c.joints) <= joints),
-        loops=(),
-        prescribed=(),
         frames=(),
+        springs=tuple(s for s in model.springs if {s.body_a, s.body_b} <= here),
+        couplings=tuple(trimmed_couplings(model, joints)),
+        loops=tuple(x for x in model.loops if {x.body_a, x.body_b} <= here),
+        prescribed=tuple(p for p in model.prescribed if p.joint in joints),
         nonphysical=tuple(x for x in model.nonphysical if x[0] in bodies),
     )
 
 
-def _grounded(joint: Joint, bodies: set[str], joints: set[str]) -> Joint:
-    if joint.parent not in bodies and joint.parent != "world":
-        joint = replace(joint, parent="world")
-    if joint.mimic is not None and joint.mimic.joint not in joints:
-        joint = replace(joint, mimic=None)
-    return joint
+def trimmed_couplings(model: Model, joints: Collection[str]) -> Iterator[JointCoupling]:
+    """Yield the couplings of some joints, the others standing at zero."""
+    for c in model.couplings:
+        kept = [k for k, name in enumerate(c.joints) if name in joints]
+        if kept:
+            yield replace(c, joints=tuple(c.joints[k] for k in kept), factors=c.factors[kept])
 
 
-def smallest(model: Model, differs: Callable[[set[str]], bool]) -> tuple[str, ...]:
-    """Return the joints of the smallest part that still differs, found by taking joints away.
+def part(model: Model, joints: Collection[str]) -> Model:
+    """Return some joints of a merged description with their bodies, without loops and prescribed motions.
+
+    A joint whose parent is left out is fixed in the world as it is on its parent.
+    """
+    out = restricted(model, joints)
+    bodies = {b.name for b in out.bodies}
+    return replace(
+        out,
+        joints=tuple(j if j.parent in bodies else replace(j, parent="world") for j in out.joints),
+        couplings=tuple(c for c in model.couplings if set(c.joints) <= set(joints)),
+        loops=(),
+        prescribed=(),
+    )
+
+
+def minimal_differing_subtree(model: Model, differs: Callable[[set[str]], bool]) -> tuple[str, ...]:
+    """Return the joints of the smallest part that still differs: none of them can be left out.
 
     Parameters
     ----------
     model : Model
-        Fused.
+        Merged.
     differs : callable
         Whether the part with these joints differs between the two sides.
 
     Returns
     -------
     tuple of str
-        In the model's order; no joint can be left out of it. Empty where only the whole differs.
+        In the model's order; empty where only the whole differs.
     """
     below: dict[str, set[str]] = {}
     for joint in reversed(model.tree):
-        own = {joint.name}
-        for child in model.joints:
-            if child.parent == joint.child:
-                own |= below[child.name]
-        below[joint.name] = own
-    # The smallest subtree, and then its branches one by one.
-    for joints in sorted(below.values(), key=len):
-        if differs(joints):
-            left = set(joints)
-            break
-    else:
-        return ()
+        below[joint.name] = {joint.name}.union(*(below[c.name] for c in model.joints if c.parent == joint.child))
+    left = next((joints for joints in sorted(below.values(), key=len) if differs(joints)), set[str]())
     for joint in reversed(model.tree):
-        # A branch can go when it does not matter; what is above it stays.
+        # A branch that does not matter goes; the joints above it stay.
         without = left - below[joint.name]
         if joint.name in left and without and differs(without):
             left = without

@@ -24,13 +24,12 @@ from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_links import urdf_links
 from mbkit.model import Joint, Model
 from mbkit.studies import results
-from mbkit.studies.explain.hypotheses import angle_of, told
-from mbkit.studies.explain.joint_matching import Matching, aligned, renamed, settled
-from mbkit.studies.explain.merged_links import Compact
+from mbkit.studies.explain.hypotheses import angle_of, number_text
+from mbkit.studies.explain.joint_matching import Matching, align_frames, reconcile_joint_sets, rename_joints
+from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
-from mbkit.studies.explain.tolerance import Near
 from mbkit.studies.importers.process import ImporterError, Reading, one_at_a_time
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 
@@ -73,9 +72,9 @@ def stages(
     """
     described = reference.model if isinstance(reference, Imported) else reference
     free = unmimicked(described)
-    near = Near.of(free, tolerance)
-    one, other, matching, structural = settled(free, imported.model, near)
-    there = aligned(renamed(other, one.model, matching), one.model, near).compact
+    near = Tolerances.of(free, tolerance)
+    one, other, matching, structural = reconcile_joint_sets(free, imported.model, near)
+    there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
     pairs = [(a, b) for a, b in zip(one.model.joints, there.model.joints, strict=False) if a.name == b.name]
     alone = [h.subject for h in structural]
     out = [
@@ -110,7 +109,7 @@ def _stage(name: str, found: Iterable[_Difference]) -> Stage:
     return Stage(name, False, worst.size, worst.where, f"{worst.where}: {worst.says}{more}")
 
 
-def _tree(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
+def _tree(pairs: list[tuple[Joint, Joint]], near: Tolerances) -> list[Stage]:
     def kinds(a: Joint, b: Joint) -> _Difference | None:
         same = a.type.motion == b.type.motion
         return None if same else _Difference(a.name, 1.0, f"{b.kind} for {a.kind}")
@@ -128,7 +127,9 @@ def _tree(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
     def axes(a: Joint, b: Joint) -> _Difference | None:
         if near.vector(a.axes, b.axes):
             return None
-        return _Difference(a.name, float(np.abs(a.axes - b.axes).max()), f"{told(b.axes)} for {told(a.axes)}")
+        return _Difference(
+            a.name, float(np.abs(a.axes - b.axes).max()), f"{number_text(b.axes)} for {number_text(a.axes)}"
+        )
 
     checks: dict[str, Callable[[Joint, Joint], _Difference | None]] = {
         "kinds": kinds,
@@ -152,12 +153,16 @@ def _mimics(reference: Model, made: Model, matching: Matching) -> Stage:
     return Stage("mimic", not lost, float(len(lost)), lost[0] if lost else "", says)
 
 
-def _matter(one: Compact, other: Compact, near: Near) -> list[Stage]:
+def _matter(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Stage]:
     total = [sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other)]
     whole = []
     if not near.number(*total):
         base = " (the base's)" if near.number(total[0] - total[1], one.ground.mass - other.ground.mass) else ""
-        whole = [_Difference("all", abs(total[1] / total[0] - 1), f"{told(total[1])} kg for {told(total[0])} kg{base}")]
+        whole = [
+            _Difference(
+                "all", abs(total[1] / total[0] - 1), f"{number_text(total[1])} kg for {number_text(total[0])} kg{base}"
+            )
+        ]
     masses, coms, inertias = [], [], []
     theirs = {b.name: b for b in other.model.bodies}
     for a in one.model.bodies:
@@ -166,13 +171,13 @@ def _matter(one: Compact, other: Compact, near: Near) -> list[Stage]:
         b = theirs[a.name]
         if not near.number(a.mass, b.mass):
             size = abs(b.mass - a.mass) / max(a.mass, b.mass)
-            masses.append(_Difference(a.name, size, f"{told(b.mass)} kg for {told(a.mass)} kg"))
+            masses.append(_Difference(a.name, size, f"{number_text(b.mass)} kg for {number_text(a.mass)} kg"))
         if not near.point(a.com, b.com):
             size = float(np.linalg.norm(a.com - b.com))
-            coms.append(_Difference(a.name, size, f"{told(b.com)} for {told(a.com)} m"))
+            coms.append(_Difference(a.name, size, f"{number_text(b.com)} for {number_text(a.com)} m"))
         if not near.inertia(a.inertia, b.inertia, a.mass):
             size = float(np.abs(b.inertia - a.inertia).max() / max(np.abs(a.inertia).max(), np.abs(b.inertia).max()))
-            inertias.append(_Difference(a.name, size, f"{told(b.inertia)} for {told(a.inertia)} kg m²"))
+            inertias.append(_Difference(a.name, size, f"{number_text(b.inertia)} for {number_text(a.inertia)} kg m²"))
     return [
         _stage("total mass", whole),
         _stage("masses", masses),
@@ -181,7 +186,7 @@ def _matter(one: Compact, other: Compact, near: Near) -> list[Stage]:
     ]
 
 
-def _numbers(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
+def _numbers(pairs: list[tuple[Joint, Joint]], near: Tolerances) -> list[Stage]:
     out = []
     for name in ("armature", "damping", "friction", "limits"):
         found = []
@@ -191,7 +196,7 @@ def _numbers(pairs: list[tuple[Joint, Joint]], near: Near) -> list[Stage]:
                 if x.shape == y.shape and not near.numbers(x, y):
                     size = float(np.max(np.where(np.isfinite(x) & np.isfinite(y), np.abs(y - x), np.inf)))
                     label = f"{field.replace('_', ' ')} " if name == "limits" else ""
-                    found.append(_Difference(a.name, size, f"{label}{told(y)} for {told(x)}"))
+                    found.append(_Difference(a.name, size, f"{label}{number_text(y)} for {number_text(x)}"))
         out.append(_stage(name, found))
     return out
 

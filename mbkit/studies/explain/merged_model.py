@@ -1,0 +1,239 @@
+"""A description with links that are fixed together merged into one body, and comparison of its parts to a tolerance.
+
+Two descriptions of one robot may merge links or keep them apart; the motion is the same. So they are compared merged,
+and each body knows its links.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.load.shapes import NOTHING, Lump, together
+from mbkit.model import Body, Joint, Model
+from mbkit.studies._targets import with_values
+
+__all__ = ["FrameChange", "LinkInBody", "MergedModel", "Tolerances", "composite", "merge", "reattached", "with_lump"]
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Comparison of parts of descriptions to a relative tolerance.
+
+    Attributes
+    ----------
+    relative : float
+    length : float
+        Size of the robot, m: the scale for coordinates that should be zero.
+    """
+
+    relative: float
+    length: float
+
+    @classmethod
+    def of(cls, model: Model, relative: float) -> Tolerances:
+        """Take the size from the distances between joints and centres of mass."""
+        points = (*(j.translation for j in model.joints), *(b.com for b in model.bodies))
+        return cls(relative, max([1e-3, *(float(np.linalg.norm(x)) for x in points)]))
+
+    def number(self, a: float, b: float) -> bool:
+        """Return whether two numbers are equal; an infinite limit equals itself alone."""
+        size = max(abs(a), abs(b))
+        return a == b or (size < np.inf and abs(a - b) <= self.relative * size)
+
+    def numbers(self, a: Array, b: Array) -> bool:
+        """Return whether all numbers of two vectors are equal."""
+        return a.shape == b.shape and all(map(self.number, a.tolist(), b.tolist()))
+
+    def vector(self, a: Array, b: Array, scale: float = 1.0) -> bool:
+        """Return whether two vectors or matrices are equal, as a whole."""
+        return a.shape == b.shape and bool(np.abs(a - b).max(initial=0.0) <= self.relative * scale)
+
+    def point(self, a: Array, b: Array) -> bool:
+        """Return whether two points are equal."""
+        return self.vector(a, b, self.length)
+
+    def inertia(self, a: Array, b: Array, mass: float) -> bool:
+        """Return whether two inertias of bodies of this mass are equal."""
+        # A move of an inertia from one point to another rounds as m l².
+        floor = 1e-3 * mass * self.length**2 * self.relative
+        return bool(np.abs(a - b).max() <= self.relative * np.abs(a).max() + floor)
+
+    def lump(self, a: Lump, b: Lump) -> bool:
+        """Return whether mass, centre of mass and inertia are equal."""
+        com = self.point(a.com, b.com) or not (a.mass or b.mass)
+        return self.number(a.mass, b.mass) and com and self.inertia(a.inertia, b.inertia, a.mass)
+
+
+@dataclass(frozen=True)
+class LinkInBody:
+    """A link merged into a body.
+
+    Attributes
+    ----------
+    name : str
+    R, p : (3, 3) and (3,) arrays
+        Pose of its frame in the body's.
+    matter : Lump
+        In its own axes.
+    """
+
+    name: str
+    R: Array
+    p: Array
+    matter: Lump
+
+    @property
+    def lump(self) -> Lump:
+        """Its matter in the body's axes."""
+        return self.matter.moved(self.R, self.p)
+
+    @property
+    def massive(self) -> bool:
+        """Whether it has mass or inertia; otherwise it is a mere frame."""
+        return bool(self.matter.mass or self.matter.inertia.any())
+
+
+@dataclass(frozen=True)
+class MergedModel:
+    """A merged description.
+
+    Attributes
+    ----------
+    model : Model
+        Without fixed joints, and without links fixed to the world.
+    links : mapping of str to tuple of LinkInBody
+        Body -> its links, its own first; ``"world"`` has those that stand still.
+    """
+
+    model: Model
+    links: Mapping[str, tuple[LinkInBody, ...]]
+
+    @property
+    def ground(self) -> Lump:
+        """The matter that stands still, in the world's axes."""
+        return composite(self.links["world"])
+
+    def lump(self, body: str) -> Lump:
+        """Return the matter of a body."""
+        x = self.model.body(body)
+        return Lump(x.mass, x.com, x.inertia)
+
+    def with_fields(self, **fields: Any) -> MergedModel:
+        """Return the description with other fields of the model."""
+        return replace(self, model=replace(self.model, **fields))
+
+    def with_joint(self, name: str, fields: Mapping[str, Any]) -> MergedModel:
+        """Return the description with other fields in one joint."""
+        return self.with_fields(joints=tuple(replace(j, **fields) if j.name == name else j for j in self.model.joints))
+
+    def with_body(self, name: str, fields: Mapping[str, Any]) -> MergedModel:
+        """Return the description with another mass, centre of mass or inertia in one body."""
+        return replace(self, model=with_lump(self.model, name, replace(self.lump(name), **fields)))
+
+    def with_link(self, body: str, link: str, fields: Mapping[str, Any]) -> MergedModel:
+        """Return the description with other matter in one link of a body, in the link's axes."""
+        links = tuple(replace(x, matter=replace(x.matter, **fields)) if x.name == link else x for x in self.links[body])
+        return MergedModel(with_lump(self.model, body, composite(links)), {**self.links, body: links})
+
+
+@dataclass(frozen=True)
+class FrameChange:
+    """Coordinates in another frame: x becomes A (x - o) + t on `body`."""
+
+    body: str
+    A: Array
+    o: Array
+    t: Array
+
+    @classmethod
+    def none(cls, body: str) -> FrameChange:
+        """Return the change that changes nothing."""
+        return cls(body, np.eye(3), np.zeros(3), np.zeros(3))
+
+    def point(self, x: Array) -> Array:
+        """Return a point in the other frame."""
+        return np.asarray(self.A @ (x - self.o) + self.t)
+
+    def joint(self, joint: Joint) -> Joint:
+        """Return a joint on this body as it stands in the other frame."""
+        return replace(
+            joint, parent=self.body, rotation=self.A @ joint.rotation, translation=self.point(joint.translation)
+        )
+
+
+def merge(model: Model) -> MergedModel:
+    """Return the description with links merged that are fixed together.
+
+    A parameter without a value is an error, the others take their values; frames are left out.
+    """
+    if model.parameters:
+        model.require_values("explain")
+        model = with_values(model)
+    bodies = {b.name: b for b in model.bodies}
+    at = {"world": FrameChange.none("world")}
+    links: dict[str, list[LinkInBody]] = {"world": []}
+    moving: dict[str, Joint] = {}
+    for joint in model.tree:
+        placed, own = at[joint.parent].joint(joint), bodies[joint.child]
+        if joint.type.nv:
+            moving[joint.name] = placed
+            at[joint.child] = FrameChange.none(joint.child)
+            links[joint.child] = []
+        else:
+            at[joint.child] = FrameChange(placed.parent, placed.rotation, np.zeros(3), placed.translation)
+        here = at[joint.child]
+        links[here.body].append(LinkInBody(own.name, here.A, here.t, Lump(own.mass, own.com, own.inertia)))
+    joints = tuple(moving[j.name] for j in model.joints if j.name in moving)
+    merged = replace(
+        reattached(model, at),
+        bodies=tuple(_body(j.child, composite(links[j.child])) for j in joints),
+        joints=joints,
+        frames=(),
+    )
+    return MergedModel(merged, {name: tuple(some) for name, some in links.items()})
+
+
+def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
+    """Return the description with the ends of springs and loops in other frames."""
+    springs = []
+    for s in model.springs:
+        a, b = changes[s.body_a], changes[s.body_b]
+        ends: dict[str, Any] = {
+            "body_a": a.body,
+            "point_a": a.point(s.point_a),
+            "body_b": b.body,
+            "point_b": b.point(s.point_b),
+        }
+        springs.append(replace(s, **ends))
+    loops = []
+    for x in model.loops:
+        a, b = changes[x.body_a], changes[x.body_b]
+        ends = {"body_a": a.body, "rotation_a": a.A @ x.rotation_a, "translation_a": a.point(x.translation_a)}
+        ends |= {"body_b": b.body, "rotation_b": b.A @ x.rotation_b, "translation_b": b.point(x.translation_b)}
+        loops.append(replace(x, **ends))
+    return replace(model, springs=tuple(springs), loops=tuple(loops))
+
+
+def composite(links: Iterable[LinkInBody]) -> Lump:
+    """Return several links as one lump, in the body's axes."""
+    lumps = [x.lump for x in links if x.massive]
+    if not lumps:
+        return NOTHING
+    if len(lumps) > 1 and not any(x.mass for x in lumps):
+        return Lump(0.0, np.zeros(3), np.asarray(sum(x.inertia for x in lumps)))
+    return together(lumps)
+
+
+def with_lump(model: Model, name: str, lump: Lump) -> Model:
+    """Return the description with other matter in one body."""
+    return replace(model, bodies=tuple(_body(name, lump) if b.name == name else b for b in model.bodies))
+
+
+def _body(name: str, lump: Lump) -> Body:
+    # A rotation of an inertia leaves rounding on one side of the diagonal.
+    return Body(name, lump.mass, lump.com, 0.5 * (lump.inertia + lump.inertia.T))
