@@ -1,9 +1,7 @@
 """Locks that a fork waits for.
 
-A forked child has the forking thread only. A lock that another thread held at that moment
-stays held in the child for ever, and what it guards may be half written. A fork therefore
-takes these locks first: it waits until no thread is inside, and parent and child release
-them afterwards.
+A forked child has the forking thread only. A lock of another thread would stay locked in the child, and its data may be
+half written. A fork therefore takes these locks first, and parent and child release them afterwards.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ __all__ = ["fork_safe"]
 
 Lock = TypeVar("Lock")
 
-#: In the order in which they were made, so that two threads that fork at once take them alike.
+#: In the order of their creation, so that two threads that fork at once take them in the same order.
 _LOCKS: Final[WeakValueDictionary[int, Any]] = WeakValueDictionary()
 _NUMBERS: Final = count()
 _TAKEN: Final[list[list[Any]]] = []

@@ -1,11 +1,11 @@
-"""Ctrl-C in a command: one line, status 130, at once, whatever is under way.
+"""Ctrl-C in a command: one line, status 130, at once.
 
-Python raises KeyboardInterrupt in its main thread when that is back from a library, and libraries may swallow it, print
-it, or report it as a failure of their own. So a thread listens too. A command with nothing to keep says that it was
-interrupted, is silent from then on, has `GRACE` seconds to close its files, and ends. A study that can be shown in part
-says so with `keeping`: there the first Ctrl-C is a KeyboardInterrupt, and the second ends the command.
+Python raises KeyboardInterrupt in its main thread after a library call returns, and libraries may swallow, print or
+report it as a failure of their own. So a thread listens too. A command prints one line, is silent from then on, has
+`GRACE` seconds to close its files, and ends. A study that can show a part of its result marks itself with `keeping`:
+there the first Ctrl-C is a KeyboardInterrupt, and the second ends the command.
 
-Only the light modules of Python's own are imported here, because the entry point installs this before anything else.
+Only light modules of Python are imported here, because the entry point installs this before anything else.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ class Section:
 
 
 class _Interrupts:
-    """What has happened so far.
+    """State of the command.
 
     Attributes
     ----------
     heard, count : int
-        How often Ctrl-C has come, and how often the main thread knows of.
+        Number of Ctrl-C, and of those that the main thread knows of.
     pending : bool
-        Whether it came while a file was written, and is still to be raised.
+        Whether one came while a file was written, and is still to be raised.
     ending : bool
         Whether the command has said that it was interrupted.
     """
@@ -84,9 +84,9 @@ def _install() -> None:
         return
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return
-    listening, told = os.pipe()
-    os.set_blocking(told, False)
-    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    listening, waking = os.pipe()
+    os.set_blocking(waking, False)
+    signal.set_wakeup_fd(waking, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, _raise)
     threading.Thread(target=_listen, args=(listening,), name="mbkit Ctrl-C", daemon=True).start()
 

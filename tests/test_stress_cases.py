@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-import time
 import warnings
 
 import numpy as np
@@ -18,6 +17,7 @@ from mbkit.model.validation import sample_mass_matrix
 from mbkit.simulate import METHODS, simulate
 from mbkit.studies.stress import cases
 from mbkit.studies.stress.case import Case, problem_of, times_of
+from mbkit.studies.stress.cases import exact_motions
 from mbkit.studies.stress.cases._common import largest_step, stable_steps
 from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum, precession
 from mbkit.studies.stress.cases.mass_ratio import straight_inertia
@@ -59,11 +59,11 @@ def test_a_case_is_told_and_sent_to_other_processes(case: Case) -> None:
 
 
 @pytest.mark.parametrize("case", ALL, ids=ids)
-def test_every_value_makes_a_problem(case: Case) -> None:
-    values = [v for v in case.values if v <= SLOW.get(case.name, math.inf)]
-    problem_of(case, values[0])  # loads what is loaded once
-    spent = time.process_time()
-    for value in values:
+def test_every_value_makes_a_problem(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Making a problem integrates nothing.
+    monkeypatch.setattr(exact_motions, "_step", None)
+    problem_of(case, case.values[0])  # loads files, which may warn
+    for value in (v for v in case.values if v <= SLOW.get(case.name, math.inf)):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             problem = problem_of(case, value)
@@ -77,7 +77,6 @@ def test_every_value_makes_a_problem(case: Case) -> None:
             assert problem.floor < 0.5 * (case.bar or 1e-6) * problem.scale
         if problem.dt is not None:
             assert times_of(problem, case.measure)[-1] == pytest.approx(problem.duration)
-    assert time.process_time() - spent < 0.2 * len(values)
 
 
 @pytest.mark.parametrize("case", MOTIONS, ids=ids)

@@ -93,7 +93,7 @@ class WorkerDiedError(RuntimeError):
 
 
 class WorkerTimeoutError(RuntimeError):
-    """A call took longer than allowed, and its process was ended after `seconds`."""
+    """A call took longer than allowed; its process was ended after `seconds`."""
 
     def __init__(self, seconds: float) -> None:
         super().__init__(f"stopped after {seconds:.2g} s")
@@ -416,7 +416,7 @@ def in_worker() -> bool:
 
 
 def report_stage(name: str) -> None:
-    """Tell the parent what a call begins now, from which its time is counted anew; nothing in other processes."""
+    """Tell the parent what a call begins now, which has a time limit of its own; does nothing in other processes."""
     if _to_parent is not None:
         _to_parent.send(("stage", name))
 

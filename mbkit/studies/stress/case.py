@@ -1,4 +1,4 @@
-"""What is swept: a case makes one problem of each value, from mild to extreme."""
+"""A case of a stress study: one number swept from mild to extreme, and the problem of each value."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["Case", "Family", "Measure", "Problem", "Truth", "problem_of", "step_
 
 
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "long", "step"]
-#: What an error is: of q along a run, of the energy along a run, or of terms at given states.
+#: The error of q along a run, of the energy along a run, or of terms at states.
 Measure = Literal["motion", "energy", "terms"]
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a run is measured by.
+    """The motion that a run is measured against.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Truth:
         From 0, s.
     q : (K, nq) array
     floor : float
-        How well it is known, rad or m.
+        Its error, rad or m.
     how : str
         The closed form with its source, or the runs that agree to the floor.
     """
@@ -49,24 +49,23 @@ class Problem:
     ----------
     model : Model
     q, v : (nq,) and (nv,) arrays, or (N, nq) and (N, nv) for terms
-        Where a run starts, or the states at which terms are measured.
+        The start of a run, or the states at which terms are measured.
     tau : (N, nv) array or None
         Generalized force of the terms' forward dynamics.
     duration : float
         Of a run, s; 0 for terms.
     exact : callable or None
-        From the times (K,) to q (K, nq), where a closed form is known.
+        The closed form of the motion, from times (K,) to q (K, nq).
     floor : float
-        How well `exact` is known, rad or m.
+        Error of `exact`, rad or m.
     source : str
         Of the closed form.
     scale : float
-        What an error of q is divided by: the size of the motion, rad or m.
+        Size of the motion, by which an error of q is divided, rad or m.
     dt : float or None
         Step of fixed-step methods, s, where the case prescribes it.
     facts : dict
-        Numbers worth telling, with a unit behind a comma in their names: ``"fastest frequency, rad/s"``,
-        a condition number.
+        Further numbers for the report, with a unit behind a comma in their names: ``"fastest frequency, rad/s"``.
     """
 
     model: Model
@@ -89,27 +88,27 @@ class Case:
     Attributes
     ----------
     name : str
-        As `mbkit stress` takes it.
+        Argument of `mbkit stress`.
     about : str
-        One sentence: the system, and what is asked of it.
+        One sentence on the system and its task.
     family : str
     parameter, unit : str
-        What is swept; the unit is empty for a pure number.
+        The number that is swept; the unit is empty for a pure number.
     values, quick : tuple of float
-        From mild to extreme; the fewer of a quick run.
+        From mild to extreme, and the few of a quick study.
     make : callable
-        From a value to its `Problem`; a function of a module, for it is called in other processes.
+        From a value to its `Problem`; a function of a module, because other processes call it.
     measure : {"motion", "energy", "terms"}
     bar : float or None
-        The error up to which a value is held, where the study's own has no meaning here.
+        The error up to which a value is held; None for the study's own.
     why : str
         Reason of that bar.
     methods : tuple of str
-        The only ones that are asked, where others have no meaning; all where empty.
+        The only ones with a meaning here; all where empty.
     theory : callable or None
         From an engine and a method to the value at which linear theory lets it break, or None.
     patience : float
-        How many times as long as the study allows a run may take here; more than 1 for long motions.
+        Factor on the time that the study allows a run; more than 1 for long motions.
     """
 
     name: str
@@ -128,53 +127,46 @@ class Case:
     patience: float = 1.0
 
     def facts(self) -> dict[str, Any]:
-        """Return what a result keeps of it, as plain data."""
+        """Return the case's entries in a result, as plain data."""
         kept = ("name", "about", "family", "parameter", "unit", "measure", "bar", "why")
         return {name: getattr(self, name) for name in kept}
 
 
-# Problems as cases make them, checked; and the times and steps of their runs.
-
-#: Parts of a run at whose ends errors are measured; the energy is looked at more closely.
+#: Parts of a run at whose ends errors are measured; the energy at more of them.
 _PARTS: Final[dict[Measure, int]] = {"motion": 10, "energy": 200}
 
 
 def problem_of(case: Case, value: float) -> Problem:
-    """Return the problem of one value.
-
-    Raises
-    ------
-    InputError
-        What was made is no problem, or none of this measure.
-    """
-    made: Any = case.make(value)
+    """Return the problem of one value, checked; `InputError` where it is unusable or has another measure."""
+    problem: Any = case.make(value)
     what = f"{case.name} at {value:g}"
-    if not isinstance(made, Problem):
-        raise InputError(f"{what}: expected make to return a Problem, got {type(made).__name__}")
-    if not isinstance(made.model, Model):
-        raise InputError(f"{what}: model: expected a Model, got {type(made.model).__name__}")
-    made.model.require_values("a study of stress")
-    if not made.model.nv:
-        raise InputError(f"{what}: nothing moves in {made.model.name} (nv = 0)")
-    q, v = made.model.check_q(made.q), made.model.check_v(made.v)
+    if not isinstance(problem, Problem):
+        raise InputError(f"{what}: expected make to return a Problem, got {type(problem).__name__}")
+    model: Any = problem.model
+    if not isinstance(model, Model):
+        raise InputError(f"{what}: model: expected a Model, got {type(model).__name__}")
+    model.require_values("a study of stress")
+    if not model.nv:
+        raise InputError(f"{what}: nothing moves in {model.name} (nv = 0)")
+    q, v = model.check_q(problem.q), model.check_v(problem.v)
     if case.measure == "terms":
-        if made.tau is not None:
-            made.model.check_v(made.tau, "tau")
-        return made
+        if problem.tau is not None:
+            model.check_v(problem.tau, "tau")
+        return problem
     if q.ndim != 1 or v.ndim != 1:
         raise InputError(f"{what}: q, v: expected one state for a run, got shapes {q.shape} and {v.shape}")
-    real(f"{what}: duration", made.duration, positive=True)
-    real(f"{what}: scale", made.scale, positive=True)
-    real(f"{what}: floor", made.floor, nonnegative=True)
-    if made.dt is not None:
-        real(f"{what}: dt", made.dt, positive=True)
-    if made.exact is not None and not callable(made.exact):
-        raise InputError(f"{what}: exact: expected a function of the times or None, got {made.exact!r}")
-    return made
+    real(f"{what}: duration", problem.duration, positive=True)
+    real(f"{what}: scale", problem.scale, positive=True)
+    real(f"{what}: floor", problem.floor, nonnegative=True)
+    if problem.dt is not None:
+        real(f"{what}: dt", problem.dt, positive=True)
+    if problem.exact is not None and not callable(problem.exact):
+        raise InputError(f"{what}: exact: expected a function of the times or None, got {problem.exact!r}")
+    return problem
 
 
 def times_of(problem: Problem, measure: Measure) -> Array:
-    """Return the times at which a run is measured, s, on which steps that the problem prescribes end."""
+    """Return the times at which a run is measured, s; prescribed steps end on them."""
     parts = _PARTS[measure]
     if problem.dt is None:
         return np.linspace(0.0, problem.duration, parts + 1)
@@ -184,9 +176,9 @@ def times_of(problem: Problem, measure: Measure) -> Array:
     return np.arange(0, steps + 1, stride, dtype=np.float64) * problem.dt
 
 
-def step_of(problem: Problem, times: Array, asked: float) -> float:
-    """Return the step of fixed-step methods, s: prescribed, or as asked and shortened to end on the times."""
+def step_of(problem: Problem, times: Array, dt: float) -> float:
+    """Return the step of fixed-step methods, s: prescribed, or `dt` shortened to end on the times."""
     if problem.dt is not None:
         return problem.dt
     interval = float(times[1])
-    return interval / max(1, int(np.ceil(interval / asked * (1 - 1e-9))))
+    return interval / max(1, int(np.ceil(interval / dt * (1 - 1e-9))))

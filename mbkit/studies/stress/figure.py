@@ -46,7 +46,7 @@ SHADES: Final = {
     "mute": "#aab1ba",
     "none": "#ffffff",
 }
-#: How an outcome is called in a cell where there is room, and where there is not.
+#: Outcome -> its word in a wide and in a narrow cell.
 WORDS: Final[dict[Outcome, tuple[str, str]]] = {
     "diverged": ("diverged", "div"),
     "nan": ("NaN", "NaN"),
@@ -179,9 +179,9 @@ def _strip(ax: Axes, y: int, line: Line, count: int, palette: Palette) -> None:
         face = SHADES[shade(cell, how)]
         ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=1.0))
         weight = "bold" if how == "silent" else "normal"
-        told = cell_text(cell, how, short=count > ROOMY)
+        text = cell_text(cell, how, short=count > ROOMY)
         # Cells are light on every paper.
-        ax.text(x, y, told, ha="center", va="center", fontsize=7.5, weight=weight, color=PLAIN.ink)
+        ax.text(x, y, text, ha="center", va="center", fontsize=7.5, weight=weight, color=PLAIN.ink)
     if line.broken.failed is not None:
         ax.plot([line.reach - 0.5] * 2, [y - 0.5, y + 0.5], color=palette.ink, linewidth=2.2, solid_capstyle="butt")
 
@@ -222,12 +222,12 @@ def _overview(cases: Sequence[CaseResult], palette: Palette) -> Figure:
     ax = fig.subplots(gridspec_kw=margins)
     engines = engines_of(cases)
     for y, case in enumerate(cases):
-        found = best(case)
+        leaders = best(case)
         for k, engine in enumerate(engines):
-            if engine in found:
+            if engine in leaders:
                 shift = (k - (len(engines) - 1) / 2) * 0.2
                 colour, mark = palette.engine(engine), engine_mark(engine)
-                ax.plot([found[engine].reach / len(case.values)], [y + shift], mark, color=colour, markersize=5.5)
+                ax.plot([leaders[engine].reach / len(case.values)], [y + shift], mark, color=colour, markersize=5.5)
         choice = recommended(case)
         if choice is not None:
             ax.plot([choice.reach / len(case.values)], [y], "|", color=palette.ink, markersize=13, markeredgewidth=1.6)
@@ -256,7 +256,7 @@ def _engines_legend(fig: Figure, engines: list[str], palette: Palette, *, chosen
         for e in engines
     ]
     if chosen:
-        told = "method auto"
-        handles.append(Line2D([], [], color=palette.ink, marker="|", linestyle="none", markersize=12, label=told))
+        auto = Line2D([], [], color=palette.ink, marker="|", linestyle="none", markersize=12, label="method auto")
+        handles.append(auto)
     if handles:
         fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.02, 1.0), ncols=len(handles))

@@ -225,6 +225,8 @@ def _integrate(held: _Held, setting: Setting, dyn: Dynamics, truth: Truth | None
     cell = Measurement(value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
     if not stats.finished or len(run.t) != len(times):
         return replace(cell, end="diverged", note=stats.message or f"ended at t = {run.t[-1]:g} s")
+    # Its checks integrate again: their time is not the run's.
+    report_stage("check")
     doubts = (f"{dyn.model.name}: {method}: {one}" for one in run.check().doubts)
     cell = replace(cell, warnings=tuple(dict.fromkeys([*heard, *doubts])))
     if not (np.isfinite(run.q).all() and np.isfinite(run.v).all()):

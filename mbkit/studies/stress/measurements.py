@@ -253,8 +253,8 @@ class Line:
     def ended(self) -> tuple[Measurement, Outcome] | None:
         """The first cell that was not even usable, if there is one."""
         at = self.usable
-        found = at < len(self.row.cells) and self.outcomes[at] not in ("unjudged", "not run")
-        return (self.row.cells[at], self.outcomes[at]) if found else None
+        failed = at < len(self.row.cells) and self.outcomes[at] not in ("unjudged", "not run")
+        return (self.row.cells[at], self.outcomes[at]) if failed else None
 
     @property
     def rest(self) -> Outcome | None:
@@ -292,8 +292,7 @@ def name_of(row: Row) -> str:
 
 def engines_of(cases: Iterable[CaseResult]) -> list[str]:
     """Return the engines that are in any row, in the order of every figure."""
-    found = dict.fromkeys(row.engine for case in cases for row in case.rows)
-    return sorted(found, key=engine_index)
+    return sorted(dict.fromkeys(row.engine for case in cases for row in case.rows), key=engine_index)
 
 
 def best(case: CaseResult) -> dict[str, Line]:

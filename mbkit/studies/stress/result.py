@@ -158,10 +158,10 @@ class StressResult(ResultTable):
 
     def best(self, case: str, bar: float | None = None) -> tuple[Row, ...]:
         """Return the rows that hold furthest in a case; none where none holds at all."""
-        found = self.case(case)
-        reach = {id(row): row.reach(_bar(found, bar)) for row in found.rows}
+        data = self.case(case)
+        reach = {id(row): row.reach(_bar(data, bar)) for row in data.rows}
         most = max(reach.values(), default=0)
-        return tuple(row for row in found.rows if reach[id(row)] == most > 0)
+        return tuple(row for row in data.rows if reach[id(row)] == most > 0)
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data, with the outcome of each cell and the breaking point of each row."""
