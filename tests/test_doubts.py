@@ -309,7 +309,7 @@ def test_a_joint_that_moves_no_mass_in_a_pose_is_named():
 
 @pytest.mark.parametrize(("reached", "ends"), [(0.5, False), (1e-5, False), (1e-8, True)])
 def test_steps_that_cover_nothing_end_a_run(reached, ends):
-    member = TrajectoryRecord(duration=1.0)
+    member = TrajectoryRecord(mb.catalog.pendulum(), duration=1.0)
     member.steps, member.rejected, member.reached = 19_000, 900, reached / 2
     assert not member.crawls()
     member.rejected, member.reached = 1_000, reached

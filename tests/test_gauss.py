@@ -19,7 +19,7 @@ from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import METHODS, simulate
 from mbkit.simulate.solvers.fixed_step import make_step
-from mbkit.simulate.solvers.runge_kutta import Field
+from mbkit.simulate.solvers.vector_field import Field
 from tests.random_trees import random_tree
 
 EPS = np.finfo(float).eps

@@ -9,7 +9,7 @@ import pytest
 
 #: Packages -> modules of mbkit that are about nothing else.
 OPTIONAL = {
-    ("pydrake", "heyoka", "distributed"): ("mbkit.engines.drake.", "mbkit.simulate.solvers.drake"),
+    ("pydrake", "heyoka", "distributed"): ("mbkit.engines.drake.",),
     ("llvmlite",): ("mbkit.codegen.", "_compiled", "compiled_"),
 }
 SCRIPT = """

@@ -202,7 +202,7 @@ def _drake(scheme: str, order: int | None, about: str) -> Method:
         engines=("drake",),
         least=1e-15,
         callables=False,
-        solver="drake:run_drake",
+        solver="native:run_drake",
         scheme=scheme,
     )
 

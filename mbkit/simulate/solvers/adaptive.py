@@ -9,7 +9,6 @@ stand side by side in a vector.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -19,17 +18,17 @@ from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
 from mbkit.methods.registry import Tolerances
 from mbkit.model.integration_space import Space
-from mbkit.simulate.events import Event, Hit, State, Watch
+from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.adaptive_numpy import RungeKuttaAttempts
-from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
 from mbkit.simulate.solvers.step_attempts import AcceptedSteps, StepAttempts
-from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
+from mbkit.simulate.solvers.trajectory_record import assemble_result, record_of
+from mbkit.simulate.solvers.vector_field import DIVERGED, is_bounded
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Torque
 
-__all__ = ["TrajectoryRecorder", "make_attempts", "march", "recorded_result", "run_embedded", "stop_times"]
+__all__ = ["TrajectoryRecorder", "make_attempts", "march", "run_embedded", "stop_times"]
 
 _BEYOND: Final = f"diverged: {DIVERGED}"
 
@@ -41,13 +40,10 @@ def run_embedded(asked: IntegrationProblem) -> SolverResult:
     as machine code; elsewhere stage by stage, by the same formulas. Torques held as an
     array start a new step at each interval.
     """
-    dyn, tolerances, batch, save = asked.dyn, asked.tolerances, asked.batch, asked.save
+    dyn, tolerances, batch = asked.dyn, asked.tolerances, asked.batch
     q0, v0, space = asked.q, asked.v, Space(asked.dyn.model)
     trials = make_attempts(asked.method, dyn, space, tolerances, asked.torque, asked.duration, batch)
-    tracks = []
-    for i in range(len(q0)):
-        member = record_of(dyn, asked.member(i), asked.start, asked.duration)
-        tracks.append(TrajectoryRecorder(space, q0.shape[1], i, batch, save, asked.events, tolerances, member))
+    tracks = [TrajectoryRecorder(asked, space, i) for i in range(len(q0))]
     stops = stop_times(asked)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), trials.width):
@@ -66,7 +62,8 @@ def run_embedded(asked: IntegrationProblem) -> SolverResult:
                 which = getattr(error, "member", None)
                 group[0 if which is None else which - first].member.fail(error)
                 break
-    return recorded_result(dyn, tracks, batch, save, trials.evaluations, trials.jacobians)
+    records = [track.member for track in tracks]
+    return assemble_result(asked, records, evaluations=trials.evaluations, jacobians=trials.jacobians)
 
 
 def make_attempts(
@@ -132,53 +129,32 @@ def march(
 
 
 class TrajectoryRecorder:
-    """One trajectory: what is kept of it, and how it ends.
+    """One trajectory: its steps so far, what is kept of them, and how it ends.
 
     Parameters
     ----------
+    problem : IntegrationProblem
     space : Space
-    nq : int
     index : int
         Which trajectory.
-    batch : int or None
-    save : (K,) array or None
-    events : tuple of Event
-    tolerances : Tolerances
+
+    Attributes
+    ----------
     member : TrajectoryRecord
-        Of which this holds the states.
     """
 
-    def __init__(
-        self,
-        space: Space,
-        nq: int,
-        index: int,
-        batch: int | None,
-        save: Array | None,
-        events: tuple[Event, ...],
-        tolerances: Tolerances,
-        member: TrajectoryRecord,
-    ) -> None:
-        which = None if batch is None else index
-        self.member, self._nq, self._start = member, nq, member.reached
-        self._space, self._save, self._tolerances = space, save, tolerances
-        self._watch = Watch(events, which) if events else None
-        self._kept: list[tuple[Array, Array, Array]] = []
+    def __init__(self, problem: IntegrationProblem, space: Space, index: int) -> None:
+        self.member = record_of(problem, index)
+        self._space, self._save, self._tolerances = space, problem.save, problem.tolerances
+        self._watch = Watch(problem.events, problem.member(index)) if problem.events else None
 
     def begin(self, q: Array, v: Array) -> None:
         """Start at a state."""
-        if self._save is None or (len(self._save) and self._save[0] == self._start):
-            self._kept.append((np.array([self._start]), q[None], v[None]))
+        start = self.member.reached
+        if self._save is None or (len(self._save) and self._save[0] == start):
+            self.member.add(np.array([start]), q[None], v[None])
         if self._watch is not None:
-            self._watch.start(self._start, q, v)
-
-    def states(self) -> tuple[Array, Array, Array]:
-        """Return t, q and v of all that was kept."""
-        space = self._space
-        if not self._kept:
-            return np.empty(0), np.empty((0, self._nq)), np.empty((0, space.nv))
-        t, q, v = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
-        return t, q, v
+            self._watch.start(start, q, v)
 
     def take(self, trials: StepAttempts, place: int, made: AcceptedSteps) -> bool:
         """Take in some steps; return whether to go on."""
@@ -203,7 +179,7 @@ class TrajectoryRecorder:
         for k in range(1 if member.poses is not None else max(steps, 1), steps + 1):
             member.saw(float(made.t[k]), made.q[k])
         if hit is not None:
-            self._stop_at(hit)
+            member.stop_at(hit)
         elif lost:
             member.stop("diverged", _BEYOND)
         return hit is None and not lost
@@ -214,10 +190,7 @@ class TrajectoryRecorder:
         if stuck:
             self.member.stop("diverged", f"diverged: {trials.why(place)}")
         elif stuck is False:
-            rtol, atol = self._tolerances
-            own = "" if atol == rtol else f", atol = {atol:g}"
-            told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
-            self.member.stop("step_too_small", told)
+            self.member.stop_below_rounding(self._tolerances)
         return stuck is not None or (self.member.ended == "finished" and self.member.crawls())
 
     def _look(self, trials: StepAttempts, place: int, made: AcceptedSteps, steps: int) -> Hit | None:
@@ -262,41 +235,9 @@ class TrajectoryRecorder:
     def _add(self, t: Array, q: Array, w: Array) -> bool:
         good = bool(is_bounded(q).all() and is_bounded(w).all())
         if good and len(t):
-            self._kept.append((t, q, self._space.leave(q, w)))
+            self.member.add(t, q, self._space.leave(q, w))
         return good
-
-    def _stop_at(self, hit: Hit) -> None:
-        self.member.stop_at(hit)
-        # Of one of a batch the state is with the event, off the common times.
-        if hit.member is None and not (self._kept and self._kept[-1][0][-1] == hit.t):
-            self._kept.append((np.array([hit.t]), hit.q[None], hit.v[None]))
 
 
 def _rows(made: AcceptedSteps, which: Indices) -> AcceptedSteps:
     return AcceptedSteps(made.t[which], made.q[which], made.w[which], 0)
-
-
-def recorded_result(
-    dyn: Dynamics,
-    tracks: Sequence[TrajectoryRecorder],
-    batch: int | None,
-    save: Array | None,
-    evaluations: int,
-    jacobians: int,
-) -> SolverResult:
-    """Return all trajectories as an outcome."""
-    for track in tracks:
-        # The states are put in below, whole arrays of them.
-        track.member.t, track.member.y = [], []
-    members = [track.member for track in tracks]
-    told = assemble_result(dyn.model, members, batch, save, evaluations=evaluations, jacobians=jacobians)
-    kept = [track.states() for track in tracks]
-    if batch is None:
-        t, q, v = kept[0]
-        return replace(told, t=t, q=q, v=v)
-    assert save is not None
-    count = max((len(t) for t, _, _ in kept), default=len(save))
-    q, v = (np.full((batch, count, n), np.nan) for n in (dyn.model.nq, dyn.model.nv))
-    for i, (t, *state) in enumerate(kept):
-        q[i, : len(t)], v[i, : len(t)] = state
-    return replace(told, t=save[:count], q=q, v=v)

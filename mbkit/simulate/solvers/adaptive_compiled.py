@@ -22,8 +22,8 @@ from mbkit.methods.one_step import FIRST_ROOT, MAX_GROWTH
 from mbkit.methods.registry import Tolerances
 from mbkit.methods.tableaus import dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
-from mbkit.simulate.solvers.runge_kutta import DIVERGED, DivergenceError, Field
 from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, first_length
+from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Torque
 
 __all__ = ["CompiledAttempts"]

@@ -28,9 +28,8 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.constraint_projection import LOOSEST
 from mbkit.simulate.diagnostics.linearization import Linearization
-from mbkit.simulate.solvers.runge_kutta import DIVERGED, DivergenceError, Field
 from mbkit.simulate.solvers.step_attempts import AcceptedSteps, first_length
-from mbkit.simulate.solvers.vector_field import Rates
+from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field, Rates
 from mbkit.simulate.torque import Force, Torque
 
 __all__ = ["RosenbrockAttempts", "RungeKuttaAttempts"]

@@ -17,15 +17,14 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import FunctionError, NumericalError
-from mbkit.methods.registry import Tolerances
+from mbkit.methods.registry import ADAPTIVE_METHOD, SERIES_METHOD, STIFF_METHOD, Tolerances
 from mbkit.model.integration_space import Space
 from mbkit.simulate.diagnostics.eigenvalues import Stiffness, linearized, stiffness_of
-from mbkit.simulate.events import Event
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.adaptive import TrajectoryRecorder, make_attempts, march, recorded_result, stop_times
+from mbkit.simulate.solvers.adaptive import TrajectoryRecorder, make_attempts, march, stop_times
 from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, StepAttempts
-from mbkit.simulate.solvers.trajectory_record import record_of
+from mbkit.simulate.solvers.trajectory_record import assemble_result
 
 __all__ = [
     "EXPLICIT",
@@ -45,7 +44,7 @@ __all__ = [
 
 # What all trajectories of a run by method auto share, and how the pace of a method is taken.
 
-EXPLICIT, IMPLICIT = "rk853", "rodas5"
+EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
 #: No tolerance below: rounding would be taken for error, and steps shrink without end.
 LEAST: Final = 1e-13
 #: What rk853 has of the tolerance that is asked for: with the whole of it, errors of a thousand steps come to 500
@@ -321,9 +320,7 @@ class Course:
     scene : Scene
     index : int
         Which trajectory.
-    nq : int
-    save : (K,) array or None
-    events : tuple of Event
+    asked : IntegrationProblem
 
     Attributes
     ----------
@@ -332,10 +329,9 @@ class Course:
         What the user must know; empty where all is well.
     """
 
-    def __init__(self, scene: Scene, index: int, nq: int, save: Array | None, events: tuple[Event, ...]) -> None:
+    def __init__(self, scene: Scene, index: int, asked: IntegrationProblem) -> None:
         self._scene, self._index = scene, index
-        member = record_of(scene.dyn, None if scene.batch is None else index, scene.start, scene.duration)
-        self.track = _Recorder(scene.space, nq, index, scene.batch, save, events, scene.tolerances, member)
+        self.track = _Recorder(asked, scene.space, index)
         self.doubt = ""
         # As asked for or loosened, and as tightened.
         self._base, self._tolerances = scene.tolerances, scene.granted(EXPLICIT, scene.tolerances)
@@ -592,7 +588,7 @@ class Course:
         self.doubt = (
             f"near t = {t:.6g} s accelerations are known {digits}, which is not enough for rtol = {asked:g}; there "
             f"it took {self._base.rtol:.0e}. Leave out what has next to no mass, or compute with 34 digits: "
-            "mbkit.dynamics(model, 'oracle') and method='taylor'"
+            f"mbkit.dynamics(model, 'oracle') and method={SERIES_METHOD!r}"
         )
         return self._base.rtol > before
 
@@ -619,10 +615,10 @@ _FEW: Final = 3
 
 def run_auto(asked: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
-    q0, v0, save, batch = asked.q, asked.v, asked.save, asked.batch
+    q0, v0, batch = asked.q, asked.v, asked.batch
     space = Space(asked.dyn.model)
     scene = Scene(asked, space, stop_times(asked))
-    courses = [Course(scene, i, q0.shape[1], save, asked.events) for i in range(len(q0))]
+    courses = [Course(scene, i, asked) for i in range(len(q0))]
     explicit = scene.make(EXPLICIT, scene.granted(EXPLICIT, asked.tolerances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), explicit.width):
@@ -639,8 +635,8 @@ def run_auto(asked: IntegrationProblem) -> SolverResult:
                 which = getattr(error, "member", None)
                 group.courses[0 if which is None else which - first].track.member.fail(error)
                 break
-    tracks = [course.track for course in courses]
-    outcome = recorded_result(asked.dyn, tracks, batch, save, scene.evaluations, scene.jacobians)
+    records = [course.track.member for course in courses]
+    outcome = assemble_result(asked, records, evaluations=scene.evaluations, jacobians=scene.jacobians)
     told = outcome.ended in ("finished", "event")
     doubts = tuple(dict.fromkeys(course.doubt for course in courses if course.doubt and told))
     return replace(outcome, chosen=_chosen(courses, batch), doubts=(*outcome.doubts, *doubts))

@@ -1,15 +1,13 @@
 """Fixed steps with torques held over each of them, compiled, on all cores.
 
-The formulas are those of `mbkit.simulate.solvers.fixed_step`. A chunk of states runs to its end
-without looking back; whether a state got lost on the way is told by the sum of
-squares that each carries along, and only then is its run repeated, with a look at
-every step.
+A chunk of states runs to its end without looking back. The sum of squares that each carries along shows whether it
+diverged; only then is its run repeated, with a look at every step.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import pairwise
@@ -25,15 +23,14 @@ from mbkit.methods.registry import method_of
 from mbkit.model.integration_space import Space
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import reason
-from mbkit.simulate.solvers.runge_kutta import BOUND, is_bounded
+from mbkit.simulate.solvers.fixed_step import divergence_reason
+from mbkit.simulate.solvers.trajectory_record import grid_result
+from mbkit.simulate.solvers.vector_field import BOUND, is_bounded
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
-__all__ = ["BLOCK", "Chunk", "Plan", "run_rollout"]
+__all__ = ["BLOCK", "BlockLoop", "Chunk", "Plan", "blocks", "padded", "run_parts", "run_rollout"]
 
-
-# Many steps of many states at once, by a compiled step on coordinate-major arrays.
 
 #: Steps that are made without a look at them, at most.
 BLOCK: Final = 16
@@ -47,6 +44,144 @@ _LANES: Final = 8
 _MOST: Final = 1032
 # What a step writes -> what the next one reads.
 _STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares"}
+
+
+class BlockLoop:
+    """Room for the states of a block of steps side by side, one trajectory in each column.
+
+    Columns beyond the states repeat the last one.
+
+    Parameters
+    ----------
+    sizes : dict of str to (int, int)
+        Of each name the number of places, one for each step that has its own, and of rows.
+    count : int
+        States that there is room for.
+
+    Attributes
+    ----------
+    block : int
+        Steps of the next block, at most.
+    """
+
+    block: int
+
+    def __init__(self, sizes: Mapping[str, tuple[int, int]], count: int) -> None:
+        self._width = padded(count)
+        self._room = {name: _room(places, rows, self._width) for name, (places, rows) in sizes.items()}
+        self._count = self._taken = 0
+
+    def _array(self, name: str, place: int) -> Array:
+        room = self._room[name]
+        return np.asarray(room[place % len(room)].T)
+
+    def _fill(self, name: str, place: int, columns: Array) -> None:
+        room = self._room[name][place]
+        room[:, : self._count] = columns
+        room[:, self._count :] = room[:, self._count - 1 : self._count]
+
+    def _fill_parameters(self, values: Array) -> None:
+        for place in range(len(self._room.get("parameters", ())) if values.size else 0):
+            self._fill("parameters", place, np.atleast_2d(values).T)
+
+    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
+        """Take some steps, at most `block`, from where the last ones ended.
+
+        Parameters
+        ----------
+        steps : int
+        start, dt : float
+            Time at which the first begins, and length of each; s.
+        torques : (steps or 1, nv, n or 1) array
+        """
+        raise NotImplementedError
+
+    def again(self) -> None:
+        """Make the last state the first one of the next block."""
+        raise NotImplementedError
+
+
+def padded(count: int) -> int:
+    """Return the number of columns for so many states: whole cache lines, and an odd number of them.
+
+    So no two rows fall on the same lines of a cache that is split by powers of two: 20 % of the time at 1024 states.
+    """
+    return -(-count // _LANES) * _LANES | _LANES
+
+
+def _room(places: int, rows: int, width: int) -> Array:
+    out = aligned(places * rows * width).reshape(places, rows, width)
+    out[:] = 0.0
+    return out
+
+
+def blocks(
+    loop: BlockLoop, grid: Grid, torque: Torque, members: slice | Indices, ends: Iterable[int] = ()
+) -> Iterator[tuple[int, int]]:
+    """Take members of the batch, which are in the loop, through the run in blocks that stop at `ends` too.
+
+    Yields the number of steps before and after each block.
+    """
+    k, torques = 0, np.empty(0)
+    # The last step may have a length of its own.
+    stops = {*ends, grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps}
+    for stop in sorted(stops):
+        while k < stop:
+            n = min(loop.block, stop - k)
+            if torque.held or not torques.size:
+                torques = torque.columns(members, k, k + n)
+            loop.advance(n, grid.time(k), grid.step(k), torques)
+            yield k, k + n
+            loop.again()
+            k += n
+
+
+def run_parts(
+    parts: Sequence[slice],
+    new_worker: Callable[[], Callable[[slice], Iterator[int]]],
+    workers: int,
+    steps: int,
+    bar: Progress,
+) -> None:
+    """Run parts of a batch on all cores.
+
+    Parameters
+    ----------
+    parts : sequence of slice
+    new_worker : callable
+        Called in each thread; returns run(part), which yields the number of steps done.
+    workers, steps : int
+        Threads at most, and steps of each part.
+    bar : Progress
+    """
+    done, left, stop = [0] * len(parts), iter(list(enumerate(parts))), threading.Event()
+    total = max(len(parts) * steps, 1)
+
+    def work(report: Callable[[], None]) -> None:
+        run = new_worker()
+        # A list's iterator hands each part to one thread.
+        for i, part in left:
+            for end in run(part):
+                done[i] = end
+                report()
+                if stop.is_set():
+                    return
+
+    workers = min(workers, len(parts))
+    if workers < 2:
+        if parts:
+            work(lambda: bar.update(sum(done) / total))
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: set[Future[None]] = {pool.submit(work, lambda: None) for _ in range(workers)}
+        try:
+            while waiting:
+                finished, waiting = wait(waiting, timeout=0.1, return_when=FIRST_EXCEPTION)
+                for future in finished:
+                    future.result()
+                bar.update(sum(done) / total)
+        finally:
+            stop.set()
 
 
 class Plan:
@@ -85,19 +220,11 @@ class Plan:
     @property
     def widest(self) -> int:
         """States that the cache holds with all that belongs to them, from 72 to 1032."""
-        return min(max(_padded(_CACHE // (8 * sum(self.sizes.values()))), 9 * _LANES), _MOST)
+        return min(max(padded(_CACHE // (8 * sum(self.sizes.values()))), 9 * _LANES), _MOST)
 
 
-def _padded(count: int) -> int:
-    # An odd number of cache lines, so that no two rows fall on the same ones of a
-    # cache that is split by powers of two: 20 % of the time at 1024 states.
-    return -(-count // _LANES) * _LANES | _LANES
-
-
-class Chunk:
-    """Room for states side by side, one in each column, on their way through a run.
-
-    Columns beyond the states repeat the last one.
+class Chunk(BlockLoop):
+    """States on their way by an explicit step.
 
     Parameters
     ----------
@@ -110,18 +237,26 @@ class Chunk:
         Whether all states of a block can be read after it, or the last one alone.
     """
 
+    block = BLOCK
+
     def __init__(self, plan: Plan, most: int, *, torques: bool, all_kept: bool) -> None:
-        width = _padded(most)
-        self._places = BLOCK + 1 if all_kept else 2
-        self._torques = BLOCK if torques else 1
-        rooms = {**dict.fromkeys(_STATE.values(), self._places), "tau": self._torques}
-        read = {name: size for name, size in plan.sizes.items() if name not in _STATE}
-        self._held = {name: _room(rooms.get(name, 1), size, width) for name, size in read.items()}
+        self._all_kept, self._torques = all_kept, BLOCK if torques else 1
+        places = {**dict.fromkeys(_STATE.values(), BLOCK + 1 if all_kept else 2), "tau": self._torques}
+        own = {name: (places.get(name, 1), rows) for name, rows in plan.sizes.items() if name not in _STATE}
+        super().__init__(own, most)
         self._calls = len(plan.parts)
         period = BLOCK if all_kept or torques else 2
         steps = [call for j in range(period) for call in self._step(plan, j)]
         self._sequence = KernelSequence(steps, BLOCK // period)
-        self._count = self._taken = 0
+
+    def _step(self, plan: Plan, j: int) -> list[Call]:
+        def array(name: str) -> Array:
+            return self._array(_STATE.get(name, name), j + (name in _STATE))
+
+        return [
+            Call(code, [array(n) for n in part.reads], [array(n) for n in part.writes])
+            for part, code in zip(plan.parts, plan.codes, strict=True)
+        ]
 
     def begin(self, q: Array, w: Array, parameters: Array) -> None:
         """Put states in.
@@ -136,35 +271,12 @@ class Chunk:
         self._count = len(q)
         self._fill("q", 0, q.T)
         self._fill("w", 0, w.T)
-        self._held["squares"][0] = 0.0
-        if parameters.size:
-            self._fill("parameters", 0, np.atleast_2d(parameters).T)
+        self._room["squares"][0] = 0.0
+        self._fill_parameters(parameters)
 
-    def _step(self, plan: Plan, j: int) -> list[Call]:
-        def array(name: str) -> Array:
-            held = self._held[_STATE.get(name, name)]
-            return np.asarray(held[(j + (name in _STATE)) % len(held)].T)
-
-        return [
-            Call(code, [array(n) for n in part.reads], [array(n) for n in part.writes])
-            for part, code in zip(plan.parts, plan.codes, strict=True)
-        ]
-
-    def _fill(self, name: str, place: int, columns: Array) -> None:
-        held = self._held[name][place]
-        held[:, : self._count] = columns
-        held[:, self._count :] = held[:, self._count - 1 : self._count]
-
-    def advance(self, steps: int, dt: float, torques: Array) -> None:
-        """Take some steps, at most `BLOCK`, from where the last ones ended.
-
-        Parameters
-        ----------
-        steps : int
-        dt : float
-        torques : (steps or 1, nv, n or 1) array
-        """
-        self._held["dt"][:] = dt
+    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:  # noqa: ARG002  # no time enters
+        """Take some steps."""
+        self._room["dt"][:] = dt
         for j in range(min(steps, self._torques)):
             self._fill("tau", j, torques[j])
         self._sequence.run(0, steps * self._calls)
@@ -173,25 +285,19 @@ class Chunk:
     def again(self) -> None:
         """Make the last state the first one of the next block."""
         for name in _STATE.values():
-            held = self._held[name]
-            held[0] = held[self._taken % len(held)]
+            room = self._room[name]
+            room[0] = room[self._taken % len(room)]
 
     def states(self, name: str) -> Array:
         """Return q, w or squares after each step of the block, or after its last one: (steps or 1, rows, n)."""
-        held = self._held[name]
-        first = self._taken % len(held)
-        places = held[1 : self._taken + 1] if self._places > 2 else held[first : first + 1]
+        room = self._room[name]
+        first = self._taken % len(room)
+        places = room[1 : self._taken + 1] if self._all_kept else room[first : first + 1]
         return places[:, :, : self._count]
 
     def start(self, name: str) -> Array:
         """Return q, w or squares before the block, (rows, n)."""
-        return self._held[name][0, :, : self._count]
-
-
-def _room(places: int, rows: int, width: int) -> Array:
-    out = aligned(places * rows * width).reshape(places, rows, width)
-    out[:] = 0.0
-    return out
+        return self._room[name][0, :, : self._count]
 
 
 def run_rollout(
@@ -217,7 +323,7 @@ def run_rollout(
     check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])
     run = _Run(dyn, method, q0, v0, grid, kept, torque)
     run.all(bar, workers or dyn.threads or cores())
-    return run.outcome(single)
+    return run.result(single)
 
 
 def _plan(dyn: LagrangianDynamics, method: str) -> Plan:
@@ -252,68 +358,31 @@ class _Run:
             self._q[:, 0], self._v[:, 0] = q0, v0
         self._squares = np.zeros(n)
         self._lost: dict[int, _Lost] = {}
-        self._done: list[int] = []
-        self._stop = threading.Event()
 
     def all(self, bar: Progress, workers: int) -> None:
         """Run every state, and those that got lost once more."""
         parts = _split(len(self._q0), self._plan.widest, workers)
-        self._done, self._left = [0] * len(parts), iter(list(enumerate(parts)))
-        total = max(len(parts) * self._grid.steps, 1)
-        workers = min(workers, len(parts))
-        if workers > 1:
-            with ThreadPoolExecutor(workers) as pool:
-                waiting: set[Future[None]] = {pool.submit(self._work, lambda: None) for _ in range(workers)}
-                try:
-                    while waiting:
-                        done, waiting = wait(waiting, timeout=0.1, return_when=FIRST_EXCEPTION)
-                        for future in done:
-                            future.result()
-                        bar.update(sum(self._done) / total)
-                finally:
-                    self._stop.set()
-        elif parts:
-            self._work(lambda: bar.update(sum(self._done) / total))
+        # Every block costs some calls: worth it for a state now and then, not for most.
+        dense = 2 * len(self._kept) > self._grid.steps
+
+        def new_worker() -> Callable[[slice], Iterator[int]]:
+            # The parts differ by one state at most.
+            chunk = self._chunk(-(-len(self._q0) // len(parts)), all_kept=dense)
+            return lambda members: self._march(chunk, members, dense=dense)
+
+        run_parts(parts, new_worker, workers, self._grid.steps, bar)
         # A NaN is not below anything.
         lost = np.flatnonzero(~(self._squares < BOUND**2))
         for start in range(0, len(lost), self._plan.widest):
             self._look(lost[start : start + self._plan.widest])
 
-    def _work(self, tell: Callable[[], None]) -> None:
-        # Every block costs some calls: worth it for a state now and then, not for most.
-        dense = 2 * len(self._kept) > self._grid.steps
-        # The parts differ by one state at most.
-        chunk = self._chunk(-(-len(self._q0) // len(self._done)), all_kept=dense)
-        # A list's iterator hands each part to one thread.
-        for i, members in self._left:
-            for end in self._march(chunk, members, dense=dense):
-                self._done[i] = end
-                tell()
-                if self._stop.is_set():
-                    return
-
     def _chunk(self, most: int, *, all_kept: bool) -> Chunk:
         return Chunk(self._plan, most, torques=self._torque.held, all_kept=all_kept)
 
     def _blocks(self, chunk: Chunk, members: slice | Indices, ends: Indices) -> Iterator[tuple[int, int]]:
-        """Take members of the batch through the run in blocks that stop at `ends` too.
-
-        Yields the number of steps before and after each block.
-        """
-        grid, k, torques = self._grid, 0, np.empty(0)
         own = self._parameters[members] if self._parameters.ndim == 2 else self._parameters
         chunk.begin(self._q0[members], self._w0[members], own)
-        # The last step may have a length of its own.
-        stops = {int(i) for i in ends} | {grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps}
-        for stop in sorted(stops):
-            while k < stop:
-                n = min(BLOCK, stop - k)
-                if self._torque.held or not torques.size:
-                    torques = self._torque.columns(members, k, k + n)
-                chunk.advance(n, grid.step(k), torques)
-                yield k, k + n
-                chunk.again()
-                k += n
+        return blocks(chunk, self._grid, self._torque, members, ends.tolist())
 
     def _march(self, chunk: Chunk, members: slice, *, dense: bool) -> Iterator[int]:
         kept = self._kept
@@ -349,43 +418,21 @@ class _Run:
             if not alive.any():
                 break
 
-    def outcome(self, single: bool) -> SolverResult:
+    def result(self, single: bool) -> SolverResult:
         """Return what was kept; NaN where there is nothing."""
-        n, grid, kept = len(self._q0), self._grid, self._kept
-        steps = np.full(n, grid.steps)
+        steps = np.full(len(self._q0), self._grid.steps)
         for i, lost in self._lost.items():
             steps[i] = lost.steps
-            self._q[i, kept > lost.steps], self._v[i, kept > lost.steps] = np.nan, np.nan
-        message = self._message(single)
-        rows = int(np.count_nonzero(kept <= steps.max())) if n else len(kept)
-        times = np.array([grid.time(int(k)) for k in steps])
-        q, v = (x if rows == len(kept) else x[:, :rows].copy() for x in (self._q, self._v))
-        # Handed on as they are, however large, and not copied for fear of a later change.
-        q.setflags(write=False)
-        v.setflags(write=False)
-        return SolverResult(
-            t=np.array([grid.time(int(k)) for k in kept[:rows]]),
-            q=q[0] if single else q,
-            v=v[0] if single else v,
-            steps=int(steps.sum()),
-            evaluations=method_of(self._method).stages * (int(steps.sum()) + len(self._lost)),
-            ended="diverged" if message else "finished",
-            reached=np.asarray(times[0] if single else times),
-            message=message,
+        evaluations = method_of(self._method).stages * (int(steps.sum()) + len(self._lost))
+        return grid_result(
+            self._grid, self._kept, self._q, self._v, steps, single=single, why=self._reason, evaluations=evaluations
         )
 
-    def _message(self, single: bool) -> str:
-        if not self._lost:
-            return ""
-        i, lost = min(self._lost.items(), key=lambda item: item[1].steps)
-        grid, k = self._grid, lost.steps
+    def _reason(self, i: int) -> str:
+        lost, grid, k = self._lost[i], self._grid, self._lost[i].steps
         force = np.asarray(self._torque.columns(np.array([i]), k, k + 1)[0][:, 0])
         state = (lost.q[None], lost.w[None], force[None])
-        why = reason(self._dyn.of_samples([i]), self._method, grid.time(k), grid.step(k), *state)
-        message = f"diverged after t = {grid.time(k):.6g} s (step {k + 1}): {why}; dt = {grid.dt:g} s may be too long"
-        if not single:
-            message += f"; {len(self._lost)} of {len(self._q0)} trajectories diverged, see reached"
-        return message
+        return divergence_reason(self._dyn.of_samples([i]), self._method, grid.time(k), grid.step(k), *state)
 
 
 def _split(n: int, widest: int, workers: int) -> list[slice]:

@@ -18,12 +18,12 @@ from mbkit._check import Array
 from mbkit.derivation.equations import Equations
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import UnsupportedError
-from mbkit.methods.registry import Tolerances
+from mbkit.methods.registry import METHODS, Tolerances
 from mbkit.model import Model
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
-from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
+from mbkit.simulate.solvers.vector_field import DIVERGED, is_bounded
 
 __all__ = ["run_cvodes"]
 
@@ -37,6 +37,10 @@ _MOST_STEPS: Final = 2_000_000
 
 # Integrators, each for its own grid of times.
 _REMEMBERED: Final = 32
+
+
+#: Methods that take what this one does not.
+_OTHERS: Final = "method=" + " or ".join(repr(m.name) for m in METHODS.values() if m.multistep and m.callables)
 
 
 class _Failure(NamedTuple):
@@ -54,45 +58,37 @@ def run_cvodes(asked: IntegrationProblem) -> SolverResult:
     if not isinstance(dyn, LagrangianDynamics):
         raise UnsupportedError(
             f"{asked.method}: integrates expressions, which {dyn.engine} has not; "
-            "use mbkit.dynamics(model, 'lagrangian'), or method='bdf' or 'lsoda'"
+            f"use mbkit.dynamics(model, 'lagrangian'), or {_OTHERS}"
         )
     if torque.callable or asked.events:
-        raise UnsupportedError(
-            f"{asked.method}: takes neither torque functions nor events; use method='bdf' or 'lsoda'"
-        )
+        raise UnsupportedError(f"{asked.method}: takes neither torque functions nor events; use {_OTHERS}")
     save, times = asked.told()
     solve = _Solve(dyn, asked.tolerances)
     members = []
     for i, start in enumerate(asked.y):
         which = asked.member(i)
-        run = _Run(solve, save, asked.report(i))
+        run = _Run(solve, record_of(asked, i), save, asked.report(i))
         values = dyn.parameter_values if which is None else dyn.of_samples([which]).parameter_values
         force = torque.of_member(which)
         # A jump within a call is one that CVODES does not know of: its error test fails.
         pieces = [times[k : k + 2] for k in range(len(times) - 1)] if torque.held else [times]
-        run.begin(asked.start, start)
+        run.keep(asked.start, start)
         for k, piece in enumerate(pieces):
             given = np.concatenate([np.asarray(force(k)), np.ravel(values)])
             if not run.over(piece, given):
                 break
-        members.append(run.member)
-    return assemble_result(
-        dyn.model, members, asked.batch, save, evaluations=solve.evaluations, jacobians=solve.jacobians
-    )
+        members.append(run.record)
+    return assemble_result(asked, members, evaluations=solve.evaluations, jacobians=solve.jacobians)
 
 
 class _Run:
     """One trajectory on its way."""
 
-    def __init__(self, solve: _Solve, save: Array, done: Any) -> None:
+    def __init__(self, solve: _Solve, record: TrajectoryRecord, save: Array, done: Any) -> None:
         self._solve, self._saved, self._done = solve, frozenset(save.tolist()), done
-        self.member = TrajectoryRecord()
+        self.record = record
         self._y: Array = np.empty(0)
         self._intervals = 1
-
-    def begin(self, t: float, y0: Array) -> None:
-        """Start at a state."""
-        self._keep(t, y0)
 
     def over(self, times: Array, given: Array) -> bool:
         """Go on to these times, of which the first is reached; return whether that was possible."""
@@ -106,7 +102,7 @@ class _Run:
                     half = n // 2
                     _, first = self._piece(times[at : at + half + 1], given)
                     at, n, failure = (at + half, n - half, failure) if first is None else (at, half, first)
-                self.member.stop(*failure)
+                self.record.stop(*failure)
                 return False
             at += n
             self._intervals = max(1, min(4 * n, n * _PIECE // max(steps, 1)))
@@ -120,20 +116,18 @@ class _Run:
         good = is_bounded(y)
         if not good.all():
             return 0, _Failure("diverged", f"diverged: {DIVERGED}")
-        self.member.steps += steps
-        self.member.rejected += rejected
+        self.record.steps += steps
+        self.record.rejected += rejected
         for t, state in zip(times[1:].tolist(), y, strict=True):
-            self._take(t, state)
+            self.keep(t, state)
+            self._done(t)
         return steps, None
 
-    def _take(self, t: float, y: Array) -> None:
-        self._keep(t, y)
-        self._done(t)
-
-    def _keep(self, t: float, y: Array) -> None:
-        self._y, self.member.reached = y, t
+    def keep(self, t: float, y: Array) -> None:
+        """Go on from a state."""
+        self._y, self.record.reached = y, t
         if t in self._saved:
-            self.member.keep(t, y)
+            self.record.keep(t, y)
 
 
 class _Solve:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
-from mbkit.simulate.solvers.runge_kutta import DIVERGED, DivergenceError, Field
+from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
 __all__ = ["CollocationStep"]

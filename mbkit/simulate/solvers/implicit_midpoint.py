@@ -9,11 +9,9 @@ linearly, at the rate of the step times the torque's derivative.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from collections.abc import Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +23,15 @@ from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
 from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import FunctionError, UnsupportedError
+from mbkit.methods.registry import IMPLICIT_METHODS
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import refuse_constraints
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.runge_kutta import BOUND, DIVERGED
+from mbkit.simulate.solvers.trajectory_record import grid_result
+from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
-
-if TYPE_CHECKING:
-    from mbkit.simulate.solvers.implicit_midpoint_compiled import MidpointChunk
 
 __all__ = ["MidpointSolver", "called", "run_midpoint"]
 
@@ -181,7 +178,7 @@ def run_midpoint(
     if not isinstance(dyn, LagrangianDynamics):
         raise UnsupportedError(
             f"{method}: {dyn.engine} gives neither momenta nor ∂T/∂q, which the midpoint rule in (q, p) is made of; "
-            "mbkit.dynamics(model, 'lagrangian') has them; 'gauss4' and 'gauss6' run on any engine"
+            f"mbkit.dynamics(model, 'lagrangian') has them; {IMPLICIT_METHODS} run on any engine"
         )
     refuse_constraints(dyn, method, "which its step in (q, p) does not know")
     single = q0.ndim == 1
@@ -193,7 +190,7 @@ def run_midpoint(
             run.in_chunks(bar)
         else:
             run.step_by_step(bar, single=single)
-        return run.outcome(single)
+        return run.result(single)
 
 
 def _machine_code(dyn: LagrangianDynamics, torque: Torque) -> bool:
@@ -231,66 +228,36 @@ class _Run:
         """Run every trajectory, some side by side, and such chunks at once on several cores."""
         # These load LLVM, which interpreting never needs.
         from mbkit.codegen.compiled import cores
+        from mbkit.simulate.solvers.compiled_fixed_step import blocks, run_parts
         from mbkit.simulate.solvers.implicit_midpoint_compiled import WIDEST, MidpointChunk
 
-        n, workers = len(self._q0), self._dyn.threads or cores()
-        parts = -(-n // WIDEST)
-        ends = [n * i // max(parts, 1) for i in range(parts + 1)]
-        chunks = [slice(a, b) for a, b in pairwise(ends)]
-        done, stop = [0] * parts, threading.Event()
-        total = max(parts * self._grid.steps, 1)
+        n, grid = len(self._q0), self._grid
+        count = -(-n // WIDEST)
+        ends = [n * i // max(count, 1) for i in range(count + 1)]
 
-        def work(i: int, tell: Callable[[], None]) -> None:
-            def progress(k: int) -> bool:
-                done[i] = k
-                tell()
-                return stop.is_set()
+        def run(members: slice) -> Iterator[int]:
+            chunk = MidpointChunk(self._dyn, members.stop - members.start, grid.steps, torques=self._torque.held)
+            own = values[members] if values.ndim == 2 else values
+            chunk.begin(self._q0[members], self._pi0[members], self._w0[members], own)
+            alive = np.full(members.stop - members.start, True)
+            for k, end in blocks(chunk, grid, self._torque, members):
+                good, block = chunk.good, end - k
+                if (rows := self._rows(k + 1, end)).start < rows.stop:
+                    at = self._kept[rows] - k
+                    self._q[members, rows], self._v[members, rows] = chunk.states("q", at), chunk.states("pi", at)
+                self._steps[members][alive] = k + good[alive]
+                for m in np.flatnonzero(alive & (good < block)):
+                    last = [chunk.states(name, good[m : m + 1])[m] for name in ("q", "pi")]
+                    self._last[members.start + m] = max(np.abs(x).max() for x in last)
+                alive &= good == block
+                yield end
+                if not alive.any():
+                    break
+            self._iterations.append(chunk.iterations)
 
-            members = chunks[i]
-            chunk = MidpointChunk(self._dyn, members.stop - members.start, self._grid.steps, torques=self._torque.held)
-            self._march(chunk, members, progress)
-
-        if parts < 2 or workers < 2:
-            for i in range(parts):
-                work(i, lambda: bar.update(sum(done) / total))
-            return
-        with ThreadPoolExecutor(min(workers, parts)) as pool:
-            waiting: set[Future[None]] = {pool.submit(work, i, lambda: None) for i in range(parts)}
-            try:
-                while waiting:
-                    finished, waiting = wait(waiting, timeout=0.1, return_when=FIRST_EXCEPTION)
-                    for future in finished:
-                        future.result()
-                    bar.update(sum(done) / total)
-            finally:
-                stop.set()
-
-    def _march(self, chunk: MidpointChunk, members: slice, progress: Callable[[int], bool]) -> None:
-        grid, held = self._grid, self._torque.held
         values = self._dyn.parameter_values
-        own = values[members] if values.ndim == 2 else values
-        chunk.begin(self._q0[members], self._pi0[members], self._w0[members], own)
-        alive, k, torques = np.full(members.stop - members.start, True), 0, np.empty(0)
-        while k < grid.steps and alive.any():
-            # The last step may have a length of its own.
-            whole = grid.steps - 1 if grid.last != grid.dt and k < grid.steps - 1 else grid.steps
-            n = min(chunk.block, whole - k)
-            if held or not torques.size:
-                torques = self._torque.columns(members, k, k + n)
-            good = chunk.advance(n, grid.time(k), grid.step(k), torques)
-            if (rows := self._rows(k + 1, k + n)).start < rows.stop:
-                at = self._kept[rows] - k
-                self._q[members, rows], self._v[members, rows] = chunk.states("q", at), chunk.states("pi", at)
-            self._steps[members][alive] = k + good[alive]
-            for m in np.flatnonzero(alive & (good < n)):
-                last = [chunk.states(name, good[m : m + 1])[m] for name in ("q", "pi")]
-                self._last[members.start + m] = max(np.abs(x).max() for x in last)
-            alive &= good == n
-            chunk.again()
-            k += n
-            if progress(k):
-                break
-        self._iterations.append(chunk.iterations)
+        parts = [slice(a, b) for a, b in pairwise(ends)]
+        run_parts(parts, lambda: run, self._dyn.threads or cores(), grid.steps, bar)
 
     # In Python
 
@@ -323,29 +290,26 @@ class _Run:
 
     # In the end
 
-    def outcome(self, single: bool) -> SolverResult:
+    def result(self, single: bool) -> SolverResult:
         """Return what was kept, with velocities."""
-        grid, kept, steps = self._grid, self._kept, self._steps
-        for i in np.flatnonzero(steps < grid.steps):
-            self._q[i, kept > steps[i]], self._v[i, kept > steps[i]] = np.nan, np.nan
+        for i in np.flatnonzero(self._steps < self._grid.steps):
+            self._v[i, self._kept > self._steps[i]] = np.nan
         self._to_velocities()
-        if kept[0] == 0:
+        if self._kept[0] == 0:
             self._q[:, 0], self._v[:, 0] = self._q0, self._v0
-        rows = int(np.count_nonzero(kept <= steps.max())) if len(steps) else len(kept)
-        q, v = self._q[:, :rows], self._v[:, :rows]
-        times = np.array([grid.time(int(k)) for k in steps])
-        message = self._message(single)
-        return SolverResult(
-            t=np.array([grid.time(int(k)) for k in kept[:rows]]),
-            q=q[0] if single else q,
-            v=v[0] if single else v,
-            steps=int(steps.sum()),
+        iterations = sum(self._iterations)
+        return grid_result(
+            self._grid,
+            self._kept,
+            self._q,
+            self._v,
+            self._steps,
+            single=single,
+            # An overflow in the middle of a step leaves no number for the iteration either.
+            why=lambda i: DIVERGED if self._last[i] > BOUND**0.5 else _UNSOLVED,
             # Each iteration is one, and so is the end of each step.
-            evaluations=sum(self._iterations) + int(steps.sum()),
-            ended="function_failed" if self._error else "diverged" if message else "finished",
-            reached=np.asarray(times[0] if single else times),
-            message=message,
-            jacobians=sum(self._iterations),
+            evaluations=iterations + int(self._steps.sum()),
+            jacobians=iterations,
             error=self._error,
         )
 
@@ -365,19 +329,3 @@ class _Run:
             return called(self._dyn, self._midpoint.velocity, members, t, q, pi)[0]
         M, p = called(self._dyn, self._midpoint.velocity_system, members, t, q, pi)
         return np.asarray(np.linalg.solve(M, p[..., None])[..., 0])
-
-    def _message(self, single: bool) -> str:
-        grid, steps = self._grid, self._steps
-        if self._error is not None:
-            return str(self._error)
-        short = np.flatnonzero(steps < grid.steps)
-        if not len(short):
-            return ""
-        i = int(short[np.argmin(steps[short])])
-        t = grid.time(int(steps[i]))
-        # What overflows in the middle of a step leaves no number for the iteration either.
-        why = DIVERGED if self._last[i] > BOUND**0.5 else _UNSOLVED
-        message = f"diverged after t = {t:.6g} s (step {steps[i] + 1}): {why}; dt = {grid.dt:g} s may be too long"
-        if not single:
-            message += f"; {len(short)} of {len(steps)} trajectories diverged, see reached"
-        return message

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import Call, KernelSequence, aligned
+from mbkit.codegen.compiled import Call, KernelSequence
 from mbkit.derivation.steps.midpoint import GUESS, MOST, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.simulate.solvers.compiled_fixed_step import BlockLoop, padded
 from mbkit.simulate.time_grid import Indices
 
 __all__ = ["WIDEST", "MidpointChunk"]
@@ -27,10 +28,9 @@ _CACHE: Final = 2**19
 _SHORTEST, _LONGEST = 16, 256
 # Until there are velocities to guess the next one from, more iterations are needed.
 _FIRST: Final = len(GUESS)
-_LANES: Final = 8
 
 
-class MidpointChunk:
+class MidpointChunk(BlockLoop):
     """Room for the states of a block of steps, one trajectory in each column.
 
     All steps of a block are made with the same number of Newton's iterations, without a
@@ -50,8 +50,8 @@ class MidpointChunk:
 
     Attributes
     ----------
-    block : int
-        Steps of the next block, at most.
+    good : (n,) array of int
+        How many steps of the last block are solved, per trajectory.
     iterations : int
         Newton's iterations so far, summed over the trajectories.
     """
@@ -60,25 +60,23 @@ class MidpointChunk:
         midpoint, nq, nv = Midpoint(dyn.equations), dyn.model.nq, dyn.model.nv
         self._newton, self._end = midpoint.newton, midpoint.end
         self._codes = {part.name: dyn.code(part.name, make=part.make) for part in (self._newton, self._end)}
-        self._count = count
-        width = -(-count // _LANES) * _LANES | _LANES if count > _LANES else _LANES
-        most = min(_CACHE // (8 * width * (nq + 3 * nv + 1)), _LONGEST, isqrt(steps))
+        most = min(_CACHE // (8 * padded(count) * (nq + 3 * nv + 1)), _LONGEST, isqrt(steps))
         n, back = max(most, _SHORTEST), len(GUESS) - 1
         self._longest, self.block = n, _FIRST
-        rooms = [("q", n + 1, nq), ("pi", n + 1, nv), ("misses", n + 1, 1), ("tau", n if torques else 1, nv)]
-        # The velocity of each step behind those of the last ones before the block.
-        rooms += [("w", n + back, nv), ("guess", 2, nv), ("trial", 2, nv), ("miss", 1, 1), ("dt", 1, 1)]
-        # The time is one of them, and another in each step.
+        # The time is one of the parameters, and another in each step.
         names, clock = list(dyn.model.parameters), dyn.model.time_parameter
         self._clock = None if clock is None else names.index(clock)
-        rooms += [("parameters", 1 if clock is None else n, len(names))]
-        self._rooms = {name: _room(places, rows, width) for name, places, rows in rooms}
-        self._back = back
+        # The velocity of each step behind those of the last ones before the block.
+        sizes = {"q": (n + 1, nq), "pi": (n + 1, nv), "misses": (n + 1, 1), "tau": (n if torques else 1, nv)}
+        sizes |= {"w": (n + back, nv), "guess": (2, nv), "trial": (2, nv), "miss": (1, 1), "dt": (1, 1)}
+        sizes["parameters"] = 1 if clock is None else n, len(names)
+        super().__init__(sizes, count)
+        self._count, self._back = count, back
         self._sequences: dict[tuple[int, int], KernelSequence] = {}
         self._iterations, self._smooth = 2, 0
-        self._taken = 0
         self.iterations = 0
         self._alive = np.full(count, True)
+        self.good: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
 
     def begin(self, q: Array, pi: Array, w: Array, parameters: Array) -> None:
         """Put (n, nq) configurations, (n, nv) momenta and velocities in, and the parameters' values, (p,) or (n, p)."""
@@ -87,14 +85,7 @@ class MidpointChunk:
         self._fill("guess", 0, w.T)
         for place in range(self._back):
             self._fill("w", place, w.T)
-        for place in range(len(self._rooms["parameters"]) if parameters.size else 0):
-            self._fill("parameters", place, np.atleast_2d(parameters).T)
-
-    def _fill(self, name: str, place: int, columns: Array) -> None:
-        # Columns beyond the states repeat the last one.
-        room = self._rooms[name][place]
-        room[:, : self._count] = columns
-        room[:, self._count :] = room[:, self._count - 1 : self._count]
+        self._fill_parameters(parameters)
 
     def _sequence(self, iterations: int) -> KernelSequence:
         key = iterations, self.block
@@ -104,10 +95,7 @@ class MidpointChunk:
         return self._sequences[key]
 
     def _step(self, j: int, iterations: int) -> list[Call]:
-        def at(name: str, place: int) -> Array:
-            room = self._rooms[name]
-            return np.asarray(room[place % len(room)].T)
-
+        at = self._array
         held = {name: at(name, j) for name in ("q", "pi", "tau", "misses", "parameters")}
         held |= {name: at(name, 0) for name in ("dt", "miss")}
         new = {"q1": at("q", j + 1), "pi1": at("pi", j + 1), "misses1": at("misses", j + 1), "guess": at("guess", 1)}
@@ -124,35 +112,22 @@ class MidpointChunk:
     def _call(self, name: str, reads: tuple[str, ...], given: dict[str, Array], outs: list[Array]) -> Call:
         return Call(self._codes[name], [given[n] for n in reads], outs)
 
-    def advance(self, steps: int, start: float, dt: float, torques: Array) -> NDArray[np.intp]:
-        """Take some steps, at most `block`, from where the last ones ended.
-
-        Parameters
-        ----------
-        steps : int
-        start, dt : float
-            Time at which the first begins, and length of each; s.
-        torques : (steps or 1, nv, n or 1) array
-
-        Returns
-        -------
-        (n,) array of int
-            How many of them are good, per trajectory.
-        """
-        self._rooms["dt"][:] = dt
-        for j in range(min(steps, len(self._rooms["tau"]))):
+    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
+        """Take some steps, and count in `good` how many of them are solved."""
+        self._room["dt"][:] = dt
+        for j in range(min(steps, len(self._room["tau"]))):
             self._fill("tau", j, torques[j])
         if self._clock is not None:
             middles = start + (np.arange(steps) + 0.5) * dt
-            self._rooms["parameters"][:steps, self._clock] = middles[:, None]
-        self._rooms["misses"][0] = 0.0
+            self._room["parameters"][:steps, self._clock] = middles[:, None]
+        self._room["misses"][0] = 0.0
         if self._smooth >= _PATIENCE and self._iterations > 1:
             self._iterations, self._smooth = self._iterations - 1, 0
         iterations = self._iterations
         while True:
             self._sequence(iterations).run(0, steps * (iterations + 1))
             self.iterations += iterations * steps * int(self._alive.sum())
-            missed = self._rooms["misses"][steps, 0, : self._count] > 0
+            missed = self._room["misses"][steps, 0, : self._count] > 0
             if not (missed & self._alive).any():
                 self._smooth += 1
                 break
@@ -161,14 +136,13 @@ class MidpointChunk:
                 break
             iterations = min(iterations + max(iterations // 2, 1), MOST)
         self._iterations, self._taken = iterations, steps
-        good = np.full(self._count, steps)
+        self.good = np.full(self._count, steps)
         if missed.any():
-            good = np.count_nonzero(self._rooms["misses"][1 : steps + 1, 0, : self._count] == 0, axis=0)
+            self.good = np.count_nonzero(self._room["misses"][1 : steps + 1, 0, : self._count] == 0, axis=0)
             # What is lost asks for no more iterations.
             self._alive &= ~missed
             if self._iterations == MOST:
                 self._iterations = 2
-        return good
 
     def again(self) -> None:
         """Make the last state the first one of the next block."""
@@ -176,16 +150,10 @@ class MidpointChunk:
         if self.block != self._longest:
             self.block, self._iterations = self._longest, 2
         for name in ("q", "pi"):
-            self._rooms[name][0] = self._rooms[name][n]
-        self._rooms["guess"][0] = self._rooms["guess"][1]
-        self._rooms["w"][: self._back] = self._rooms["w"][n : n + self._back].copy()
+            self._room[name][0] = self._room[name][n]
+        self._room["guess"][0] = self._room["guess"][1]
+        self._room["w"][: self._back] = self._room["w"][n : n + self._back].copy()
 
     def states(self, name: str, which: Indices) -> Array:
         """Return q or pi after these many steps of the block, (n, steps, rows)."""
-        return np.asarray(self._rooms[name][which, :, : self._count].transpose(2, 0, 1))
-
-
-def _room(places: int, rows: int, width: int) -> Array:
-    out = aligned(places * rows * width).reshape(places, rows, width)
-    out[:] = 0.0
-    return out
+        return np.asarray(self._room[name][which, :, : self._count].transpose(2, 0, 1))

@@ -1,23 +1,28 @@
-"""MuJoCo's own integrators, through the engine that has them."""
+"""The engines' own integrators: MuJoCo's with a step, Drake's with a tolerance."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import UnsupportedError
-from mbkit.methods.registry import Method
+from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, Method, method_of
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.runge_kutta import is_bounded
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, grid_result, record_of
+from mbkit.simulate.solvers.vector_field import DIVERGED, is_bounded
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
-__all__ = ["HasRollout", "run_native"]
+if TYPE_CHECKING:
+    from mbkit.engines.drake.engine import DrakeRun
+
+__all__ = ["HasRollout", "run_drake", "run_native"]
 
 
 @runtime_checkable
@@ -44,62 +49,101 @@ class HasRollout(Protocol):
 def run_native(
     dyn: Dynamics, method: Method, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque, bar: Progress
 ) -> SolverResult:
-    """Run the engine's integrator; from the first state that is none on, nothing is kept."""
-    engine, integrator = method.name.split("_", 1)
+    """Run the engine's integrator; nothing is kept after a trajectory's last bounded state."""
+    (engine,), integrator = method.engines, method.scheme
+    ours = f"method={DEFAULT_METHOD!r} or {EULER_METHOD!r}"
     if dyn.engine != engine or not isinstance(dyn, HasRollout):
         raise UnsupportedError(
-            f"{method.name}: an integrator of {engine}'s own, which {dyn.engine} has not; "
-            f"use mbkit.dynamics(model, {engine!r}), or method='rk4' or 'semi_implicit_euler' with its formulas"
+            f"{method.name}: {engine}'s own integrator is not available on the {dyn.engine} engine; "
+            f"use mbkit.dynamics(model, {engine!r}), or {ours} with its formulas"
         )
     if torque.callable:
         raise UnsupportedError(
-            f"{method.name}: {engine} steps by itself and cannot call back; give the torque as an array, "
-            "or use method='rk4' or 'semi_implicit_euler'"
+            f"{method.name}: {engine} steps by itself and cannot call back; give the torque as an array, or use {ours}"
         )
     check_room((grid.steps + 1) * (1 if q0.ndim == 1 else len(q0)), q0.shape[-1] + v0.shape[-1])
     if q0.ndim == 2 and not len(q0):
         # mujoco.rollout 4.0.0 does not survive an empty batch.
         empty = np.empty((0, grid.steps + 1, q0.shape[-1])), np.empty((0, grid.steps + 1, v0.shape[-1]))
-        return _outcome(method, grid, kept, *empty)
+        return _result(method, grid, kept, *empty, single=False)
     # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
     whole = grid.steps if grid.last == grid.dt else grid.steps - 1
     first: dict[str, Any] = {"q0": q0, "v0": v0, "dt": grid.dt, "tau": torque.over(0, whole), "steps": whole}
     q, v = dyn.rollout(integrator=integrator, progress=bar.update, **first)
     if whole < grid.steps:
-        # What has diverged is void whatever follows; it only must not stop the others.
+        # A state that diverged stays void; it only must not stop the others.
         good = np.isfinite(q[..., -1, :]).all(-1, keepdims=True) & np.isfinite(v[..., -1, :]).all(-1, keepdims=True)
         q1, v1 = np.where(good, q[..., -1, :], q0), np.where(good, v[..., -1, :], v0)
         tail = torque.over(whole, grid.steps)
         q1, v1 = dyn.rollout(integrator=integrator, q0=q1, v0=v1, dt=grid.last, tau=tail, steps=1)
         q, v = np.concatenate([q, q1[..., 1:, :]], -2), np.concatenate([v, v1[..., 1:, :]], -2)
-    return _outcome(method, grid, kept, np.asarray(q), np.asarray(v))
+    single = q0.ndim == 1
+    q, v = (np.asarray(x)[None] if single else np.asarray(x) for x in (q, v))
+    return _result(method, grid, kept, q, v, single=single)
 
 
-def _outcome(method: Method, grid: Grid, kept: Indices, q: Array, v: Array) -> SolverResult:
+def _result(method: Method, grid: Grid, kept: Indices, q: Array, v: Array, *, single: bool) -> SolverResult:
     good = is_bounded(q) & is_bounded(v)
-    good[..., 0] = True  # the start is the caller's
+    good[:, 0] = True  # the start is the caller's
     # After the first bad state everything is void, even what looks like numbers.
-    good = np.logical_and.accumulate(good, axis=-1)
-    count = good.sum(-1)
-    times = np.array([grid.time(k) for k in range(q.shape[-2])])
-    reached = times[count - 1]
-    full = grid.steps + 1
-    message = ""
-    if np.any(count < full):
-        first = int(np.min(count))
-        message = f"diverged after t = {grid.time(first - 1):.6g} s (step {first}); dt = {grid.dt:g} s may be too long"
-        if good.ndim == 2:
-            message += f"; {np.count_nonzero(count < full)} of {len(count)} trajectories diverged, see reached"
-    q, v = np.where(good[..., None], q, np.nan), np.where(good[..., None], v, np.nan)
-    index = kept[kept < np.max(count)] if count.size else kept
-    steps = int(np.sum(count - 1))
-    return SolverResult(
-        t=np.array([grid.time(int(k)) for k in index]),
-        q=q[..., index, :],
-        v=v[..., index, :],
-        steps=steps,
-        evaluations=steps * method.stages,
-        ended="diverged" if message else "finished",
-        reached=np.asarray(reached),
-        message=message,
+    steps = np.logical_and.accumulate(good, axis=1).sum(1) - 1
+    return grid_result(
+        grid,
+        kept,
+        q[:, kept],
+        v[:, kept],
+        steps,
+        single=single,
+        why=lambda _: "",
+        evaluations=int(steps.sum()) * method.stages,
     )
+
+
+# Drake's own integrators, with a tolerance.
+
+
+def run_drake(asked: IntegrationProblem) -> SolverResult:
+    """Integrate one state, or each of a batch by itself, to the times of `save`.
+
+    Steps end on the saved times. Drake has one accuracy, relative to a state of size 1 and above, for which
+    `rtol` is taken.
+    """
+    dyn, torque = asked.dyn, asked.torque
+    # Drake is an extra.
+    from mbkit.engines.drake.engine import DrakeDynamics, DrakeRun
+
+    if not isinstance(dyn, DrakeDynamics) or torque.callable or asked.events:
+        raise UnsupportedError(
+            f"{asked.method}: takes neither torque functions nor events; use method={ADAPTIVE_METHOD!r}"
+        )
+    save, times = asked.told()
+    scheme, accuracy = method_of(asked.method).scheme, asked.tolerances.rtol
+    records, evaluations = [], 0
+    for i, (q, v) in enumerate(zip(asked.q, asked.v, strict=True)):
+        record = record_of(asked, i)
+        run = DrakeRun(dyn, scheme, accuracy, asked.start, q, v, asked.report(i))
+        _over(record, run, times, frozenset(save.tolist()), torque.of_member(asked.member(i)))
+        record.steps, record.rejected = run.steps, run.rejected
+        evaluations += run.evaluations
+        records.append(record)
+    return assemble_result(asked, records, evaluations=evaluations)
+
+
+def _over(record: TrajectoryRecord, run: DrakeRun, times: Array, saved: frozenset[float], force: object) -> None:
+    """Take one trajectory through the times, as far as it goes."""
+    y = np.concatenate(run.state())
+    for k, t in enumerate(times.tolist()):
+        if k:
+            run.push(np.asarray(force(k - 1)))  # type: ignore[operator]  # of what is held
+            try:
+                y = np.concatenate(run.over(t))
+            except RuntimeError as error:
+                text = str(error).strip().splitlines()[0]
+                record.stop("step_too_small", f"step below the smallest: stiff, singular or diverging ({text})")
+                return
+            if not is_bounded(y[None]).all():
+                record.stop("diverged", f"diverged: {DIVERGED}")
+                return
+        record.reached = t
+        if t in saved:
+            record.keep(t, y)

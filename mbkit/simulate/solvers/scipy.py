@@ -3,7 +3,8 @@
 DOP853 (Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, ch.
 II.5), Radau IIA of order 5 (Hairer, Wanner 1996, volume II, ch. IV.8), BDF (Shampine,
 Reichelt 1997) and ODEPACK's LSODA (Petzold 1983). The implicit ones get the exact
-Jacobian.
+Jacobian. Interpolants of DOP853 and Radau are less accurate than their steps (order 7 beside 8, 3 beside 5), so these
+end where a state is wanted; multistep methods interpolate, since stopping often would slow them.
 """
 
 from __future__ import annotations
@@ -12,22 +13,21 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, MbkitError
-from mbkit.methods.registry import Tolerances
+from mbkit.methods.registry import Method, Tolerances, method_of
 from mbkit.model import Model
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
-from mbkit.simulate.solvers.vector_field import Rates
+from mbkit.simulate.solvers.vector_field import DIVERGED, Rates, is_bounded
 from mbkit.simulate.torque import Force
 
 __all__ = ["run_scipy"]
@@ -35,24 +35,7 @@ __all__ = ["run_scipy"]
 _EPS: Final = float(np.finfo(float).eps)
 
 
-class _Scheme(NamedTuple):
-    """A solver of SciPy; `dense` where its interpolant is as accurate as its steps."""
-
-    solver: str
-    implicit: bool
-    dense: bool
-
-
-# Of DOP853 the interpolant has order 7 beside the steps' 8, of Radau 3 beside 5: their
-# steps end where a state is wanted. Multistep methods are interpolants themselves, and
-# would be slowed by ending often.
-_SCHEMES: Final = {
-    "dop853": _Scheme("DOP853", implicit=False, dense=False),
-    "radau": _Scheme("Radau", implicit=True, dense=False),
-    "bdf": _Scheme("BDF", implicit=True, dense=True),
-    "lsoda": _Scheme("LSODA", implicit=True, dense=True),
-}
-# Forward dynamics per step that DOP853 tries.
+#: Forward dynamics of each step that DOP853 tries.
 _STAGES: Final = 12
 
 
@@ -71,7 +54,6 @@ class _Task:
     t0: float
     y0: Array
     stops: tuple[float, ...]
-    saved: tuple[float, ...] | None
     force: Callable[[int], Force]
     held: bool
     watch: Watch | None
@@ -85,26 +67,26 @@ def run_scipy(asked: IntegrationProblem) -> SolverResult:
     kept. Torques held as an array start every method anew at each interval.
     """
     dyn, save, torque = asked.dyn, asked.save, asked.torque
-    scheme = _SCHEMES[asked.method]
-    ends = (asked.end,) if save is None or (scheme.dense and not torque.held) else (*save.tolist(), asked.end)
+    method = method_of(asked.method)
+    dense = method.multistep
+    ends = (asked.end,) if save is None or (dense and not torque.held) else (*save.tolist(), asked.end)
     stops = tuple(sorted({*ends} - {asked.start}))
-    solve = _Solve(dyn, scheme, asked.tolerances)
-    members = []
+    solve = _Solve(dyn, method, asked.tolerances)
+    records = []
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"), _quiet():
         for i, start in enumerate(asked.y):
             which = asked.member(i)
             if which is not None:
                 solve.only(which)
             watch = Watch(asked.events, which) if asked.events else None
-            saved = None if save is None else tuple(save.tolist())
-            task = _Task(asked.start, start, stops, saved, torque.of_member(which), torque.held, watch)
-            member = record_of(dyn, which, asked.start, asked.duration)
-            members.append(solve.member(task, member, asked.report(i)))
-            if members[-1].error is not None:
+            task = _Task(asked.start, start, stops, torque.of_member(which), torque.held, watch)
+            records.append(record_of(asked, i))
+            try:
+                solve.integrate(records[-1], task, asked.report(i))
+            except FunctionError as error:
+                records[-1].fail(error)
                 break
-    return assemble_result(
-        dyn.model, members, asked.batch, save, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations
-    )
+    return assemble_result(asked, records, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations)
 
 
 @contextmanager
@@ -118,12 +100,12 @@ def _quiet() -> Iterator[None]:
 class _Solve:
     """Integrates one trajectory after the other."""
 
-    def __init__(self, dyn: Dynamics, scheme: _Scheme, tolerances: Tolerances) -> None:
-        self.rates = Rates(dyn, explicit=not scheme.implicit)
+    def __init__(self, dyn: Dynamics, method: Method, tolerances: Tolerances) -> None:
+        self.rates = Rates(dyn, explicit=not method.jacobian)
         self._model: Model = dyn.model
-        self._scheme, self._tolerances = scheme, tolerances
+        self._method, self._tolerances = method, tolerances
         self._jacobian: _Jacobian | None = None
-        if scheme.implicit:
+        if method.jacobian:
             from mbkit.simulate.diagnostics.linearization import Linearization
 
             self._jacobian = Linearization(dyn)
@@ -138,17 +120,9 @@ class _Solve:
         if self._jacobian is not None:
             self._jacobian.only(member)
 
-    def member(self, task: _Task, member: TrajectoryRecord, done: Callable[[float], None]) -> TrajectoryRecord:
-        """Return what comes of one trajectory."""
-        try:
-            self._integrate(member, task, done)
-        except FunctionError as error:
-            member.fail(error)
-        return member
-
-    def _integrate(self, member: TrajectoryRecord, task: _Task, done: Callable[[float], None]) -> None:
-        if task.saved is None or (task.saved and task.saved[0] == task.t0):
-            member.keep(task.t0, task.y0)
+    def integrate(self, member: TrajectoryRecord, task: _Task, done: Callable[[float], None]) -> None:
+        """Take one trajectory to the end, or as far as it goes."""
+        member.begin(task.t0, task.y0)
         if task.watch is not None:
             task.watch.start(task.t0, *self._state(task.y0))
         solver: Any = None
@@ -168,7 +142,7 @@ class _Solve:
                     return
                 member.steps += 1
                 member.reached = float(solver.t)
-                self._keep(member, task, solver)
+                self._keep(member, solver)
                 member.saw(member.reached, solver.y[: self._model.nq])
                 done(member.reached)
                 if member.crawls():
@@ -177,7 +151,7 @@ class _Solve:
     def _anew(self, task: _Task, last: Any, force: Force, stop: float) -> Any:
         t, y = (task.t0, task.y0) if last is None else (float(last.t), last.y)
         # A multistep method starts again with order 1, for which its last step is too long.
-        first = None if last is None or self._scheme.dense else min(last.h_abs, stop - t)
+        first = None if last is None or self._method.multistep else min(last.h_abs, stop - t)
         return self._solver(t, y, force, stop, first)
 
     def _solver(self, t: float, y: Array, force: Force, stop: float, first: float | None) -> Any:
@@ -190,7 +164,7 @@ class _Solve:
         jacobian = self._jacobian
         if jacobian is not None:
             more["jac"] = lambda t, y: jacobian(t, y, force)
-        return getattr(integrate, self._scheme.solver)(
+        return getattr(integrate, self._method.scheme)(
             lambda t, y: self.rates(t, y, force),
             t,
             y,
@@ -211,10 +185,10 @@ class _Solve:
             member.stop("diverged", f"diverged: {self.rates.why or DIVERGED}")
             return None
         self._lengthen(solver, wanted)
-        if not self._scheme.implicit:
+        if not self._method.jacobian:
             tried = (self.rates.evaluations - before) // _STAGES
             member.rejected += max(0, tried - (solver.status != "failed"))
-        while self._scheme.solver == "LSODA" and solver.status != "failed" and not is_bounded(solver.y):
+        while self._method.scheme == "LSODA" and solver.status != "failed" and not is_bounded(solver.y):
             # It takes a step into what is no state; the others try a shorter one by themselves.
             first = (solver.t - t) / 4
             again = self._solver(t, y, force, stop, first) if first > duration * _EPS else None
@@ -229,23 +203,20 @@ class _Solve:
             member.stop("diverged", f"diverged: {self.rates.why}")
             return None
         if stuck:
-            rtol, atol = self._tolerances
-            own = "" if atol == rtol else f", atol = {atol:g}"
-            told = f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
-            member.stop("step_too_small", told)
+            member.stop_below_rounding(self._tolerances)
             return None
         # Radau and DOP853 go on from the rate at the end of a step.
         if not is_bounded(solver.y) or not np.isfinite(getattr(solver, "f", 0.0)).all():
             member.stop("diverged", f"diverged: {self.rates.why or DIVERGED}")
             return None
-        if self._model.constrained and not self._scheme.dense:
+        if self._model.constrained and not self._method.multistep:
             solver.y = self.rates.settled(float(solver.t), solver.y)
             solver.f = self.rates(float(solver.t), solver.y, force)
         return solver
 
     def _shorten(self, solver: Any, stop: float) -> float:
         """Let a one-step method's next step end at the stop; return the length that it had chosen."""
-        if self._scheme.dense:
+        if self._method.multistep:
             return 0.0
         room, wanted = stop - float(solver.t), float(solver.h_abs)
         # A little longer is better than a rest below rounding; the error is judged either way.
@@ -255,7 +226,7 @@ class _Solve:
 
     def _lengthen(self, solver: Any, wanted: float) -> None:
         # One short step on the way is no reason to grow from its length again.
-        if not self._scheme.dense and solver.status == "finished" and solver.step_size < wanted:
+        if not self._method.multistep and solver.status == "finished" and solver.step_size < wanted:
             self._resize(solver, max(wanted, solver.h_abs))
 
     def _resize(self, solver: Any, length: float) -> None:
@@ -275,7 +246,7 @@ class _Solve:
         if last is None:
             return False
         member.steps += 1
-        self._keep(member, task, solver, last.t)
+        self._keep(member, solver, last.t)
         member.stop_at(last)
         return True
 
@@ -289,7 +260,7 @@ class _Solve:
                 return self._state(solver.y)
             if t == start[0]:
                 return self._state(start[1])
-            if not self._scheme.dense:
+            if not self._method.multistep:
                 return self._state(self._shorter(start, t, force))
             interpolant = interpolant or solver.dense_output()
             return self._state(interpolant(t))
@@ -303,22 +274,18 @@ class _Solve:
             pass
         return np.asarray(solver.y)
 
-    def _keep(self, member: TrajectoryRecord, task: _Task, solver: Any, end: float | None = None) -> None:
+    def _keep(self, member: TrajectoryRecord, solver: Any, end: float | None = None) -> None:
         """Keep what is wanted of the last step, up to its end or an earlier one."""
-        t = float(solver.t)
-        end = t if end is None else end
-        if task.saved is None:
-            if end == t:
-                member.keep(t, solver.y)
-            return
-        interpolant: Any = None
-        while len(member.t) < len(task.saved) and task.saved[len(member.t)] <= end:
-            wanted = task.saved[len(member.t)]
-            if wanted == t:
-                member.keep(t, solver.y)
-            else:
-                interpolant = interpolant or solver.dense_output()
-                member.keep(wanted, interpolant(wanted))
+        last, interpolant = float(solver.t), None
+
+        def state(t: float) -> Array:
+            nonlocal interpolant
+            if t == last:
+                return np.asarray(solver.y)
+            interpolant = interpolant or solver.dense_output()
+            return np.asarray(interpolant(t))
+
+        member.keep_step(last, last if end is None else end, state)
 
     def _state(self, y: Array) -> tuple[Array, Array]:
         nq = self._model.nq

@@ -18,14 +18,14 @@ from mbkit.engines.base import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
+from mbkit.methods.registry import ADAPTIVE_METHOD
 from mbkit.model import Model
 from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.events import State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.solvers.runge_kutta import DIVERGED, is_bounded
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
-from mbkit.simulate.solvers.vector_field import Rates
+from mbkit.simulate.solvers.vector_field import DIVERGED, Rates, is_bounded
 
 __all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
 
@@ -50,7 +50,7 @@ def run_taylor(asked: IntegrationProblem) -> SolverResult:
     dyn, save, torque = asked.dyn, asked.save, asked.torque
     if torque.callable:
         raise UnsupportedError(
-            f"{asked.method}: a torque function has no Taylor series; use method='rk853' or 'dop853', "
+            f"{asked.method}: a torque function has no Taylor series; use method={ADAPTIVE_METHOD!r}, "
             "or an array held over each interval of save"
         )
     if not isinstance(dyn, (LagrangianDynamics, OracleDynamics)):
@@ -70,11 +70,10 @@ def run_taylor(asked: IntegrationProblem) -> SolverResult:
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             steps = TaylorSteps(system, integrator, kind, _behind(own, kind), settled)
             watch = Watch(asked.events, which) if asked.events else None
-            member = record_of(dyn, which, asked.start, asked.duration)
-            one = _Run(own, steps, save, watch, member, asked.report(i))
+            one = _Run(own, steps, watch, record_of(asked, i), asked.report(i))
             members.append(one.all(asked.start, start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
-    return assemble_result(dyn.model, members, asked.batch, save, evaluations=evaluations)
+    return assemble_result(asked, members, evaluations=evaluations)
 
 
 def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:
@@ -184,7 +183,8 @@ class TaylorSteps:
                     raise StoppedError("diverged", DIVERGED)
                 if self._system.kinked and self._jumped(float(h), force(k)):
                     raise StoppedError(
-                        "step_too_small", "a force jumps, which a series cannot follow and method='rk853' can,"
+                        "step_too_small",
+                        f"a force jumps, which a series cannot follow and method={ADAPTIVE_METHOD!r} can,",
                     )
                 if self._settled is not None:
                     state[:] = self._settled(float(integrator.time), _rounded(state))
@@ -197,7 +197,8 @@ class TaylorSteps:
         series = _rounded(self._integrator.tc)
         if np.isfinite(series[:, :2]).all() and np.isnan(series[:, 2:4]).any():
             return StoppedError(
-                "step_too_small", "a root or power of zero, which has no Taylor series and method='rk853' goes past,"
+                "step_too_small",
+                f"a root or power of zero, which has no Taylor series and method={ADAPTIVE_METHOD!r} goes past,",
             )
         return StoppedError("diverged", DIVERGED)
 
@@ -246,21 +247,18 @@ class _Run:
         self,
         dyn: LagrangianDynamics | OracleDynamics,
         steps: TaylorSteps,
-        save: Array | None,
         watch: Watch | None,
         member: TrajectoryRecord,
         done: Callable[[float], None],
     ) -> None:
         self._dyn, self._steps, self._watch, self._done = dyn, steps, watch, done
-        self._save = None if save is None else save.tolist()
         self._member = member
 
     def all(self, t0: float, y0: Array, stops: Sequence[float], force: Callable[[int], Any]) -> TrajectoryRecord:
         """Return what comes of it."""
         member, steps = self._member, self._steps
         member.reached = t0
-        if self._save is None or self._save[:1] == [t0]:
-            member.keep(t0, y0)
+        member.begin(t0, y0)
         try:
             if self._watch is not None:
                 self._watch.start(t0, *_state(self._dyn.model, y0))
@@ -297,14 +295,7 @@ class _Run:
 
     def _keep(self, end: float) -> None:
         """Keep what is wanted of the last step, up to a time."""
-        if self._save is None:
-            if end == self._steps.t:
-                self._member.keep(end, _rounded(self._steps.y))
-            return
-        for t in self._save[len(self._member.t) :]:
-            if t > end:
-                break
-            self._member.keep(t, _rounded(self._steps.at(t)))
+        self._member.keep_step(self._steps.t, end, lambda t: _rounded(self._steps.at(t)))
 
     def _reason(self, force: Array) -> str:
         """Return why there is no step from the last good state, in the engine's words if it has some."""
