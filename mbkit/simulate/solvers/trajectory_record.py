@@ -91,7 +91,8 @@ class TrajectoryRecord:
     def keep(self, t: float, y: Array) -> None:
         """Keep a state (q, v) with quaternions of any length."""
         nq = self._model.nq
-        self.add(np.array([t]), unit_quaternions(self._model, y[None, :nq].copy())[0], y[None, nq:].copy())
+        q, _ = unit_quaternions(self._model, y[:nq])
+        self.add(np.array([t]), q[None].copy(), y[None, nq:].copy())
 
     def keep_step(self, t: float, end: float, state: Callable[[float], Array]) -> None:
         """Keep what is wanted of a step that ended at t, up to `end`; state(t) is (q, v) within the step."""
