@@ -15,9 +15,8 @@ __all__ = ["make_callable"]
 def make_callable(package: str, function: Callable[..., Any]) -> None:
     """Let a package be called as one of its functions.
 
-    Importing ``mbkit.load`` binds the package to the name ``load`` in `mbkit`, where
-    people expect the function; so it is both. It shows the function's signature and
-    docstring and the package's public names, and can be sent to worker processes.
+    Importing ``mbkit.load`` binds the package to the name ``load`` in `mbkit`, which is also the function's name;
+    so it is both. It has the function's signature and docstring and the package's public names, and can be pickled.
     """
     module = sys.modules[package]
     public = sorted(module.__all__)

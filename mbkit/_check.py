@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mbkit.errors import InputError
 
 Array = NDArray[np.float64]
-_FEW: Final = 64
+_MAX_SUMMED: Final = 64
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
 
@@ -32,9 +32,9 @@ __all__ = [
 
 def all_finite(array: Array) -> bool:
     """Return whether an array holds only finite numbers."""
-    # A plain sum of few numbers is several times cheaper than isfinite; huge but finite
-    # ones overflow it and are looked at again.
-    if array.size <= _FEW and math.isfinite(sum(array.ravel().tolist())):
+    # A plain sum of few numbers is several times cheaper than isfinite; huge finite ones
+    # overflow it and are checked again.
+    if array.size <= _MAX_SUMMED and math.isfinite(sum(array.ravel().tolist())):
         return True
     return bool(np.isfinite(array).all())
 
@@ -93,8 +93,8 @@ def batch_of(**arrays: Array) -> int | None:
     if not sizes:
         return None
     if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{k} has {v}" for k, v in sizes.items())
-        raise InputError(f"batches of different sizes: {told}; give every array the same N, or one state")
+        found = ", ".join(f"{k} has {v}" for k, v in sizes.items())
+        raise InputError(f"batches of different sizes: {found}; give every array the same N, or one state")
     return next(iter(sizes.values()), None)
 
 

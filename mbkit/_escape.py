@@ -1,6 +1,6 @@
 r"""Text from names, made safe for where it goes: one function for each kind of output.
 
-Names of robots, links, joints and symbols come from files of strangers. Each function here returns text that the
+Names of robots, links, joints and symbols come from untrusted files. Each function here returns text that the
 reader of its output (a terminal, a browser, TeX, Python, a C compiler, an XML parser) takes as text alone. Characters
 that cannot be seen, such as a terminal's control codes and marks that change the direction of writing, are spelled
 out in all of them: ``\x1b``, ``\u202e``.
@@ -56,7 +56,7 @@ _LEADING: Final = re.compile(r"(?=[#+=>-])|(?<=\d)(?=[.)]\s)")
 
 
 def markdown(text: str) -> str:
-    """Return text for one line or one cell of a table in Markdown; what is HTML in it is text."""
+    """Return text for one line or one cell of a table in Markdown; HTML in it is escaped."""
     marked = _MARKS.sub(lambda m: "\\" + m[0], one_line(text))
     if found := _LEADING.match(marked):
         marked = marked[: found.end()] + "\\" + marked[found.end() :]

@@ -35,8 +35,8 @@ __all__ = [
 ]
 
 # A message is for reading: this many faults of a description, and so many characters of each.
-_MOST_FAULTS: Final = 100
-_MOST_CHARACTERS: Final = 2000
+_MAX_FAULTS: Final = 100
+_MAX_CHARACTERS: Final = 2000
 # Longer names are not compared with others: the comparison takes the square of the length.
 _LONGEST_NAME: Final = 200
 
@@ -61,7 +61,7 @@ class FunctionError(InputError):
     Attributes
     ----------
     trajectory : mbkit.simulate.Trajectory or None
-        The run up to then; None where there is none.
+        The run up to then, or None.
     """
 
     trajectory: Any = None
@@ -71,11 +71,11 @@ class FunctionError(InputError):
 
 
 class TorqueError(FunctionError):
-    """A torque function raised, or returned what is no torque."""
+    """A torque function raised, or returned no valid torque."""
 
 
 class EventError(FunctionError):
-    """An event's function raised, or returned what is no number.
+    """An event's function raised, or returned no number.
 
     Attributes
     ----------
@@ -92,9 +92,9 @@ class UnknownNameError(MbkitError, LookupError):
     Parameters
     ----------
     what : str
-        The kind of thing asked for, such as ``"robot"``.
+        The kind of thing, such as ``"robot"``.
     name : str
-        What was asked for.
+        The unknown name.
     known : iterable of str
         The names that exist.
     hint : str
@@ -129,7 +129,7 @@ class ModelError(MbkitError, ValueError):
 
     def __init__(self, name: str, faults: Sequence[str]) -> None:
         self.name, self.faults = name, tuple(faults)
-        shown = [_shortened(fault) for fault in self.faults[:_MOST_FAULTS]]
+        shown = [_shortened(fault) for fault in self.faults[:_MAX_FAULTS]]
         if len(self.faults) == 1:
             text = f"{name}: {shown[0]}"
         else:
@@ -155,7 +155,7 @@ class OutputError(MbkitError, OSError):
 
 
 class UnsupportedError(MbkitError, NotImplementedError):
-    """An engine cannot do what was asked; the message has the reason."""
+    """An engine cannot do this; the message has the reason."""
 
 
 class NumericalError(MbkitError, ArithmeticError):
@@ -170,7 +170,7 @@ class MbkitWarning(UserWarning):
 
 
 class DoubtfulRunWarning(MbkitWarning):
-    """A run finished with plausible numbers, and something measured speaks against them."""
+    """A run finished with plausible numbers, but a check found a reason for doubt."""
 
 
 class KnownDefectWarning(MbkitWarning):
@@ -178,11 +178,11 @@ class KnownDefectWarning(MbkitWarning):
 
 
 class NoCompilerWarning(MbkitWarning):
-    """There is no compiler: what would be compiled is interpreted, with the same results and slower."""
+    """There is no compiler: functions are interpreted, slower and with the same results."""
 
 
 class NonPhysicalWarning(MbkitWarning):
-    """A body that no piece of matter can have, taken as it was written."""
+    """A body with an inconsistent inertia, used as it was written."""
 
 
 def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
@@ -215,5 +215,5 @@ class Suggestions:
         return self._found[name]
 
 
-def _shortened(text: str, most: int = _MOST_CHARACTERS) -> str:
+def _shortened(text: str, most: int = _MAX_CHARACTERS) -> str:
     return text if len(text) <= most else text[: most - 4] + " ..."

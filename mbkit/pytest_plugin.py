@@ -1,7 +1,6 @@
-"""A pytest plugin: robots and engines as parameters of tests, and baselines that tests hold them to.
+"""A pytest plugin: robots and engines as parameters of tests, and comparison with baselines.
 
-It is found by itself where mbkit is installed. Nothing of mbkit is loaded before a test asks for it,
-because every run of pytest loads this file.
+pytest finds it where mbkit is installed, and every run loads this file: so mbkit is imported only in fixtures.
 
     @pytest.mark.mbkit(robots=["panda", "robots/arm.urdf"], engines=["pinocchio", "mujoco"])
     def test_my_robots(mbkit_model, mbkit_engine): ...
@@ -34,10 +33,10 @@ _MARK = (
     "mbkit(robots=[...], engines=[...], **load): run a test for each robot (mbkit_model) and engine (mbkit_engine); "
     "a robot is a name, a file beside the test, package.module:function, or a Model; load are options of mbkit.load"
 )
-#: What a report brings from the process of the test to the one that prints.
-_TOLD = "mbkit"
+#: Name of the property in which a report carries messages to the process that prints.
+_PROPERTY = "mbkit"
 _CACHE = pytest.StashKey[dict[Any, Any]]()
-Made = TypeVar("Made")
+T = TypeVar("T")
 # `mbkit.testing.STRICT`, which is not imported for one word.
 _STRICT = "MBKIT_TEST_STRICT"
 
@@ -75,9 +74,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     wants_engine = "mbkit_engine" in metafunc.fixturenames
     if not wants_model and not wants_engine:
         return
-    asked = _asked(metafunc)
+    options = _mark_options(metafunc)
     if wants_model:
-        robots = _several(asked.get("robots"), "robots")
+        robots = _several(options.get("robots"), "robots")
         if not robots:
             pytest.fail(
                 f"{metafunc.function.__name__}: mbkit_model wants @pytest.mark.mbkit(robots=[...])", pytrace=False
@@ -86,12 +85,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if wants_engine:
         from mbkit.engines.registry import STANDARD
 
-        engines = _several(asked.get("engines", STANDARD), "engines")
+        engines = _several(options.get("engines", STANDARD), "engines")
         metafunc.parametrize("mbkit_engine", engines, indirect=True, ids=[str(e) for e in engines])
 
 
-def _asked(node: Any) -> dict[str, Any]:
-    """Return what the markers of a test say, the nearest first."""
+def _mark_options(node: Any) -> dict[str, Any]:
+    """Return the arguments of a test's markers; the nearest marker wins."""
     out: dict[str, Any] = {}
     for mark in getattr(node, "definition", node).iter_markers("mbkit"):
         if mark.args:
@@ -109,7 +108,7 @@ def _several(given: Any, name: str) -> list[Any]:
 
 
 def _id(robot: Any) -> str:
-    """Return what a robot is called in a test's name, the same in every process."""
+    """Return the name of a robot in a test's name, the same in every process."""
     if isinstance(robot, (str, os.PathLike)):
         text = os.fspath(robot)
         return Path(text).stem if text.lower().endswith((".urdf", ".xml", ".mjcf")) else text
@@ -121,7 +120,7 @@ def mbkit_model(request: pytest.FixtureRequest) -> Model:
     """One of the robots of the test's marker."""
     __tracebackhide__ = True
     robot = request.param
-    options = {k: x for k, x in _asked(request.node).items() if k not in ("robots", "engines")}
+    options = {k: x for k, x in _mark_options(request.node).items() if k not in ("robots", "engines")}
     if not isinstance(robot, (str, os.PathLike)):
         return robot() if callable(robot) else robot  # type: ignore[no-any-return]
     target = _target(os.fspath(robot), request)
@@ -138,7 +137,7 @@ def _load(target: str, options: Mapping[str, Any]) -> Model:
     __tracebackhide__ = True
     from mbkit.studies._targets import model_of
 
-    return _told(lambda: model_of(target, options))
+    return _without_traceback(lambda: model_of(target, options))
 
 
 @pytest.fixture
@@ -160,28 +159,28 @@ def mbkit_dynamics(request: pytest.FixtureRequest, mbkit_model: Model, mbkit_eng
     from mbkit.engines import dynamics
 
     key = "dynamics", mbkit_model.digest, mbkit_engine
-    return _once(request.config, key, lambda: _told(lambda: dynamics(mbkit_model, mbkit_engine)))
+    return _once(request.config, key, lambda: _without_traceback(lambda: dynamics(mbkit_model, mbkit_engine)))
 
 
-def _told(call: Callable[[], Made], write: Callable[[Exception], str] = str) -> Made:
-    """Return what a call gives; what mbkit raises is one message, without the lines that led to it."""
+def _without_traceback(call: Callable[[], T], write: Callable[[Exception], str] = str) -> T:
+    """Return the value of a call; an error of mbkit fails the test with its message, without a traceback."""
     __tracebackhide__ = True
     from mbkit.errors import MbkitError
 
     try:
         return call()
     except (AssertionError, MbkitError) as error:
-        told = write(error)
-    pytest.fail(told, pytrace=False)
+        message = write(error)
+    pytest.fail(message, pytrace=False)
 
 
-def _once(config: pytest.Config, key: Any, make: Callable[[], Made]) -> Made:
-    """Return what is made once in a process."""
+def _once(config: pytest.Config, key: Any, make: Callable[[], T]) -> T:
+    """Return a value that is made once in a process."""
     cache = config.stash[_CACHE]
     if key not in cache:
         cache[key] = make()
-    made: Made = cache[key]
-    return made
+    value: T = cache[key]
+    return value
 
 
 # Baselines.
@@ -219,7 +218,7 @@ class MbkitBaseline:
         Returns
         -------
         BaselineResult or Baseline
-            What was found, or recorded.
+            The comparison, or the recorded baseline.
         """
         __tracebackhide__ = True
         path = self.path(name)
@@ -234,12 +233,12 @@ class MbkitBaseline:
         from mbkit.studies import baseline as baselines
 
         target, options = self._target(model, path)
-        # A test that was given another robot means it.
+        # With force: the test may have another robot than before.
         arguments = {"target": target, "options": options, "force": True, **given}
-        made = _told(lambda: baselines.record(model, path, **arguments))
+        made = _without_traceback(lambda: baselines.record(model, path, **arguments))
         self._tell(f"recorded {self._shown(path)} ({', '.join(made.engines)})")
-        for told in made.disagreements:
-            self._tell(f"{self._shown(path)}: {told}")
+        for disagreement in made.disagreements:
+            self._tell(f"{self._shown(path)}: {disagreement}")
         return made
 
     def _check(self, model: Model, path: Path) -> Any:
@@ -251,10 +250,10 @@ class MbkitBaseline:
         target = self._target(model, path)[0] or None
 
         def write(error: Exception) -> str:
-            told = f"{error}\n  To record it: {again}" if isinstance(error, BaselineError) else str(error)
-            return told.replace(str(path), self._shown(path))
+            message = f"{error}\n  To record it: {again}" if isinstance(error, BaselineError) else str(error)
+            return message.replace(str(path), self._shown(path))
 
-        result = _told(lambda: assert_baseline(model, path, target=target, remedy=again), write)
+        result = _without_traceback(lambda: assert_baseline(model, path, target=target, remedy=again), write)
         if result.status == "versions":
             self._tell(f"{self._shown(path)}: {result.verdict} pytest --mbkit-regen")
         for refusal in result.skipped:
@@ -268,7 +267,7 @@ class MbkitBaseline:
             return "", {}
         from mbkit.studies._targets import kept
 
-        options = {k: x for k, x in _asked(self._request.node).items() if k not in ("robots", "engines")}
+        options = {k: x for k, x in _mark_options(self._request.node).items() if k not in ("robots", "engines")}
         return kept(_target(os.fspath(robot), self._request), path), options
 
     def _shown(self, path: Path) -> str:
@@ -278,8 +277,8 @@ class MbkitBaseline:
             return str(path)
 
     def _tell(self, text: str) -> None:
-        # Reports carry it to the process that prints, whoever ran the test.
-        self._request.node.user_properties.append((_TOLD, text))
+        # Reports carry it to the process that prints, with pytest-xdist too.
+        self._request.node.user_properties.append((_PROPERTY, text))
 
 
 def _plain(name: str) -> str:
@@ -293,16 +292,16 @@ def mbkit_baseline(request: pytest.FixtureRequest) -> MbkitBaseline:
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Say what was recorded, what was skipped, and where it is time to record anew."""
-    told = {
+    """Print which baselines were recorded or skipped, and which should be recorded again."""
+    messages = {
         text: None
         for reports in terminalreporter.stats.values()
         for report in reports
         if getattr(report, "when", "") == "call"
         for key, text in getattr(report, "user_properties", ())
-        if key == _TOLD
+        if key == _PROPERTY
     }
-    if told:
+    if messages:
         terminalreporter.section("mbkit")
-        for text in told:
+        for text in messages:
             terminalreporter.write_line(text)

@@ -481,7 +481,7 @@ def test_a_child_forked_during_another_threads_work_computes(work):
 
 def test_a_folder_of_other_files_is_neither_closed_nor_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(disk_cache, "_MOST", 1000)
+    monkeypatch.setattr(disk_cache, "_MAX_BYTES", 1000)
     mine = tmp_path / "thesis.dat"
     mine.write_bytes(b"x" * 3000)
     os.utime(mine, (1, 1))

@@ -32,7 +32,7 @@ from mbkit.errors import (
     UnknownNameError,
 )
 from mbkit.load import load, robots
-from mbkit.load.mjcf_schema import rules as mjcf_rules
+from mbkit.load.mjcf_attributes import rules as mjcf_rules
 from mbkit.load.robot_data import find
 from mbkit.load.shapes import solid
 from mbkit.load.urdf import Snapper

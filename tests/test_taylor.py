@@ -369,7 +369,7 @@ def test_what_has_no_series_is_refused(swing: Any) -> None:
 
 
 def test_too_large_a_model_is_refused_before_it_is_derived(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbkit.codegen.taylor._MOST", 3)
+    monkeypatch.setattr("mbkit.codegen.taylor._MAX_OPERATIONS", 3)
     with pytest.raises(UnsupportedError, match=r"double_pendulum takes \d+ operations.*'rk853' or 'dop853'"):
         TaylorSystem(Equations(catalog.double_pendulum()))
 

@@ -1,4 +1,4 @@
-"""How a derived function is run: as machine code, or in CasADi's own machine."""
+"""Selects how a derived function runs: as machine code, or in CasADi's interpreter."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ DERIVING: Final = fork_safe(threading.RLock())
 #: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not
 #: spent unasked: a Coriolis matrix of a hundred joints has twice as many, and is
 #: interpreted in 0.5 ms.
-_MOST: Final = 200_000
+_MAX_OPERATIONS: Final = 200_000
 
 
 def compile_by_default() -> bool:
-    """Return whether functions are compiled when nobody says: yes, unless ``MBKIT_COMPILE=0``."""
+    """Return whether functions are compiled by default: yes, unless ``MBKIT_COMPILE=0``."""
     return os.environ.get("MBKIT_COMPILE", "1") != "0"
 
 
@@ -46,7 +46,7 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
         Derives it; not called if its machine code is in the cache.
     compile : bool
         Whether to compile; where there is no compiler a `NoCompilerWarning` says so
-        once, and CasADi's machine runs it. It also runs what is very large.
+        once, and CasADi's machine runs it. It also runs very large functions.
     """
     if not compile or not _compiler():
         return Machine(make())
@@ -55,7 +55,7 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
 
     def checked() -> ca.Function:
         function = make()
-        if function.n_instructions() > _MOST:
+        if function.n_instructions() > _MAX_OPERATIONS:
             raise _TooLargeError(function)
         return function
 

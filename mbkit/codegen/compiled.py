@@ -171,7 +171,7 @@ class Compiled:
         return first
 
     def table(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Array:
-        """Return what the code is told of these arrays, which must outlive its use."""
+        """Return the table of these arrays that the code reads; they must outlive its use."""
         table = [len(inputs), len(outputs), self._share]
         for x in (*inputs, *outputs):
             table += [x.ctypes.data, x.shape[1], x.strides[1] >> 3, x.strides[0] >> 3]
@@ -217,7 +217,7 @@ def _batch_object() -> bytes:
 
 
 def shared_object(name: str, make: Callable[[], bytes]) -> bytes:
-    """Return an object file that depends on no model, from disk or made now."""
+    """Return an object file that depends on no model, from disk or compiled now."""
     key = disk.key_of(name, SOURCES, *map(str, jit.host()))
     found = disk.read(key)
     if found:
@@ -240,7 +240,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
-    """Return machine code of a function: kept in this process, from disk, or made now.
+    """Return machine code of a function: kept in this process, from disk, or compiled now.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def _compile(make: Callable[[], ca.Function]) -> tuple[dict[str, Any], bytes]:
     }, code
 
 
-#: Functions in use by anyone in this process.
+#: Functions in use in this process.
 _HELD: Final[WeakValueDictionary[str, Compiled]] = WeakValueDictionary()
 
 
@@ -310,7 +310,7 @@ class Call(NamedTuple):
 
 
 class KernelSequence:
-    """Calls on fixed arrays, made in order; one thread may run it at a time.
+    """Calls of compiled functions on fixed arrays, in order; one thread may run it at a time.
 
     Parameters
     ----------
@@ -323,7 +323,7 @@ class KernelSequence:
     def __init__(self, calls: Sequence[Call], times: int = 1) -> None:
         self._calls = tuple(calls)
         self._work = aligned(max((call.code.work_size for call in calls), default=0))
-        # The sum in which a compiled function tells that something is not finite.
+        # The sum in which a compiled function marks numbers that are not finite.
         self._work[:] = 0.0
         self._tables = [call.code.table(call.inputs, call.outputs) for call in calls]
         entries = [

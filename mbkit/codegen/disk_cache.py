@@ -1,13 +1,13 @@
 """Machine code kept on disk between processes.
 
 The folder belongs to the user alone (0700), an entry is written under another name
-and then renamed, so that any number of processes may write at once, and nothing is
-handed out unless its SHA-256, its key and its owner are right. Whatever is wrong with
-an entry, it is as if it were not there.
+and then renamed, so that any number of processes may write at once, and an entry
+is used only if its SHA-256, its key and its owner are right. A faulty entry counts as
+absent.
 
 ``MBKIT_CACHE_DIR`` moves the folder; set to the empty string it switches this off. A
-folder that is open to others and holds anything else is somebody's own: its mode is
-not changed, and nothing is kept there. No file but an entry is ever deleted.
+folder that is open to others and holds other files belongs to the user: its mode is
+not changed, and nothing is kept there. Only entries are ever deleted.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ __all__ = [
 T = TypeVar("T")
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
-_MOST: Final = 512 * 2**20
+_MAX_BYTES: Final = 512 * 2**20
 #: Names of entries, and of those being written.
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}|\.new-.+")
-#: Entries made within a block of `force_recompile`; None outside of one.
+#: Entries compiled within a block of `force_recompile`; None outside of one.
 _RECOMPILED: Final[ContextVar[set[str] | None]] = ContextVar("_RECOMPILED", default=None)
 
 
@@ -52,7 +52,7 @@ def key_of(*parts: str) -> str:
 
 
 def folder() -> Path | None:
-    """Return the folder, made if need be, or None where no safe one is to be had."""
+    """Return the folder, created if necessary, or None without a safe one."""
     chosen = os.environ.get("MBKIT_CACHE_DIR")
     if chosen == "":
         return None
@@ -75,9 +75,9 @@ def folder() -> Path | None:
 
 @contextmanager
 def force_recompile() -> Iterator[None]:
-    """Make each entry once more within the block, in this thread, as if none had been kept.
+    """Compile each entry again within the block, once, in this thread.
 
-    So that what a first run takes can be measured at any time. What is made is kept as ever.
+    It serves to measure a first run at any time. New entries are kept as usual.
     """
     token = _RECOMPILED.set(set())
     try:
@@ -87,13 +87,13 @@ def force_recompile() -> Iterator[None]:
 
 
 def is_bypassed(key: str) -> bool:
-    """Return whether an entry is to be made although it may be kept, here or in memory: see `force_recompile`."""
+    """Return whether a kept entry, on disk or in memory, must be compiled again: see `force_recompile`."""
     made = _RECOMPILED.get()
     return made is not None and key not in made
 
 
 def read(key: str) -> tuple[dict[str, Any], bytes] | None:
-    """Return the description and code of an entry, or None if there is none to be trusted."""
+    """Return the description and code of an entry, or None without a valid one."""
     at = folder()
     if at is None or is_bypassed(key):
         return None
@@ -120,7 +120,7 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
 
 
 def write(key: str, about: dict[str, Any], code: bytes) -> None:
-    """Keep an entry; where that is not possible, nothing happens."""
+    """Write an entry; failures are ignored."""
     made = _RECOMPILED.get()
     if made is not None:
         made.add(key)
@@ -139,7 +139,7 @@ def write(key: str, about: dict[str, Any], code: bytes) -> None:
             with suppress(OSError):
                 os.unlink(temporary)
             return
-        _forget_oldest(at)
+        _delete_oldest(at)
     except OSError:
         return
 
@@ -181,7 +181,7 @@ def _restored(key: str, restore: Callable[[dict[str, Any], bytes], T]) -> T | No
     return None
 
 
-def _forget_oldest(at: Path) -> None:
+def _delete_oldest(at: Path) -> None:
     entries = []
     for path in at.iterdir():
         if not _ENTRY.fullmatch(path.name):
@@ -191,7 +191,7 @@ def _forget_oldest(at: Path) -> None:
             entries.append((found.st_mtime, found.st_size, path))
     size = sum(entry[1] for entry in entries)
     for _, bytes_, path in sorted(entries):
-        if size <= _MOST:
+        if size <= _MAX_BYTES:
             return
         with suppress(OSError):
             path.unlink()

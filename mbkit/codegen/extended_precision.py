@@ -131,7 +131,7 @@ def arithmetic(name: Backend | None = None) -> Arithmetic:
 
 @cache
 def mpmath_context() -> Any:
-    """Return a context of mpmath's of our own, so that nobody's `mp.prec` is touched."""
+    """Return a private context of mpmath, so that the user's `mp.prec` is unchanged."""
     import mpmath
 
     context = mpmath.MPContext()

@@ -1,7 +1,6 @@
-"""Run a CasADi function in CasADi's own machine, one state or many.
+"""Run a CasADi function in CasADi's interpreter, one state or many.
 
-Nothing is compiled, so it is at once at hand: right for what is evaluated a few
-times, and where there is no compiler. `Compiled` has the same face.
+It needs no compilation: for few evaluations, and without a compiler. `Compiled` has the same interface.
 """
 
 from __future__ import annotations

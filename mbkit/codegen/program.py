@@ -1,8 +1,8 @@
-"""A CasADi function as a list of scalar operations, for whoever runs it elsewhere.
+"""A CasADi function as a list of scalar operations, the input of all backends.
 
 CasADi's own list reuses places in a work vector; here every operation has a value
-of its own (single static assignment), so that a compiler may order them freely. What
-stands there twice is computed once (value numbering), which takes a tenth of the time
+of its own (single static assignment), so that a compiler may order them freely. Repeated
+operations are computed once (value numbering), which takes a tenth of the time
 of CasADi's own search for common subexpressions.
 """
 
@@ -80,8 +80,8 @@ class Operation:
         exp, expm1, log, log1p, sinh, cosh, tanh, asinh, acosh, atanh, pow, hypot. Decisions, 1 or 0: lt
         (a < b), le, eq, ne, and, or, not; if_else_zero (b where a is not 0, else 0).
 
-        Of what is no number, fmin and fmax are none either; no comparison but ne holds of
-        it, and in a logical operation it counts as true, as in C.
+        fmin and fmax propagate NaN; every comparison with NaN is false except ne, and in a
+        logical operation it counts as true, as in C.
     arguments : tuple of int
         Indices of earlier operations; of an input, (which argument, which entry).
     value : float

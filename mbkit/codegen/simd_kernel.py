@@ -33,7 +33,7 @@ _STORE: Final = 4  # weight of a store, in operations
 _ARGUMENTS: Final = "ptr noalias %in, ptr noalias %is, ptr noalias %out, ptr noalias %os, ptr noalias %work"
 _COMPARISONS: Final = {"lt": "olt", "le": "ole", "eq": "oeq", "ne": "une"}
 _LOGICAL: Final = {"and": "and", "or": "or"}
-#: What can be finite where an argument is not: 1/inf, exp(-inf), atan(inf), NaN to the power of 0.
+#: Operations that can be finite where an argument is not: 1/inf, exp(-inf), atan(inf), NaN to the power of 0.
 _HIDING: Final = frozenset(
     {"div", "inv", "sign", "fmin", "fmax", "not", "if_else_zero", *_COMPARISONS, *_LOGICAL}
     | {"exp", "expm1", "tanh", "atan", "atan2", "pow"}
@@ -60,7 +60,7 @@ def vector_code(program: Program, width: int) -> tuple[str, int]:
 
 
 def pieces_of(program: Program) -> list[list[int]]:
-    """Split the operations, in their order, into what is compiled as one function."""
+    """Split the operations, in their order, into the pieces that are compiled as one function each."""
     stored: dict[int, int] = {}
     for out in program.outputs:
         for k in out.ravel().tolist():
@@ -127,7 +127,7 @@ def slots_of(program: Program, pieces: list[list[int]]) -> dict[int, int]:
     free: list[int] = []
     slots: dict[int, int] = {}
     ending: dict[int, list[int]] = {}
-    size = 1  # after the vector that finds what is not finite
+    size = 1  # after the vector that finds numbers that are not finite
     for n, piece in enumerate(pieces):
         for k in piece:
             if k in last:
@@ -167,7 +167,7 @@ class Piece:
                         continue
                     place = self._place("in", "is", i, j)
                     self._watched.append(self._text.put(f"load {self._text.vector}, ptr {place}, align 8"))
-        # A call spills what is live: functions of inputs come first, when little is.
+        # A call spills live values: functions of inputs come first, when few are live.
         early = [
             k
             for k in self._own
@@ -191,7 +191,7 @@ class Piece:
         self._watch()
 
     def _watch(self) -> None:
-        """Add 0 times what was read and written to the vector that finds what is not finite."""
+        """Add 0 times all numbers read and written to the vector that finds those that are not finite."""
         t = self._text
         total = t.put(f"load {t.vector}, ptr %work, align 8")
         for name in self._watched:
@@ -275,7 +275,7 @@ class Piece:
             return t.select(t.compare("ogt", a[0], zero), one, negative)
         if name in ("fmin", "fmax"):
             better = t.compare("olt" if name == "fmin" else "ogt", a[0], a[1])
-            # What is no number is taken, so that it comes to light.
+            # NaN is propagated.
             return t.select(t.bits("or", better, t.compare("uno", a[0], a[0])), a[0], a[1])
         raise ValueError(f"operation {name!r} has no vector code")
 

@@ -71,7 +71,7 @@ class CompiledStepLoop:
 def compiled_step_loop(
     name: Sequence[str], make: Callable[[], Sequence[Part]], state: Sequence[str]
 ) -> CompiledStepLoop:
-    """Return machine code of parts: kept in this process, from disk, or made now.
+    """Return machine code of parts: kept in this process, from disk, or compiled now.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def compiled_step_loop(
         Derives the parts, in order; one name among them is one function, which reads
         the same each time. Called only if they have not been compiled before.
     state : sequence of str
-        What a round starts from. The last part writes these names with a 1 behind,
+        The names at the start of a round. The last part writes these names with a 1 behind,
         in this order.
     """
     key = disk.key_of("lanes", *name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, (*jit.host(), width())))
@@ -118,7 +118,7 @@ def _rows(
         sizes.update(zip(part.writes, (r * c for r, c in programs[part.name].shapes), strict=True))
         order += part.writes
     for name in state:
-        # Nobody may read what is only handed on.
+        # A row that is only handed on may have no reader.
         sizes.setdefault(name, sizes[f"{name}1"])
     order += [name for part in parts for name in part.reads]
     order = list(dict.fromkeys(order))
@@ -173,7 +173,7 @@ class _Placed(Piece):
         return self._text.put(f"getelementptr inbounds {self._text.vector}, ptr %{base}, i64 {row}")
 
     def _watch(self) -> None:
-        # The error of a step tells of what is no number.
+        # The error of a step shows numbers that are not finite.
         pass
 
     def function(self, name: str) -> str:

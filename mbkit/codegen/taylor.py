@@ -34,7 +34,7 @@ from mbkit.errors import UnsupportedError
 __all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
 
 # A compiler's time for more is no longer spent unasked: 34,000 operations take 9 s.
-_MOST: Final = 100_000
+_MAX_OPERATIONS: Final = 100_000
 # Up to this many operations times order², the recurrences are written out: 2 to 3
 # times as fast to run as loops over them, compiled in about a second.
 _UNROLLED: Final = 25_000
@@ -169,7 +169,7 @@ class TaylorSystem:
         where forces can jump. A series goes on analytically there, as if nothing had
         happened.
     clock : int or None
-        Place of the time among what is behind tau, where it enters.
+        Place of the time among the arguments behind tau, where it enters.
 
     Raises
     ------
@@ -180,11 +180,11 @@ class TaylorSystem:
     def __init__(self, equations: Equations) -> None:
         heyoka = _heyoka()
         size = elimination_size(equations.model)
-        if size <= _MOST:
+        if size <= _MAX_OPERATIONS:
             self.rates = rates(equations)
             made = program(self.rates)
             size = made.arithmetic
-        if size > _MOST:
+        if size > _MAX_OPERATIONS:
             name = equations.model.name
             raise UnsupportedError(
                 f"taylor: {name} takes {size} operations, too many for a Taylor series; method='rk853' or 'dop853'"
@@ -194,7 +194,7 @@ class TaylorSystem:
         kinks, model = sum(o.name in _KINKS for o in made.operations), equations.model
         rows = equations.constraints.value.numel() if model.constrained else 0  # type: ignore[attr-defined]  # written
         self.kinked = kinks > len(model.quaternions) + rows
-        # Parameters stand first among what is behind tau.
+        # Parameters stand first among the arguments behind tau.
         self.clock = list(model.parameters).index(model.time_parameter) if model.time_parameter else None
         self._nq, self._nv = made.inputs[:2]
         #: Place of each parameter among heyoka's -> (argument, entry); unused ones have none.
@@ -227,10 +227,10 @@ class TaylorSystem:
 
     @contextmanager
     def integrator(self, kind: Precision, tolerance: float) -> Iterator[Any]:
-        """Lend a `heyoka.taylor_adaptive` that nobody else uses meanwhile.
+        """Lend a `heyoka.taylor_adaptive` for exclusive use.
 
         Its state, time and parameters are whatever the last user left. It is compiled
-        when there is none to lend; heyoka keeps what it compiled in memory and on disk.
+        when all are in use; heyoka keeps what it compiled in memory and on disk.
         """
         key = (kind.bits, order_of(tolerance))
         idle = self._idle.setdefault(key, [])

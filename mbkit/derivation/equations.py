@@ -20,7 +20,6 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
-from mbkit.derivation import equations
 from mbkit.derivation import kinematics as energies
 from mbkit.derivation.conditioning import loses_digits
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
@@ -36,8 +35,6 @@ __all__ = [
     "FUNCTIONS",
     "Equations",
     "equations_of",
-    "forward_dynamics",
-    "inverse_dynamics",
 ]
 
 
@@ -234,13 +231,28 @@ class Equations:
 
     @cached_property
     def inverse_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
-        """∂ID/∂q on the manifold, ∂ID/∂v and ∂ID/∂a = M."""
-        return equations.inverse_dynamics(self)
+        """∂ID/∂q, ∂ID/∂v and ∂ID/∂a = M, as expressions of (q, v, a).
+
+        Column k of ∂/∂q is d/dt f(q ⊕ t e_k) at t = 0, with `Model.integrate`'s ⊕: the directional derivative along
+        q̇ = D(q) e_k. Components of v, a and τ are held fixed, those in moving axes (free and ball joints) too.
+        """
+        tangent = ca.jacobian(self.kin.qdot, self.v)
+        by_q = ca.jtimes(self.inverse_dynamics, self.q, tangent)
+        return by_q, ca.jacobian(self.inverse_dynamics, self.v), self.mass_matrix
 
     @cached_property
     def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
-        """∂FD/∂q on the manifold, ∂FD/∂v and ∂FD/∂τ = M⁻¹."""
-        return equations.forward_dynamics(self)
+        """∂FD/∂q = -M⁻¹ ∂ID/∂q, ∂FD/∂v = -M⁻¹ ∂ID/∂v and ∂FD/∂τ = M⁻¹, as expressions of (q, v, τ).
+
+        From ID(q, v, FD(q, v, τ)) = τ, at a = FD (Carpentier and Mansard 2018, Analytical Derivatives of Rigid Body
+        Dynamics Algorithms): forward dynamics is never differentiated through its factorization.
+        """
+        by_q, by_v, _ = self.inverse_dynamics_derivatives
+        n = self.model.nv
+        by_q, by_v = ca.substitute([by_q, by_v], [self.a], [self.forward_dynamics])
+        out = self.over_mass(ca.horzcat(-by_q, -by_v, ca.SX.eye(n)))
+        by_q, by_v, by_tau = ca.horzsplit(out, [0, n, 2 * n, 3 * n])
+        return by_q, by_v, by_tau
 
     def function(self, name: str) -> ca.Function:
         """Return a quantity as a function of its arguments, with repeated operations as they came."""
@@ -303,35 +315,3 @@ class Equations:
     def _frame(self, name: str) -> tuple[str, Any]:
         frame = self.model.frame(name)
         return frame.body, self.kin.values.frame(frame)
-
-
-# First partial derivatives of inverse and forward dynamics, for linearization and optimal control.
-#
-# The derivative with respect to q is the one along the configuration manifold:
-# column k is d/dt f(q ⊕ t e_k) at t = 0, with `Model.integrate`'s ⊕. Its tangent is
-# q̇ = D(q) e_k, so the column is one directional derivative along a column of D; for
-# joints whose velocities are their coordinates' rates it is plain ∂/∂q. Components
-# of v, a and τ are held fixed, those in moving axes (free and ball joints) too.
-#
-# Forward dynamics is never differentiated through its factorization. From
-# ID(q, v, FD(q, v, τ)) = τ follows, at a = FD (Carpentier and Mansard 2018, Analytical
-# Derivatives of Rigid Body Dynamics Algorithms)::
-#
-#     ∂FD/∂q = -M⁻¹ ∂ID/∂q      ∂FD/∂v = -M⁻¹ ∂ID/∂v      ∂FD/∂τ = M⁻¹
-
-
-def inverse_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
-    """Return ∂ID/∂q, ∂ID/∂v and ∂ID/∂a as expressions of (q, v, a)."""
-    tangent = ca.jacobian(eq.kin.qdot, eq.v)
-    by_q = ca.jtimes(eq.inverse_dynamics, eq.q, tangent)
-    return by_q, ca.jacobian(eq.inverse_dynamics, eq.v), eq.mass_matrix
-
-
-def forward_dynamics(eq: Equations) -> tuple[Any, Any, Any]:
-    """Return ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ as expressions of (q, v, τ)."""
-    by_q, by_v, _ = inverse_dynamics(eq)
-    n = eq.model.nv
-    by_q, by_v = ca.substitute([by_q, by_v], [eq.a], [eq.forward_dynamics])
-    out = eq.over_mass(ca.horzcat(-by_q, -by_v, ca.SX.eye(n)))
-    by_q, by_v, by_tau = ca.horzsplit(out, [0, n, 2 * n, 3 * n])
-    return by_q, by_v, by_tau

@@ -6,9 +6,9 @@ With the kinetic energy as ½ Σ w ẋ², ẋ = J v, the mass matrix is M = Jᵀ
 
 J's columns are made orthogonal from the leaves to the root, in W's measure, and c with them (modified Gram-Schmidt,
 which is backward stable so: Björck 1996, Numerical Methods for Least Squares Problems, ch. 2.4 and 4.1). That gives M's
-LᵀDL with D as sums of squares. To form M and eliminate loses eps M_kk/D_k where a light part moves with a heavy one,
-for D_k is what is left of M_kk; and so loses who forms Jᵀ W c, the sum of forces that mostly cancel. Here neither is
-ever formed. A leaf's column has entries in the rows of what it moves alone, and that stays so.
+LᵀDL with D as sums of squares. Elimination of a formed M loses eps M_kk/D_k where a light part moves with a heavy one,
+and so does the formed Jᵀ W c, a sum of forces that mostly cancel. Here neither
+is formed. A leaf's column has entries in the rows of what it moves alone, and that stays so.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _Form = dict[tuple[int, int], Fraction]
 
 @lru_cache(maxsize=1024)
 def inertia_squares(inertia: tuple[float, ...]) -> tuple[InertiaSquare, ...] | None:
-    """Return the squares of an inertia given row by row; None where there are none, as of no matter."""
+    """Return the squares of an inertia given row by row; None if inconsistent."""
     exact = [Fraction(x) for x in inertia]
     I = [exact[3 * i : 3 * i + 3] for i in range(3)]
     torque = _torque(I)
@@ -253,8 +253,8 @@ class LeastConstraint:
             k = self._order[place]
             column = columns[k]
             weighted = {row: x * weights[row] for row, x in column.items()}
-            # A joint that moves nothing has no entry at all: the quotient is then infinite, and whoever evaluates
-            # finds it.
+            # A joint that moves nothing has no entry at all: the quotient is then infinite, and the
+            # evaluation reports it.
             diagonal = self.diagonal[k] = _dot(weighted, column)
             for i in self._order[:place]:
                 other = columns[i]

@@ -57,7 +57,7 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
     M : (n, n) casadi.SX
         Symmetric positive definite, sparse.
     f : (n,) or (n, k) casadi.SX
-        Right-hand sides; what is structurally zero stays so where it can.
+        Right-hand sides; structural zeros are kept where possible.
     order : sequence of int
         The indices with every parent before its children.
     """
@@ -80,7 +80,7 @@ class Factors:
         for k in reversed(range(n)):
             row, factors = rows[k], self._factors[k]
             # A joint that moves nothing has no entry at all: the quotient is then
-            # infinite, and whoever evaluates finds it.
+            # infinite, and the evaluation reports it.
             self._diagonal[k] = row.pop(k, 0.0)
             for i in sorted(row, reverse=True):
                 factors[i] = row[i] / self._diagonal[k]

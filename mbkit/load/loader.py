@@ -41,9 +41,9 @@ def load(
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
-    Of other files, those that an MJCF includes are opened, and the meshes that give a body of an MJCF its
-    inertia; no others. What was decided on the way (mimic joints, parts left out, rounded zeros, files that
-    were opened) stands in the model's ``notes``. Tendons and actuators of an MJCF act as springs, dampers and
+    The only other files that are opened are those that an MJCF includes, and the meshes that give a body of an
+    MJCF its inertia. The model's ``notes`` name all decisions (mimic joints, parts left out, rounded zeros, opened
+    files). Tendons and actuators of an MJCF act as springs, dampers and
     rotors where their forces at zero control are linear.
 
     Parameters
@@ -58,7 +58,7 @@ def load(
         without coordinates of their own, or independent joints. MJCF has none: its
         equality constraints are left out, and noted.
     nonphysical : {"error", "warn"}, optional
-        What to do about bodies that no matter is like: refuse them, or take them as
+        What to do about inconsistent inertias: refuse them, or use them as
         written with a warning. By default robots by name warn, and files are refused.
         A negative mass is always refused.
     gravity : (3,) array_like, optional
@@ -86,7 +86,7 @@ def load(
     Warns
     -----
     NonPhysicalWarning
-        Some bodies can be of no matter, and were taken as written.
+        Some inertias are inconsistent and were used as written.
     MbkitWarning
         Masses or lengths are so far apart that engines lose digits in double precision.
 
@@ -110,7 +110,7 @@ def load(
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml_reader.read(path)
     if root.tag == "robot":
-        # Pinocchio is loaded by whoever needs it.
+        # Pinocchio is imported only for a URDF.
         from mbkit.load.urdf import model_of
 
         urdf = examine(

@@ -24,11 +24,10 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.errors import ModelError
-from mbkit.load.mjcf_attributes import HERE, Compiler, Defaults, about
+from mbkit.load.mjcf_attributes import HERE, Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, listed
 from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, unfolded, walk
-from mbkit.load.mjcf_schema import check_names
 from mbkit.load.urdf import Snapper
 from mbkit.load.urdf_links import floated
 from mbkit.load.xml_reader import Element, Reader
@@ -184,7 +183,7 @@ def _add_joint(
     snap: Snapper,
     springs: Mapping[str, tuple[float, float]],
 ) -> None:
-    who, element, read = f"joint {joint.name!r}", joint.element, scene.read
+    item, element, read = f"joint {joint.name!r}", joint.element, scene.read
     angle = scene.compiler.angle if joint.kind in ("hinge", "ball") else 1.0
     given: dict[str, Any] = {}
     if joint.kind in ("hinge", "slide"):
@@ -194,30 +193,30 @@ def _add_joint(
             R = R @ about(axis, -joint.ref)
         elif joint.ref:
             p = p - R @ (joint.ref * axis)
-        given["rest"] = angle * read.number(element, "springref", who, 0.0)
-        limits = _range(element, "range", "limited", who, scene)
+        given["rest"] = angle * read.number(element, "springref", item, 0.0)
+        limits = _range(element, "range", "limited", item, scene)
         if limits:
             given["lower"], given["upper"] = (angle * x for x in limits)
-        force = _range(element, "actuatorfrcrange", "actuatorfrclimited", who, scene)
+        force = _range(element, "actuatorfrcrange", "actuatorfrclimited", item, scene)
         if force:
             given["effort_limit"] = max(abs(x) for x in force)
-    elif joint.kind == "ball" and _range(element, "range", "limited", who, scene, ordered=False):
+    elif joint.kind == "ball" and _range(element, "range", "limited", item, scene, ordered=False):
         scene.left_out["limit of a ball joint"] += 1
     for name in ("stiffness", "damping"):
-        given[name], *higher = read.numbers(element, name, who, count=3, least=1, default=(0.0,))
+        given[name], *higher = read.numbers(element, name, item, count=3, least=1, default=(0.0,))
         if any(higher):
-            read.fault(f"{who}: {name} that depends on the position or speed; only constants are read", element)
+            read.fault(f"{item}: {name} that depends on the position or speed; only constants are read", element)
     if joint.name in springs:
         given["stiffness"], given["damping"] = springs[joint.name]
-    armature = read.number(element, "armature", who, 0.0)
+    armature = read.number(element, "armature", item, 0.0)
     if joint.kind in ("ball", "free"):
         # They may come from a default class that was meant for hinges.
         for name, value in (("stiffness", given["stiffness"]), ("armature", armature)):
             if value:
                 why = "a joint of one coordinate" if name == "stiffness" else "a joint of one velocity"
-                read.fault(f"{who}: {name} {value:g} on a {joint.kind} joint; expected {why}; set it to 0", element)
+                read.fault(f"{item}: {name} {value:g} on a {joint.kind} joint; expected {why}; set it to 0", element)
         given["stiffness"] = armature = 0.0
-    if read.number(element, "springyield", who, 0.0) and given["stiffness"]:
+    if read.number(element, "springyield", item, 0.0) and given["stiffness"]:
         scene.left_out["yield of a spring"] += 1
     if not given["stiffness"]:
         given.pop("rest", None)
@@ -229,23 +228,23 @@ def _add_joint(
         translation=p,
         rotation=snap(R),
         armature=armature,
-        friction=read.number(element, "frictionloss", who, 0.0),
+        friction=read.number(element, "frictionloss", item, 0.0),
         **given,
     )
 
 
 def _range(
-    element: Element, range_: str, limited: str, who: str, scene: Scene, *, ordered: bool = True
+    element: Element, range_: str, limited: str, item: str, scene: Scene, *, ordered: bool = True
 ) -> tuple[float, float] | None:
     """Return a range that applies, or None."""
-    low, high = scene.read.numbers(element, range_, who, count=2, default=(0.0, 0.0), bounded=False)
+    low, high = scene.read.numbers(element, range_, item, count=2, default=(0.0, 0.0), bounded=False)
     said = scene.read.choice(element, limited, ("auto", "true", "false"))
     if said == "auto" and (low or high) and not scene.compiler.autolimits:
-        scene.read.fault(f"{who}: {range_} without {limited}, and autolimits is off; write {limited}", element)
+        scene.read.fault(f"{item}: {range_} without {limited}, and autolimits is off; write {limited}", element)
     if said == "false" or (said == "auto" and not low < high):
         return None
     if ordered and not low < high:
-        scene.read.fault(f"{who}: {range_} {low:g} {high:g}; expected the lower limit first", element)
+        scene.read.fault(f"{item}: {range_} {low:g} {high:g}; expected the lower limit first", element)
     return low, high
 
 
@@ -260,18 +259,18 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
             out.append(f"included from outside the folder of {path.name}: {', '.join(outside)}")
     sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in (*_READ, *_NOTED))
     if sections:
-        told = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
-        out.append(f"sections left out, with whatever they do to the motion: {told}")
+        listing = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
+        out.append(f"sections left out, with whatever they do to the motion: {listing}")
     if scene.left_out:
-        told = ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()))
-        out.append(f"not represented here, and left out: {told}")
+        listing = ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()))
+        out.append(f"not represented here, and left out: {listing}")
     out += _fluid_note(mujoco, scene)
-    told = ", ".join(f"{k}={v}" for k, v in sorted(flags.items()) if k not in _HONOURED)
-    if told:
-        out.append(f"option flags are an engine's, and were left out: {told}")
+    listing = ", ".join(f"{k}={v}" for k, v in sorted(flags.items()) if k not in _HONOURED)
+    if listing:
+        out.append(f"option flags are an engine's, and were left out: {listing}")
     if scene.unnamed:
-        told = " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items()))
-        out.append(f"names were made up for what has none ({told})")
+        listing = " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items()))
+        out.append(f"names were made up for what has none ({listing})")
     for setting, bodies in scene.bounded.items():
         what = "mass" if setting == "boundmass" else "inertia"
         out.append(f"compiler {setting} changed the {what} of {listed(bodies)}")
@@ -295,5 +294,5 @@ def _fluid_note(mujoco: Element, scene: Scene) -> list[str]:
     medium = Element("option", option, 0)
     if not any(scene.read.number(medium, name, "the file", 0.0) for name in ("density", "viscosity")):
         return []
-    told = ", ".join(f"{k} {v}" for k, v in sorted(option.items()))
-    return [f"the forces of a fluid were left out (option {told}), with fluidshape and fluidcoef of geoms"]
+    listing = ", ".join(f"{k} {v}" for k, v in sorted(option.items()))
+    return [f"the forces of a fluid were left out (option {listing}), with fluidshape and fluidcoef of geoms"]

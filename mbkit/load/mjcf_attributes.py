@@ -1,18 +1,37 @@
-"""MJCF's settings: compiler, default classes, and the many ways to write a pose."""
+"""MJCF's elements: the schema of names, compiler settings, default classes, and the ways to write a pose.
+
+The schema is printed by `mujoco.mj_printSchema`. It leaves out <frame>, in which MuJoCo 4.0.0 checks no
+names: there mbkit is stricter.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit.errors import nearest
 from mbkit.load.xml_reader import Element, Reader
 
-__all__ = ["HERE", "ORIENTATIONS", "Compiler", "Defaults", "Pose", "about", "has_length", "pose", "z_to"]
+__all__ = [
+    "HERE",
+    "ORIENTATIONS",
+    "Compiler",
+    "Defaults",
+    "Pose",
+    "about",
+    "check_names",
+    "has_length",
+    "pose",
+    "rules",
+    "z_to",
+]
 
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
@@ -68,7 +87,7 @@ class Compiler:
             merged.attributes.update(element.attributes)
             merged.line, merged.file = element.line, element.file
         given = merged.attributes
-        who = "the file"
+        item = "the file"
         if given.get("coordinate", "local") != "local":
             read.fault("compiler coordinate: only 'local' is read; convert the file with MuJoCo 2.3.3", merged)
         if given.get("alignfree", "false") != "false":
@@ -77,7 +96,7 @@ class Compiler:
         if len(seq) != 3 or set(seq.lower()) - set("xyz"):
             read.fault(f"compiler eulerseq: expected three of xyzXYZ, got {seq[:20]!r}", merged)
             seq = "xyz"
-        low, high = read.numbers(merged, "inertiagrouprange", who, count=2, default=(0.0, 5.0))
+        low, high = read.numbers(merged, "inertiagrouprange", item, count=2, default=(0.0, 5.0))
         return cls(
             angle={"degree": np.pi / 180, "radian": 1.0}[read.choice(merged, "angle", ("degree", "radian"))],
             eulerseq=seq,
@@ -87,9 +106,9 @@ class Compiler:
             ],
             groups=(low, high),
             balanceinertia=read.choice(merged, "balanceinertia", ("false", "true")) == "true",
-            boundmass=read.number(merged, "boundmass", who, 0.0),
-            boundinertia=read.number(merged, "boundinertia", who, 0.0),
-            settotalmass=read.number(merged, "settotalmass", who, -1.0),
+            boundmass=read.number(merged, "boundmass", item, 0.0),
+            boundinertia=read.number(merged, "boundinertia", item, 0.0),
+            settotalmass=read.number(merged, "settotalmass", item, -1.0),
         )
 
 
@@ -119,8 +138,8 @@ class Defaults:
         """Return the class name, or None after a fault."""
         if name is None or name in self.classes:
             return name
-        told = ", ".join(sorted(self.classes)[:20])
-        self.read.fault(f"<{element.tag}>: unknown default class {name!r}; there are: {told}", element)
+        listing = ", ".join(sorted(self.classes)[:20])
+        self.read.fault(f"<{element.tag}>: unknown default class {name!r}; there are: {listing}", element)
         return None
 
     def filled(self, element: Element, childclass: str | None) -> Element:
@@ -136,21 +155,21 @@ def _over(values: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
     return {**kept, **own}
 
 
-def pose(element: Element, compiler: Compiler, read: Reader, who: str) -> Pose:
+def pose(element: Element, compiler: Compiler, read: Reader, item: str) -> Pose:
     """Return the pose that an element's pos and orientation give."""
-    p = np.array(read.numbers(element, "pos", who, count=3, default=(0, 0, 0)))
+    p = np.array(read.numbers(element, "pos", item, count=3, default=(0, 0, 0)))
     given = [name for name in ORIENTATIONS if name in element.attributes]
     if not given:
         return Pose(np.eye(3), p)
     if len(given) > 1:
-        read.fault(f"{who}: {element.tag} has {' and '.join(given)}; keep one orientation", element)
+        read.fault(f"{item}: {element.tag} has {' and '.join(given)}; keep one orientation", element)
     before = len(read.faults)
-    values = np.array(read.numbers(element, given[0], who, count=ORIENTATIONS[given[0]]))
+    values = np.array(read.numbers(element, given[0], item, count=ORIENTATIONS[given[0]]))
     if len(read.faults) > before:
         return Pose(np.eye(3), p)
     R = _rotation(given[0], values, compiler)
     if R is None:
-        read.fault(f"{who}: {element.tag} {given[0]}: expected directions of some length, got zeros", element)
+        read.fault(f"{item}: {element.tag} {given[0]}: expected directions of some length, got zeros", element)
         R = np.eye(3)
     return Pose(R, p)
 
@@ -200,3 +219,108 @@ def z_to(direction: Array) -> Array:
     if sine < 1e-10:
         axis = np.array([1.0, 0.0, 0.0])
     return about(axis, float(np.arctan2(sine, z[2])))
+
+
+# Names that MuJoCo's schema does not have: misspelt ones, whose values would be lost.
+
+# Where nothing acts on the smooth motion, an unknown name is a note.
+_ASIDE: Final = frozenset(
+    {
+        *("visual", "statistic", "size", "sensor", "custom", "keyframe", "extension", "contact"),
+        *("texture", "material", "skin", "hfield", "camera", "light"),
+    }
+)
+# These are refused or not read as a whole.
+_UNREAD: Final = frozenset({"replicate", "attach", "composite", "flexcomp", "plugin"})
+_MOST_NOTED: Final = 6
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What an element may hold; `once` says that its parent has one at most."""
+
+    attributes: frozenset[str] = frozenset()
+    children: dict[str, Rule] = field(default_factory=dict)
+    once: bool = False
+
+
+def check_names(mujoco: Element, read: Reader) -> str:
+    """Keep a fault for each unknown name that could act on the motion, and return a note about the others."""
+    aside: list[str] = []
+    _check(mujoco, rules(), read, aside)
+    if not aside:
+        return ""
+    more = f" and {len(aside) - _MOST_NOTED} more" if len(aside) > _MOST_NOTED else ""
+    return f"unknown to MuJoCo's schema, and ignored: {', '.join(aside[:_MOST_NOTED])}{more}"
+
+
+def _check(element: Element, rule: Rule, read: Reader, aside: list[str], acts: bool = True) -> None:
+    """Check an element and all inside; without effect on the motion (not `acts`), names go into `aside`."""
+
+    def unknown(what: str, name: str, known: frozenset[str], where: Element) -> None:
+        if acts and where.tag not in _ASIDE:
+            read.fault(f"{_called(element)}: unknown {what} {name[:60]!r}{_hint(name, known)}", where)
+        else:
+            aside.append(f"{what} {name[:60]!r} of <{element.tag}> ({where.place})")
+
+    for name in element.attributes:
+        if name not in rule.attributes:
+            unknown("attribute", name, rule.attributes, element)
+    seen: set[str] = set()
+    for child in element.children:
+        inner = rule.children.get(child.tag)
+        if child.tag in _UNREAD:
+            continue
+        if inner is None:
+            unknown("element", child.tag, frozenset(rule.children), child)
+        elif inner.once and child.tag in seen:
+            read.fault(f"{_called(element)}: more than one <{child.tag}>; keep one", child)
+        else:
+            _check(child, inner, read, aside, acts and child.tag not in _ASIDE)
+        seen.add(child.tag)
+
+
+def _called(element: Element) -> str:
+    name = element.attributes.get("name", "")
+    return f"{element.tag} {name[:60]!r}" if name else f"<{element.tag}>"
+
+
+@lru_cache(maxsize=1000)
+def _hint(name: str, known: frozenset[str]) -> str:
+    near = nearest(name[:60], sorted(known), 1)
+    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(sorted(known)) or 'none'}"
+
+
+@lru_cache(maxsize=1)
+def rules() -> Rule:
+    """Return the rule for <mujoco>, from MuJoCo's schema."""
+    # The first MJCF that is loaded pays for the import.
+    import mujoco
+
+    # Lines are "name (how often)   attribute attribute", indented by level; longer ones go on below.
+    root = Rule()
+    open_rules: list[tuple[int, Rule]] = [(-1, root)]
+    found: list[tuple[int, str, str, list[str]]] = []
+    for line in mujoco.mj_printSchema(False, False).splitlines():
+        begun = re.fullmatch(r"( *)(\S+) \((.)\)(.*)", line)
+        if begun:
+            indent, tag, often, attributes = begun.groups()
+            found.append((len(indent), tag.removeprefix("(world)"), often, attributes.split()))
+        elif found:
+            found[-1][3].extend(line.split())
+    for level, tag, often, names in found:
+        rule = Rule(frozenset(names), once=often in "!?")
+        while open_rules[-1][0] >= level:
+            open_rules.pop()
+        open_rules[-1][1].children[tag] = rule
+        open_rules.append((level, rule))
+        if often == "R":
+            rule.children[tag] = rule
+    whole = root.children["mujoco"]
+    body = whole.children.pop("body")
+    frame_attributes = frozenset({"name", "class", "childclass", "pos", *ORIENTATIONS})
+    world = {tag: rule for tag, rule in body.children.items() if tag not in ("inertial", "joint", "freejoint")}
+    for children in (body.children, world):
+        children["frame"] = Rule(frame_attributes, children)
+    whole.children["worldbody"] = Rule(frozenset(), world)
+    return whole

@@ -40,9 +40,9 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
     """
     if not scene.inferred or scene.read.faults:
         return ""
-    who = f"the inertia of {listed(scene.inferred)}"
+    item = f"the inertia of {listed(scene.inferred)}"
     text = _Text(mujoco, path, scene)
-    made = text.compiled(_BODIES, who, scaled=False)
+    made = text.compiled(_BODIES, item, scaled=False)
     if made is None:
         return ""
     for body in scene.bodies:
@@ -51,7 +51,7 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
     bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
     within = f", within {' and '.join(bounds)}" if bounds else ""
     files = f"; mesh files read: {listed(text.opened)}" if text.opened else ""
-    return f"{who} was inferred from meshes or shells by MuJoCo's compiler{within}{files}"
+    return f"{item} was inferred from meshes or shells by MuJoCo's compiler{within}{files}"
 
 
 def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[float, float]]:
@@ -61,13 +61,13 @@ def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[
     """
     joints = []
     for joint in (j for b in scene.bodies for j in b.joints):
-        who = f"joint {joint.name!r}"
-        values = scene.read.numbers(joint.element, "springdamper", who, count=2, default=(0.0, 0.0))
+        item = f"joint {joint.name!r}"
+        values = scene.read.numbers(joint.element, "springdamper", item, count=2, default=(0.0, 0.0))
         if any(values):
             joints.append(joint.name)
         if any(values) and min(values) <= 0:
             scene.read.fault(
-                f"{who}: springdamper: expected a time constant and a damping ratio above 0", joint.element
+                f"{item}: springdamper: expected a time constant and a damping ratio above 0", joint.element
             )
     if not joints or scene.read.faults:
         return {}
@@ -96,7 +96,7 @@ class _Text:
         self.opened: list[str] = []
         self.assets: dict[str, bytes] = {}
 
-    def compiled(self, sections: Iterable[str], who: str, *, scaled: bool) -> Any:
+    def compiled(self, sections: Iterable[str], item: str, *, scaled: bool) -> Any:
         """Return the compiled model, or None after a fault; `scaled` says whether settotalmass applies."""
         read = self.scene.read
         before = len(read.faults)
@@ -122,18 +122,18 @@ class _Text:
                 return mujoco.MjModel.from_xml_string(text, assets=self.assets)
         except ValueError as error:
             # The line is one of the shortened text.
-            told = re.sub(r",? line -?\d+", "", " ".join(str(error).split()))
-            read.fault(f"{who}: MuJoCo's compiler refuses: {told}")
+            listing = re.sub(r",? line -?\d+", "", " ".join(str(error).split()))
+            read.fault(f"{item}: MuJoCo's compiler refuses: {listing}")
             return None
         finally:
             mujoco.set_mju_user_warning(heard)
 
-    def _need(self, name: str, who: str, geom: Element) -> None:
+    def _need(self, name: str, item: str, geom: Element) -> None:
         """Read the file of a mesh, once."""
         read = self.scene.read
         mesh = self.meshes.get(name)
         if mesh is None:
-            read.fault(f"{who}: no such <mesh> in <asset>", geom)
+            read.fault(f"{item}: no such <mesh> in <asset>", geom)
             return
         if id(mesh) in self.needed:
             return
@@ -146,14 +146,14 @@ class _Text:
         try:
             # A pipe or a device would be read for ever.
             if not found.is_file():
-                read.fault(f"{who}: no such file: {found}", mesh)
+                read.fault(f"{item}: no such file: {found}", mesh)
                 return
             if found.stat().st_size > MOST_BYTES:
-                read.fault(f"{who}: {found}: expected up to {MOST_BYTES} bytes", mesh)
+                read.fault(f"{item}: {found}: expected up to {MOST_BYTES} bytes", mesh)
                 return
             content = found.read_bytes()
         except (OSError, ValueError) as error:
-            read.fault(f"{who}: {found}: cannot be read ({error})", mesh)
+            read.fault(f"{item}: {found}: cannot be read ({error})", mesh)
             return
         self.opened.append(
             str(found.relative_to(self.path.parent) if found.is_relative_to(self.path.parent) else found)
@@ -171,7 +171,7 @@ class _Text:
         return self.path.parent / folder.replace("\\", "/") / relative
 
     def _written(self, element: Element, childclass: str | None) -> str:
-        """Return an element and what is inside, without what the compiler need not see.
+        """Return an element and its children, without those that the compiler does not need.
 
         The class is that of the elements around it, in the <worldbody>.
         """

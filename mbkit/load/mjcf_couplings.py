@@ -71,12 +71,12 @@ class _Actuator:
     forcelimited: str = "auto"
     ctrlrange: tuple[float, ...] = ()
 
-    def with_element(self, element: Element, who: str, read: Reader) -> _Actuator:
+    def with_element(self, element: Element, item: str, read: Reader) -> _Actuator:
         """Return these settings, changed by what an element says."""
         given = element.attributes
 
         def number(name: str, default: float) -> float:
-            return read.number(element, name, who, default)
+            return read.number(element, name, item, default)
 
         base = self
         heirs = ("pid",) if element.tag == "pid" else (element.tag, "general")
@@ -89,20 +89,20 @@ class _Actuator:
             bias=base.bias,
             gaintype=base.gaintype,
             biastype=base.biastype,
-            gear=read.numbers(element, "gear", who, count=6, least=1, default=(self.gear,))[0],
+            gear=read.numbers(element, "gear", item, count=6, least=1, default=(self.gear,))[0],
             armature=number("armature", self.armature),
-            damping=read.numbers(element, "damping", who, count=3, least=1, default=self.damping),
+            damping=read.numbers(element, "damping", item, count=3, least=1, default=self.damping),
             group=number("group", self.group),
-            forcerange=read.numbers(element, "forcerange", who, count=2, default=self.forcerange),
+            forcerange=read.numbers(element, "forcerange", item, count=2, default=self.forcerange),
             forcelimited=given.get("forcelimited", self.forcelimited),
-            ctrlrange=read.numbers(element, "ctrlrange", who, count=2, default=self.ctrlrange),
+            ctrlrange=read.numbers(element, "ctrlrange", item, count=2, default=self.ctrlrange),
         )
         gain, (b0, b1, b2) = out.gain, out.bias
         if element.tag == "general":
             if "gainprm" in given:
-                gain = read.numbers(element, "gainprm", who, count=10, least=1)[0]
+                gain = read.numbers(element, "gainprm", item, count=10, least=1)[0]
             if "biasprm" in given:
-                written = read.numbers(element, "biasprm", who, count=10, least=1)[:3]
+                written = read.numbers(element, "biasprm", item, count=10, least=1)[:3]
                 b0, b1, b2 = (*written, *out.bias[len(written) :])
             gaintype, biastype = given.get("gaintype", out.gaintype), given.get("biastype", out.biastype)
             return replace(out, gain=gain, bias=(b0, b1, b2), gaintype=gaintype, biastype=biastype)
@@ -116,7 +116,7 @@ class _Actuator:
             gain = number("kv", gain)
             return replace(out, gain=gain, bias=(0.0, 0.0, -gain), gaintype="fixed", biastype="affine")
         if element.tag == "cylinder":
-            bias = read.numbers(element, "bias", who, count=3, default=out.bias)
+            bias = read.numbers(element, "bias", item, count=3, default=out.bias)
             return replace(out, gain=number("area", gain), bias=(bias[0], bias[1], bias[2]), biastype="affine")
         if element.tag in ("motor", "damper", "adhesion"):
             gaintype = "affine" if element.tag == "damper" else "fixed"
@@ -130,22 +130,22 @@ class _Acting:
 
     Attributes
     ----------
-    who : str
+    item : str
         Its name, or its number and its line.
     name : str
         Of the coupling.
     factors : dict
         Joint -> dl/dq; empty where l is no sum of coordinates.
     ends : tuple of (str, array)
-        Bodies and points that l is the distance of; empty where it is none.
+        Bodies and points whose distance is l; empty for other lengths.
     dampratio : float
-        What is to be the damping, of the critical one at the pose that is drawn.
+        Damping, as a part of the critical one at the pose of the file.
     control : str
-        What is done with an actuator's control, which is left out.
+        Description of an actuator's control, which is left out.
     left_out : list of str
     """
 
-    who: str
+    item: str
     name: str
     factors: dict[str, float]
     stiffness: float = 0.0
@@ -163,7 +163,7 @@ class _Acting:
         return bool(self.stiffness or self.damping or self.armature or self.dampratio)
 
     def linear(self) -> None:
-        """Move to `left_out` what is no spring, damper or rotor on a sum of coordinates, or spring between points."""
+        """Move to `left_out` all but springs, dampers and rotors on sums of coordinates, and springs between points."""
         between = ("damping", "stiffness")[: 1 + (self.rest_length >= 0)] if self.ends else ()
         for name in ("stiffness", "damping", "armature", "dampratio"):
             value = getattr(self, name)
@@ -182,12 +182,12 @@ class _Acting:
         return PointSpring(self.name, a, at_a, b, at_b, self.stiffness, self.rest_length, self.damping)
 
     def description(self) -> str:
-        """Return who it is and what it does, for a note."""
+        """Return its name and its effect, for a note."""
         if self.ends:
             spring = f"stiffness {self.stiffness:g}, rest length {self.rest_length:g}, " if self.stiffness else ""
-            return f"{self.who} between {self.ends[0][0]!r} and {self.ends[1][0]!r}: {spring}damping {self.damping:g}"
+            return f"{self.item} between {self.ends[0][0]!r} and {self.ends[1][0]!r}: {spring}damping {self.damping:g}"
         ratio = f", damping ratio {self.dampratio:g}" if self.dampratio else ""
-        return f"{self.who}{str(self.coupling()).removeprefix(f'coupling {self.name!r}')}{ratio}"
+        return f"{self.item}{str(self.coupling()).removeprefix(f'coupling {self.name!r}')}{ratio}"
 
 
 class Transmissions:
@@ -248,23 +248,23 @@ class Transmissions:
     def _tendon(self, element: Element, number: int) -> _Acting:
         read = self._read
         full = replace(self._scene.defaults.filled(replace(element, tag="tendon"), None), tag=element.tag)
-        who = f"tendon {self._who(element, number)}"
+        item = f"tendon {self._who(element, number)}"
         out = _Acting(self._who(element, number), self._name(element, "tendon", number), {})
         for joint in element.all("joint") if element.tag == "fixed" else []:
             name = joint.attributes.get("joint", "")
-            if self._scalar(name, who, joint):
-                out.factors[name] = out.factors.get(name, 0.0) + read.number(joint, "coef", who)
+            if self._scalar(name, item, joint):
+                out.factors[name] = out.factors.get(name, 0.0) + read.number(joint, "coef", item)
         out.factors = {joint: factor for joint, factor in out.factors.items() if factor}
         if element.tag == "spatial":
             out.ends = self._ends(element)
         for name in ("stiffness", "damping"):
-            first, *higher = read.numbers(full, name, who, count=3, least=1, default=(0.0,))
+            first, *higher = read.numbers(full, name, item, count=3, least=1, default=(0.0,))
             setattr(out, name, first)
             if any(higher):
                 setattr(out, name, 0.0)
                 out.left_out.append(f"{name} that depends on the length or its rate")
-        out.armature = read.number(full, "armature", who, 0.0)
-        first, *second = read.numbers(full, "springlength", who, count=2, least=1, default=(-1.0,))
+        out.armature = read.number(full, "armature", item, 0.0)
+        first, *second = read.numbers(full, "springlength", item, count=2, least=1, default=(-1.0,))
         out.rest_length = first
         if first == -1.0 and all(x == -1.0 for x in second):
             out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
@@ -290,12 +290,12 @@ class Transmissions:
         ends = tuple(x for x in found if x is not None)
         return ends if len({body for body, _ in ends}) == 2 else ()
 
-    def _scalar(self, name: str, who: str, element: Element) -> bool:
+    def _scalar(self, name: str, item: str, element: Element) -> bool:
         """Return whether a joint has one coordinate; a fault if it has not, or is not there."""
         joint = self._joints.get(name)
         if joint is None or joint.kind not in ("hinge", "slide"):
             what = f"joint {name!r} is not in the file" if joint is None else f"joint {name!r} is a {joint.kind} joint"
-            self._read.fault(f"{who}: expected the name of a hinge or slide, {what}", element)
+            self._read.fault(f"{item}: expected the name of a hinge or slide, {what}", element)
             return False
         return True
 
@@ -307,12 +307,12 @@ class Transmissions:
     # Actuators
 
     def _actuator(self, element: Element, number: int) -> _Acting:
-        who = f"actuator {self._who(element, number)}"
+        item = f"actuator {self._who(element, number)}"
         class_ = self._scene.defaults.known(element.attributes.get("class"), element) or "main"
-        made = self._classes.get(class_, _Actuator()).with_element(element, who, self._read)
+        made = self._classes.get(class_, _Actuator()).with_element(element, item, self._read)
         out = _Acting(self._who(element, number), self._name(element, "actuator", number), {})
         out.armature = made.armature
-        out.factors = {joint: made.gear * c for joint, c in self._driven(element, who).items() if made.gear * c}
+        out.factors = {joint: made.gear * c for joint, c in self._driven(element, item).items() if made.gear * c}
         damping, *higher = made.damping
         out.damping = damping * self._dampers
         if any(higher):
@@ -321,24 +321,24 @@ class Transmissions:
         gain = f"gain {made.gain:g}" if made.gaintype == "fixed" else f"{made.gaintype} gain"
         limits = f", range {made.ctrlrange[0]:g} {made.ctrlrange[1]:g}" if made.ctrlrange else ""
         at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
-        out.control = f"{out.who} ({element.tag}, {gain}{limits}) on {at}"
+        out.control = f"{out.item} ({element.tag}, {gain}{limits}) on {at}"
         if self._actuation and made.group not in self._groups:
             self._bias(made, out)
         out.linear()
         return out
 
-    def _driven(self, element: Element, who: str) -> dict[str, float]:
+    def _driven(self, element: Element, item: str) -> dict[str, float]:
         """Return the factors of the length before the gear; none where it is no sum of coordinates."""
         given = element.attributes
         name = given.get("joint", given.get("jointinparent", ""))
         if name:
             joint = self._joints.get(name)
             if joint is None:
-                self._read.fault(f"{who}: joint {name!r} is not in the file", element)
+                self._read.fault(f"{item}: joint {name!r} is not in the file", element)
             return {name: 1.0} if joint is not None and joint.kind in ("hinge", "slide") else {}
         if "tendon" in given:
             if given["tendon"] not in self._factors:
-                self._read.fault(f"{who}: tendon {given['tendon']!r} is not in the file", element)
+                self._read.fault(f"{item}: tendon {given['tendon']!r} is not in the file", element)
                 return {}
             return self._factors[given["tendon"]]
         return {}
@@ -408,10 +408,10 @@ class Transmissions:
             at = ", at zero control" if what == "actuators" else ""
             if acting:
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
-            lost = "; ".join(f"{x.who}: {', '.join(x.left_out)}" for x in some if x.left_out)
+            lost = "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in some if x.left_out)
             if lost:
                 yield f"left out of {what}: {lost}"
-            idle = ", ".join(x.who for x in some if not (x.acts or x.left_out or x.control))
+            idle = ", ".join(x.item for x in some if not (x.acts or x.left_out or x.control))
             if idle:
                 yield f"{what} that exert no force of their own: {idle}"
         if self._actuators:

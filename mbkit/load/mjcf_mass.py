@@ -30,7 +30,7 @@ def body_lump(
     place: Array,
     compiler: Compiler,
     read: Reader,
-    who: str,
+    item: str,
 ) -> tuple[Lump | None, list[str]]:
     """Return a body's mass, centre of mass and inertia in its own axes, and the settings that changed them.
 
@@ -42,14 +42,14 @@ def body_lump(
         With the pose of the <frame> they stand in; defaults filled in. Geoms are those that `counts` lets through.
     place : (3,) array
         Of the body in its parent or <frame>, as it is written.
-    compiler, read, who
-        Settings, where faults go, and whom they blame.
+    compiler, read, item
+        Settings, where faults go, and the element that messages name.
     """
     if len(inertials) > 1:
-        read.fault(f"{who}: {len(inertials)} <inertial> elements; keep one", inertials[1][0])
+        read.fault(f"{item}: {len(inertials)} <inertial> elements; keep one", inertials[1][0])
     infer = compiler.inertiafromgeom
     if infer or (infer is None and not inertials):
-        lumps = [_geom(e, X, compiler, read, who) for e, X in geoms]
+        lumps = [_geom(e, X, compiler, read, item) for e, X in geoms]
         if any(x is None for x in lumps):
             return None, []
         heavy = [x for x in lumps if x and x.mass > _LEAST_MASS]
@@ -60,7 +60,7 @@ def body_lump(
         lump, changed = _bounded(NOTHING, compiler)
         # MuJoCo takes that place for the centre of mass in the body.
         return replace(lump, com=place) if changed else lump, changed
-    principal, placed = _written(*inertials[0], compiler, read, who)
+    principal, placed = _written(*inertials[0], compiler, read, item)
     lump, changed = _bounded(principal, compiler, slack=1e-14 if "fullinertia" in inertials[0][0].attributes else 0.0)
     return lump.moved(placed.R, placed.p), changed
 
@@ -85,76 +85,76 @@ def _bounded(lump: Lump, compiler: Compiler, slack: float = 0.0) -> tuple[Lump, 
     return (Lump(mass, lump.com, inertia) if changed else lump), changed
 
 
-def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, who: str) -> tuple[Lump, Pose]:
+def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> tuple[Lump, Pose]:
     """Return an <inertial> about its own centre, and its pose in the body."""
-    mass = read.number(element, "mass", who)
+    mass = read.number(element, "mass", item)
     if mass < 0:
-        read.fault(f"{who}: mass {mass:g} kg is negative; expected 0 or more", element)
+        read.fault(f"{item}: mass {mass:g} kg is negative; expected 0 or more", element)
     if "pos" not in element.attributes:
-        read.fault(f"{who}: <inertial> has no pos; write the centre of mass", element)
-    placed = X @ pose(element, compiler, read, who)
+        read.fault(f"{item}: <inertial> has no pos; write the centre of mass", element)
+    placed = X @ pose(element, compiler, read, item)
     if "fullinertia" in element.attributes:
         if "diaginertia" in element.attributes or ORIENTATIONS.keys() & element.attributes.keys():
-            read.fault(f"{who}: <inertial> has fullinertia and diaginertia or an orientation; keep one", element)
-        xx, yy, zz, xy, xz, yz = read.numbers(element, "fullinertia", who, count=6)
+            read.fault(f"{item}: <inertial> has fullinertia and diaginertia or an orientation; keep one", element)
+        xx, yy, zz, xy, xz, yz = read.numbers(element, "fullinertia", item, count=6)
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     else:
-        inertia = np.diag(read.numbers(element, "diaginertia", who, count=3, default=(0, 0, 0)))
+        inertia = np.diag(read.numbers(element, "diaginertia", item, count=3, default=(0, 0, 0)))
     return Lump(mass, np.zeros(3), inertia), placed
 
 
-def counts(geom: Element, compiler: Compiler, read: Reader, who: str) -> bool:
+def counts(geom: Element, compiler: Compiler, read: Reader, item: str) -> bool:
     """Return whether a geom, with its defaults filled in, may give its body mass."""
     first, last = compiler.groups
     given = geom.attributes
     # A number that cannot be read is a fault where it is used.
-    amount = Reader().number(geom, "mass" if "mass" in given else "density", who, 1000.0)
-    inside = first <= read.number(geom, "group", who, 0.0) <= last
+    amount = Reader().number(geom, "mass" if "mass" in given else "density", item, 1000.0)
+    inside = first <= read.number(geom, "group", item, 0.0) <= last
     return inside and amount != 0 and given.get("type", "sphere") not in ("plane", "hfield")
 
 
-def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, who: str) -> Lump | None:
+def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> Lump | None:
     """Return what a geom adds to its body; None where only MuJoCo's compiler can tell."""
     given = element.attributes
-    amount = read.number(element, "mass" if "mass" in given else "density", who, 1000.0)
+    amount = read.number(element, "mass" if "mass" in given else "density", item, 1000.0)
     if amount < 0:
-        read.fault(f"{who}: a geom's mass or density is negative; expected 0 or more", element)
+        read.fault(f"{item}: a geom's mass or density is negative; expected 0 or more", element)
         return NOTHING
     shape = given.get("type", "sphere")
     if shape in ("mesh", "sdf") or "mesh" in given or given.get("shellinertia", "false") != "false":
         return None
     if shape not in SIZES:
-        read.fault(f"{who}: geom type {shape[:40]!r}; expected one of {', '.join((*SIZES, 'mesh'))}", element)
+        read.fault(f"{item}: geom type {shape[:40]!r}; expected one of {', '.join((*SIZES, 'mesh'))}", element)
         return NOTHING
     before = len(read.faults)
-    size, placed = _sized(element, shape, compiler, read, who)
+    size, placed = _sized(element, shape, compiler, read, item)
     if len(read.faults) > before:
         return NOTHING
     lump = solid(shape, size)
     return lump.scaled(amount / lump.mass if "mass" in given else amount).moved((X @ placed).R, (X @ placed).p)
 
 
-def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, who: str) -> tuple[tuple[float, ...], Pose]:
+def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, item: str) -> tuple[tuple[float, ...], Pose]:
     """Return the sizes of a geom and its pose; two end points may give length and pose."""
     needed = SIZES[shape]
     if "fromto" not in element.attributes:
-        size = read.numbers(element, "size", who, count=3, least=needed)[:needed]
-        placed = pose(element, compiler, read, who)
+        size = read.numbers(element, "size", item, count=3, least=needed)[:needed]
+        placed = pose(element, compiler, read, item)
     else:
-        ends = np.array(read.numbers(element, "fromto", who, count=6))
-        size = read.numbers(element, "size", who, count=3, least=1)
+        ends = np.array(read.numbers(element, "fromto", item, count=6))
+        size = read.numbers(element, "size", item, count=3, least=1)
         if shape == "sphere":
-            read.fault(f"{who}: a sphere has no fromto; use pos", element)
+            read.fault(f"{item}: a sphere has no fromto; use pos", element)
         if "pos" in element.attributes:
-            read.fault(f"{who}: a geom has pos and fromto; keep one", element)
+            read.fault(f"{item}: a geom has pos and fromto; keep one", element)
         along = ends[3:] - ends[:3]
         if not has_length(along):
-            read.fault(f"{who}: a geom's fromto has no length", element)
+            read.fault(f"{item}: a geom's fromto has no length", element)
             return size, Pose(np.eye(3), ends[:3])
         half = float(np.linalg.norm(along)) / 2
         size = (size[0], half) if needed == 2 else (size[0], size[0], half)
         placed = Pose(z_to(along), (ends[:3] + ends[3:]) / 2)
     if min(size) <= 0:
-        told = " ".join(f"{x:g}" for x in size)
-        read.fault(f"{who}: a {shape} of size {told}; expected sizes above 0", element)
+        listing = " ".join(f"{x:g}" for x in size)
+        read.fault(f"{item}: a {shape} of size {listing}; expected sizes above 0", element)
     return size, placed

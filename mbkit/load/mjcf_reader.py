@@ -73,7 +73,7 @@ class MjcfBody:
 
 @dataclass
 class Scene:
-    """What is known while the tree is walked.
+    """The state of the walk over the tree.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Scene:
     left_out: Counter[str] = field(default_factory=Counter)
 
     def collect_names(self, world: Element) -> None:
-        """Take note of all names that are given, so that made-up ones keep clear of them."""
+        """Collect all names of the file, so that generated ones differ."""
         for element in world.walk():
             kind, name = _NAMED.get(element.tag), element.attributes.get("name", "")
             if kind and name in self.names[kind]:
@@ -109,7 +109,7 @@ class Scene:
                 self.names[kind].add(name)
 
     def name(self, element: Element, kind: str, fallback: str) -> str:
-        """Return the element's name, or one made up."""
+        """Return the element's name, or a generated one."""
         name = element.attributes.get("name", "")
         if not name:
             self.unnamed[kind] += 1
@@ -126,7 +126,7 @@ class Scene:
 
 
 def unfolded(
-    owner: Element, X: Pose, childclass: str | None, scene: Scene, who: str
+    owner: Element, X: Pose, childclass: str | None, scene: Scene, item: str
 ) -> Iterator[tuple[Element, Pose, str | None]]:
     """Yield the children of a body, with those of its <frame> elements, their pose and their class."""
     for child in owner.children:
@@ -136,27 +136,27 @@ def unfolded(
         # MuJoCo takes a frame's class for its childclass.
         own = child.attributes.get("childclass", child.attributes.get("class"))
         inner = scene.defaults.known(own, child) or childclass
-        yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, who), inner, scene, who)
+        yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, item), inner, scene, item)
 
 
 def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: Scene) -> None:
     """Read a body and everything below it into the scene."""
     name = scene.name(element, "body", f"body{len(scene.bodies) + 1}")
-    who = f"body {name!r}"
+    item = f"body {name!r}"
     read, compiler = scene.read, scene.compiler
     childclass = scene.defaults.known(element.attributes.get("childclass"), element) or childclass
-    own = pose(element, compiler, read, who)
-    if read.number(element, "gravcomp", who, 0.0):
+    own = pose(element, compiler, read, item)
+    if read.number(element, "gravcomp", item, 0.0):
         scene.left_out["gravity compensation"] += 1
     if element.attributes.get("mocap") == "true":
         scene.left_out["motion capture"] += 1
-    parts = list(unfolded(element, HERE, childclass, scene, who))
+    parts = list(unfolded(element, HERE, childclass, scene, item))
     joints = [_joint(e, name, Y, c, scene) for e, Y, c in parts if e.tag in ("joint", "freejoint")]
-    _check_joints(joints, parent, who, read)
+    _check_joints(joints, parent, item, read)
     inertials = [(e, Y) for e, Y, _ in parts if e.tag == "inertial"]
     geoms = [(e, scene.defaults.filled(e, c), Y) for e, Y, c in parts if e.tag == "geom"]
-    geoms = [(e, full, Y) for e, full, Y in geoms if counts(full, compiler, read, who)]
-    lump, changed = body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, who)
+    geoms = [(e, full, Y) for e, full, Y in geoms if counts(full, compiler, read, item)]
+    lump, changed = body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, item)
     if lump is None:
         scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
     for setting in changed:
@@ -167,7 +167,7 @@ def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: 
         if e.tag == "site":
             site = scene.defaults.filled(e, c)
             if e.attributes.get("name") and "fromto" not in site.attributes:
-                body.sites.append((e.attributes["name"], Y @ pose(site, compiler, read, f"site in {who}")))
+                body.sites.append((e.attributes["name"], Y @ pose(site, compiler, read, f"site in {item}")))
         elif e.tag == "body":
             walk(e, name, Y, c, scene)
         elif e.tag == "plugin":
@@ -179,29 +179,29 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
     free = element.tag == "freejoint"
     full = element if free else scene.defaults.filled(element, childclass)
     name = scene.name(element, "joint", f"{body}_joint")
-    who = f"joint {name!r}"
+    item = f"joint {name!r}"
     type_ = "free" if free else full.attributes.get("type", "hinge")
     if type_ not in KINDS:
-        read.fault(f"{who}: type {type_[:40]!r}; expected one of {', '.join(KINDS)}", element)
+        read.fault(f"{item}: type {type_[:40]!r}; expected one of {', '.join(KINDS)}", element)
         type_ = "hinge"
     if free and element.attributes.get("align") == "true":
-        read.fault(f"{who}: align moves the body's frame; set it to false", element)
+        read.fault(f"{item}: align moves the body's frame; set it to false", element)
     anchor, axis, ref = np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0
     if type_ != "free":
-        anchor = X.p + X.R @ np.array(read.numbers(full, "pos", who, count=3, default=(0, 0, 0)))
+        anchor = X.p + X.R @ np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0)))
     if type_ in ("hinge", "slide"):
-        axis = np.array(read.numbers(full, "axis", who, count=3, default=(0, 0, 1)))
+        axis = np.array(read.numbers(full, "axis", item, count=3, default=(0, 0, 1)))
         if not has_length(axis):
-            read.fault(f"{who}: axis is zero; expected a direction, such as 0 0 1", element)
+            read.fault(f"{item}: axis is zero; expected a direction, such as 0 0 1", element)
             axis = np.array([0.0, 0.0, 1.0])
         axis = X.R @ axis
-        ref = read.number(full, "ref", who, 0.0) * (scene.compiler.angle if type_ == "hinge" else 1.0)
+        ref = read.number(full, "ref", item, 0.0) * (scene.compiler.angle if type_ == "hinge" else 1.0)
     return MjcfJoint(name, full, type_, anchor, axis, ref)
 
 
-def _check_joints(joints: list[MjcfJoint], parent: str, who: str, read: Reader) -> None:
+def _check_joints(joints: list[MjcfJoint], parent: str, item: str, read: Reader) -> None:
     kinds = [j.kind for j in joints]
     if "free" in kinds and len(kinds) > 1:
-        read.fault(f"{who}: a free joint and others; a free body has no other joint")
+        read.fault(f"{item}: a free joint and others; a free body has no other joint")
     if "free" in kinds and parent != "world":
-        read.fault(f"{who}: a free joint below {parent!r}; only bodies of the world may be free")
+        read.fault(f"{item}: a free joint below {parent!r}; only bodies of the world may be free")

@@ -1,7 +1,7 @@
 """A URDF or MJCF as it was written, less what would open another file.
 
-An engine's own parser is given this text, and its lines are those of the file: what is taken out leaves its
-lines empty. Meshes, textures and packages are gone, and with them the shapes that were made of them. Boxes,
+Engines' parsers read this text. Its lines are those of the file: a removed element leaves empty lines.
+Meshes, textures and packages are gone, and with them the shapes that were made of them. Boxes,
 cylinders and spheres stay, because MuJoCo may take a body's inertia from them, and so does every other
 element. Meshes stay where a body of an MJCF takes its inertia from them: those files are read and handed over.
 """
@@ -38,7 +38,7 @@ _FROM_FILES: Final = ("mesh", "sdf", "hfield")
 
 @dataclass(frozen=True)
 class Stripped:
-    """What is left of a file.
+    """A file without references to others.
 
     Attributes
     ----------
@@ -185,7 +185,7 @@ class _Meshes:
             mass, density = float(full.get("mass", "nan")), float(full.get("density", "1000"))
             return first <= float(full.get("group", "0")) <= last and mass != 0 and (density != 0 or mass == mass)
         except ValueError:
-            # The parsers say what is wrong with it.
+            # The parsers report the fault.
             return True
 
     def _read(self, name: str) -> bool:
@@ -246,7 +246,7 @@ class _Writer:
         self.shapeless: list[str] = []
 
     def write(self, element: Element) -> None:
-        """Write an element and what is kept of its children."""
+        """Write an element and its kept children."""
         kept = list(self._kept(element))
         if self._shapeless(element, kept):
             self.shapeless.append(element.attributes.get("name", "?"))
@@ -254,12 +254,12 @@ class _Writer:
         if below > 0:
             self.parts.append("\n" * below)
             self._line += below
-        told = "".join(f" {k}={quoteattr(v)}" for k, v in self._attributes(element).items())
+        listing = "".join(f" {k}={quoteattr(v)}" for k, v in self._attributes(element).items())
         inside = escape(" ".join(element.text.split()))
         if not inside and not kept:
-            self.parts.append(f"<{element.tag}{told}/>")
+            self.parts.append(f"<{element.tag}{listing}/>")
             return
-        self.parts.append(f"<{element.tag}{told}>{inside}")
+        self.parts.append(f"<{element.tag}{listing}>{inside}")
         for child in kept:
             self.write(child)
         self.parts.append(f"</{element.tag}>")

@@ -1,4 +1,4 @@
-"""Mass and inertia of MuJoCo's solid shapes, and of what is made of several."""
+"""Mass and inertia of MuJoCo's solid shapes, and of several together."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIZES: Final = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box":
 
 @dataclass(frozen=True)
 class Lump:
-    """Mass, centre of mass, and inertia about it, in the axes of whoever asks."""
+    """Mass, centre of mass, and inertia about it, in some common axes."""
 
     mass: float
     com: Array

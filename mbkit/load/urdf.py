@@ -118,7 +118,7 @@ class _Conversion:
         self.bodies: list[str] = []
         self.suspects: set[str] = set()
         self.renamed: list[str] = []
-        # Links that no matter is like, by the body that they were merged into.
+        # Links with inconsistent inertias, by the body that they were merged into.
         self.odd: dict[str, list[tuple[str, str]]] = {}
 
     def run(self, source: str, nonphysical: Literal["error", "warn"], gravity: ArrayLike) -> Model:
@@ -200,7 +200,7 @@ class _Conversion:
         X = raw.jointPlacements[index]
         parent = self.bodies[raw.parents[index]]
         if raw.parents[index] == 0 and X_base is not None and not X_base.isIdentity(0.0):
-            # Kept as written: a placement relative to the base would be rounded anew.
+            # Kept as written: a placement relative to the base would be rounded again.
             parent = "world"
         self._add_body(b, body, raw.inertias[index])
         v = slice(joint.idx_v, joint.idx_v + joint.nv)
@@ -250,10 +250,10 @@ class _Conversion:
         mimics = [(j.name, j.mimic) for j in self.urdf.joints if j.mimic]
         if not mimics:
             return []
-        told = ", ".join(f"{name} = {m.ratio:g} {m.joint} {m.offset:+g}" for name, m in mimics)
+        listing = ", ".join(f"{name} = {m.ratio:g} {m.joint} {m.offset:+g}" for name, m in mimics)
         if self.mimic == "free":
-            return [f"mimic joints kept independent, as mimic='free' asks: {told}"]
-        return [f"mimic joints reduced, so that they have no coordinate of their own: {told}"]
+            return [f"mimic joints kept independent, as mimic='free' asks: {listing}"]
+        return [f"mimic joints reduced, so that they have no coordinate of their own: {listing}"]
 
     def _odd_links(self) -> dict[str, list[tuple[str, str]]]:
         bodies: dict[str, list[tuple[str, str]]] = {}
@@ -267,8 +267,8 @@ class _Conversion:
         healed = [f"{link} ({why})" for body, link, why in odd if body not in self.suspects]
         if not healed:
             return []
-        told = "; ".join(healed[:5]) + (f"; and {len(healed) - 5} more" if len(healed) > 5 else "")
-        return [f"links that no matter is like, seen alone, but sound with what is fixed to them: {told}"]
+        listing = "; ".join(healed[:5]) + (f"; and {len(healed) - 5} more" if len(healed) > 5 else "")
+        return [f"links that no matter is like, seen alone, but sound with what is fixed to them: {listing}"]
 
     def _rename_notes(self) -> list[str]:
         return [f"link 'world' is called {n!r} here, because 'world' is the ground" for n in self.renamed]

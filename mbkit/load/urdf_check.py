@@ -1,7 +1,7 @@
 """What stands in a URDF, checked before any parser in C++ sees it.
 
-`examine` finds all faults of a file at once and writes what is left of it, names and
-numbers to the letter, as plain XML: bodies and joints only. Meshes, textures, plugins
+`examine` finds all faults of a file at once and writes its bodies and joints, names and
+numbers to the letter, as plain XML. Meshes, textures, plugins
 and everything else that could point outside the file are gone from that text.
 """
 
@@ -69,13 +69,13 @@ def check_tree(links: Sequence[str], joints: Sequence[UrdfJoint], read: Reader) 
             carriers.setdefault(joint.child, []).append(joint)
     for link, several in carriers.items():
         if len(several) > 1:
-            told = ", ".join(repr(j.name) for j in several)
-            read.fault(f"link {link!r}: child of {len(several)} joints ({told}); a URDF is a tree: keep one of them")
+            listing = ", ".join(repr(j.name) for j in several)
+            read.fault(f"link {link!r}: child of {len(several)} joints ({listing}); a URDF is a tree: keep one of them")
     roots = [n for n in known if n not in carriers]
     if len(roots) > 1:
-        told = ", ".join(repr(n) for n in roots[:6]) + (", ..." if len(roots) > 6 else "")
+        listing = ", ".join(repr(n) for n in roots[:6]) + (", ..." if len(roots) > 6 else "")
         read.fault(
-            f"{len(roots)} links that no joint carries ({told}); a robot has one root: connect or remove the rest"
+            f"{len(roots)} links that no joint carries ({listing}); a robot has one root: connect or remove the rest"
         )
     for cycle in _cycles(known, carriers):
         read.fault(
@@ -174,8 +174,8 @@ class UrdfFile:
         In the file's order.
     links : frozenset of str
     odd_links : mapping of str to str
-        Links that no matter is like, seen alone, each with the reason. What is
-        fixed to them may heal them, so this is not yet a fault.
+        Links whose own inertia is inconsistent, each with the reason. Links
+        fixed to them may make it consistent, so this is not yet a fault.
     notes : tuple of str
     """
 
@@ -245,9 +245,9 @@ def unbounded(limit: float) -> float:
 
 
 def _written(tag: str, attributes: Mapping[str, str], inside: Iterable[str] = ()) -> str:
-    told = "".join(f" {k}={quoteattr(v)}" for k, v in attributes.items())
+    listing = "".join(f" {k}={quoteattr(v)}" for k, v in attributes.items())
     body = "".join(inside)
-    return f"<{tag}{told}>{body}</{tag}>" if body else f"<{tag}{told}/>"
+    return f"<{tag}{listing}>{body}</{tag}>" if body else f"<{tag}{listing}/>"
 
 
 def _copied(element: Element, *names: str) -> str:
@@ -255,33 +255,33 @@ def _copied(element: Element, *names: str) -> str:
     return _written(element.tag, given)
 
 
-def _origin(owner: Element, who: str, read: Reader) -> list[str]:
-    origin = read.only(owner, "origin", who)
+def _origin(owner: Element, item: str, read: Reader) -> list[str]:
+    origin = read.only(owner, "origin", item)
     if origin is None:
         return []
-    read.numbers(origin, "xyz", who, count=3, default=(0, 0, 0))
-    read.numbers(origin, "rpy", who, count=3, default=(0, 0, 0))
+    read.numbers(origin, "xyz", item, count=3, default=(0, 0, 0))
+    read.numbers(origin, "rpy", item, count=3, default=(0, 0, 0))
     return [_copied(origin, "xyz", "rpy")]
 
 
 def _link(link: Element, read: Reader, odd: dict[str, str]) -> str:
     name = read.name(link, "name", "a link")
-    who = f"link {name!r}"
-    inertial = read.only(link, "inertial", who)
+    item = f"link {name!r}"
+    inertial = read.only(link, "inertial", item)
     if inertial is None:
         return _written("link", {"name": name})
     before = len(read.faults)
-    texts = _origin(inertial, who, read)
-    mass, moments = (read.only(inertial, tag, who) for tag in ("mass", "inertia"))
+    texts = _origin(inertial, item, read)
+    mass, moments = (read.only(inertial, tag, item) for tag in ("mass", "inertia"))
     for tag, element in (("mass", mass), ("inertia", moments)):
         if element is None:
-            read.fault(f"{who}: <inertial> has no <{tag}>; add it, or remove <inertial>", inertial)
+            read.fault(f"{item}: <inertial> has no <{tag}>; add it, or remove <inertial>", inertial)
     if mass is None or moments is None:
         return ""
-    kg = read.number(mass, "value", who)
-    ixx, ixy, ixz, iyy, iyz, izz = (read.number(moments, m, who) for m in _MOMENTS)
+    kg = read.number(mass, "value", item)
+    ixx, ixy, ixz, iyy, iyz, izz = (read.number(moments, m, item) for m in _MOMENTS)
     if kg < 0:
-        read.fault(f"{who}: mass {kg:g} kg is negative; expected 0 or more", mass)
+        read.fault(f"{item}: mass {kg:g} kg is negative; expected 0 or more", mass)
     if len(read.faults) == before:
         inertia = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
         why = body_fault(Body(name, kg, np.zeros(3), inertia), point_masses=False)
@@ -293,80 +293,81 @@ def _link(link: Element, read: Reader, odd: dict[str, str]) -> str:
 
 def _joint(joint: Element, read: Reader) -> tuple[UrdfJoint, str]:
     name = read.name(joint, "name", "a joint")
-    who = f"joint {name!r}"
+    item = f"joint {name!r}"
     type_ = joint.attributes.get("type", "")
     kind = _KINDS.get(type_, "")
     if not kind:
-        read.fault(f"{who}: type {type_!r}; expected one of {', '.join(_KINDS)}", joint)
-    texts = _origin(joint, who, read)
-    ends = {tag: _end(joint, tag, who, read) for tag in ("parent", "child")}
+        read.fault(f"{item}: type {type_!r}; expected one of {', '.join(_KINDS)}", joint)
+    texts = _origin(joint, item, read)
+    ends = {tag: _end(joint, tag, item, read) for tag in ("parent", "child")}
     texts += [_written(tag, {"link": link}) for tag, link in ends.items()]
-    texts += _axis(joint, kind, who, read)
-    texts += _limit(joint, kind, who, read)
-    dynamics = read.only(joint, "dynamics", who)
+    texts += _axis(joint, kind, item, read)
+    texts += _limit(joint, kind, item, read)
+    dynamics = read.only(joint, "dynamics", item)
     if dynamics is not None:
-        damping, friction = (read.number(dynamics, a, who, 0.0) for a in ("damping", "friction"))
+        damping, friction = (read.number(dynamics, a, item, 0.0) for a in ("damping", "friction"))
         if friction < 0:
-            read.fault(f"{who}: friction {friction:g} is negative; expected 0 or more", dynamics)
+            read.fault(f"{item}: friction {friction:g} is negative; expected 0 or more", dynamics)
         if kind in ("free", "planar") and (damping or friction):
-            read.fault(f"{who}: damping or friction on a {type_} joint, which URDF's parsers drop; remove it", dynamics)
+            read.fault(f"{item}: damping or friction on a {type_} joint, which URDF parsers drop; remove it", dynamics)
         if kind not in ("", "fixed", "free", "planar") and {"damping", "friction"} & dynamics.attributes.keys():
             texts.append(_copied(dynamics, "damping", "friction"))
     mimic = None
-    follows = read.only(joint, "mimic", who)
+    follows = read.only(joint, "mimic", item)
     if follows is not None:
-        leader = read.name(follows, "joint", who)
-        ratio, offset = read.number(follows, "multiplier", who, 1.0), read.number(follows, "offset", who, 0.0)
+        leader = read.name(follows, "joint", item)
+        ratio, offset = read.number(follows, "multiplier", item, 1.0), read.number(follows, "offset", item, 0.0)
         mimic = Mimic(leader, ratio, offset)
     return UrdfJoint(name, kind, ends["parent"], ends["child"], mimic), _written(
         "joint", {"name": name, "type": type_}, texts
     )
 
 
-def _end(joint: Element, tag: str, who: str, read: Reader) -> str:
-    end = read.only(joint, tag, who)
+def _end(joint: Element, tag: str, item: str, read: Reader) -> str:
+    end = read.only(joint, tag, item)
     if end is None:
-        read.fault(f'{who}: no <{tag}>; add <{tag} link="..."/>', joint)
-    return "" if end is None else read.name(end, "link", who)
+        read.fault(f'{item}: no <{tag}>; add <{tag} link="..."/>', joint)
+    return "" if end is None else read.name(end, "link", item)
 
 
-def _axis(joint: Element, kind: str, who: str, read: Reader) -> list[str]:
-    axis = read.only(joint, "axis", who)
+def _axis(joint: Element, kind: str, item: str, read: Reader) -> list[str]:
+    axis = read.only(joint, "axis", item)
     before = len(read.faults)
-    vector = (1.0, 0.0, 0.0) if axis is None else read.numbers(axis, "xyz", who, count=3)
+    vector = (1.0, 0.0, 0.0) if axis is None else read.numbers(axis, "xyz", item, count=3)
     if kind in ("", "fixed", "free") or len(read.faults) > before:
         return []
     if axis is not None and not any(vector):
-        read.fault(f"{who}: axis is zero; expected a direction, such as 0 0 1", axis)
+        read.fault(f"{item}: axis is zero; expected a direction, such as 0 0 1", axis)
     elif kind == "planar" and (vector[:2] != (0, 0) or vector[2] <= 0):
-        told = " ".join(f"{x:g}" for x in vector)
+        listing = " ".join(f"{x:g}" for x in vector)
         read.fault(
-            f"{who}: planar with the normal {told} (URDF's default is 1 0 0); only 0 0 1 is read: "
+            f"{item}: planar with the normal {listing} (URDF's default is 1 0 0); only 0 0 1 is read: "
             'turn the joint by <origin rpy="..."/> and write <axis xyz="0 0 1"/>',
             axis or joint,
         )
     return [] if axis is None or kind == "planar" else [_copied(axis, "xyz")]
 
 
-def _limit(joint: Element, kind: str, who: str, read: Reader) -> list[str]:
-    limit = read.only(joint, "limit", who)
+def _limit(joint: Element, kind: str, item: str, read: Reader) -> list[str]:
+    limit = read.only(joint, "limit", item)
     bounded = kind in ("revolute", "prismatic")
     if limit is None:
         if bounded:
             remedy = "; or make it continuous" if kind == "revolute" else ""
             read.fault(
-                f'{who}: a {kind} joint needs <limit lower="..." upper="..." effort="..." velocity="..."/>{remedy}',
+                f'{item}: a {kind} joint needs <limit lower="..." upper="..." effort="..." velocity="..."/>{remedy}',
                 joint,
             )
         return []
     needed = None if bounded else 0.0
-    lower, upper = (read.number(limit, a, who, 0.0, bounded=False) for a in ("lower", "upper"))
+    lower, upper = (read.number(limit, a, item, 0.0, bounded=False) for a in ("lower", "upper"))
     for attribute in ("effort", "velocity"):
-        if read.number(limit, attribute, who, needed, bounded=False) < 0:
-            read.fault(f"{who}: limit {attribute} is negative; expected 0 or more", limit)
+        if read.number(limit, attribute, item, needed, bounded=False) < 0:
+            read.fault(f"{item}: limit {attribute} is negative; expected 0 or more", limit)
     if bounded and lower > upper:
         # PyBullet and others write no limit in this way.
-        read.notes.append(f"{who}: lower limit {lower:g} above upper limit {upper:g}, read as no limit ({limit.place})")
+        crossed = f"lower limit {lower:g} above upper limit {upper:g}"
+        read.notes.append(f"{item}: {crossed}, read as no limit ({limit.place})")
         unlimited = {"lower": _OPEN.format("-"), "upper": _OPEN.format("")}
         return [
             _copied(replace(limit, attributes=limit.attributes | unlimited), "lower", "upper", "effort", "velocity")
@@ -422,9 +423,9 @@ def _unread(robot: Element, read: Reader) -> list[str]:
         ("left out of the file, with every path in it", elements),
         ("attributes that URDF does not define, left out", attributes),
     ):
-        told = ", ".join(f"{n} {tag[:40]}" for tag, n in sorted(counts.items())[:_MOST_TOLD])
-        told += f" and {len(counts) - _MOST_TOLD} more" if len(counts) > _MOST_TOLD else ""
-        notes += [f"{what}: {told}"] if told else []
+        listing = ", ".join(f"{n} {tag[:40]}" for tag, n in sorted(counts.items())[:_MOST_TOLD])
+        listing += f" and {len(counts) - _MOST_TOLD} more" if len(counts) > _MOST_TOLD else ""
+        notes += [f"{what}: {listing}"] if listing else []
     return notes
 
 

@@ -44,8 +44,8 @@ def floated(mujoco: Element, read: Reader) -> Element:
         return mujoco
     joints = [sum(1 for _ in _parts(b, _JOINTS)) for b in tops]
     if len(tops) != 1 or joints[0]:
-        told = ", ".join(f"{_called(b)} ({n} joints)" for b, n in zip(tops, joints, strict=True))
-        read.fault(f"floating_base=True needs one body of the world, without joints; there are: {told}")
+        listing = ", ".join(f"{_called(b)} ({n} joints)" for b, n in zip(tops, joints, strict=True))
+        read.fault(f"floating_base=True needs one body of the world, without joints; there are: {listing}")
         return mujoco
     if any(e.tag in _JOINTS and e.attributes.get("name") == BASE_JOINT for e in mujoco.walk()):
         read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")

@@ -76,18 +76,18 @@ def urdf_text(model: Model, comment: str) -> str:
 
 def _unsayable(model: Model) -> Iterator[str]:
     for joint in model.joints:
-        who = f"joint {joint.name!r}"
+        item = f"joint {joint.name!r}"
         if joint.kind not in _TYPES:
-            yield f"{who} is {'a ball joint' if joint.kind == 'ball' else joint.kind.replace('_', '-')}"
+            yield f"{item} is {'a ball joint' if joint.kind == 'ball' else joint.kind.replace('_', '-')}"
             continue
         if joint.armature.any():
-            yield f"{who} has armature"
+            yield f"{item} has armature"
         if joint.stiffness.any():
-            yield f"{who} has a spring"
+            yield f"{item} has a spring"
         if joint.type.nv > 1 and (joint.damping.any() or joint.friction.any()):
-            yield f"{who} is {joint.kind} and has damping or friction"
+            yield f"{item} is {joint.kind} and has damping or friction"
         if joint.type.nv > 1 and np.isfinite([joint.lower, joint.upper]).any():
-            yield f"{who} is {joint.kind} and has limits"
+            yield f"{item} is {joint.kind} and has limits"
     yield from (f"spring {s.name!r} between two points" for s in model.springs)
     yield from (f"coupling {c.name!r} between joints" for c in model.couplings)
     yield from (f"loop {x.name!r}" for x in model.loops)
@@ -108,13 +108,13 @@ def _link(body: Body) -> list[str]:
     if not body.mass and not body.inertia.any():
         return [f"{head}/>"]
     moments = {f"i{'xyz'[i]}{'xyz'[j]}": body.inertia[i, j] for i in range(3) for j in range(i, 3)}
-    told = " ".join(f'{k}="{_numbers(x)}"' for k, x in moments.items())
+    listing = " ".join(f'{k}="{_numbers(x)}"' for k, x in moments.items())
     return [
         f"{head}>",
         "    <inertial>",
         f'      <origin xyz="{_numbers(body.com)}"/>',
         f'      <mass value="{_numbers(body.mass)}"/>',
-        f"      <inertia {told}/>",
+        f"      <inertia {listing}/>",
         "    </inertial>",
         "  </link>",
     ]
@@ -137,14 +137,14 @@ def _joint(joint: Joint) -> list[str]:
         if bounded:
             limits = {"lower": joint.lower[0], "upper": joint.upper[0]} | limits
         if bounded or np.isfinite(list(limits.values())).any():
-            told = " ".join(f'{k}="{_numbers(np.clip(x, -_OPEN, _OPEN))}"' for k, x in limits.items())
-            out.append(f"    <limit {told}/>")
+            listing = " ".join(f'{k}="{_numbers(np.clip(x, -_OPEN, _OPEN))}"' for k, x in limits.items())
+            out.append(f"    <limit {listing}/>")
         dynamics = {k: float(getattr(joint, k)[0]) for k in ("damping", "friction") if getattr(joint, k).any()}
         if dynamics:
-            told = " ".join(f'{k}="{_numbers(x)}"' for k, x in dynamics.items())
-            out.append(f"    <dynamics {told}/>")
+            listing = " ".join(f'{k}="{_numbers(x)}"' for k, x in dynamics.items())
+            out.append(f"    <dynamics {listing}/>")
     if joint.mimic is not None:
         m = joint.mimic
-        told = f'multiplier="{_numbers(m.ratio)}" offset="{_numbers(m.offset)}"'
-        out.append(f"    <mimic joint={xml_attribute(m.joint)} {told}/>")
+        listing = f'multiplier="{_numbers(m.ratio)}" offset="{_numbers(m.offset)}"'
+        out.append(f"    <mimic joint={xml_attribute(m.joint)} {listing}/>")
     return [*out, "  </joint>"]

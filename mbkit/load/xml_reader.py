@@ -1,8 +1,7 @@
-"""XML from strangers: read without entities, links or deep nesting, and with line numbers.
+"""Parser for untrusted XML, with line numbers, and a strict reader of attributes.
 
-A document type declaration is where entity bombs, external entities and file URLs
-live, and neither URDF nor MJCF needs one: it ends the reading before anything of it
-is looked at. What is left of XML then cannot refer to anything outside the text.
+A document type declaration, which can hold entity bombs, external entities and file URLs, is refused. The rest of
+XML cannot refer to anything outside the text.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from typing import Final, NoReturn
 from xml.parsers import expat
 
 from mbkit.errors import LoadError
-from mbkit.load import xml_reader
 
 __all__ = [
     "LARGEST",
@@ -211,7 +209,7 @@ def _readable(content: bytes) -> tuple[bytes, str | None, tuple[str, ...]]:
 
 
 def _unexpected(content: bytes, at: int) -> str:
-    """Say which character of a text ends its reading, and what stands before it; empty at the text's end."""
+    """Return the character that ends the reading of a text, with the text before it; empty at the text's end."""
     if not 0 <= at < len(content):
         return ""
     byte = content[at]
@@ -220,16 +218,16 @@ def _unexpected(content: bytes, at: int) -> str:
     except UnicodeDecodeError:
         return f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8"
     before = content[:at].splitlines()[-1:] if content[:at][-1:] not in (b"\n", b"\r") else []
-    told = b"".join(before).decode("utf-8", "replace").replace("\0", "").lstrip()[-_SHOWN:]
-    after = f" after {told!r}" if told else ""
+    line = b"".join(before).decode("utf-8", "replace").replace("\0", "").lstrip()[-_SHOWN:]
+    after = f" after {line!r}" if line else ""
     if not found.isprintable() and not found.isspace():
         return f"control character 0x{byte:02x}{after}; remove it"
     hint = ""
-    if told.endswith("&"):
+    if line.endswith("&"):
         hint = "; write &amp; for &"
     elif found == "<":
         hint = "; write &lt; for < in a value"
-    elif not told:
+    elif not line:
         hint = "; expected <"
     return f"unexpected {found!r}{after}{hint}"
 
@@ -262,14 +260,14 @@ class Reader:
         where = f" ({element.place})" if element else ""
         self.faults.append(text + where)
 
-    def name(self, element: Element, attribute: str, who: str) -> str:
+    def name(self, element: Element, attribute: str, item: str) -> str:
         """Return a name that must be there, not be empty, and be short enough for a message."""
         value = element.attributes.get(attribute, "")
         if not value.strip():
-            self.fault(f"{who}: <{element.tag}> has no {attribute}; give it one", element)
+            self.fault(f"{item}: <{element.tag}> has no {attribute}; give it one", element)
         if len(value) > _LONGEST_NAME:
             self.fault(
-                f"{who}: {element.tag} {attribute}: a name of {len(value)} characters; "
+                f"{item}: {element.tag} {attribute}: a name of {len(value)} characters; "
                 f"expected up to {_LONGEST_NAME}, got {_short(value)}",
                 element,
             )
@@ -280,7 +278,7 @@ class Reader:
         self,
         element: Element,
         attribute: str,
-        who: str,
+        item: str,
         *,
         count: int,
         least: int | None = None,
@@ -291,8 +289,8 @@ class Reader:
 
         Parameters
         ----------
-        element, attribute, who
-            Where to read, and whom the message blames.
+        element, attribute, item
+            Where to read, and the element that messages name.
         count, least : int
             How many numbers are expected: exactly `count`, or from `least` to `count`.
         default : tuple of float, optional
@@ -300,12 +298,12 @@ class Reader:
         bounded : bool
             Whether sizes that would overflow are a fault; limits may be that large.
         """
-        where = f"{who}: {element.tag} {attribute}"
+        where = f"{item}: {element.tag} {attribute}"
         neutral = default if default is not None else (0.0,) * count
         raw = element.attributes.get(attribute)
         if raw is None:
             if default is None:
-                self.fault(f"{where}: missing; expected {_told(count, least)}", element)
+                self.fault(f"{where}: missing; expected {_amount(count, least)}", element)
             return neutral
         values = []
         for word in raw.split():
@@ -318,16 +316,16 @@ class Reader:
                 return neutral
             values.append(value)
         if not (count if least is None else least) <= len(values) <= count:
-            self.fault(f"{where}: expected {_told(count, least)}, got {_short(raw)}", element)
+            self.fault(f"{where}: expected {_amount(count, least)}, got {_short(raw)}", element)
             return neutral
         return tuple(values)
 
     def number(
-        self, element: Element, attribute: str, who: str, default: float | None = None, *, bounded: bool = True
+        self, element: Element, attribute: str, item: str, default: float | None = None, *, bounded: bool = True
     ) -> float:
         """Return a single number; see `numbers`."""
         fallback = None if default is None else (default,)
-        return self.numbers(element, attribute, who, count=1, default=fallback, bounded=bounded)[0]
+        return self.numbers(element, attribute, item, count=1, default=fallback, bounded=bounded)[0]
 
     def choice(self, element: Element, attribute: str, choices: tuple[str, ...]) -> str:
         """Return one of the choices, the first where the attribute is absent."""
@@ -337,17 +335,17 @@ class Reader:
         self.fault(f"{element.tag} {attribute}: expected one of {', '.join(choices)}, got {value[:40]!r}", element)
         return choices[0]
 
-    def only(self, element: Element, tag: str, who: str) -> Element | None:
+    def only(self, element: Element, tag: str, item: str) -> Element | None:
         """Return the child of this tag, of which there may be one, or several that are equal."""
         found = element.all(tag)
         if len(found) > 1 and all(_content(e) == _content(found[0]) for e in found):
-            self.notes.append(f"{who}: {len(found)} equal <{tag}> elements were read as one ({found[1].place})")
+            self.notes.append(f"{item}: {len(found)} equal <{tag}> elements were read as one ({found[1].place})")
         elif len(found) > 1:
-            self.fault(f"{who}: {len(found)} <{tag}> elements; keep one", found[1])
+            self.fault(f"{item}: {len(found)} <{tag}> elements; keep one", found[1])
         return found[0] if found else None
 
 
-def _told(count: int, least: int | None) -> str:
+def _amount(count: int, least: int | None) -> str:
     if count == 1 and least in (None, 1):
         return "a number"
     return f"{count} numbers" if least in (None, count) else f"{least} to {count} numbers"
@@ -374,7 +372,7 @@ def misspelt(name: str, known: Iterable[str]) -> str:
     """Return the known name that was probably meant, or an empty text.
 
     Names are compared without case and separators. They must have most letters in common and nearly the same length,
-    so that an extension whose name holds a known word (``gear_velocity``) is none.
+    so that an extension whose name holds a known word (``gear_velocity``) is not taken for it.
     """
     plain = {_plain(k): k for k in known if abs(len(k) - len(name)) <= 2}
     found = difflib.get_close_matches(_plain(name), plain, n=1, cutoff=0.75) if plain else ()
@@ -385,7 +383,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[-_.\s]", "", name.lower())
 
 
-# MJCF written over several files: every <include> replaced by what it names, as MuJoCo does.
+# MJCF in several files: the content of a file replaces its <include>, as in MuJoCo.
 #
 # A name is looked for in the folder of the file that was asked for, then in that of the file which
 # names it; what stands inside the root element there takes the <include>'s place; no file is taken
@@ -427,7 +425,7 @@ class _Main:
     def inside(self, element: Element, folder: Path, level: int) -> list[Element]:
         """Return the children of an element of a file in `folder`, `level` deep in the whole."""
         if level > MOST_LEVELS:
-            self._refuse(element, f"elements are nested more than {MOST_LEVELS} deep, with what is included")
+            self._refuse(element, f"elements are nested more than {MOST_LEVELS} deep, included files counted")
         out: list[Element] = []
         for child in element.children:
             if child.tag == _TAG:
@@ -472,15 +470,15 @@ class _Main:
 
     def _read(self, include: Element, path: Path) -> Element:
         try:
-            root = xml_reader.read(path)
+            root = read(path)
             self.bytes += path.stat().st_size
         except (LoadError, OSError) as error:
             self._refuse(include, str(error))
         if self.bytes > MOST_BYTES:
             self._refuse(include, f"up to {MOST_BYTES} bytes of included files were expected")
-        told = _told_includes(path, self.path.parent)
+        file = _relative(path, self.path.parent)
         for element in root.walk():
-            element.file = told
+            element.file = file
             element.included_at = include.included_at or include.line
         return root
 
@@ -494,7 +492,7 @@ def _identity(path: Path) -> Path:
     return path.resolve()
 
 
-def _told_includes(path: Path, folder: Path) -> str:
+def _relative(path: Path, folder: Path) -> str:
     try:
         return str(path.relative_to(folder))
     except ValueError:

@@ -1,4 +1,4 @@
-"""`ModelBuilder`: write a system down, and get every fault of it at once."""
+"""`ModelBuilder`: collect the parts of a system, and report all faults at once."""
 
 from __future__ import annotations
 
@@ -22,15 +22,13 @@ from mbkit.model.validation import body_faults, grouped, static_bodies, structur
 __all__ = ["ArgumentReader", "ModelBuilder", "expect_model", "shape_of"]
 
 
-# Reading what a builder's caller wrote: a fault is noted, and a harmless value goes on.
-
 # The squares of sums of such lengths still fit a double.
 _LONGEST: Final = 1e150
 _LONGEST_NAME: Final = 1000
 
 
 class ArgumentReader:
-    """Turns arguments into arrays and numbers, and collects their faults.
+    """Converts arguments to arrays and numbers, and collects their faults; a harmless value replaces a faulty one.
 
     Attributes
     ----------
@@ -149,57 +147,57 @@ class ArgumentReader:
             return np.full(n, default)
         return array
 
-    def rotation(self, who: str, rotation: ArrayLike | None, rpy: ArrayLike | None, name: str = "rotation") -> Array:
+    def rotation(self, item: str, rotation: ArrayLike | None, rpy: ArrayLike | None, name: str = "rotation") -> Array:
         """Return a rotation matrix, given as such or as roll, pitch, yaw."""
         if rotation is not None and rpy is not None:
-            self.faults.append(f"{who}: both rotation and rpy given; give one")
+            self.faults.append(f"{item}: both rotation and rpy given; give one")
         if rpy is not None:
-            return spatial.matrix_from_rpy(*self.vector(f"{who}: rpy", rpy, 3))
+            return spatial.matrix_from_rpy(*self.vector(f"{item}: rpy", rpy, 3))
         if rotation is None:
             return np.eye(3)
-        R = self.matrix(f"{who}: {name}", rotation)
+        R = self.matrix(f"{item}: {name}", rotation)
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0:
-            self.faults.append(f"{who}: {name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
+            self.faults.append(f"{item}: {name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
             return np.eye(3)
         return R
 
-    def axes(self, who: str, kind: str, axis: ArrayLike | None, axis2: ArrayLike | None) -> Array:
+    def axes(self, item: str, kind: str, axis: ArrayLike | None, axis2: ArrayLike | None) -> Array:
         """Return the unit axes that a joint of this kind takes."""
         wanted = kind_of(kind).n_axes
         given: list[ArrayLike] = [a for a in (axis, axis2) if a is not None]
         if len(given) != wanted:
             names = ("no axis", "axis", "axis and axis2")[wanted]
-            self.faults.append(f"{who}: a {kind} joint takes {names}; {len(given)} given")
+            self.faults.append(f"{item}: a {kind} joint takes {names}; {len(given)} given")
             given = list(np.eye(3)[:wanted])
         out = np.zeros((wanted, 3))
         for i, a in enumerate(given):
-            vector = self.vector(f"{who}: axis", a, 3)
+            vector = self.vector(f"{item}: axis", a, 3)
             # The square of a component may overflow, or vanish.
             largest = float(np.abs(vector).max())
             if largest and not 1e-100 < largest < 1e100:
                 vector = vector / largest
             length = float(np.linalg.norm(vector))
             if not length:
-                self.faults.append(f"{who}: axis is zero; expected a direction")
+                self.faults.append(f"{item}: axis is zero; expected a direction")
                 vector, length = np.array([1.0, 0.0, 0.0]), 1.0
             # An axis that is a unit vector to rounding is kept to the bit.
             out[i] = vector if abs(length - 1) < 1e-15 else vector / length
         return out
 
-    def mimic(self, who: str, value: Mimic | Iterable[Any]) -> tuple[str, Number, Number] | None:
-        """Return whom a joint follows, with ratio and offset, or None where that is not said rightly."""
+    def mimic(self, item: str, value: Mimic | Iterable[Any]) -> tuple[str, Number, Number] | None:
+        """Return the leader of a mimic joint with ratio and offset, or None after a fault."""
         if isinstance(value, Mimic):
             value = (value.joint, value.ratio, value.offset)
         try:
             joint, ratio, offset = value
         except Exception:
             # Any: iterating over an object may raise what it likes.
-            self.faults.append(f"{who}: mimic: expected (joint, ratio, offset), got {shown(value)}")
+            self.faults.append(f"{item}: mimic: expected (joint, ratio, offset), got {shown(value)}")
             return None
         return (
-            self.name(f"{who}: mimic joint", joint),
-            self.quantity(f"{who}: mimic ratio", ratio),
-            self.quantity(f"{who}: mimic offset", offset),
+            self.name(f"{item}: mimic joint", joint),
+            self.quantity(f"{item}: mimic ratio", ratio),
+            self.quantity(f"{item}: mimic offset", offset),
         )
 
 
@@ -282,13 +280,13 @@ class ModelBuilder:
             Without it the body is a point mass.
         """
         name = self._read.name("body name", name)
-        who = f"body {name!r}"
+        item = f"body {name!r}"
         numbers = self._numbers(
             "bodies",
             name,
-            mass=self._read.quantity(f"{who}: mass", mass),
-            com=self._read.place(f"{who}: com", com),
-            inertia=self._read.inertia(f"{who}: inertia", inertia),
+            mass=self._read.quantity(f"{item}: mass", mass),
+            com=self._read.place(f"{item}: com", com),
+            inertia=self._read.inertia(f"{item}: inertia", inertia),
         )
         self._bodies.append(Body(name, **numbers))
 
@@ -350,43 +348,43 @@ class ModelBuilder:
             The joint that this one follows.
         """
         name = self._read.name("joint name", name)
-        who = f"joint {name!r}"
+        item = f"joint {name!r}"
         if not isinstance(kind, str) or kind not in KINDS:
             near = nearest(kind, KINDS) if isinstance(kind, str) else []
             near = near or list(KINDS)
-            self._read.faults.append(f"{who}: unknown kind {shown(kind)}; use one of {', '.join(near)}")
+            self._read.faults.append(f"{item}: unknown kind {shown(kind)}; use one of {', '.join(near)}")
             # The other faults of this call would only be echoes of this one.
             kind, axis, axis2, pitch, mimic = FIXED.name, None, None, 0.0, None
             lower = upper = velocity_limit = effort_limit = None
             armature = damping = friction = stiffness = rest = 0.0
         type_ = kind_of(kind)
-        follows = None if mimic is None else self._read.mimic(who, mimic)
+        follows = None if mimic is None else self._read.mimic(item, mimic)
         leader = None
         if follows:
             leader = Mimic(follows[0], **self._numbers("joints", name, ratio=follows[1], offset=follows[2]))
         numbers = self._numbers(
             "joints",
             name,
-            translation=self._read.place(f"{who}: translation", translation),
-            pitch=self._read.quantity(f"{who}: pitch", pitch),
-            armature=self._read.quantities(f"{who}: armature", armature, type_.nv),
-            damping=self._read.quantities(f"{who}: damping", damping, type_.nv),
-            stiffness=self._read.quantities(f"{who}: stiffness", stiffness, type_.nv),
-            rest=self._read.quantities(f"{who}: rest", rest, type_.nv),
+            translation=self._read.place(f"{item}: translation", translation),
+            pitch=self._read.quantity(f"{item}: pitch", pitch),
+            armature=self._read.quantities(f"{item}: armature", armature, type_.nv),
+            damping=self._read.quantities(f"{item}: damping", damping, type_.nv),
+            stiffness=self._read.quantities(f"{item}: stiffness", stiffness, type_.nv),
+            rest=self._read.quantities(f"{item}: rest", rest, type_.nv),
         )
         self._joints.append(
             Joint(
                 name=name,
                 kind=kind,
-                parent=self._read.name(f"{who}: parent", parent),
-                child=self._read.name(f"{who}: child", child),
-                rotation=self._read.rotation(who, rotation, rpy),
-                axes=self._read.axes(who, kind, axis, axis2),
-                lower=self._read.limits(f"{who}: lower", lower, type_.nq, -np.inf),
-                upper=self._read.limits(f"{who}: upper", upper, type_.nq, np.inf),
-                velocity_limit=self._read.limits(f"{who}: velocity_limit", velocity_limit, type_.nv, np.inf),
-                effort_limit=self._read.limits(f"{who}: effort_limit", effort_limit, type_.nv, np.inf),
-                friction=self._read.vector(f"{who}: friction", friction, type_.nv),
+                parent=self._read.name(f"{item}: parent", parent),
+                child=self._read.name(f"{item}: child", child),
+                rotation=self._read.rotation(item, rotation, rpy),
+                axes=self._read.axes(item, kind, axis, axis2),
+                lower=self._read.limits(f"{item}: lower", lower, type_.nq, -np.inf),
+                upper=self._read.limits(f"{item}: upper", upper, type_.nq, np.inf),
+                velocity_limit=self._read.limits(f"{item}: velocity_limit", velocity_limit, type_.nv, np.inf),
+                effort_limit=self._read.limits(f"{item}: effort_limit", effort_limit, type_.nv, np.inf),
+                friction=self._read.vector(f"{item}: friction", friction, type_.nv),
                 mimic=leader,
                 **numbers,
             )
@@ -403,11 +401,11 @@ class ModelBuilder:
     ) -> None:
         """Name a frame that is fixed to a body, for poses and Jacobians."""
         name = self._read.name("frame name", name)
-        who = f"frame {name!r}"
-        place = self._read.place(f"{who}: translation", translation)
-        R = self._read.rotation(who, rotation, rpy)
+        item = f"frame {name!r}"
+        place = self._read.place(f"{item}: translation", translation)
+        R = self._read.rotation(item, rotation, rpy)
         self._frames.append(
-            Frame(name, self._read.name(f"{who}: body", body), R, **self._numbers("frames", name, translation=place))
+            Frame(name, self._read.name(f"{item}: body", body), R, **self._numbers("frames", name, translation=place))
         )
 
     def add_spring(
@@ -443,21 +441,21 @@ class ModelBuilder:
             N s/m, on the rate of the distance.
         """
         name = self._read.name("spring name", name)
-        who = f"spring {name!r}"
+        item = f"spring {name!r}"
         numbers = self._numbers(
             "springs",
             name,
-            point_a=self._read.place(f"{who}: point_a", point_a),
-            point_b=self._read.place(f"{who}: point_b", point_b),
-            stiffness=self._read.quantity(f"{who}: stiffness", stiffness, nonnegative=True),
-            rest_length=self._read.quantity(f"{who}: rest_length", rest_length, nonnegative=True),
-            damping=self._read.quantity(f"{who}: damping", damping, nonnegative=True),
+            point_a=self._read.place(f"{item}: point_a", point_a),
+            point_b=self._read.place(f"{item}: point_b", point_b),
+            stiffness=self._read.quantity(f"{item}: stiffness", stiffness, nonnegative=True),
+            rest_length=self._read.quantity(f"{item}: rest_length", rest_length, nonnegative=True),
+            damping=self._read.quantity(f"{item}: damping", damping, nonnegative=True),
         )
         self._springs.append(
             PointSpring(
                 name,
-                body_a=self._read.name(f"{who}: body_a", body_a),
-                body_b=self._read.name(f"{who}: body_b", body_b),
+                body_a=self._read.name(f"{item}: body_a", body_a),
+                body_b=self._read.name(f"{item}: body_b", body_b),
                 **numbers,
             )
         )
@@ -487,23 +485,23 @@ class ModelBuilder:
             The kinetic energy is ½ armature (dl/dt)².
         """
         name = self._read.name("coupling name", name)
-        who = f"coupling {name!r}"
+        item = f"coupling {name!r}"
         given: Any = factors
         if not isinstance(given, Mapping):
-            told = shown(given)
-            self._read.faults.append(f"{who}: factors: expected a mapping from joint names to numbers, got {told}")
+            got = shown(given)
+            self._read.faults.append(f"{item}: factors: expected a mapping from joint names to numbers, got {got}")
             return
         numbers = self._numbers(
             "couplings",
             name,
-            factors=self._read.quantities(f"{who}: factors", list(factors.values()), len(factors)),
-            stiffness=self._read.quantity(f"{who}: stiffness", stiffness, nonnegative=True),
-            rest_length=self._read.quantity(f"{who}: rest_length", rest_length),
-            damping=self._read.quantity(f"{who}: damping", damping, nonnegative=True),
-            armature=self._read.quantity(f"{who}: armature", armature, nonnegative=True),
+            factors=self._read.quantities(f"{item}: factors", list(factors.values()), len(factors)),
+            stiffness=self._read.quantity(f"{item}: stiffness", stiffness, nonnegative=True),
+            rest_length=self._read.quantity(f"{item}: rest_length", rest_length),
+            damping=self._read.quantity(f"{item}: damping", damping, nonnegative=True),
+            armature=self._read.quantity(f"{item}: armature", armature, nonnegative=True),
         )
         self._couplings.append(
-            JointCoupling(name, tuple(self._read.name(f"{who}: factors", j) for j in factors), **numbers)
+            JointCoupling(name, tuple(self._read.name(f"{item}: factors", j) for j in factors), **numbers)
         )
 
     def add_loop(
@@ -535,24 +533,24 @@ class ModelBuilder:
             The frames' orientations in their bodies.
         """
         name = self._read.name("loop name", name)
-        who = f"loop {name!r}"
+        item = f"loop {name!r}"
         if not isinstance(kind, str) or kind not in ("point", "frame"):
-            self._read.faults.append(f"{who}: unknown kind {shown(kind)}; use 'point' or 'frame'")
+            self._read.faults.append(f"{item}: unknown kind {shown(kind)}; use 'point' or 'frame'")
             kind = "point"
         numbers = self._numbers(
             "loops",
             name,
-            translation_a=self._read.place(f"{who}: translation_a", translation_a),
-            translation_b=self._read.place(f"{who}: translation_b", translation_b),
+            translation_a=self._read.place(f"{item}: translation_a", translation_a),
+            translation_b=self._read.place(f"{item}: translation_b", translation_b),
         )
         self._loops.append(
             Loop(
                 name=name,
                 kind=kind,
-                body_a=self._read.name(f"{who}: body_a", body_a),
-                rotation_a=self._read.rotation(who, rotation_a, None, "rotation_a"),
-                body_b=self._read.name(f"{who}: body_b", body_b),
-                rotation_b=self._read.rotation(who, rotation_b, None, "rotation_b"),
+                body_a=self._read.name(f"{item}: body_a", body_a),
+                rotation_a=self._read.rotation(item, rotation_a, None, "rotation_a"),
+                body_b=self._read.name(f"{item}: body_b", body_b),
+                rotation_b=self._read.rotation(item, rotation_b, None, "rotation_b"),
                 **numbers,
             )
         )
@@ -577,7 +575,7 @@ class ModelBuilder:
         self._prescribed.append(Prescribed(joint, **self._numbers("prescribed", joint, **read)))
 
     def note(self, text: str) -> None:
-        """Keep a sentence for whoever reads the model."""
+        """Add a sentence to the model's notes."""
         self._notes.append(self._read.name("note text", text, longest=1_000_000))
 
     def build(
@@ -592,7 +590,7 @@ class ModelBuilder:
         Parameters
         ----------
         nonphysical : {"error", "warn"}
-            What to do about bodies that no matter can have (an inertia that is
+            What to do about bodies with an inconsistent inertia (an inertia that is
             not positive or violates the triangle inequality, joints that move no
             inertia): raise, or keep them as written and warn. Of a body that is fixed
             to the world only a negative mass counts; the rest is noted.
@@ -702,22 +700,19 @@ def _followed(joint: str, mimic: Mimic, bound: Mapping[tuple[str, str], Number])
     return mimic.joint, bound.get((joint, "ratio"), mimic.ratio), bound.get((joint, "offset"), mimic.offset)
 
 
-# What was expected to be a description, and is not: told with the way to one.
-
-
-def expect_model(given: Any, name: str = "model") -> Model:
+def expect_model(value: Any, name: str = "model") -> Model:
     """Return an argument that is a `Model`.
 
     Parameters
     ----------
-    given : object
+    value : object
     name : str
         The argument's.
 
     Raises
     ------
     InputError
-        With what makes one: what was given may hold it, as a `Lagrangian` on paper and a `Dynamics` do.
+        The message says how to get one: a `Lagrangian` and a `Dynamics` have it as ``.model``.
 
     Examples
     --------
@@ -725,8 +720,8 @@ def expect_model(given: Any, name: str = "model") -> Model:
     Traceback (most recent call last):
     mbkit.errors.InputError: model: expected a Model, got str; mbkit.load(...) makes one
     """
-    if isinstance(given, Model):
-        return given
-    holds = not isinstance(given, type) and isinstance(getattr(given, "model", None), Model)
+    if isinstance(value, Model):
+        return value
+    holds = not isinstance(value, type) and isinstance(getattr(value, "model", None), Model)
     way = "its .model is one" if holds else "mbkit.load(...) makes one"
-    raise InputError(f"{name}: expected a Model, got {type(given).__name__}; {way}")
+    raise InputError(f"{name}: expected a Model, got {type(value).__name__}; {way}")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -19,11 +19,10 @@ import numpy as np
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.joint_types import KINDS
-from mbkit.model.layout import Layout
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
 
-__all__ = ["Description", "Needs", "digest", "expect_name"]
+__all__ = ["Description", "Layout", "Needs", "digest", "expect_name"]
 
 
 def _plain(value: Any) -> Any:
@@ -112,6 +111,113 @@ class Needs:
         return f"has {', '.join(present) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
 
 
+@dataclass(frozen=True)
+class Layout:
+    """Index ranges of the coordinates, full and reduced.
+
+    The *full* coordinates hold every joint; the model's own q and v leave the
+    mimic joints out, with q_full = G_q q + c and v_full = G v.
+
+    Attributes
+    ----------
+    joints : tuple of Joint
+        In the order of the coordinates.
+    """
+
+    joints: tuple[Joint, ...]
+
+    def __repr__(self) -> str:
+        nq, nv, full_nq, full_nv = self.sizes
+        full = f" of {full_nq} and {full_nv} with mimic joints" if self.reduced else ""
+        return f"<Layout of {len(self.joints)} joints: nq={nq}, nv={nv}{full}>"
+
+    @cached_property
+    def full_q(self) -> dict[str, slice]:
+        """Range of each joint in the full coordinates."""
+        return self._ranges([j.type.nq for j in self.joints])
+
+    @cached_property
+    def full_v(self) -> dict[str, slice]:
+        """Range of each joint in the full velocities."""
+        return self._ranges([j.type.nv for j in self.joints])
+
+    @cached_property
+    def q(self) -> dict[str, slice]:
+        """Range of each joint in q; a mimic joint's is empty."""
+        return self._ranges([0 if j.mimic else j.type.nq for j in self.joints])
+
+    @cached_property
+    def v(self) -> dict[str, slice]:
+        """Range of each joint in v; a mimic joint's is empty."""
+        return self._ranges([0 if j.mimic else j.type.nv for j in self.joints])
+
+    def _ranges(self, sizes: Sequence[int]) -> dict[str, slice]:
+        ends = np.cumsum([0, *sizes])
+        return {j.name: slice(int(a), int(b)) for j, a, b in zip(self.joints, ends, ends[1:], strict=False)}
+
+    @cached_property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """(nq, nv, full nq, full nv)."""
+        free = [j for j in self.joints if not j.mimic]
+        return (
+            sum(j.type.nq for j in free),
+            sum(j.type.nv for j in free),
+            sum(j.type.nq for j in self.joints),
+            sum(j.type.nv for j in self.joints),
+        )
+
+    @cached_property
+    def reduced(self) -> bool:
+        """Whether any joint mimics another."""
+        return any(j.mimic for j in self.joints)
+
+    @cached_property
+    def offsets(self) -> Array:
+        """The constant c of q_full = G_q q + c."""
+        c = np.zeros(self.sizes[2])
+        for j in self.joints:
+            if j.mimic:
+                c[self.full_q[j.name]] = j.mimic.offset
+        c.setflags(write=False)
+        return c
+
+    @cached_property
+    def G_q(self) -> Array:
+        """Matrix of q_full = G_q q + c, shape (full nq, nq)."""
+        return self._matrix(self.full_q, self.q, self.sizes[2], self.sizes[0])
+
+    @cached_property
+    def G(self) -> Array:
+        """Matrix of v_full = G v, shape (full nv, nv)."""
+        return self._matrix(self.full_v, self.v, self.sizes[3], self.sizes[1])
+
+    def _matrix(self, rows: dict[str, slice], columns: dict[str, slice], n: int, k: int) -> Array:
+        G = np.zeros((n, k))
+        for j in self.joints:
+            if j.mimic:
+                G[rows[j.name], columns[j.mimic.joint]] = j.mimic.ratio
+            else:
+                part = rows[j.name]
+                G[part, columns[j.name]] = np.eye(part.stop - part.start)
+        G.setflags(write=False)
+        return G
+
+    def coupling_row(self, coupling: JointCoupling) -> Array:
+        """Return the row c of a coupling's rate dl/dt = c v_full, shape (full nv,)."""
+        row = np.zeros(self.sizes[3])
+        for joint, factor in zip(coupling.joints, coupling.factors, strict=True):
+            row[self.full_v[joint]] += factor
+        return row
+
+    def expand_q(self, q: Array) -> Array:
+        """Return the full coordinates, mimic joints included."""
+        return np.asarray(q @ self.G_q.T + self.offsets) if self.reduced else q
+
+    def expand_v(self, v: Array) -> Array:
+        """Return the full velocities (or accelerations), mimic joints included."""
+        return np.asarray(v @ self.G.T) if self.reduced else v
+
+
 @dataclass(frozen=True, eq=False)
 class Description:
     """The parts of a multibody system: a tree of bodies and what acts on it.
@@ -130,12 +236,12 @@ class Description:
     loops : tuple of Loop
     prescribed : tuple of Prescribed
     notes : tuple of str
-        What the loader decided or met, for the user to read.
+        Decisions of the loader, for the user.
     nonphysical : tuple of (str, str)
-        Bodies that no matter can have, each with the reason.
+        Bodies with an inconsistent inertia, each with the reason.
     bindings : tuple of Binding
-        The numbers that stand for expressions of parameters. The parts hold them
-        at the parameters' nominal values, and NaN where one has none.
+        The numbers that are expressions of parameters. The parts hold their nominal
+        values, and NaN without one.
     """
 
     name: str
@@ -234,9 +340,9 @@ class Description:
         """Raise `InputError` that names the parameters without a value, if there are any."""
         missing = [name for name, value in self.parameters.items() if value is None]
         if missing:
-            told = ", ".join(repr(n) for n in missing)
+            listing = ", ".join(repr(n) for n in missing)
             raise InputError(
-                f"{what}: {self.name}: no value for parameter {told}; "
+                f"{what}: {self.name}: no value for parameter {listing}; "
                 f"give it with model.with_parameters({', '.join(f'{n}=...' for n in missing)})"
             )
 
@@ -265,7 +371,7 @@ class Description:
 
     @cached_property
     def form_digest(self) -> str:
-        """The digest without the parameters' values: of what is derived once for all of them."""
+        """The digest without the parameters' values, which a derivation for all values has."""
         return self._substituted(lambda p: Parameter(p.name)).digest if self.parameters else self.digest
 
     # Structure

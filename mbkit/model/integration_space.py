@@ -15,8 +15,8 @@ class Space:
 
     A configuration is mbkit's q. A velocity `w` is mbkit's v with the linear part
     of each free joint in the axes of the joint's fixed frame; where the model has `rates` of
-    its own, it is q̇. All methods take one state or a batch; whoever reckons with something
-    else than arrays overrides the methods at the end. Where w is v and positions add, all
+    its own, it is q̇. All methods take one state or a batch; a subclass for other arithmetic
+    than arrays overrides the methods at the end. Where w is v and positions add, all
     cost one addition.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Moving on the configuration manifold: exponential, logarithm, random states."""
+"""The configuration manifold: exponential, logarithm, random states."""
 
 from __future__ import annotations
 
@@ -78,8 +78,7 @@ def limits_box(model: Description) -> tuple[Array, Array]:
 
 
 def _clipped(lower: float, upper: float, reach: float) -> tuple[float, float]:
-    # Of a range that lies wholly beyond the clip its near end is kept: an empty one
-    # helps nobody.
+    # A range beyond the clip keeps its near end, so that it is not empty.
     if lower > reach:
         return lower, min(upper, lower + 2 * reach)
     if upper < -reach:

@@ -154,11 +154,11 @@ class _Operation(Expression):
                 yield from x.parameters()
 
     def __str__(self) -> str:
-        told = [str(x) if isinstance(x, Expression) else f"{x:g}" for x in self.operands]
+        listing = [str(x) if isinstance(x, Expression) else f"{x:g}" for x in self.operands]
         if self.name == "neg":
-            return f"(-{told[0]})"
+            return f"(-{listing[0]})"
         sign = {"add": "+", "sub": "-", "mul": "*", "div": "/"}[self.name]
-        return f"({told[0]} {sign} {told[1]})"
+        return f"({listing[0]} {sign} {listing[1]})"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Faults in how the parts of a description hang together."""
+"""Checks of a description: names, tree, mimic joints, inertias, and joints that move no mass."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ __all__ = [
 ]
 
 
-# Up to so many names stand in a message.
-_FEW: Final = 40
+# Names in a message.
+_MAX_NAMES: Final = 40
 # M of so many velocities takes 200 MB.
-_MOST_VELOCITIES: Final = 5000
+_MAX_VELOCITIES: Final = 5000
 
 
 def structure_faults(description: Description) -> list[str]:
@@ -45,8 +45,8 @@ def structure_faults(description: Description) -> list[str]:
     if not bodies:
         faults.append("no bodies; add at least one")
     velocities = sum(j.type.nv for j in joints)
-    if velocities > _MOST_VELOCITIES:
-        faults.append(f"{velocities} velocities; up to {_MOST_VELOCITIES} are taken, because M takes their square")
+    if velocities > _MAX_VELOCITIES:
+        faults.append(f"{velocities} velocities; up to {_MAX_VELOCITIES} are taken, because M takes their square")
     for what, names in (
         ("body", [b.name for b in bodies]),
         ("joint", [j.name for j in joints]),
@@ -96,53 +96,53 @@ def structure_faults(description: Description) -> list[str]:
     return faults
 
 
-def _unknown(who: str, names: Iterable[str], known: Set[str], suggestions: Suggestions) -> list[str]:
+def _unknown(item: str, names: Iterable[str], known: Set[str], suggestions: Suggestions) -> list[str]:
     out = []
     for name in names:
         if name not in known:
             near = suggestions.near(name, known)
-            few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _FEW else "; declare it"
-            out.append(f"{who}: unknown body {name!r}" + (f"; did you mean {near!r}?" if near else few))
+            few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _MAX_NAMES else "; declare it"
+            out.append(f"{item}: unknown body {name!r}" + (f"; did you mean {near!r}?" if near else few))
     return out
 
 
 def _joint_faults(joint: Joint) -> list[str]:
-    who, out = f"joint {joint.name!r}", []
+    item, out = f"joint {joint.name!r}", []
     if joint.child == "world":
-        out.append(f"{who}: the world cannot be a child; swap parent and child")
+        out.append(f"{item}: the world cannot be a child; swap parent and child")
     if np.any(joint.lower > joint.upper):
-        out.append(f"{who}: lower limit {joint.lower} above upper limit {joint.upper}")
+        out.append(f"{item}: lower limit {joint.lower} above upper limit {joint.upper}")
     signed = ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
-    out += [f"{who}: {n} {getattr(joint, n)} is negative" for n in signed if np.any(getattr(joint, n) < 0)]
+    out += [f"{item}: {n} {getattr(joint, n)} is negative" for n in signed if np.any(getattr(joint, n) < 0)]
     if joint.type.quaternion is not None:
         turning = slice(joint.type.quaternion, None)
         if np.isfinite([joint.lower[turning], joint.upper[turning]]).any():
-            out.append(f"{who}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite")
+            out.append(f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite")
     if np.any(joint.armature) and joint.type.nv != 1:
         out.append(
-            f"{who}: armature on a {joint.kind} joint; expected a joint of one velocity "
+            f"{item}: armature on a {joint.kind} joint; expected a joint of one velocity "
             "(engines leave out the gyroscopic term otherwise): add a rotor as a body"
         )
     if np.any(joint.stiffness) and not joint.type.coordinate_velocities:
-        out.append(f"{who}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring")
+        out.append(f"{item}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring")
     if joint.pitch and not joint.type.pitched:
-        out.append(f"{who}: pitch {joint.pitch} on a {joint.kind} joint; only pitched types, such as helical, have one")
+        out.append(f"{item}: pitch {joint.pitch} on a {joint.kind} joint; only types such as helical have one")
     return out
 
 
 def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterator[str]:
-    who, sizes = f"coupling {coupling.name!r}", {j.name: j.type.nv for j in joints}
+    item, sizes = f"coupling {coupling.name!r}", {j.name: j.type.nv for j in joints}
     for name in coupling.joints:
         if name not in sizes:
             near = nearest(name, sizes)
-            yield f"{who}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
+            yield f"{item}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
         elif sizes[name] != 1:
-            yield f"{who}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
+            yield f"{item}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
     for n in ("stiffness", "damping", "armature"):
         if getattr(coupling, n) < 0:
-            yield f"{who}: {n} {getattr(coupling, n):g} is negative"
+            yield f"{item}: {n} {getattr(coupling, n):g} is negative"
     if not np.any(coupling.factors):
-        yield f"{who}: no joint has a factor other than zero; it would never act"
+        yield f"{item}: no joint has a factor other than zero; it would never act"
 
 
 def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
@@ -154,9 +154,9 @@ def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
         carried.setdefault(joint.parent, []).append(joint)
     for name, several in carriers.items():
         if len(several) > 1 and name != "world":
-            told = ", ".join(repr(j.name) for j in several)
+            names = ", ".join(repr(j.name) for j in several)
             out.append(
-                f"body {name!r}: carried by {len(several)} joints ({told}); keep one and close the loop with add_loop"
+                f"body {name!r}: carried by {len(several)} joints ({names}); keep one and close the loop with add_loop"
             )
     reached = {"world"}
     stack = ["world"]
@@ -184,18 +184,18 @@ def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
     for joint in joints:
         if joint.mimic is None:
             continue
-        who = f"joint {joint.name!r}"
+        item = f"joint {joint.name!r}"
         leader = by_name.get(joint.mimic.joint)
         if leader is None:
             near = suggestions.near(joint.mimic.joint, by_name)
-            out.append(f"{who}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near!r}" if near else ""))
+            out.append(f"{item}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near!r}" if near else ""))
             continue
         if joint.type.nv != 1 or leader.type.nv != 1:
-            out.append(f"{who}: mimics {leader.name!r}, but both must have one velocity")
+            out.append(f"{item}: mimics {leader.name!r}, but both must have one velocity")
         seen, at = {joint.name}, leader
         while at.name not in ends and at.mimic is not None and at.mimic.joint in by_name:
             if at.name in seen:
-                out.append(f"{who}: mimics in a circle through {at.name!r}")
+                out.append(f"{item}: mimics in a circle through {at.name!r}")
                 break
             seen.add(at.name)
             at = by_name[at.mimic.joint]
@@ -203,13 +203,11 @@ def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
     return out
 
 
-# Whether a body can exist, and whether every joint moves some inertia.
-
 # Descriptions carry rounded decimals; a thin plate written with six digits may
 # miss A + B >= C by its last digit.
 _TRIANGLE = 1e-6
 # Bodies in one sentence.
-_MOST_TOLD = 20
+_MAX_LISTED = 20
 _JOINT = re.compile(r"joint '.*?'(?=, so)")
 # Ten times mjMINVAL is left of MuJoCo's smallest numbers, in kg and kg m².
 _LEAST = 1e-14
@@ -220,7 +218,7 @@ _FAR = 1e6
 
 
 def body_fault(body: Body, *, point_masses: bool) -> str | None:
-    """Return why no matter can have this mass and inertia, or None.
+    """Return why mass and inertia are inconsistent, or None.
 
     A body of zero mass and zero inertia is no fault: it is a frame, and
     `idle_joints` finds the joints that would then move nothing.
@@ -240,11 +238,11 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     if largest == 0:
         return None if point_masses else "mass without inertia: give the inertia, however small"
     if eigenvalues[0] < -1e-12 * largest:
-        return f"inertia is not positive: principal moments {_told(eigenvalues)} kg m²"
+        return f"inertia is not positive: principal moments {_moments(eigenvalues)} kg m²"
     if eigenvalues[0] <= 1e-12 * largest and not point_masses:
-        return f"inertia is not positive: principal moments {_told(eigenvalues)} kg m²"
+        return f"inertia is not positive: principal moments {_moments(eigenvalues)} kg m²"
     if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
-        return f"inertia violates A + B >= C: principal moments {_told(eigenvalues)} kg m²"
+        return f"inertia violates A + B >= C: principal moments {_moments(eigenvalues)} kg m²"
     return None
 
 
@@ -263,14 +261,14 @@ def static_bodies(joints: Iterable[Joint]) -> set[str]:
     return found
 
 
-def _told(values: Array) -> str:
+def _moments(values: Array) -> str:
     return ", ".join(f"{x:.4g}" for x in values)
 
 
 def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[str, str], ...]:
-    """Return the bodies that cannot exist, each with the reason.
+    """Return the bodies with inconsistent inertias, each with the reason.
 
-    A body that waits for a parameter's value is not judged yet.
+    A body with a parameter without value is not checked.
     """
     return tuple(
         (b.name, why)
@@ -280,9 +278,9 @@ def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[st
 
 
 def suspects(model: Description, *, point_masses: bool) -> tuple[tuple[str, str], ...]:
-    """Return the bodies that cannot exist or that leave a joint idle, each with the reason.
+    """Return the bodies that are inconsistent or leave a joint idle, each with the reason.
 
-    What waits for a parameter's value is not judged yet.
+    Bodies with a parameter without value are not checked.
     """
     found = dict(body_faults(model.bodies, point_masses=point_masses))
     # A negative mass makes M indefinite, and joints look idle that are not.
@@ -313,7 +311,7 @@ def check_substituted(before: _D, after: _D) -> _D:
 
 
 def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
-    """Return one sentence per kind of fault, with every body that has it.
+    """Return one sentence for each kind of fault, with all its bodies.
 
     Parameters
     ----------
@@ -340,17 +338,17 @@ def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple
             out.append(f"{what} {name!r}: {reason}")
             continue
         plural = "links" if all(what == "link" for what, *_ in members) else "bodies"
-        told = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members[:_MOST_TOLD]]
-        more = f" and {len(members) - _MOST_TOLD} more" if len(members) > _MOST_TOLD else ""
-        out.append(f"{len(members)} {plural}: {sentence}: {', '.join(told)}{more}")
+        listing = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members[:_MAX_LISTED]]
+        more = f" and {len(members) - _MAX_LISTED} more" if len(members) > _MAX_LISTED else ""
+        out.append(f"{len(members)} {plural}: {sentence}: {', '.join(listing)}{more}")
     return out
 
 
 def idle_joints(model: Description) -> tuple[list[str], bool]:
-    """Return the joints whose motion costs no kinetic energy, so that M is singular, and whether each alone costs none.
+    """Return the joints with motions of no kinetic energy, so that M is singular, and whether each alone has one.
 
     M is formed at one random state from the definition, Σ Jᵀ I J, and scaled to
-    a unit diagonal; a null vector names its joints. Motions that loops do not allow count as if they moved mass.
+    a unit diagonal; a null vector names its joints. Motions that violate loops count as if they moved mass.
     """
     if not model.nv:
         return [], True
@@ -359,15 +357,15 @@ def idle_joints(model: Description) -> tuple[list[str], bool]:
     M, diagonal = sample.M, np.diag(sample.M)
     if not np.isfinite(M).all():
         wild = [j.name for j in model.independent_joints if not np.isfinite(diagonal[model.layout.v[j.name]]).all()]
-        told = ", ".join(repr(n) for n in wild[:_MOST_TOLD]) or "all joints together"
-        raise InputError(f"{model.name}: the mass matrix overflows at {told}; give smaller masses and lengths")
+        listing = ", ".join(repr(n) for n in wild[:_MAX_LISTED]) or "all joints together"
+        raise InputError(f"{model.name}: the mass matrix overflows at {listing}; give smaller masses and lengths")
     rows = [sample.held(loop) @ model.layout.G for loop in model.loops]
     if rows and (size := float(np.trace(M))):
         held = np.concatenate(rows)
         # M need have an inverse only on what loops allow.
         M = M + size / len(M) * held.T @ held
     diagonal, alone = np.diag(M), True
-    # What is left of a mass on its own axis is the square of a rounded length.
+    # A mass on its own axis leaves the square of a rounded length.
     zero = diagonal <= 1e-28 * float(diagonal.max())
     if not zero.any():
         # One root after the other: the product of two would leave the range of doubles.
@@ -423,8 +421,8 @@ def scale_doubts(model: Description) -> list[str]:
 
 
 def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _MOST_TOLD} more" if len(names) > _MOST_TOLD else ""
-    return f"{', '.join(names[:_MOST_TOLD])}{more}"
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return f"{', '.join(names[:_MAX_LISTED])}{more}"
 
 
 def sample_mass_matrix(model: Description, q: Array | None = None) -> Array:
