@@ -1,0 +1,120 @@
+"""Every joint type on every engine: each quantity is right against the oracle, or refused by name."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.engines import ENGINES, QUANTITIES
+from mbkit.errors import KnownDefectWarning, UnsupportedError
+from mbkit.model import KINDS, Model, kind_of
+from tests.joint_of_ones_own import OWN
+
+BUILT_IN = tuple(name for name, joint_type in KINDS.items() if joint_type.built_in and joint_type.nv)
+DERIVATIVES = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
+ARGUMENTS = {
+    **dict.fromkeys(("mass_matrix", "gravity", "potential_energy"), "q"),
+    **dict.fromkeys(("coriolis_force", "nle", "passive", "kinetic_energy"), "qv"),
+    **dict.fromkeys(("inverse_dynamics", "inverse_dynamics_derivatives"), "qva"),
+    **dict.fromkeys(("forward_dynamics", "forward_dynamics_derivatives"), "qvt"),
+}
+EPS = np.finfo(float).eps
+
+
+def model_of(kind: str) -> Model:
+    """Return two bodies with a joint of this type each, all features that it can have, and a hinge between."""
+    joint_type, rng = kind_of(kind), np.random.default_rng(5)
+    b = mb.ModelBuilder(kind, gravity=(1.0, -2.0, -9.0))
+    options: dict = {f"axis{k or ''}": x for k, x in ((0, (0.6, 0.0, 0.8)), (2, (0.0, 1.0, 0.0)))[: joint_type.n_axes]}
+    options["damping"] = 0.4
+    if joint_type.pitched:
+        options["pitch"] = 0.3
+    if joint_type.coordinate_velocities and not joint_type.pitched:
+        options |= {"stiffness": 2.0, "rest": 0.1}
+    if joint_type.nv == 1:
+        options["armature"] = 0.2
+    parent = "world"
+    for k, (name, more) in enumerate(((kind, options), ("revolute", {"axis": (0, 0, 1)}), (kind, options))):
+        inertia = np.diag(rng.uniform(0.4, 0.6, 3))
+        b.add_body(f"b{k}", mass=1.0 + k, com=rng.uniform(-0.2, 0.2, 3), inertia=inertia)
+        place = {"translation": rng.uniform(-0.3, 0.3, 3), "rpy": rng.uniform(-1, 1, 3)}
+        b.add_joint(f"j{k}", name, parent=parent, child=f"b{k}", **place, **more)
+        parent = f"b{k}"
+    return b.build()
+
+
+def state(model: Model) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(8)
+    q, v = model.random_state(rng)
+    a, tau = rng.standard_normal((2, model.nv))
+    return {"q": q, "v": v, "a": a, "t": tau}
+
+
+def value(dyn, quantity: str, at: dict[str, np.ndarray]) -> np.ndarray:
+    if quantity in ("pose", "jacobian"):
+        return np.asarray(getattr(dyn, quantity)(at["q"], "b2"))
+    return np.asarray(getattr(dyn, quantity)(*(at[name] for name in ARGUMENTS[quantity])))
+
+
+@pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])
+def test_each_quantity_is_right_or_refused(kind):
+    model = model_of(kind)
+    at, oracle = state(model), mb.dynamics(model, "oracle")
+    M = oracle.mass_matrix(at["q"])
+    condition = np.linalg.cond(M)
+    # Forces at play: what is left of large terms has their rounding.
+    size = 1.0 + np.abs(M).max() * max(1.0, float(at["v"] @ at["v"])) + np.abs(oracle.nle(at["q"], at["v"])).max()
+    tolerance = 2000 * EPS * size
+    refused: dict = {}
+    for engine in ENGINES:
+        try:
+            dyn = mb.dynamics(model, engine)
+        except UnsupportedError as error:
+            refused[engine] = str(error)
+            continue
+        for quantity in (*QUANTITIES, *DERIVATIVES):
+            if quantity in ("function", "coriolis_matrix"):
+                continue
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", KnownDefectWarning)
+                try:
+                    found = value(dyn, quantity, at)
+                except UnsupportedError as error:
+                    refused[engine, quantity] = str(error)
+                    continue
+            if any(issubclass(w.category, KnownDefectWarning) for w in caught):
+                continue
+            factor = condition if quantity.startswith("forward") else 1.0
+            off = np.abs(found - value(oracle, quantity, at)).max()
+            assert off < tolerance * factor, (engine, quantity, off)
+    assert not {"lagrangian", "oracle"} & {*refused}
+    assert all(kind in text for key, text in refused.items() if isinstance(key, str)), refused
+    assert all(key[0] in text for key, text in refused.items() if not isinstance(key, str)), refused
+
+
+@pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])
+def test_coriolis_matrices_give_the_force_and_a_skew_difference(kind):
+    model = model_of(kind)
+    at = state(model)
+    for engine in ("lagrangian", "oracle"):
+        dyn = mb.dynamics(model, engine)
+        C = dyn.coriolis_matrix(at["q"], at["v"])
+        h = 1e-6
+        ahead, behind = (dyn.mass_matrix(model.integrate(at["q"], s * h * at["v"])) for s in (1, -1))
+        skew = (ahead - behind) / (2 * h) - 2 * C
+        assert np.abs(C @ at["v"] - dyn.coriolis_force(at["q"], at["v"])).max() < 1e-13 * (1 + np.abs(C).max())
+        assert np.abs(skew + skew.T).max() < 1e-8 * (1 + np.abs(C).max())
+
+
+@pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])
+def test_a_run_keeps_the_energy_and_the_manifold(kind):
+    model = model_of(kind).without("damping")
+    q, v = model.random_state(np.random.default_rng(3))
+    dyn = mb.dynamics(model, "lagrangian", compile=False)
+    run = mb.simulate(dyn, q, 0.5 * v, 0.2, method="rk853", rtol=1e-10)
+    assert np.abs(run.energy() - run.energy()[0]).max() < 1e-8 * (1 + np.abs(run.energy()[0]))
+    step = model.difference(run.q[0], run.q[-1])
+    assert np.abs(model.integrate(run.q[0], step) - run.q[-1]).max() < 1e-13
