@@ -263,7 +263,7 @@ def _registered(name: str, *values: Any) -> EngineInfo:
 
 
 @cache
-def _load_entry_points() -> None:
+def load_entry_points() -> None:
     for point in entry_points(group=ENTRY_POINTS):
         loaded = point.load()
         if isinstance(loaded, EngineInfo) and loaded.name not in ENGINES:
@@ -279,7 +279,7 @@ def find_engine(name: str) -> EngineInfo:
         No engine of this name.
     """
     if name not in ENGINES:
-        _load_entry_points()
+        load_entry_points()
     if name not in ENGINES:
         raise UnknownNameError("engine", str(name), ENGINES)
     return ENGINES[name]
@@ -287,7 +287,7 @@ def find_engine(name: str) -> EngineInfo:
 
 def compared() -> tuple[str, ...]:
     """Return the engines that can be compared and measured: all but the reference."""
-    _load_entry_points()
+    load_entry_points()
     return tuple(info.name for info in ENGINES.values() if not info.reference)
 
 

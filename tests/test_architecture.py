@@ -1,0 +1,100 @@
+"""The shape of the code: sizes of files and folders, and names of engines and joint types in one place each."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import mbkit
+from mbkit.engines.registry import ENGINES
+from mbkit.model.joint_types import KINDS
+
+ROOT = Path(mbkit.__file__).parent
+FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("*.py"))}
+#: Lines of a file, and modules of a folder, `__init__` not counted.
+MAX_LINES, MAX_MODULES = 800, 15
+#: What is larger today; these must not grow.
+LARGE_FILES: dict[str, int] = {}
+LARGE_FOLDERS: dict[str, int] = {"load": 16, "simulate/solvers": 18}
+
+#: Files and folders that may write the name of an engine.
+ENGINE_NAMES = (
+    "engines/",
+    # Texts of examples, and words of formats: <mujoco> is a tag of MJCF.
+    "load/",
+    # The package of the same name, and the code that a compiled function depends on.
+    "__init__.py",
+    "derivation/fingerprint.py",
+    # Which engine has a method of its own.
+    "methods/",
+    # The engine as the default of a signature.
+    "lagrangian/system.py",
+)
+#: Files and folders that may write the name of a joint type. Models are described with the public builder, and
+#: formats have tables from their words to ours.
+JOINT_NAMES = ("model/joint_types.py", "engines/", "load/", "catalog/", "studies/stress/cases/")
+#: Names of joint types that are ordinary words too: a method with fixed steps, ``mimic="free"``.
+WORDS = ("fixed", "free", "ball")
+
+
+def literals(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the strings of a module with their lines, without docstrings and f-strings."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    skipped = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Expr, ast.JoinedStr))
+        for part in ([node.value] if isinstance(node, ast.Expr) else node.values)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped:
+            yield node.lineno, node.value
+
+
+def uses(names: Iterable[str], allowed: Iterable[str], found: Callable[[Path], Iterable[tuple[int, str]]]) -> list[str]:
+    """Return where a name stands as a string outside of files and folders (which end in a slash)."""
+    names, allowed = frozenset(names), tuple(allowed)
+    return [
+        f"mbkit/{name}:{line}: {text!r}"
+        for name, path in FILES.items()
+        if not any(name == x or (x.endswith("/") and name.startswith(x)) for x in allowed)
+        for line, text in found(path)
+        if text in names
+    ]
+
+
+def test_names_of_engines_stand_in_the_registry():
+    assert uses((n for n, info in ENGINES.items() if info.built_in), ENGINE_NAMES, literals) == []
+
+
+def test_names_of_joint_types_stand_with_the_joint_types():
+    names = (n for n, joint_type in KINDS.items() if joint_type.built_in and n not in WORDS)
+    assert uses(names, JOINT_NAMES, literals) == []
+
+
+def test_no_joint_is_asked_for_the_name_of_its_type():
+    """``joint.kind == "free"`` leaves joint types of one's own behind; `JointType` has an attribute instead."""
+    found = []
+    for name, path in FILES.items():
+        if name.startswith(("engines/", "load/")):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            sides = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
+            constants = {x.value for x in sides if isinstance(x, ast.Constant)}
+            kinds = any(isinstance(x, ast.Attribute) and x.attr == "kind" for x in sides)
+            if kinds and constants & {*KINDS} - {"fixed"}:
+                found.append(f"mbkit/{name}:{node.lineno}")
+    assert found == []
+
+
+def test_files_are_no_longer_than_a_concept():
+    lines = {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in FILES.items()}
+    assert {name: n for name, n in lines.items() if n > LARGE_FILES.get(name, MAX_LINES)} == {}
+
+
+def test_folders_hold_few_modules():
+    folders = {path.parent for path in FILES.values()}
+    sizes = {f.relative_to(ROOT).as_posix(): sum(p.name != "__init__.py" for p in f.glob("*.py")) for f in folders}
+    assert {n: k for n, k in sizes.items() if k > LARGE_FOLDERS.get(n, MAX_MODULES)} == {}
+    assert {n for n in LARGE_FOLDERS if sizes.get(n, 0) <= MAX_MODULES} == set(), "take it off the list"
