@@ -55,47 +55,42 @@ def stress(
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> StressResult:
-    """Sweep each case's number over decades, and see where each engine and method breaks, and how.
+    """Sweep each case's number over decades, and return where each engine and method breaks, and how.
 
     Parameters
     ----------
     cases : sequence of str or Case, optional
-        Names of `mbkit.studies.stress.cases`, or cases of your own, whose functions stand
-        in a module or a script; by default all there are.
+        Names of `mbkit.studies.stress.cases`, or your own cases, whose functions are in a module, or in a script with
+        its work below ``if __name__ == "__main__":``; by default all named ones.
     engines : sequence of str
     methods : sequence of str, or mapping of str to sequence of str, optional
-        Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by
-        default all, in a quick study one of each kind. A case that only some have a meaning for
-        asks these of them. Cases about terms take none.
+        Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by default all, in a quick study
+        one of each kind. A case may restrict them; cases about terms use none.
     values : sequence of float, or mapping of str to sequence of float, optional
-        From mild to extreme, instead of the cases' own: for all of them, or by name.
+        From mild to extreme, instead of the cases' own: for all cases, or by name.
     quick : bool
         Fewer values, methods and seconds.
     dt : float
-        Step of fixed-step methods, s, where a case prescribes none; shortened so that a
-        whole number of steps ends on the times at which errors are measured.
+        Step of fixed-step methods, s, where a case prescribes none; shortened to end on the times of measurement.
     rtol : float
-        rtol and atol of adaptive methods, raised to the least that one takes.
+        rtol and atol of adaptive methods, raised to the least that a method allows.
     bar : float
-        Up to this error, relative to the size of the motion or term, a value is held,
-        where a case has no bar of its own.
+        A value is held up to this error, relative to the size of the motion or term, unless a case has its own bar.
     seconds : float, optional
-        That a run may take, of the processor's time; 2, in a quick study 0.5. Making the
-        problem, deriving and compiling may take fifteen times as long.
+        Processor time of a run, 2, in a quick study 0.5. Making the problem, deriving and compiling have fifteen times
+        as long.
     memory : int, optional
-        Bytes that a worker process may take, 2 GiB when not given; enforced on Linux.
+        Bytes of a worker process, 2 GiB when not given; enforced on Linux.
     budget : float, optional
-        Seconds that the study may take as a whole, 1700, in a quick study 100. What is
-        not reached by then is "not run".
+        Seconds of the whole study, 1700, in a quick study 100. Cells beyond it are "not run".
     jobs : int, optional
-        Processes side by side; by default as many as there are processors, and not
-        more than 16. They share memory and caches: run times are those of a busy machine.
+        Processes side by side; by default one per processor, at most 16. They share memory and caches: run times are
+        those of a busy machine.
     progress : callable, optional
-        Called as ``progress(fraction, text)``. What it raises ends the study, after
-        `checkpoint` has got what was finished.
+        Called as ``progress(fraction, text)``. An exception of it ends the study, after `checkpoint` has the result.
     checkpoint : path or callable, optional
-        Where the result so far goes every few seconds and at the end: a JSON file, which is
-        whole at any time, or a function.
+        Receives the result so far every few seconds and at the end: a JSON file, which is whole at any time, or a
+        function.
 
     Returns
     -------
@@ -104,33 +99,27 @@ def stress(
     Raises
     ------
     InputError, UnknownNameError
-        For unusable arguments. What an engine or method cannot do is in the result.
+        For unusable arguments. Failures of an engine or method are in the result.
     UnsupportedError
         Worker processes do not start.
     InterruptedSweepError
-        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is what was finished, which
-        `checkpoint` has got before.
+        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` holds the finished cells, as `checkpoint` does.
 
     Notes
     -----
-    Every run takes place in a worker process with a folder of its own, which is ended
-    when a run takes too long, and replaced when it has ended by itself; so a crash, an endless
-    loop and a want of memory are results. Runs of one worker follow each other: what
-    one leaves behind in memory is there for the next.
+    Every run takes place in a worker process with a folder of its own, which is ended when a run takes too long, and
+    replaced when it died; so a crash, an endless loop and too little memory are results. The runs of one worker follow
+    each other in the same memory.
 
-    The error of a motion is the largest difference of q to its truth over ten times,
-    on the manifold, divided by the problem's scale. The truth is a closed form, or what two
-    independent runs agree on, and `CaseResult.truths` says which and how well it is known;
-    where there is none, a wrong energy speaks against a run, and a right one not for it.
-    The error of a term is normwise per state, against 34 digits. Run times are the
-    processor's, of the whole run after all that is compiled once.
+    The error of a motion is the largest difference of q to its truth over ten times, on the manifold, divided by the
+    problem's scale. The truth is a closed form, or the motion on which two independent runs agree;
+    `CaseResult.truths` says which, and how well it is known. Without a truth, a wrong energy speaks against a run, and
+    a right one not for it. The error of a term is normwise per state, against 34 digits. Run times are processor time
+    of the whole run, without compilation.
 
-    After a value at which a row is too slow or its process died, more extreme ones are not
-    run: they cost as much, and tell no more. Likewise after two in a row that diverged,
-    were refused or gave NaN. An error above the bar ends no row.
-
-    A case of your own is sent to the workers by name: its functions stand in a module, or in a
-    script whose work is below ``if __name__ == "__main__":``.
+    After a value at which a row is too slow or its process died, more extreme values are not run: they cost as much,
+    and tell no more. Likewise after two in a row that diverged, were refused or gave NaN. An error above the bar ends
+    no row.
 
     Examples
     --------

@@ -1,0 +1,128 @@
+"""Worker processes: results and exceptions come back, and a crash, a hang and a want of memory have a name."""
+
+from __future__ import annotations
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import pytest
+
+from mbkit.errors import InputError
+from mbkit.studies.worker import (
+    OUT_OF_MEMORY,
+    CallError,
+    RemoteError,
+    Worker,
+    WorkerClosedError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+    in_worker,
+    report_stage,
+    run,
+)
+
+
+class StubbornError(Exception):
+    """Cannot be sent: it needs two arguments."""
+
+    def __init__(self, one: str, other: str) -> None:
+        super().__init__(f"{one} and {other}")
+
+
+def stubborn() -> None:
+    raise StubbornError("this", "that")
+
+
+def refuse() -> None:
+    raise InputError("not this one")
+
+
+def hang(stage: str = "") -> None:
+    if stage:
+        report_stage(stage)
+    while True:
+        pass
+
+
+def wait_for_ever() -> None:
+    threading.Event().wait()
+
+
+@pytest.fixture(scope="module")
+def worker():
+    worker = Worker(memory=2**30)
+    yield worker
+    worker.end()
+
+
+def test_results_and_exceptions_come_back_from_one_process(worker):
+    first = worker.call(os.getpid)
+    assert first != os.getpid()
+    assert worker.call(in_worker)
+    assert not in_worker()
+    with pytest.raises(InputError, match="not this one"):
+        worker.call(refuse)
+    with pytest.raises(RemoteError, match="StubbornError: this and that"):
+        worker.call(stubborn)
+    with pytest.raises(RemoteError, match="SystemExit: 3"):
+        worker.call(partial(exec, "raise SystemExit(3)"))
+    assert worker.call(os.getpid) == first
+    # And each has its own folder.
+    assert worker.call(os.getcwd) != os.getcwd()
+
+
+def test_a_crash_is_named_and_the_next_call_has_a_new_process(worker):
+    first = worker.call(os.getpid)
+    with pytest.raises(WorkerDiedError, match="SIGABRT") as caught:
+        worker.call(partial(exec, "import os; print('the last words', flush=True); os.abort()"))
+    assert (caught.value.signal, caught.value.last) == ("SIGABRT", "the last words")
+    with pytest.raises(WorkerDiedError, match="status 7"):
+        worker.call(os._exit, 7)
+    with pytest.raises(MemoryError):
+        worker.call(bytearray, 2**31)
+    with pytest.raises(WorkerDiedError, match=OUT_OF_MEMORY):
+        worker.call(partial(exec, "import os; os.write(2, b'std::bad_alloc'); os.abort()"))
+    assert worker.call(os.getpid) != first
+
+
+@pytest.mark.parametrize("function", [hang, wait_for_ever])
+def test_what_computes_too_long_or_not_at_all_is_ended(worker, function):
+    with pytest.raises(WorkerTimeoutError, match="stopped after"):
+        worker.call(function, cpu_seconds=0.1)
+    assert worker.call(abs, -1) == 1
+
+
+def test_a_stage_has_a_limit_of_its_own(worker):
+    with pytest.raises(WorkerTimeoutError):
+        worker.call(hang, "endless", stage_seconds={"endless": 0.1})
+    assert worker.stage == "endless"
+
+
+def test_a_function_that_the_process_cannot_import_is_the_callers_mistake(worker):
+    class Here:
+        pass
+
+    Here.__qualname__, Here.__module__ = "Nowhere", "tests.test_worker"
+    globals()["Nowhere"] = Here
+    with pytest.raises(CallError, match="Nowhere"):
+        worker.call(Here)
+
+
+def test_another_thread_can_close_it():
+    worker = Worker()
+    worker.call(abs, 1)
+    with ThreadPoolExecutor(1) as thread:
+        call = thread.submit(worker.call, wait_for_ever)
+        while worker._busy is False:
+            pass
+        worker.close()
+        with pytest.raises(WorkerClosedError):
+            call.result()
+    with pytest.raises(WorkerClosedError):
+        worker.call(abs, 1)
+
+
+def test_no_calls_take_no_workers():
+    assert list(run({})) == []
