@@ -53,7 +53,7 @@ def _causes(causes: Iterable[Cause]) -> list[Block]:
     known = list(causes)
     for acts, mark, style in ((True, "✗", "bad"), (False, "!", "allowed")):
         for kind, says, what in grouped(c for c in known if c.acts == acts):
-            # What a kind means is told once.
+            # What a kind means is said once.
             again = any(b.head == kind for b in bullets)
             bullets.append(Bullet(kind, f"{says} ({what})", mark, style, "" if again else meaning(kind)))  # type: ignore[arg-type]
     return [Items(bullets)]

@@ -117,8 +117,7 @@ def digits(result: Comparison) -> str:
                     ax.plot([worst], [y], "x", color=PAGE.bad, markersize=11, markeredgewidth=2.2)
         limit = -math.log10(result.tolerance)
         ax.axvline(limit, color=PAGE.muted, linestyle=(0, (2, 2)), linewidth=1.0)
-        told = f"tolerance {result.tolerance:g} "
-        ax.text(limit, -0.75, told, color=PAGE.muted, ha="right", va="center", fontsize=9)
+        ax.text(limit, -0.75, f"tolerance {result.tolerance:g} ", color=PAGE.muted, ha="right", va="center", fontsize=9)
         ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])
         ax.set_ylim(len(terms) - 0.4, -1.1)
         _digit_axis(ax, min(_digits(r.relative) for rows in terms.values() for r in rows.values()))
@@ -251,6 +250,6 @@ def _legend(fig: Figure, result: Comparison) -> None:
         for e in result.engines
     ]
     handles.append(Line2D([], [], color=PAGE.muted, linewidth=0.9, label="eps of double precision"))
-    told = f"tolerance {result.tolerance:g}"
-    handles.append(Line2D([], [], color=PAGE.muted, linestyle=(0, (4, 3)), linewidth=0.9, label=told))
+    label = f"tolerance {result.tolerance:g}"
+    handles.append(Line2D([], [], color=PAGE.muted, linestyle=(0, (4, 3)), linewidth=0.9, label=label))
     fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.03, 1.0), ncols=len(handles), columnspacing=1.8)

@@ -1,7 +1,7 @@
 """The content of the stress page; a case has a map, a table of coloured cells, and what stands under it.
 
 The map is a table and no picture: as sharp as the page on any screen, to be searched and copied, with the rest
-of a cell told to whoever points at it.
+of a cell shown to whoever points at it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Final
 from mbkit.report import stress_view
 from mbkit.report.formatting import error_text, time_text
 from mbkit.report.stress_steps import against_theory, kinds, rules, stable_steps, steps
-from mbkit.report.stress_view import HOW, Overview, held_text, told, value_text
+from mbkit.report.stress_view import HOW, Overview, held_text, remarks, value_text
 from mbkit.studies._figure_style import engine_index
 from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
 from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, engines_of, name_of, place
@@ -122,7 +122,7 @@ def _title(case: CaseResult, row: Row, cell: Measurement, outcome: Outcome) -> s
     parts += [f"the truth is known to {error_text(cell.floor)}"] if cell.floor else []
     parts += [] if math.isnan(cell.seconds) else [time_text(cell.seconds)]
     parts += [f"{cell.steps} steps"] if cell.steps else []
-    return "; ".join(parts + ([told(cell)] if told(cell) else []))
+    return "; ".join(parts + ([remarks(cell)] if remarks(cell) else []))
 
 
 def _truths(case: CaseResult) -> list[tuple[str, str]]:
@@ -143,7 +143,7 @@ def _ends(texts: Sequence[str]) -> str:
 
 
 def _facts(case: CaseResult) -> list[tuple[str, list[float]]]:
-    """Return each fact over the values, NaN where it is not told."""
+    """Return each fact over the values, NaN where it is unknown."""
     names = dict.fromkeys(name for facts in case.facts for name in facts)
     padded = [*case.facts, *({} for _ in range(len(case.values) - len(case.facts)))]
     return [(name, [facts.get(name, math.nan) for facts in padded]) for name in names]
@@ -195,6 +195,6 @@ FILTERS: Final = {
     "value": value_text,
     "held": held_text,
     "how": lambda outcome: HOW.get(outcome, ""),
-    "told": told,
+    "remarks": remarks,
     "rowname": name_of,
 }

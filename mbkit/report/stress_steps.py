@@ -73,13 +73,13 @@ class Rule:
 
     @property
     def words(self) -> str:
-        """The rule for whoever chooses a step, told once where it is the same."""
-        told: dict[str, list[str]] = {}
+        """The rule for whoever chooses a step, by_words once where it is the same."""
+        by_words: dict[str, list[str]] = {}
         for kind, bound in self.bounds.items():
-            told.setdefault(bound.words, []).append(kind)
-        if len(told) == 1:
-            return next(iter(told))
-        return "; ".join(f"{words} ({', '.join(which)})" for words, which in told.items())
+            by_words.setdefault(bound.words, []).append(kind)
+        if len(by_words) == 1:
+            return next(iter(by_words))
+        return "; ".join(f"{words} ({', '.join(which)})" for words, which in by_words.items())
 
 
 def _two(x: float) -> str:
@@ -89,10 +89,10 @@ def _two(x: float) -> str:
 def steps(cases: Iterable[Overview]) -> list[StepCase]:
     """Return the cases whose step is swept."""
     out = []
-    for told in cases:
-        if told.case.family == "step":
-            found = [StepLine(line, against_theory(line, told.case)) for line in told.lines if not line.left_out]
-            out += [StepCase(told.case, told.anchor, tuple(found))] if found else []
+    for each in cases:
+        if each.case.family == "step":
+            found = [StepLine(line, against_theory(line, each.case)) for line in each.lines if not line.left_out]
+            out += [StepCase(each.case, each.anchor, tuple(found))] if found else []
     return out
 
 

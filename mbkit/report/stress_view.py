@@ -28,7 +28,7 @@ from mbkit.studies.stress.measurements import (
 from mbkit.studies.stress.result import StressResult
 
 __all__ = ["HOW", "Overview", "avoid", "bars", "families", "headline", "held_text", "methods", "overview", "ranks"]
-__all__ += ["silences", "told", "value_text", "view"]
+__all__ += ["remarks", "silences", "value_text", "view"]
 
 
 #: Outcomes in words that follow "then".
@@ -99,7 +99,7 @@ class Overview:
         found: dict[str, list[str]] = {}
         for line in self.lines:
             if line.left_out:
-                reason = told(line.row.cells[0]) if line.row.cells else ""
+                reason = remarks(line.row.cells[0]) if line.row.cells else ""
                 found.setdefault(reason or HOW[line.outcomes[0] if line.outcomes else "not run"], []).append(
                     name_of(line.row)
                 )
@@ -196,7 +196,7 @@ def families(cases: Sequence[Overview]) -> list[tuple[str, str, list[Overview]]]
     return [(name, _FAMILIES.get(name, name), found[name]) for name in sorted(found, key=order.index)]
 
 
-def told(cell: Measurement | None) -> str:
+def remarks(cell: Measurement | None) -> str:
     """Return what was said of a cell beside its numbers."""
     return "" if cell is None else "; ".join(dict.fromkeys(x for x in (cell.note, *cell.warnings) if x))
 

@@ -41,7 +41,7 @@ def model_of(target: str, options: Mapping[str, Any] | None = None) -> Model:
     Raises
     ------
     UnknownNameError, LoadError, ModelError
-        With the culprit; whatever a user's function raises is told in a `LoadError`.
+        With the culprit; what a user's function raises becomes a `LoadError`.
     """
     options = options or {}
     if _FUNCTION.fullmatch(target) and not os.path.exists(target):
@@ -52,8 +52,8 @@ def model_of(target: str, options: Mapping[str, Any] | None = None) -> Model:
         if find(target) is None:
             _refuse(options, "a catalog system")
             return named[target]()
-        told = f"{target!r} is a robot and a catalog system; this is the robot, mbkit.catalog:{target} is the other"
-        warnings.warn(told, MbkitWarning, stacklevel=2)
+        message = f"{target!r} is a robot and a catalog system; this is the robot, mbkit.catalog:{target} is the other"
+        warnings.warn(message, MbkitWarning, stacklevel=2)
     try:
         return load(target, **options)
     except UnknownNameError as error:
@@ -75,8 +75,8 @@ def is_code(target: str) -> bool:
 
 def _refuse(options: Mapping[str, Any], what: str) -> None:
     if options:
-        told = ", ".join(options)
-        raise InputError(f"{told}: only for robots and files; the target is {what}, which makes its own model")
+        names = ", ".join(options)
+        raise InputError(f"{names}: only for robots and files; the target is {what}, which makes its own model")
 
 
 def _from_function(module_name: str, name: str) -> Model:
@@ -84,22 +84,22 @@ def _from_function(module_name: str, name: str) -> Model:
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     with _blamed(f"{target}: cannot import {module_name!r}"):
-        made: Any = importlib.import_module(module_name)
+        value: Any = importlib.import_module(module_name)
     where = module_name
     for part in name.split("."):
-        if not hasattr(made, part):
-            raise UnknownNameError("function", part, [n for n in dir(made) if n[0] != "_"], f"(in {where})")
-        made, where = getattr(made, part), f"{where}.{part}"
-    if callable(made):
+        if not hasattr(value, part):
+            raise UnknownNameError("function", part, [n for n in dir(value) if n[0] != "_"], f"(in {where})")
+        value, where = getattr(value, part), f"{where}.{part}"
+    if callable(value):
         with _blamed(f"{target}: the function failed"):
-            made = made()
-    if not isinstance(made, Model) and isinstance(getattr(made, "model", None), Model):
+            value = value()
+    if not isinstance(value, Model) and isinstance(getattr(value, "model", None), Model):
         # A system on paper, which knows itself as a model.
-        made = made.model
-    if not isinstance(made, Model):
-        told = f"expected a Model, got {type(made).__name__}; return mbkit.load(...) or builder.build()"
-        raise LoadError(f"{target}: {told}")
-    return made
+        value = value.model
+    if not isinstance(value, Model):
+        message = f"expected a Model, got {type(value).__name__}; return mbkit.load(...) or builder.build()"
+        raise LoadError(f"{target}: {message}")
+    return value
 
 
 @contextlib.contextmanager

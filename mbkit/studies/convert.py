@@ -192,9 +192,9 @@ def _to_urdf(model: Model) -> Converted:
     found = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
     acting: tuple[Cause, ...] = found.acting
     if acting or not (found.agree or found.massless):
-        told = "; ".join(str(c) for c in acting) or found.verdict
+        reasons = "; ".join(str(c) for c in acting) or found.verdict
         raise MbkitError(
-            f"convert: what was written of {model.name} reads back otherwise: {told}; please report this model"
+            f"convert: what was written of {model.name} reads back otherwise: {reasons}; please report this model"
         )
     if found.massless:
         notes.append("no body has mass, so that reading back compares no forces, but bodies and joints alone")

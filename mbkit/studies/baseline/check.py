@@ -40,7 +40,7 @@ def check(
 ) -> BaselineResult:
     """Hold a model and the engines against what was recorded of them.
 
-    First the description: a parameter that changed is told by name, with its old and new value,
+    First the description: a parameter that changed is named, with its old and new value,
     and what it does to the terms. Where there is none, the numbers of every recorded engine, to
     its own rounding (`mbkit.studies.baseline.tolerance` says how much that is). Where these stand,
     the versions: new ones alone ask whether to record anew.
@@ -103,9 +103,9 @@ def check(
     if not meant and not moved_versions and processor == recorded.processor:
         # Another parser or processor may round otherwise; neither is another, so somebody wrote another number.
         meant = found
-    told = tuple(f"only rounding: {c.text}" for c in found if c not in meant)
+    notes = tuple(f"only rounding: {c.text}" for c in found if c not in meant)
     if not found and model.digest != recorded.digest:
-        told = ("the digest is another, though no parameter is",)
+        notes = ("the digest is another, though no parameter is",)
     plain = with_values(model)
     if meant:
         return replace(result, status="description", changes=meant, effect=_effect(recorded, plain, meant), engines=())
@@ -126,7 +126,7 @@ def check(
         engines=tuple(built),
         moved=tuple(rows),
         skipped=tuple(missing),
-        notes=(*told, *_shared(rows, built)),
+        notes=(*notes, *_shared(rows, built)),
         worst=worst,
     )
 

@@ -239,8 +239,8 @@ def _section(section: str, old: Description, new: Description) -> Iterator[Chang
         yield Change(section, name, "", None, after[name], f"{noun} {name} is new")
     kept = [n for n in before if n in after] if section not in FLAT else [""]
     if section == "joints" and kept != (now := [n for n in after if n in before]):
-        told = f"order of the joints: {', '.join(kept)} → {', '.join(now)}"
-        yield Change(section, "", "order", kept, now, told)
+        order = f"order of the joints: {', '.join(kept)} → {', '.join(now)}"
+        yield Change(section, "", "order", kept, now, order)
     for name in kept:
         owner = f"{noun} {name}{_more(section, name, new)}"
         yield from _fields(section, name, owner, before.get(name, {}), after.get(name, {}))

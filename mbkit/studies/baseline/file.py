@@ -117,8 +117,8 @@ class Baseline:
         )
 
     def __repr__(self) -> str:
-        told = f"{len(self.terms)} terms at {len(self.states.kinds)} states"
-        return f"<Baseline of {self.model!r}: {', '.join(self.engines)}; {told}>"
+        content = f"{len(self.terms)} terms at {len(self.states.kinds)} states"
+        return f"<Baseline of {self.model!r}: {', '.join(self.engines)}; {content}>"
 
 
 # A baseline as a table of plain data, and back: one row for each joint, so that a changed line names it.
@@ -165,7 +165,7 @@ def _from_table(t: Mapping[str, Any]) -> Baseline:
     q, v, a, tau = (_unfolded(states[x]) for x in _VECTORS)
     at = States(q, v, a, tau, tuple(states["kinds"]))
     sizes = len(at.kinds), len(velocities)
-    made = Baseline(
+    baseline = Baseline(
         model=t["model"],
         digest=t["digest"],
         target=t["target"],
@@ -190,8 +190,8 @@ def _from_table(t: Mapping[str, Any]) -> Baseline:
             for term, reason in terms.items()
         ),
     )
-    _check(made)
-    return made
+    _check(baseline)
+    return baseline
 
 
 def _check(b: Baseline) -> None:
@@ -238,8 +238,8 @@ def _is_number(x: object) -> bool:
 
 def _errors(t: Mapping[str, Any], engine: str) -> dict[str, float]:
     """Return the errors of every term that an engine gave."""
-    told, without = t.get("errors", {}).get(engine, {}), t.get("left_out", {}).get(engine, {})
-    return {term: told.get(term, 0.0) for term in t["terms"] if term not in without}
+    errors, without = t.get("errors", {}).get(engine, {}), t.get("left_out", {}).get(engine, {})
+    return {term: errors.get(term, 0.0) for term in t["terms"] if term not in without}
 
 
 def _description(t: Mapping[str, Any]) -> Description:
@@ -391,11 +391,11 @@ def parsed(raw: bytes, where: Path) -> Baseline:
     if _CONFLICT.search(text):
         raise BaselineError(f"{where}: a merge has left conflict marks in it; take either side, or record it anew")
     _check_format(text, where)
-    body, mark, told = text.rpartition(_SUM)
-    if not mark or len(told.strip()) != 64 or not body.endswith("\n"):
+    body, mark, checksum = text.rpartition(_SUM)
+    if not mark or len(checksum.strip()) != 64 or not body.endswith("\n"):
         lines = text.count("\n")
         raise BaselineError(f"{where}: cut short after line {lines}: its last line, the checksum, is lost; {_REMEDY}")
-    if told.strip() != _checksum(body):
+    if checksum.strip() != _checksum(body):
         raise BaselineError(f"{where}: edited or damaged: its checksum belongs to other content; {_REMEDY}")
     try:
         return _from_table(tomllib.loads(body))
@@ -412,10 +412,12 @@ def _check_format(text: str, where: Path) -> None:
         # Without the line it is damaged, which the checksum tells.
         return
     if number > FORMAT:
-        told = f"of format {number}, by a newer mbkit; this one reads format {FORMAT}: update mbkit, or record it anew"
+        message = (
+            f"of format {number}, by a newer mbkit; this one reads format {FORMAT}: update mbkit, or record it anew"
+        )
     else:
-        told = f"of format {number}, by an older mbkit; this one reads format {FORMAT}: record it anew"
-    raise BaselineError(f"{where}: {told}")
+        message = f"of format {number}, by an older mbkit; this one reads format {FORMAT}: record it anew"
+    raise BaselineError(f"{where}: {message}")
 
 
 def _format(text: str) -> int | None:

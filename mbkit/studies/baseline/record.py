@@ -153,9 +153,9 @@ def record(
     if not force:
         check_replaceable(where, model.name)
     recorded = _recorded(model, names, engines is not None, samples, seed, progress or silent)
-    given = dict(options or {})
-    description = recorded.description | links_of(model, target, given, where)
-    recorded = replace(recorded, target=target, options=given, description=description)
+    kept = dict(options or {})
+    description = recorded.description | links_of(model, target, kept, where)
+    recorded = replace(recorded, target=target, options=kept, description=description)
     store(where, text_of(recorded), model.name, force=force)
     return recorded
 
@@ -218,7 +218,7 @@ def _error(comparator: Comparator, term: str, value: Array, reference: Array) ->
     return error if error > FINE else 0.0
 
 
-# The engines of a baseline, made; one that is not installed is told apart from one that refuses.
+# The engines of a baseline; one that is not installed is no refusal.
 
 
 def checked_model(model: object) -> Model:

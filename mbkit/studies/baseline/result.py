@@ -79,13 +79,13 @@ class BaselineResult(ResultTable):
         missing = f"; {', '.join(r.engine for r in self.skipped)} {how}" if self.skipped else ""
         if self.question == "diff":
             parameters = f"{_count(self.changes, 'parameter')} of the description"
-            told = {
+            sentences = {
                 "same": "the same robot, with the same numbers",
                 "versions": f"the same numbers, of other versions: {self._told_versions()}",
                 "numbers": "the same description, with other numbers",
                 "description": f"{parameters} differ{'s' if _one(self.changes) else ''}",
             }
-            return told[self.status]
+            return sentences[self.status]
         if self.status == "skipped":
             return f"nothing was checked: {', '.join(f'{r.engine} ({r.reason})' for r in self.skipped)}"
         if self.status == "description":
@@ -138,7 +138,7 @@ class BaselineResult(ResultTable):
         head = f"{self.model}, {self.path}: {self.verdict}"
         if self.question == "diff":
             head = f"{self.path} → {self.against}: {self.verdict}"
-        out = [head, *(f"  {what}: {told}" for what, told in self.lines())]
+        out = [head, *(f"  {what}: {text}" for what, text in self.lines())]
         if self.status in ("description", "numbers") and self.question == "check" and remedy:
             out.append(f"  If this is meant: {remedy}")
         return "\n".join(out)

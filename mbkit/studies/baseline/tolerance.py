@@ -82,9 +82,9 @@ class Moved:
             return f"{self.term}: {self.reason}"
         at = f" at {self.joint}" if self.joint else ""
         where = f" ({self.state})" if self.state else ""
-        told = f"{self.term}{at}{where}: {self.recorded:.12g} → {self.now:.12g}"
+        change = f"{self.term}{at}{where}: {self.recorded:.12g} → {self.now:.12g}"
         more = f"; {self.reason}" if self.reason else ""
-        return f"{told}, off by {self.error:.1e} where {self.allowed:.1e} is rounding{more}"
+        return f"{change}, off by {self.error:.1e} where {self.allowed:.1e} is rounding{more}"
 
 
 def allowed(baseline: Baseline, engine: str, term: str) -> float:
@@ -212,5 +212,5 @@ def of_engine(engine: str, old: Mapping[str, str], changed: Iterable[VersionChan
     package = _package(engine)
     own = [str(m) for m in changed if m.package == package]
     others = [str(m) for m in changed if m.package in _SHARED and m.package != package]
-    told = own or [f"{package} {old.get(package, '?')}, as recorded"]
-    return "; ".join([*told, *others])
+    names = own or [f"{package} {old.get(package, '?')}, as recorded"]
+    return "; ".join([*names, *others])

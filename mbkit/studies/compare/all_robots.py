@@ -212,8 +212,8 @@ def outcome_of(
             file = find(name)
             return RobotOutcome(name, "refused", str(error).removeprefix(f"{file.path}: " if file else ""))
         result = compare(model, engines, samples, seed, terms_only=True)
-    told = (f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in result.refusals)
-    refused = "; ".join(dict.fromkeys(told))
+    reasons = (f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in result.refusals)
+    refused = "; ".join(dict.fromkeys(reasons))
     if result.nothing:
         return RobotOutcome(name, "refused", refused or result.verdict, result)
     if result.passed:

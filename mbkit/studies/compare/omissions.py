@@ -34,15 +34,15 @@ _FLAGS: Final = (
 )
 
 
-def omissions(model: Model, made: Mapping[str, Dynamics], seed: int) -> tuple[Omission, ...]:
+def omissions(model: Model, engines: Mapping[str, Dynamics], seed: int) -> tuple[Omission, ...]:
     """Return one row per need, measured on the engines at hand."""
     # Well within the limits, where none of them acts.
     q, v = state_within_limits(model, np.random.default_rng([seed, 2]))
     rows: list[Omission] = []
-    mujoco = made.get(MUJOCO)
+    mujoco = engines.get(MUJOCO)
     if mujoco is not None:
         rows += _in_mujoco(model, mujoco, q, v)
-    if DERIVED in made:
+    if DERIVED in engines:
         rows.append(_coriolis(model, q, v))
     return tuple(rows)
 
@@ -55,14 +55,14 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
         "geometry": Variant(dyn, spheres=True),
         "contacts": Variant(dyn, ("CONTACT", "CONSTRAINT"), spheres=True),
     }
-    told = {
+    words = {
         "geometry": "meshes and shapes never opened (measured with one small sphere per body)",
         "contacts": "collision detection and contact forces (measured on those spheres)",
     }
     kept: dict[str, str] = {}
     needs = model.needs.as_dict()
     for need, flag, bits, what in _FLAGS:
-        told[need] = what
+        words[need] = what
         if need in ("damping", "springs", "gravity") and needs[flag]:
             kept[need] = "needed, so it is on"
             continue
@@ -90,7 +90,7 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
         chosen = need == "dry friction" and present
         note = "it is off in every engine, so that the smooth terms compare" if chosen else ""
         unchanged = chosen or changes[need] <= _UNCHANGED
-        rows.append(Omission(need, present, told[need], saved, spread, math.nan, changes[need], unchanged, note))
+        rows.append(Omission(need, present, words[need], saved, spread, math.nan, changes[need], unchanged, note))
     return rows
 
 

@@ -207,7 +207,7 @@ class Comparison(ResultTable):
     omissions : tuple of Omission
     refusals : tuple of Refusal
     setup : dict
-        Seconds each engine took to be made; the derivation works when first asked.
+        Seconds to build each engine; the derivation works when first called.
     versions : dict
     processor : str
     seconds : float
@@ -302,8 +302,8 @@ class Comparison(ResultTable):
     @property
     def not_compared(self) -> tuple[str, ...]:
         """Terms that no engine could give, as where M is singular; `refusals` has the reasons."""
-        given = {r.term for r in self.rows}
-        return tuple(dict.fromkeys(r.term for r in self.refusals if r.engine and r.term and r.term not in given))
+        known = {r.term for r in self.rows}
+        return tuple(dict.fromkeys(r.term for r in self.refusals if r.engine and r.term and r.term not in known))
 
     @property
     def digits(self) -> float:

@@ -39,12 +39,11 @@ _FEWEST: Final = 50
 _PAIRS: Final = (("rk4", "mujoco_rk4"), ("semi_implicit_euler", "mujoco_euler"))
 
 
-def rollouts(model: Model, made: Mapping[str, Dynamics], seed: int, note: str) -> tuple[RolloutRow, ...]:
+def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str) -> tuple[RolloutRow, ...]:
     """Compare trajectories of 1 s at 1 ms, for Runge–Kutta 4 and semi-implicit Euler.
 
     Nothing is compared unless MuJoCo and another engine hold the model.
     """
-    engines = dict(made)
     ours_on = [name for name in (PINOCCHIO, DERIVED) if name in engines]
     if MUJOCO not in engines or not ours_on:
         return ()

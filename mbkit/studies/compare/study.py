@@ -18,6 +18,7 @@ from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalEr
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import results
+from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import with_values
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.omissions import omissions
@@ -38,7 +39,6 @@ _EPS: Final = float(np.finfo(float).eps)
 _ROUNDINGS: Final = 4.0
 #: Where a warning of a known defect goes on with the joints of this model.
 _AS_IT_IS: Final = "; returned as it is"
-Progress = Callable[[float, str], None]
 
 
 class Judge:
@@ -51,14 +51,14 @@ class Judge:
     def __init__(
         self,
         model: Model,
-        made: dict[str, Dynamics],
+        engines: dict[str, Dynamics],
         oracle: OracleDynamics,
         at: States,
         tolerance: float,
         defects: Mapping[str, str] | None = None,
     ) -> None:
-        self.model, self.made, self.oracle = model, made, oracle
-        #: What engines announced when they were made, of all their terms.
+        self.model, self.engines, self.oracle = model, engines, oracle
+        #: Defects that engines announced when they were built.
         self.defects = defects or {}
         self.at, self.tolerance = at, tolerance
         self.refusals: list[Refusal] = []
@@ -84,7 +84,7 @@ class Judge:
         def refuse(engine: str, error: MbkitError) -> None:
             self._refuse(engine, "power balance", error)
 
-        for name, errors in power_rows(self.made, self.oracle, self.at, self.scales, refuse):
+        for name, errors in power_rows(self.engines, self.oracle, self.at, self.scales, refuse):
             rows.append(self._row("power balance", name, errors, (np.nan, np.nan), self.defects.get(name, "")))
         return rows, self.refusals
 
@@ -92,7 +92,7 @@ class Judge:
         values: dict[str, Array] = {}
         defects: dict[str, str] = {}
         broken: dict[str, str] = {}
-        for name, dyn in self.made.items():
+        for name, dyn in self.engines.items():
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
                 try:
@@ -108,9 +108,13 @@ class Judge:
             return []
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KnownDefectWarning)
-            times = interleaved({name: term.single(self.made[name], self.at) for name in values})
+            times = interleaved({name: term.single(self.engines[name], self.at) for name in values})
         reference, high, low = self._reference(term, values)
-        rows = [self._broken_row(term.name, name, reference, why) for name, why in broken.items()]
+        worst, nowhere, untimed = (np.inf,) * 4, ("", (), ()), (np.nan, np.nan)
+        rows = [
+            Row(term.name, name, reference, "", *worst, len(self.at.q), *nowhere, *untimed, False, why, self.tolerance)
+            for name, why in broken.items()
+        ]
         for name, value in values.items():
             errors = term.errors((value - high) - low, high, self.scales)
             allowed = self._allowed(term, name, errors)
@@ -128,36 +132,14 @@ class Judge:
         return name, values[name], np.zeros_like(values[name])
 
     def _refuse(self, engine: str, term: str, error: MbkitError) -> None:
-        self.refusals.append(Refusal(engine, term, str(error).removeprefix(f"{engine}: ")))
-
-    def _broken_row(self, term: str, engine: str, reference: str, why: str) -> Row:
-        """Return the failure of an engine that gives no number where another gives one."""
-        return Row(
-            term=term,
-            engine=engine,
-            reference=reference,
-            joint="",
-            max_abs=float("inf"),
-            relative=float("inf"),
-            per_joint=float("inf"),
-            median=float("inf"),
-            samples=len(self.at.q),
-            worst_kind="",
-            worst_q=(),
-            worst_v=(),
-            ns=float("nan"),
-            ns_spread=float("nan"),
-            passed=False,
-            reason=why,
-            allowed=self.tolerance,
-        )
+        self.refusals.append(Refusal.of(engine, error, term))
 
     def _allowed(self, term: Term, engine: str, errors: Errors) -> float:
         """Return the tolerance, or the engine's own bound where its formula cannot do better."""
         # Accelerations are M's solution: they cannot be better than M.
         if term.quantity not in ("mass_matrix", "forward_dynamics") or errors.relative.max() <= self.tolerance:
             return self.tolerance
-        amplified = self.made[engine].mass_matrix_rounding(self.at.q[errors.worst])
+        amplified = self.engines[engine].mass_matrix_rounding(self.at.q[errors.worst])
         return self.tolerance if amplified is None else max(self.tolerance, _ROUNDINGS * _EPS * float(amplified))
 
     def _row(
@@ -263,29 +245,29 @@ def compare(
     begun = time.perf_counter()
     names = _checked(model, engines, samples, seed, tolerance)
     model = with_values(model)
-    tell = progress or _silent
-    made, refusals, setup, defects = _made(model, names, tell, compile=not terms_only)
+    tell = progress or silent
+    built, refusals, setup, defects = _build(model, names, tell, compile=not terms_only)
     reference = ""
     rows: list[Row] = []
     # What was written as energies has the derivation and its 34 digits, and no other engine.
-    enough = len(made) > 1 or (bool(made) and not model.has_bodies)
+    enough = len(built) > 1 or (bool(built) and not model.has_bodies)
     if enough:
         tell(0.05, "34 digits")
         reference = OracleDynamics.engine
-        study = Judge(model, made, OracleDynamics(model), states(model, samples, seed), tolerance, defects)
+        study = Judge(model, built, OracleDynamics(model), states(model, samples, seed), tolerance, defects)
         rows, refused = study.rows(lambda f, text: tell(0.05 + f * (0.85 if terms_only else 0.35), text))
         refusals += refused
     result: dict[str, Any] = {}
     # Without mass nothing can be simulated.
     massless = any(r.term == "M" and r.zero for r in rows)
     if enough and not terms_only and not massless:
-        result, refused = _beyond_terms(model, made, seed, tell)
+        result, refused = _beyond_terms(model, built, seed, tell)
         refusals += refused
     tell(1.0, "done")
     return Comparison(
         model=model.name,
         facts=model_info(model),
-        engines=tuple(made),
+        engines=tuple(built),
         reference=reference,
         samples=samples,
         seed=seed,
@@ -301,15 +283,15 @@ def compare(
 
 
 def _beyond_terms(
-    model: Model, made: dict[str, Dynamics], seed: int, tell: Progress
+    model: Model, engines: dict[str, Dynamics], seed: int, tell: Progress
 ) -> tuple[dict[str, Any], list[Refusal]]:
-    """Return rollouts, run times and omissions; what fails is told, and loses nothing else."""
+    """Return rollouts, run times and omissions; what fails is a refusal, and loses nothing else."""
     result: dict[str, Any] = {}
     refusals: list[Refusal] = []
-    moving, movers, note = model, made, ""
+    moving, movers, note = model, engines, ""
     if model.layout.reduced:
         moving, note = free_of_mimic(model), "mimic joints free"
-        movers, _, _, _ = _made(moving, tuple(made), _silent, compile=True)
+        movers, _, _, _ = _build(moving, tuple(engines), silent, compile=True)
 
     def study(fraction: float, name: str, call: Callable[[], None]) -> None:
         tell(fraction, name)
@@ -335,17 +317,13 @@ def _beyond_terms(
         )
 
     def run_omissions() -> None:
-        result["omissions"] = omissions(model, made, seed)
+        result["omissions"] = omissions(model, engines, seed)
 
     study(0.42, "rollouts", run_rollouts)
     study(0.6, "error against run time", run_times)
     if model.has_bodies:
         study(0.9, "what was left out", run_omissions)
     return result, refusals
-
-
-def _silent(_fraction: float, _text: str) -> None:
-    """Tell nobody."""
 
 
 def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tolerance: float) -> tuple[str, ...]:
@@ -370,7 +348,7 @@ def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tole
     return unique
 
 
-def _made(
+def _build(
     model: Model,
     names: Sequence[str],
     tell: Progress,
@@ -378,7 +356,7 @@ def _made(
     compile: bool,  # noqa: A002  # the engine's own word
 ) -> tuple[dict[str, Dynamics], list[Refusal], dict[str, float], dict[str, str]]:
     """Return the engines, who refuses the model, the time each took, and the known defects announced."""
-    made, refusals, setup, defects = {}, [], {}, {}
+    engines, refusals, setup, defects = {}, [], {}, {}
     for k, name in enumerate(names):
         tell(0.05 * k / len(names), f"building {name}")
         start = time.perf_counter()
@@ -386,12 +364,12 @@ def _made(
             warnings.simplefilter("always", KnownDefectWarning)
             try:
                 # A few dozen states are no reason to compile; run times are.
-                made[name] = dynamics(model, name, **({} if compile else find_engine(name).brief))
+                engines[name] = dynamics(model, name, **({} if compile else find_engine(name).brief))
             except MbkitError as error:
-                refusals.append(Refusal(name, "", str(error).removeprefix(f"{name}: ")))
+                refusals.append(Refusal.of(name, error))
         setup[name] = time.perf_counter() - start
         defects[name] = announced(caught)
         for w in caught:
             if not issubclass(w.category, KnownDefectWarning):
                 warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
-    return made, refusals, setup, defects
+    return engines, refusals, setup, defects

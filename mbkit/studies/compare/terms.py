@@ -72,9 +72,9 @@ def states(model: Model, samples: int, seed: int) -> States:
             ("near singular", _near_singular(model, rng, few)),
         ]
     )
-    for kind, made in special:
-        parts.append(made)
-        kinds += [kind] * len(made)
+    for kind, drawn in special:
+        parts.append(drawn)
+        kinds += [kind] * len(drawn)
     q = np.concatenate(parts)
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
     a, tau = rng.standard_normal((2, len(q), model.nv))
@@ -161,14 +161,14 @@ TERMS: Final = (
 
 
 def power_rows(
-    made: Mapping[str, Dynamics],
+    engines: Mapping[str, Dynamics],
     oracle: OracleDynamics,
     at: States,
     scales: Scales,
     refuse: Callable[[str, MbkitError], None],
 ) -> Iterator[tuple[str, Errors]]:
-    """Yield (engine, errors) for every engine; what cannot be had is told to `refuse`."""
-    for name, dyn in made.items():
+    """Yield (engine, errors) for every engine; an engine that raises is handed to `refuse`."""
+    for name, dyn in engines.items():
         try:
             a = dyn.forward_dynamics(at.q, at.v, at.tau)
             damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))

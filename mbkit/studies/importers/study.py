@@ -144,8 +144,8 @@ def _tree(pairs: list[tuple[Joint, Joint]], near: Tolerances) -> list[Stage]:
     ]
 
 
-def _mimics(reference: Model, made: Model, matching: Matching) -> Stage:
-    theirs = {j.name: j.mimic for j in made.joints}
+def _mimics(reference: Model, imported: Model, matching: Matching) -> Stage:
+    theirs = {j.name: j.mimic for j in imported.joints}
     lost = [
         j.name for j in reference.joints if j.mimic is not None and theirs.get(matching.to_b.get(j.name, "")) is None
     ]
@@ -233,8 +233,7 @@ def _asked(reference: Model, imported: Imported, names: Mapping[str, str], at: S
     if q.shape != at.q.shape or v.shape != at.v.shape:
         return {}
     q[:, q_order], v[:, v_order] = at.q, at.v
-    made = imported.terms(q, v, ())
-    return {k: _ordered(x, v_order) for k, x in made.items()}
+    return {k: _ordered(x, v_order) for k, x in imported.terms(q, v, ()).items()}
 
 
 def _ordered(x: Array, order: np.ndarray) -> Array:
@@ -265,25 +264,25 @@ class OwnTerms:
         return tuple(f"{says}; in no term while controls are zero" for says in self.idle)
 
 
-def own_terms(engine: str, made: Imported, samples: int, seed: int, tolerance: float) -> OwnTerms:
+def own_terms(engine: str, imported: Imported, samples: int, seed: int, tolerance: float) -> OwnTerms:
     """Measure what acts in an importer's model beside its bodies and joints.
 
     Parameters
     ----------
     engine : str
-    made : Imported
+    imported : Imported
     samples, seed : int
         Random states.
     tolerance : float
         Relative difference of a term that counts.
     """
-    at = states_of(made.model, samples, seed)
-    owners = [j.name for j in made.model.independent_joints for _ in range(j.type.nv)]
-    whole, described = made.terms(at.q, at.v, ()), model_terms(made.model, at)
-    bare = made.terms(at.q, at.v, tuple(x.key for x in made.beside)) if made.beside else whole
+    at = states_of(imported.model, samples, seed)
+    owners = [j.name for j in imported.model.independent_joints for _ in range(j.type.nv)]
+    whole, described = imported.terms(at.q, at.v, ()), model_terms(imported.model, at)
+    bare = imported.terms(at.q, at.v, tuple(x.key for x in imported.beside)) if imported.beside else whole
     causes, idle = [], []
-    for extra in made.beside:
-        without = made.terms(at.q, at.v, (extra.key,))
+    for extra in imported.beside:
+        without = imported.terms(at.q, at.v, (extra.key,))
         part = {} if extra.without is None else _less(described, model_terms(extra.without, at))
         bare = _with(bare, part)
         if gaps(whole, without, at.v, owners).worst <= tolerance:
@@ -350,7 +349,7 @@ def compare_parsers(
     The importers are given the file without meshes and textures, so that nothing else is opened but what
     an MJCF includes and the meshes from which its bodies take their inertia; boxes, cylinders and spheres
     stay. Each runs in a process of its own, kept until this one ends: a crash or an endless loop there is
-    told like any other refusal.
+    reported like any other refusal.
 
     What each made is compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses,
     centres of mass, inertias, armature, damping, friction, limits, and M, g, nle and passive by joint name,
@@ -403,12 +402,12 @@ def compare_parsers(
     with one_at_a_time():
         read, refused = _read(stripped, engines, floating_base, seconds)
         reference, label, faults = _reference(stripped, read, floating_base)
-        for engine, made in read.items():
+        for engine, imported in read.items():
             if reference is None or engine == label:
-                parsed[engine] = Parsed(engine, _version(engine), notes=_alone(made))
+                parsed[engine] = Parsed(engine, _version(engine), notes=_alone(imported))
                 continue
             try:
-                parsed[engine] = _compared(engine, made, reference, label, samples, seed, tolerance)
+                parsed[engine] = _compared(engine, imported, reference, label, samples, seed, tolerance)
             except ImporterError as error:
                 refused[engine] = str(error)
     parsed |= {engine: Parsed(engine, _version(engine), why) for engine, why in refused.items()}
@@ -457,23 +456,23 @@ def _read(
 
 
 def _compared(
-    engine: str, made: Imported, reference: Model | Imported, label: str, samples: int, seed: int, tolerance: float
+    engine: str, imported: Imported, reference: Model | Imported, label: str, samples: int, seed: int, tolerance: float
 ) -> Parsed:
     """Return what an importer made, against the reference."""
     described = reference.model if isinstance(reference, Imported) else reference
-    found = explain(described, made.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine))
-    compared = stages(reference, made, samples, seed, tolerance)
-    own = own_terms(engine, made, samples, seed, tolerance)
+    found = explain(described, imported.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine))
+    compared = stages(reference, imported, samples, seed, tolerance)
+    own = own_terms(engine, imported, samples, seed, tolerance)
     if isinstance(reference, Imported):
         theirs = own_terms(label, reference, samples, seed, tolerance)
         own = OwnTerms((*theirs.causes, *own.causes), own.idle, own.held and theirs.held)
-    notes = (*found.notes, *made.notes, *own.notes)
+    notes = (*found.notes, *imported.notes, *own.notes)
     return Parsed(engine, _version(engine), "", compared, measured(found, compared, own), notes)
 
 
-def _alone(made: Imported) -> tuple[str, ...]:
+def _alone(imported: Imported) -> tuple[str, ...]:
     """Return the notes on an importer that is compared with nothing."""
-    return (*made.notes, *(x.says for x in made.beside))
+    return (*imported.notes, *(x.says for x in imported.beside))
 
 
 def written(source: str | os.PathLike[str]) -> Model:
@@ -522,8 +521,8 @@ def _reference(
 def _notes(stripped: Stripped) -> list[str]:
     out = []
     if stripped.gone:
-        told = ", ".join(f"{n} {tag}" for tag, n in stripped.gone)
-        out.append(f"taken out before, because they name other files or say nothing of the motion: {told}")
+        removed = ", ".join(f"{n} {tag}" for tag, n in stripped.gone)
+        out.append(f"taken out before, because they name other files or say nothing of the motion: {removed}")
     if stripped.meshes:
         out.append(f"opened, because bodies take their inertia from them: {', '.join(stripped.meshes)}")
     out += stripped.unread
