@@ -569,3 +569,14 @@ def test_what_takes_a_description_or_an_engine_says_where_paper_has_it(study) ->
         study(lag, **more)
     with pytest.raises(InputError, match=r"dyn: expected a Dynamics, got Lagrangian; its \.dynamics\(\) makes one"):
         mb.simulate(lag, [0.1], [0.0], 1.0)
+
+
+def test_models_of_bodies_and_of_energies_answer_the_same_questions():
+    lag, robot = mb.lagrangian.systems.driven_pendulum(), mb.catalog.pendulum()
+    energies = lag.model
+    for model, expected in ((energies, (False, "t", None, False)), (robot, (True, None, None, False))):
+        assert (model.has_bodies, model.time_parameter, model.velocity_map, model.constrained) == expected
+        # Earlier names.
+        assert (model.clock, model.rates, model.written is None) == (*expected[1:3], expected[0])
+    assert robot.energy_equations is None
+    assert energies.energy_equations("literal").form is lag

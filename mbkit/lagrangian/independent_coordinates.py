@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,20 +240,10 @@ class EmbeddedDynamics(Dynamics):
     def _potential_energy(self, q: Array) -> Array:
         return per_sample(lambda u: np.asarray(self._manifold.dyn.potential_energy(self.configuration(u))), q)
 
-    def _gravity(self, q: Array) -> Array:
+    def _refused(self, *args: Any, **named: Any) -> Array:
         raise NotImplementedError
 
-    def _nle(self, q: Array, v: Array) -> Array:
-        raise NotImplementedError
-
-    def _passive(self, q: Array, v: Array) -> Array:
-        raise NotImplementedError
-
-    def _pose(self, q: Array, frame: str) -> Array:
-        raise NotImplementedError
-
-    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
-        raise NotImplementedError
+    _gravity = _nle = _passive = _pose = _jacobian = _refused
 
 
 #: A pose is near a singular one where the smallest singular value of J, or of the

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import mpmath
 import numpy as np
@@ -246,14 +246,6 @@ _SMALL: Final = 24
 _LONG: Final = 250
 
 
-class _Inverse(Protocol):
-    """The inverse of one block of M."""
-
-    def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr: ...
-
-    def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]: ...
-
-
 class Squares:
     """The inverse of a symmetric positive definite matrix, each set of coupled coordinates by itself.
 
@@ -270,7 +262,7 @@ class Squares:
     """
 
     def __init__(self, M: Any, what: str) -> None:
-        self._blocks: list[tuple[list[int], _Inverse]] = []
+        self._blocks: list[tuple[list[int], _Eliminated | _Cofactors]] = []
         for block in blocks(M):
             part = sp.ImmutableMatrix(M.extract(block, block))
             p = sp.symbols(f"p0:{len(block)}", cls=sp.Dummy)
@@ -291,10 +283,10 @@ class Squares:
         return out
 
 
-def _tried(M: sp.ImmutableMatrix, what: str) -> list[_Inverse]:
+def _tried(M: sp.ImmutableMatrix, what: str) -> list[_Eliminated | _Cofactors]:
     n = M.shape[0]
     few = n <= _TRIED and (n < _TRIED or sum(x.count_ops() for x in M) <= _SMALL)
-    out: list[_Inverse] = []
+    out: list[_Eliminated | _Cofactors] = []
     for order in permutations(range(n)) if few else (None,):
         with suppress(_NoPivotError):
             out.append(_Eliminated(M, order))
