@@ -91,16 +91,16 @@ class Compiled:
     def call_checked(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
         """Return the results, and whether all that was read and written is finite."""
         single = arguments[0].ndim == 1
-        given = [x[None] for x in arguments] if single else list(arguments)
-        n = given[0].shape[0]
-        for i, (x, size) in enumerate(zip(given, self.inputs, strict=True)):
+        args = [x[None] for x in arguments] if single else list(arguments)
+        n = args[0].shape[0]
+        for i, (x, size) in enumerate(zip(args, self.inputs, strict=True)):
             if x.shape != (n, size):
                 raise ValueError(f"argument {i}: expected ({n}, {size}), got {x.shape}")
-        given = [_readable(x) for x in given]
-        major = n > 1 and all(x.strides[0] == 8 for x in given if x.shape[1] > 1)
+        args = [_readable(x) for x in args]
+        major = n > 1 and all(x.strides[0] == 8 for x in args if x.shape[1] > 1)
         sizes = [rows * columns for rows, columns in self.shapes]
         flat = [np.empty((size, n)).T if major else np.empty((n, size)) for size in sizes]
-        finite = self.run(given, flat, threads)
+        finite = self.run(args, flat, threads)
         results = [
             (x.T.reshape(r, c, n).transpose(2, 0, 1) if major else x.reshape(n, r, c))
             for x, (r, c) in zip(flat, self.shapes, strict=True)

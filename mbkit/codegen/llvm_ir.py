@@ -231,25 +231,25 @@ def library(width: int, *programs: Program) -> str:
 
 def call(text: Text, name: str, arguments: list[str]) -> str:
     """Append a call of one of `CALLS`, and return the name of its result."""
-    given = ", ".join(f"{text.vector} {a}" for a in arguments)
-    return text.put(f"call {text.vector} @mbkit_{name}({given})")
+    operands = ", ".join(f"{text.vector} {a}" for a in arguments)
+    return text.put(f"call {text.vector} @mbkit_{name}({operands})")
 
 
 def _lanes(width: int, name: str, arguments: int) -> str:
     t = Text(width)
-    V, made = t.vector, "poison"
+    V, result = t.vector, "poison"
     for lane in range(width):
         each = [t.put(f"extractelement {V} %x{i}, i64 {lane}") for i in range(arguments)]
         value = t.put(f"call double @{name}({', '.join(f'double {x}' for x in each)})")
-        made = t.put(f"insertelement {V} {made}, double {value}, i64 {lane}")
-    taken = ", ".join(f"{V} %x{i}" for i in range(arguments))
-    told = "nounwind willreturn memory(none)"
+        result = t.put(f"insertelement {V} {result}, double {value}, i64 {lane}")
+    parameters = ", ".join(f"{V} %x{i}" for i in range(arguments))
+    attributes = "nounwind willreturn memory(none)"
     body = "\n".join(t.lines)
     return f"""
-declare double @{name}({", ".join(["double"] * arguments)}) {told}
+declare double @{name}({", ".join(["double"] * arguments)}) {attributes}
 
-define internal {V} @mbkit_{name}({taken}) noinline {told} {{
+define internal {V} @mbkit_{name}({parameters}) noinline {attributes} {{
 {body}
-  ret {V} {made}
+  ret {V} {result}
 }}
 """

@@ -135,7 +135,7 @@ def program(function: ca.Function) -> Program:
     """
     where: dict[int, int] = {}
     operations: list[Operation] = []
-    made: _Entry
+    entry: _Entry
     known: dict[_Entry, int] = {}
     shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
     outputs = [np.full(rows * columns, -1, dtype=np.intp) for rows, columns in shapes]
@@ -143,28 +143,28 @@ def program(function: ca.Function) -> Program:
         raise ValueError(f"{function.name()}: expected dense outputs; casadi.densify makes them")
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
-        out, given = function.instruction_output(k), function.instruction_input(k)
+        out, args = function.instruction_output(k), function.instruction_input(k)
         if code == ca.OP_OUTPUT:
-            outputs[out[0]][out[1]] = where[given[0]]
+            outputs[out[0]][out[1]] = where[args[0]]
             continue
         if code == ca.OP_INPUT:
-            made = ("input", (given[0], given[1]), 0.0)
+            entry = ("input", (args[0], args[1]), 0.0)
         elif code == ca.OP_CONST:
-            made = ("const", (), function.instruction_constant(k))
+            entry = ("const", (), function.instruction_constant(k))
         elif code == ca.OP_ASSIGN:
-            where[out[0]] = where[given[0]]
+            where[out[0]] = where[args[0]]
             continue
         elif code in _UNARY:
             # CasADi names the argument of some of them twice.
-            made = (_UNARY[code], (where[given[0]],), 0.0)
+            entry = (_UNARY[code], (where[args[0]],), 0.0)
         elif code in _BINARY:
-            made = (_BINARY[code], (where[given[0]], where[given[1]]), 0.0)
+            entry = (_BINARY[code], (where[args[0]], where[args[1]]), 0.0)
         else:
             raise UnsupportedError(_unknown(function, code))
         # CasADi has one zero, so that equal constants are the same.
-        place = where[out[0]] = known.setdefault(made, len(operations))
+        place = where[out[0]] = known.setdefault(entry, len(operations))
         if place == len(operations):
-            operations.append(Operation(*made))
+            operations.append(Operation(*entry))
     return Program(
         inputs=tuple(function.size1_in(i) for i in range(function.n_in())),
         shapes=shapes,

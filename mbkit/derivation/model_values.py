@@ -23,10 +23,9 @@ __all__ = ["Constants", "Scalar", "Values", "cos", "is_zero", "scalar", "sin"]
 
 # Expressions whose arithmetic is quick to write down, entry by entry.
 #
-# CasADi's operators first look for what their operands could be converted to, some
-# 15 µs each; `SX.binary` is told, and takes 2. A tree's kinematics are tens of thousands
-# of them. The functions are those that a joint's kind asks for: this module stands for
-# CasADi there.
+# CasADi's operators first search a conversion of their operands, some 15 µs each;
+# `SX.binary` takes 2. A tree's kinematics are tens of thousands of them. This module
+# replaces CasADi in the formulas of the joint types.
 
 
 class Scalar(ca.SX):
