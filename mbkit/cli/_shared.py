@@ -1,17 +1,17 @@
-"""How every command ends: its status, and one message on stderr."""
+"""Options, output, messages and exit status of all commands."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import re
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
@@ -22,6 +22,8 @@ from mbkit.errors import InputError, MbkitError, MbkitWarning, OutputError, Unkn
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
+    from mbkit.report.document import Document
+
 __all__ = [
     "AGREE",
     "DIFFER",
@@ -30,17 +32,22 @@ __all__ = [
     "INTERRUPTED",
     "MISUSE",
     "Door",
-    "File",
     "check_engines",
     "console",
-    "force_option",
+    "engines_option",
     "in_options",
+    "json_option",
     "leave",
     "load_options",
-    "model_options",
+    "out_option",
+    "prepare",
+    "report_options",
+    "samples_option",
     "say",
+    "seed_option",
     "show",
     "split",
+    "stem_of",
     "tell",
 ]
 
@@ -54,17 +61,53 @@ _OPTIONS: Final = {
     "floating_base=True": "--floating-base",
 }
 
-#: Of commands that write results into a folder.
-force_option = click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
+Command = Callable[..., None]
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+
+
+def out_option(default: str) -> Callable[[Command], Command]:
+    """Return the option for the folder of results."""
+    return click.option(
+        "--out", default=default, show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
+    )
+
+
+def report_options(command: Command) -> Command:
+    """Add the options of commands that write a report: folder, and whether foreign files are replaced."""
+    force = click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
+    return out_option("mbkit-report")(force(command))
+
+
+def engines_option(default: str) -> Callable[[Command], Command]:
+    """Return the option for names of engines."""
+    return click.option("--engines", default=default, show_default=True, callback=split, metavar="A,B,...")
+
+
+def seed_option(text: str | None = None) -> Callable[[Command], Command]:
+    """Return the option for the seed of random states."""
+    return click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help=text)
+
+
+def samples_option(default: int) -> Callable[[Command], Command]:
+    """Return the option for the number of random states."""
+    kind = click.IntRange(min=1)
+    return click.option("--samples", default=default, show_default=True, type=kind, help="Random states.")
 
 
 def split(_ctx: click.Context, _parameter: click.Parameter, value: str) -> tuple[str, ...]:
-    """Return names that a comma parts."""
+    """Return names that are separated by commas."""
     return tuple(name.strip() for name in value.split(",") if name.strip())
 
 
-def model_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that say how a file or robot is read; `load_options` gathers them."""
+def load_options(command: Command) -> Command:
+    """Add the options for reading a file or robot; the command gets those that were set as `options`."""
+
+    @functools.wraps(command)
+    def with_options(*args: Any, floating_base: bool, mimic: str | None, nonphysical: str | None, **more: Any) -> None:
+        options = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical}
+        command(*args, options={k: v for k, v in options.items() if v is not None}, **more)
+
+    out: Command = with_options
     for option in (
         click.option(
             "--nonphysical", type=click.Choice(["error", "warn"]), help="Refuse impossible bodies, or take them."
@@ -74,14 +117,24 @@ def model_options(command: Callable[..., None]) -> Callable[..., None]:
         ),
         click.option("--floating-base", is_flag=True, help="Let the base of a file or robot move freely."),
     ):
-        command = option(command)
-    return command
+        out = option(out)
+    return out
 
 
-def load_options(floating_base: bool, mimic: str | None, nonphysical: str | None) -> dict[str, Any]:
-    """Return what was asked for as keyword arguments of `mbkit.load`."""
-    asked = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical}
-    return {k: v for k, v in asked.items() if v is not None}
+def prepare(out: Path, stem: str, *endings: str, force: bool) -> None:
+    """Raise before anything is computed if a result could not be written."""
+    from mbkit.report.output_folder import check_replaceable, check_writable
+
+    check_writable(out)
+    check_replaceable(out, *(f"{stem}.{ending}" for ending in endings), force=force)
+
+
+def stem_of(target: str, name: str) -> str:
+    """Return the stem of a target's files: the robot's name, because several robots' files hold the same name."""
+    from mbkit.load.robot_data import canonical
+    from mbkit.report.output_folder import file_stem
+
+    return file_stem(canonical(target) or name)
 
 
 def in_options(message: str) -> str:
@@ -184,58 +237,80 @@ def _one_line_warnings() -> Iterator[None]:
         yield
 
 
-# What a command prints and writes.
+# Output.
 
 
-@dataclass(frozen=True)
-class File:
-    """A file to write: what it is called on the terminal, its name, and how its content is made."""
+class Result(Protocol):
+    """A study's result as a command writes it."""
 
-    what: str
-    name: str
-    make: Callable[[], str | bytes]
+    def to_json(self) -> str:
+        """Return it as JSON."""
+        ...
 
 
 def show(
-    data: str, table: Callable[[], RenderableType], files: Sequence[File], out: Path, *, as_json: bool, force: bool
+    result: Result,
+    view: Callable[[], Document],
+    stem: str,
+    out: Path,
+    *,
+    as_json: bool,
+    force: bool,
+    table: Callable[[], str] | None = None,
+    figure: Callable[[], bytes] | None = None,
 ) -> bool:
-    """Write a result and print it; return whether all could be written.
+    """Write a result as files and print it; return whether all files could be written.
 
     Parameters
     ----------
-    data : str
-        The result as JSON, printed where that was asked for.
-    table : callable
-        Makes what is printed else.
-    files : sequence of File
-        Written in their order, so the dearest to lose first.
-    out : Path
-        The folder.
+    result : Result
+        Its JSON is written first, and printed with `as_json`.
+    view : callable
+        Returns the document for the terminal and the page.
+    stem, out : str, Path
+        Stem of the files' names, and their folder.
     as_json, force : bool
         Whether JSON is printed, and whether files are replaced that mbkit did not write.
+    table, figure : callable, optional
+        Return CSV and PNG.
     """
     from mbkit.report import output_folder
 
+    data = result.to_json()
+
+    def page() -> str:
+        from mbkit.report.page import render
+
+        return render(view(), data=f"{stem}.json", table=f"{stem}.csv" if table else "")
+
+    contents: dict[str, tuple[str, Callable[[], str | bytes] | None]] = {
+        "data": ("json", lambda: data + "\n"),
+        "table": ("csv", table),
+        "figure": ("png", figure),
+        "page": ("html", page),
+    }
     paths: dict[str, Path] = {}
     failure = ""
     try:
-        for file in files:
-            paths[file.what] = output_folder.write(out, file.name, file.make(), force=force)
+        for what, (ending, content) in contents.items():
+            if content is not None:
+                paths[what] = output_folder.write(out, f"{stem}.{ending}", content(), force=force)
     except OutputError as error:
         failure = str(error)
     try:
         if as_json:
             tell(data)
         else:
+            from mbkit.report import terminal as report
+
             screen = console()
-            screen.print(table())
+            screen.print(report.render(view()))
             if not failure:
-                told = "\n".join(f"{what} {path}" for what, path in reversed(paths.items()))
-                screen.print(told, markup=False, highlight=False, soft_wrap=True)
+                lines = "\n".join(f"{what} {path}" for what, path in reversed(paths.items()))
+                screen.print(lines, markup=False, highlight=False, soft_wrap=True)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Whoever reads may stop early (head); the verdict stands all the same, and
-        # what is still buffered must not complain at the end.
+        # The reader may stop early (head). The verdict stands, and the rest of the buffer must not fail at the end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if failure:
         say("error", f"{failure}; the result itself is printed on stdout")

@@ -17,10 +17,12 @@ from mbkit.cli._shared import (
     check_engines,
     console,
     in_options,
+    json_option,
     leave,
     load_options,
-    model_options,
+    samples_option,
     say,
+    seed_option,
     split,
     tell,
 )
@@ -45,9 +47,9 @@ def baseline() -> None:
 @click.argument("targets", metavar="TARGET...", nargs=-1, required=True)
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--engines", callback=split, default="", metavar="A,B,...", help="[default: all that are installed]")
-@click.option("--samples", default=2, show_default=True, type=click.IntRange(min=1), help="Random states.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
-@model_options
+@samples_option(2)
+@seed_option()
+@load_options
 @click.option("--force", is_flag=True, help="Replace a file that is another robot's baseline, or none.")
 def record(
     targets: tuple[str, ...],
@@ -55,9 +57,7 @@ def record(
     engines: tuple[str, ...],
     samples: int,
     seed: int,
-    floating_base: bool,
-    mimic: str | None,
-    nonphysical: str | None,
+    options: dict[str, Any],
     force: bool,
 ) -> None:
     """Record each TARGET in PATH: a .toml file, or a folder that gets a file for each.
@@ -70,7 +70,6 @@ def record(
         raise click.UsageError(f"{len(targets)} targets want a folder, and {path} is a file's name")
     if engines:
         check_engines(engines, least=1)
-    options = load_options(floating_base, mimic, nonphysical)
     files = {target: path if path.suffix == ".toml" else path / _name(target) for target in targets}
     for file in files.values():
         alike = [t for t, other in files.items() if other == file]
@@ -114,16 +113,14 @@ def _record_one(
 )
 @click.option("--strict", is_flag=True, help="Fail where an engine that was recorded is not installed.")
 @click.option("--rebaseline", is_flag=True, help="Tell what differs, and record it anew.")
-@model_options
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@load_options
+@json_option
 def check(
     paths: tuple[Path, ...],
     target: str | None,
     strict: bool,
     rebaseline: bool,
-    floating_base: bool,
-    mimic: str | None,
-    nonphysical: str | None,
+    options: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Hold robots and engines against what was recorded in each PATH, a file or a folder of them.
@@ -137,7 +134,6 @@ def check(
     files = _files(paths)
     if target is not None and len(files) != 1:
         raise click.UsageError(f"--target goes with one file, and there are {len(files)}")
-    options = load_options(floating_base, mimic, nonphysical)
     if options and target is None:
         raise click.UsageError("options of loading go with --target; what was recorded is loaded as it was then")
     statuses = []
@@ -209,7 +205,7 @@ def _confirmed(file: Path) -> bool:
 @baseline.command()
 @click.argument("path_a", type=click.Path(path_type=Path))
 @click.argument("path_b", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@json_option
 def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     """Say what PATH_B has that PATH_A has not: parameters, numbers, versions. Nothing is computed.
 

@@ -15,21 +15,22 @@ from mbkit.cli._shared import (
     DONE,
     INTERRUPTED,
     MISUSE,
-    File,
     check_engines,
-    force_option,
+    engines_option,
+    json_option,
     leave,
     load_options,
-    model_options,
+    prepare,
+    report_options,
     say,
+    seed_option,
     show,
     split,
+    stem_of,
 )
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
-    from mbkit.studies.work_precision.result import WorkPrecision
+    pass
 
 __all__ = ["bench"]
 
@@ -49,20 +50,17 @@ _USUAL: Final[dict[str, Any]] = {"repeats": 5, "work": None}
 
 @click.command()
 @click.argument("target")
-@click.option("--engines", default="pinocchio,lagrangian,mujoco", show_default=True, callback=split, metavar="A,B,...")
+@engines_option("pinocchio,lagrangian,mujoco")
 @click.option("--methods", default="", callback=split, metavar="A,B,...", help="Integrators.  [default: all there are]")
 @click.option("--duration", default=1.0, show_default=True, type=float, help="Horizon of the motion, s.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Of the start.")
+@seed_option("Of the start.")
 @click.option("--repeats", type=click.IntRange(min=1), help="Timings of each setting.  [default: 5; quick: 3]")
 @click.option("--seconds", type=float, help="Of the processor, at the most, s.  [default: work is bounded, not time]")
 @click.option("--jobs", type=click.IntRange(min=1), help="Measure in so many processes: sooner done, times less sure.")
 @click.option("--quick", is_flag=True, help="Seven methods, fewer repetitions and shorter runs.")
-@model_options
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
-@click.option(
-    "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
-)
-@force_option
+@load_options
+@json_option
+@report_options
 def bench(
     target: str,
     engines: tuple[str, ...],
@@ -73,9 +71,7 @@ def bench(
     seconds: float | None,
     jobs: int | None,
     quick: bool,
-    floating_base: bool,
-    mimic: str | None,
-    nonphysical: str | None,
+    options: dict[str, Any],
     as_json: bool,
     out: Path,
     force: bool,
@@ -85,9 +81,9 @@ def bench(
     TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written.
     Ctrl-C ends the study early, and what is finished is written.
     """
-    from mbkit.load.robot_data import canonical
     from mbkit.methods.registry import METHODS, method_of
-    from mbkit.report.output_folder import check_replaceable, check_writable, file_stem
+    from mbkit.report import work_precision_view
+    from mbkit.report.output_folder import check_writable
     from mbkit.report.progress import Bar
     from mbkit.studies import work_precision
     from mbkit.studies._targets import model_of
@@ -97,10 +93,9 @@ def bench(
     for name in methods:
         method_of(name)
     check_writable(out)
-    model = model_of(target, load_options(floating_base, mimic, nonphysical))
-    # Several robots' files hold the same name.
-    stem = f"{file_stem(canonical(target) or model.name)}-bench"
-    check_replaceable(out, *(f"{stem}.{ending}" for ending in ("json", "csv", "png", "html")), force=force)
+    model = model_of(target, options)
+    stem = f"{stem_of(target, model.name)}-bench"
+    prepare(out, stem, "json", "csv", "png", "html", force=force)
     if quick and not methods:
         # Those that none of the engines has would be refused as asked for in error.
         methods = tuple(m for m in _QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
@@ -121,7 +116,16 @@ def bench(
             )
     except InterruptedSweepError as stopped:
         result = stopped.result
-    written = _show(result, target, stem, out, as_json, force)
+    written = show(
+        result,
+        lambda: work_precision_view.view(result, target),
+        stem,
+        out,
+        as_json=as_json,
+        force=force,
+        table=result.to_csv,
+        figure=(lambda: work_precision_view.picture(result)) if result.front else None,
+    )
     if not result.complete:
         settings, curves = sum(len(c.points) for c in result.curves), len(result.curves)
         say("interrupted", f"{settings} settings of {curves} curve{'s' * (curves != 1)} were finished")
@@ -139,28 +143,3 @@ def _workers(jobs: int | None) -> Iterator[Executor | None]:
     else:
         with WorkerPool(jobs) as pool:
             yield pool
-
-
-def _show(result: WorkPrecision, target: str, stem: str, out: Path, as_json: bool, force: bool) -> bool:
-    def table() -> RenderableType:
-        from mbkit.report import terminal, work_precision_view
-
-        return terminal.render(work_precision_view.view(result, target))
-
-    def page() -> str:
-        from mbkit.report import work_precision_view
-        from mbkit.report.page import render
-
-        return render(work_precision_view.view(result, target), data=f"{stem}.json", table=f"{stem}.csv")
-
-    def picture() -> bytes:
-        from mbkit.report import work_precision_view
-
-        return work_precision_view.picture(result)
-
-    data = result.to_json()
-    files = [File("data", f"{stem}.json", lambda: data + "\n"), File("table", f"{stem}.csv", result.to_csv)]
-    if result.front:
-        files.append(File("figure", f"{stem}.png", picture))
-    files.append(File("page", f"{stem}.html", page))
-    return show(data, table, files, out, as_json=as_json, force=force)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,19 +16,22 @@ from mbkit.cli._shared import (
     DIFFER,
     INTERRUPTED,
     MISUSE,
-    File,
     check_engines,
-    force_option,
+    engines_option,
+    json_option,
     leave,
     load_options,
-    model_options,
+    prepare,
+    report_options,
+    samples_option,
     say,
+    seed_option,
     show,
-    split,
+    stem_of,
 )
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from mbkit.model import Model
 
 __all__ = ["check"]
 
@@ -35,27 +39,22 @@ __all__ = ["check"]
 @click.command()
 @click.argument("target", required=False)
 @click.option("--all", "everything", is_flag=True, help="Check every robot of example-robot-data.")
-@click.option("--engines", default="pinocchio,lagrangian,mujoco", show_default=True, callback=split, metavar="A,B,...")
-@click.option("--samples", default=64, show_default=True, type=click.IntRange(min=1), help="Random states.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
-@model_options
+@engines_option("pinocchio,lagrangian,mujoco")
+@samples_option(64)
+@seed_option()
+@load_options
 @click.option("--no-rollouts", is_flag=True, help="Terms only: no trajectories, run times or omissions.")
 @click.option("--own-parsers", is_flag=True, help="Compare what each engine's own importer makes of the file.")
 @click.option("--jobs", type=click.IntRange(min=1), help="With --all: processes.  [default: one per processor]")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
-@click.option(
-    "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
-)
-@force_option
+@json_option
+@report_options
 def check(
     target: str | None,
     everything: bool,
     engines: tuple[str, ...],
     samples: int,
     seed: int,
-    floating_base: bool,
-    mimic: Literal["reduce", "free"] | None,
-    nonphysical: Literal["error", "warn"] | None,
+    options: dict[str, Any],
     no_rollouts: bool,
     own_parsers: bool,
     jobs: int | None,
@@ -70,69 +69,48 @@ def check(
     it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves; --floating-base then lets
     its base go in all of them.
     """
-    if own_parsers and (everything or target is None or mimic or nonphysical or no_rollouts):
+    if own_parsers and (everything or target is None or no_rollouts or options.keys() - {"floating_base"}):
         raise click.UsageError(
             "--own-parsers takes one TARGET as it is written, and --floating-base, --seed, --json and --out"
         )
-    if everything and (target is not None or nonphysical is not None):
+    if everything and (target is not None or "nonphysical" in options):
         raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")
     if not everything and jobs is not None:
         raise click.UsageError("--jobs goes with --all")
     from mbkit.report.output_folder import check_writable
 
-    if own_parsers:
-        check_writable(out)
-        _check_parsers(str(target), floating_base, seed, as_json, out, force)
-        return
-    check_engines(engines, least=2)
+    if not own_parsers:
+        check_engines(engines, least=2)
     check_writable(out)
+    write = partial(show, out=out, as_json=as_json, force=force)
     if everything:
-        _check_all(engines, samples, seed, floating_base, mimic or "reduce", jobs, as_json, out, force)
-    elif target is not None:
-        options = load_options(floating_base, mimic, nonphysical)
-        _check_one(target, options, engines, samples, seed, no_rollouts, as_json, out, force)
-    else:
+        prepare(out, "all", "json", "html", force=force)
+        _check_all(write, jobs, {"engines": engines, "samples": samples, "seed": seed, **options})
+    elif target is None:
         raise click.UsageError("give a TARGET, such as panda, or --all; mbkit robots lists what there is")
+    elif own_parsers:
+        stem = f"{stem_of(target, Path(target).stem)}.importers"
+        prepare(out, stem, "json", "html", force=force)
+        _check_parsers(write, target, stem, seed, **options)
+    else:
+        from mbkit.studies._targets import model_of
+
+        model = model_of(target, options)
+        stem = stem_of(target, model.name)
+        prepare(out, stem, "json", "html", force=force)
+        _check_one(write, target, model, stem, engines, samples=samples, seed=seed, terms_only=no_rollouts)
 
 
 def _check_one(
-    target: str,
-    options: Mapping[str, Any],
-    engines: tuple[str, ...],
-    samples: int,
-    seed: int,
-    no_rollouts: bool,
-    as_json: bool,
-    out: Path,
-    force: bool,
+    write: Callable[..., bool], target: str, model: Model, stem: str, engines: tuple[str, ...], **settings: Any
 ) -> None:
-    from mbkit.load.robot_data import canonical
-    from mbkit.report.output_folder import check_replaceable, file_stem
+    from mbkit.report import compare_view
     from mbkit.report.progress import Bar
     from mbkit.studies import compare
-    from mbkit.studies._targets import model_of
 
-    model = model_of(target, options)
-    # Several robots' files hold the same name.
-    stem = file_stem(canonical(target) or model.name)
-    check_replaceable(out, f"{stem}.json", f"{stem}.html", force=force)
     with Bar(f"check {model.name}") as bar:
-        result = compare(model, engines, samples, seed, terms_only=no_rollouts, progress=bar)
-
-    def table() -> RenderableType:
-        from mbkit.report import compare_view, terminal
-
-        return terminal.render(compare_view.view(result, target))
-
-    def page() -> str:
-        from mbkit.report import compare_view
-        from mbkit.report.page import render
-
-        return render(compare_view.view(result, target), data=f"{stem}.json")
-
-    data = result.to_json()
-    files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
-    written = show(data, table, files, out, as_json=as_json, force=force)
+        result = compare(model, engines, **settings, progress=bar)
+    written = write(result, lambda: compare_view.view(result, target), stem)
     if not result.rows:
         say("error", f"{result.verdict}; two engines that hold the model are needed")
     elif result.nothing:
@@ -140,61 +118,33 @@ def _check_one(
     leave(MISUSE if not written or result.nothing else AGREE if result.passed else DIFFER)
 
 
-def _check_parsers(target: str, floating_base: bool, seed: int, as_json: bool, out: Path, force: bool) -> None:
-    from mbkit.load.robot_data import canonical
-    from mbkit.report.output_folder import check_replaceable, file_stem
+def _check_parsers(
+    write: Callable[..., bool], target: str, stem: str, seed: int, *, floating_base: bool = False
+) -> None:
+    from mbkit.report import explain_view
     from mbkit.studies.importers import compare_parsers
 
-    stem = f"{file_stem(canonical(target) or Path(target).stem)}.importers"
-    check_replaceable(out, f"{stem}.json", f"{stem}.html", force=force)
     result = compare_parsers(target, floating_base=floating_base, seed=seed)
-
-    def table() -> RenderableType:
-        from mbkit.report import explain_view, terminal
-
-        return terminal.render(explain_view.importers_view(result))
-
-    def page() -> str:
-        from mbkit.report import explain_view
-        from mbkit.report.page import render
-
-        return render(explain_view.importers_view(result), data=f"{stem}.json")
-
-    data = result.to_json()
-    files = (File("data", f"{stem}.json", lambda: data + "\n"), File("page", f"{stem}.html", page))
-    written = show(data, table, files, out, as_json=as_json, force=force)
+    written = write(result, lambda: explain_view.importers_view(result), stem)
     read = any(not p.refused for p in result.importers)
     if not read:
         say("error", f"no importer reads {target}")
     leave(MISUSE if not written or not read else AGREE if result.agree else DIFFER)
 
 
-def _check_all(
-    engines: tuple[str, ...],
-    samples: int,
-    seed: int,
-    floating_base: bool,
-    mimic: Literal["reduce", "free"],
-    jobs: int | None,
-    as_json: bool,
-    out: Path,
-    force: bool,
-) -> None:
+def _check_all(write: Callable[..., bool], jobs: int | None, settings: dict[str, Any]) -> None:
     from mbkit.load import robots
-    from mbkit.report.output_folder import check_replaceable
+    from mbkit.report import compare_view
     from mbkit.report.progress import Bar
     from mbkit.studies.compare.all_robots import RobotOutcome, Sweep, all_robots
 
-    check_replaceable(out, "all.json", "all.html", force=force)
     expected = len(robots())
     outcomes: list[RobotOutcome] = []
     begun = time.perf_counter()
     interrupted = False
     try:
         with _interrupt.keeping, Bar("check --all") as bar:
-            for outcome in all_robots(
-                engines=engines, samples=samples, seed=seed, floating_base=floating_base, mimic=mimic, jobs=jobs
-            ):
+            for outcome in all_robots(**settings, jobs=jobs):
                 outcomes.append(outcome)
                 bar(len(outcomes) / expected, f"{len(outcomes)}/{expected} {outcome.robot}: {outcome.status}")
     except KeyboardInterrupt:
@@ -202,26 +152,12 @@ def _check_all(
     result = Sweep(
         outcomes=tuple(sorted(outcomes, key=lambda o: o.robot)),
         expected=expected,
-        engines=engines,
-        samples=samples,
-        seed=seed,
+        engines=settings["engines"],
+        samples=settings["samples"],
+        seed=settings["seed"],
         seconds=time.perf_counter() - begun,
     )
-
-    def table() -> RenderableType:
-        from mbkit.report import compare_view, terminal
-
-        return terminal.render(compare_view.robots_view(result))
-
-    def page() -> str:
-        from mbkit.report import compare_view
-        from mbkit.report.page import render
-
-        return render(compare_view.robots_view(result), data="all.json")
-
-    data = result.to_json()
-    files = (File("data", "all.json", lambda: data + "\n"), File("page", "all.html", page))
-    written = show(data, table, files, out, as_json=as_json, force=force)
+    written = write(result, lambda: compare_view.robots_view(result), "all")
     if interrupted:
         say("interrupted", f"{len(outcomes)} of {expected} robots were finished")
     leave(INTERRUPTED if interrupted else MISUSE if not written else AGREE if result.passed else DIFFER)

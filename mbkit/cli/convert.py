@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from mbkit.cli._shared import load_options, model_options, say, tell
+from mbkit.cli._shared import load_options, say, tell
 from mbkit.errors import OutputError
 
 __all__ = ["convert"]
@@ -17,15 +18,13 @@ __all__ = ["convert"]
 @click.option("--to", "to", required=True, type=click.Choice(["mjcf", "urdf"]), help="The format.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="File to write.  [default: print]")
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
-@model_options
+@load_options
 def convert(
     target: str,
     to: str,
     output: Path | None,
     force: bool,
-    floating_base: bool,
-    mimic: str | None,
-    nonphysical: str | None,
+    options: dict[str, Any],
 ) -> None:
     """Write TARGET as MJCF or URDF: its motion alone, without geometry.
 
@@ -37,7 +36,7 @@ def convert(
 
     if output is not None and output.exists() and not force:
         raise OutputError(f"{output} is there already; choose another with -o, or replace it with --force")
-    made = converted(model_of(target, load_options(floating_base, mimic, nonphysical)), to)
+    made = converted(model_of(target, options), to)
     if output is None:
         tell(made.text.removesuffix("\n"))
     else:

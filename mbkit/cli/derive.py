@@ -10,7 +10,7 @@ import click
 
 from mbkit._escape import json_text
 from mbkit._version import __version__
-from mbkit.cli._shared import load_options, model_options, say, tell
+from mbkit.cli._shared import json_option, load_options, say, tell
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
@@ -26,7 +26,7 @@ _WIDTH: Final = 100
 @click.option("--latex", "form", flag_value="latex", help="Print LaTeX.")
 @click.option("--python", "form", flag_value="python", help="Print a Python module that needs NumPy only.")
 @click.option("--c", "form", flag_value="c", help="Write C99, as mbkit export does.")
-@model_options
+@load_options
 @click.option(
     "--snap",
     type=click.FloatRange(0.0, 1e-2),
@@ -34,15 +34,13 @@ _WIDTH: Final = 100
     show_default=True,
     help="To read: take entries of rotations this near to 0 or 1 as exact. --python and --c take them as they are.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@json_option
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to, instead of printing.")
 @click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
 def derive(
     system: str,
     form: str | None,
-    floating_base: bool,
-    mimic: str | None,
-    nonphysical: str | None,
+    options: dict[str, Any],
     snap: float,
     as_json: bool,
     out: Path | None,
@@ -61,7 +59,7 @@ def derive(
 
     if out is not None:
         check_writable(out)
-    target = _model(system, load_options(floating_base, mimic, nonphysical))
+    target = _model(system, options)
     if form == "c":
         _write_c(target, system, out or Path("mbkit-export"), force)
         return

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from mbkit.cli._shared import AGREE, DIFFER, check_engines, console, leave, load_options, model_options, split, tell
+from mbkit.cli._shared import (
+    AGREE,
+    DIFFER,
+    check_engines,
+    console,
+    json_option,
+    leave,
+    load_options,
+    samples_option,
+    seed_option,
+    split,
+    tell,
+)
 from mbkit.errors import MbkitError
 
 if TYPE_CHECKING:
@@ -23,13 +35,13 @@ __all__ = ["diff"]
 @click.option(
     "--engines", callback=split, default="", metavar="A,B", help="Two engines, to be compared on FIRST (and SECOND)."
 )
-@click.option("--samples", default=3, show_default=True, type=click.IntRange(min=1), help="Random states.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
+@samples_option(3)
+@seed_option()
 @click.option(
     "--tolerance", default=1e-9, show_default=True, type=click.FloatRange(min=0, min_open=True), help="What counts."
 )
-@model_options
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+@load_options
+@json_option
 def diff(
     first: str,
     second: str | None,
@@ -37,9 +49,7 @@ def diff(
     samples: int,
     seed: int,
     tolerance: float,
-    floating_base: bool,
-    mimic: Literal["reduce", "free"] | None,
-    nonphysical: Literal["error", "warn"] | None,
+    options: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Say why SECOND moves otherwise than FIRST, and name the causes.
@@ -56,7 +66,6 @@ def diff(
     from mbkit.engines import dynamics
     from mbkit.studies.explain import explain
 
-    options = load_options(floating_base, mimic, nonphysical)
     models = [_model(target, options) for target in ([first] if second is None else [first, second])]
     sides: list[Any] = list(models)
     if engines:

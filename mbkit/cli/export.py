@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from mbkit.cli._shared import load_options, model_options, tell
+from mbkit.cli._shared import json_option, load_options, out_option, tell
 
 __all__ = ["export"]
 
@@ -21,19 +21,15 @@ __all__ = ["export"]
     metavar="NAME",
     help="What to compute; may be repeated.  [default: inverse_dynamics, forward_dynamics]",
 )
-@model_options
+@load_options
 @click.option("--name", help="Prefix of every name in C, and stem of the files.  [default: the target's name]")
 @click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
-@click.option(
-    "--out", default="mbkit-export", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
-)
+@json_option
+@out_option("mbkit-export")
 def export(
     target: str,
     quantities: tuple[str, ...],
-    floating_base: bool,
-    mimic: str | None,
-    nonphysical: str | None,
+    options: dict[str, Any],
     name: str | None,
     force: bool,
     as_json: bool,
@@ -49,7 +45,7 @@ def export(
     from mbkit.load.robot_data import canonical
     from mbkit.studies._targets import model_of
 
-    model = model_of(target, load_options(floating_base, mimic, nonphysical))
+    model = model_of(target, options)
     # Several robots' files hold the same name.
     robot = canonical(target)
     stem = name if name is not None else c_identifier(robot) if robot is not None else None

@@ -12,11 +12,13 @@ from mbkit.cli._shared import (
     DONE,
     INTERRUPTED,
     MISUSE,
-    File,
     check_engines,
     console,
-    force_option,
+    engines_option,
+    json_option,
     leave,
+    prepare,
+    report_options,
     say,
     show,
     split,
@@ -24,9 +26,7 @@ from mbkit.cli._shared import (
 )
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
-    from mbkit.studies.stress.result import StressResult
+    pass
 
 __all__ = ["stress"]
 
@@ -34,7 +34,7 @@ __all__ = ["stress"]
 @click.command()
 @click.argument("cases", nargs=-1, metavar="[CASE]...")
 @click.option("--quick", is_flag=True, help="Fewer values and methods: under two minutes instead of thirty.")
-@click.option("--engines", default="lagrangian,pinocchio,mujoco", show_default=True, callback=split, metavar="A,B,...")
+@engines_option("lagrangian,pinocchio,mujoco")
 @click.option(
     "--methods",
     default="",
@@ -49,11 +49,8 @@ __all__ = ["stress"]
 @click.option("--budget", type=float, help="What the study may take, s.  [default: 1700; quick: 100]")
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes side by side.  [default: one a processor]")
 @click.option("--list", "listing", is_flag=True, help="List the cases, and end.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
-@click.option(
-    "--out", default="mbkit-report", show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
-)
-@force_option
+@json_option
+@report_options
 def stress(
     cases: tuple[str, ...],
     quick: bool,
@@ -76,7 +73,7 @@ def stress(
         _list(as_json=as_json)
         leave(DONE)
     from mbkit.methods.registry import method_of
-    from mbkit.report.output_folder import check_replaceable, check_writable
+    from mbkit.report import stress_view
     from mbkit.report.progress import Bar
     from mbkit.studies.stress.study import stress as study
     from mbkit.studies.work_precision.result import InterruptedSweepError
@@ -84,44 +81,24 @@ def stress(
     check_engines(engines, least=1)
     for name in methods:
         method_of(name)
-    check_writable(out)
     # One case has files of its own; several share theirs.
     stem = f"{cases[0]}-stress" if len(cases) == 1 else "stress"
-    check_replaceable(out, *(f"{stem}.{ending}" for ending in ("json", "csv", "html")), force=force)
+    prepare(out, stem, "json", "csv", "html", force=force)
     given: dict[str, Any] = {name: x for name, x in numbers.items() if x is not None}
     try:
         with _interrupt.keeping, Bar("stress") as bar:
             result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **given)
     except InterruptedSweepError as stopped:
         result = stopped.result
-    written = _show(result, stem, out, as_json=as_json, force=force)
+    written = show(
+        result, lambda: stress_view.view(result), stem, out, as_json=as_json, force=force, table=result.to_csv
+    )
     finished = sum(cell.end == "finished" for _, row in result.rows() for cell in row.cells)
     if not result.complete:
         say("interrupted", f"{finished} runs were finished")
     elif not finished:
         say("error", "no run was finished; the reasons are in the data")
     leave(INTERRUPTED if not result.complete else MISUSE if not written or not finished else DONE)
-
-
-def _show(result: StressResult, stem: str, out: Path, *, as_json: bool, force: bool) -> bool:
-
-    def table() -> RenderableType:
-        from mbkit.report import stress_view, terminal
-
-        return terminal.render(stress_view.view(result))
-
-    def page() -> str:
-        from mbkit.report.page import stress_page
-
-        return stress_page(result, data=f"{stem}.json", table=f"{stem}.csv")
-
-    data = result.to_json()
-    files = [
-        File("data", f"{stem}.json", lambda: data + "\n"),
-        File("table", f"{stem}.csv", result.to_csv),
-        File("page", f"{stem}.html", page),
-    ]
-    return show(data, table, files, out, as_json=as_json, force=force)
 
 
 def _list(*, as_json: bool) -> None:
