@@ -20,7 +20,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["GRACE", "INTERRUPTED", "at_end", "ending", "held", "keeping", "raise_again", "received"]
+__all__ = ["GRACE", "INTERRUPTED", "at_end", "ending", "keeping", "raise_again", "received", "uninterrupted"]
 
 #: Exit status of an interrupted command.
 INTERRUPTED = 130
@@ -45,7 +45,7 @@ class Section:
 
     def __exit__(self, *_: object) -> None:
         self.depth -= 1
-        if _interrupts.pending and not held.depth:
+        if _interrupts.pending and not uninterrupted.depth:
             _interrupts.pending = False
             raise KeyboardInterrupt
 
@@ -71,9 +71,9 @@ class _Interrupts:
         self.at_end: set[Callable[[], object]] = set()
 
 
-#: A file is being written, which is brought to its end first.
-held = Section()
-#: What is finished will be shown and written: the first Ctrl-C raises KeyboardInterrupt, and the caller goes on.
+#: A file is being written: Ctrl-C waits until it is whole.
+uninterrupted = Section()
+#: The finished part will be shown and written: the first Ctrl-C raises KeyboardInterrupt, and the caller goes on.
 keeping = Section()
 _interrupts = _Interrupts()
 
@@ -130,7 +130,7 @@ def _begin_end() -> None:
 
 def _end_later() -> None:
     time.sleep(GRACE)
-    while held.depth:
+    while uninterrupted.depth:
         time.sleep(0.01)
     _end()
 
@@ -146,7 +146,7 @@ def _raise(*_: object) -> None:
     _interrupts.count = max(_interrupts.count + 1, _interrupts.heard)
     if not keeping.depth or _interrupts.count > 1:
         _begin_end()
-    if held.depth:
+    if uninterrupted.depth:
         _interrupts.pending = True
     else:
         raise KeyboardInterrupt

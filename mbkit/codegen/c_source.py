@@ -328,7 +328,7 @@ class CSource:
         OutputError
             A file of other origin is in the way, or the folder cannot be written to.
         """
-        with _interrupt.held:
+        with _interrupt.uninterrupted:
             return self._write(Path(folder), force=force)
 
     def _write(self, folder: Path, *, force: bool) -> tuple[Path, Path]:

@@ -83,7 +83,7 @@ def write(folder: Path, name: str, content: str | bytes, *, force: bool = False)
     OutputError
         It cannot be written; or, unless `force` is given, a file is there that mbkit did not write.
     """
-    with _interrupt.held:
+    with _interrupt.uninterrupted:
         check_replaceable(folder, name, force=force)
         return _write(folder, name, content)
 

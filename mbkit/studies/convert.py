@@ -64,7 +64,7 @@ class Converted:
         """Write the text to a file, and return its path."""
         out = Path(path)
         try:
-            with _interrupt.held:
+            with _interrupt.uninterrupted:
                 out.write_text(self.text, encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write {out}: {error.strerror}; the text itself is kept") from error

@@ -467,7 +467,7 @@ def store(path: Path, text: str, model: str, *, force: bool) -> None:
     # Where a link leads, so that it stays one.
     path = Path(os.path.realpath(path))
     try:
-        with _interrupt.held:
+        with _interrupt.uninterrupted:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, text.encode("utf-8"), None if force else lambda temporary: _claim(temporary, path, model))
     except UnicodeEncodeError as error:

@@ -104,8 +104,8 @@ class Setting:
     compile_seconds: float
 
 
-class _Held:
-    """What the calls about one value of a case share."""
+class _ValueCache:
+    """Problem, oracle and engines of one value of a case, for all calls about it."""
 
     def __init__(self, case: Case, value: float) -> None:
         self.case, self.value = case, value
@@ -125,32 +125,32 @@ class _Held:
         return self.engines[engine]
 
 
-_held: _Held | None = None
+_cache: _ValueCache | None = None
 _searches: Final[dict[str, ReferenceSearch]] = {}
 
 
 @contextmanager
-def _value_of(case: Case, value: float) -> Iterator[_Held]:
-    """Give what is held of a value, and let go of the value before."""
-    global _held
+def _value_of(case: Case, value: float) -> Iterator[_ValueCache]:
+    """Give the cache of a value, and free that of the value before."""
+    global _cache
     try:
-        if _held is None or (_held.case.name, _held.value) != (case.name, value):
-            _held = None
-            _held = _Held(case, value)
-        yield _held
+        if _cache is None or (_cache.case.name, _cache.value) != (case.name, value):
+            _cache = None
+            _cache = _ValueCache(case, value)
+        yield _cache
     except MemoryError:
-        _held = None
+        _cache = None
         raise
 
 
 def prepare(case: Case, value: float, bar: float, seconds: float) -> Prepared:
     """Return the reference of a value, searched for within so many seconds of processor time."""
-    with _value_of(case, value) as held:
-        problem = held.problem
+    with _value_of(case, value) as cache:
+        problem = cache.problem
         facts = {name: float(x) for name, x in problem.facts.items()}
         report_stage("truth")
         if case.measure == "terms":
-            terms = reference_terms(problem, held.oracle)
+            terms = reference_terms(problem, cache.oracle)
             return Prepared("the own derivation with 34 digits", terms, facts)
         if case.measure == "energy":
             return Prepared("the energy at the start, with 34 digits", None, facts, problem.dt)
@@ -161,18 +161,18 @@ def prepare(case: Case, value: float, bar: float, seconds: float) -> Prepared:
 
 def condition_number(case: Case, value: float) -> float:
     """Return the condition number of the mass matrix at a value; see `reference.condition`."""
-    with _value_of(case, value) as held:
-        return condition(held.oracle, held.problem.q)
+    with _value_of(case, value) as cache:
+        return condition(cache.oracle, cache.problem.q)
 
 
 def measure(case: Case, value: float, setting: Setting, truth: Truth | Terms | None) -> Measurement:
     """Return one cell: a run, or the evaluation of a term, timed, and its error."""
-    with _value_of(case, value) as held:
+    with _value_of(case, value) as cache:
         report_stage("engine")
-        dyn, heard = held.dynamics(setting.engine)
+        dyn, heard = cache.dynamics(setting.engine)
         if case.measure != "terms":
             assert not isinstance(truth, Terms)
-            cell = _integrate(held, setting, dyn, truth)
+            cell = _integrate(cache, setting, dyn, truth)
         elif isinstance(truth, Terms):
             cell = _evaluate(value, setting.method, dyn, truth)
         else:
@@ -181,9 +181,9 @@ def measure(case: Case, value: float, setting: Setting, truth: Truth | Terms | N
         return replace(cell, warnings=(*heard, *cell.warnings)) if cell.end == "finished" else cell
 
 
-def _integrate(held: _Held, setting: Setting, dyn: Dynamics, truth: Truth | None) -> Measurement:
-    value, problem, method = held.value, held.problem, setting.method
-    times = times_of(problem, held.case.measure)
+def _integrate(cache: _ValueCache, setting: Setting, dyn: Dynamics, truth: Truth | None) -> Measurement:
+    value, problem, method = cache.value, cache.problem, setting.method
+    times = times_of(problem, cache.case.measure)
     kind = METHODS[method]
     adaptive = kind.kind == "adaptive"
     dt = 0.0 if adaptive else step_of(problem, times, setting.dt)
@@ -233,11 +233,11 @@ def _integrate(held: _Held, setting: Setting, dyn: Dynamics, truth: Truth | None
         return replace(cell, end="nan", note="states that are not finite, and nothing was said")
     try:
         # A run that is judged by its energy alone needs more digits of it than the run has.
-        energy = _energy_error(held.oracle if truth is None else dyn, run)
+        energy = _energy_error(cache.oracle if truth is None else dyn, run)
     except MbkitError:
         energy = math.nan
     if truth is None:
-        return replace(cell, error=energy if held.case.measure == "energy" else math.nan, energy=energy)
+        return replace(cell, error=energy if cache.case.measure == "energy" else math.nan, energy=energy)
     apart = float(np.abs(problem.model.difference(truth.q, run.q)).max()) / problem.scale
     return replace(cell, error=min(apart, _MAX_ERROR), energy=energy, floor=truth.floor / problem.scale)
 

@@ -61,7 +61,7 @@ class SilentFailure:
     cell: Measurement
 
 
-_Held = tuple[CaseResult, Row, Measurement]
+_Item = tuple[CaseResult, Row, Measurement]
 
 
 def _columns(part: int, *names: str) -> list[Column]:
@@ -69,7 +69,7 @@ def _columns(part: int, *names: str) -> list[Column]:
 
     def column(name: str) -> Column:
         value = attrgetter(name)
-        return Column(name, lambda held: value(held[part]))
+        return Column(name, lambda item: value(item[part]))
 
     return [column(name) for name in names]
 
@@ -99,13 +99,13 @@ class StressResult(ResultTable):
     settings: dict[str, Any] = field(default_factory=dict)
 
     _csv_columns: ClassVar = (
-        Column("case", lambda held: held[0].name),
+        Column("case", lambda item: item[0].name),
         *_columns(0, "parameter", "unit"),
         *_columns(2, "value"),
         *_columns(1, "engine", "method", "setting"),
-        Column("outcome", lambda held: held[2].outcome(held[0].bar)),
+        Column("outcome", lambda item: item[2].outcome(item[0].bar)),
         *_columns(2, "end", "error", "floor", "energy", "seconds", "steps"),
-        Column("warnings", lambda held: "; ".join(held[2].warnings)),
+        Column("warnings", lambda item: "; ".join(item[2].warnings)),
         *_columns(2, "note"),
     )
 
@@ -176,7 +176,7 @@ class StressResult(ResultTable):
                     entry["outcome"] = cell.outcome(case.bar)
         return out
 
-    def _csv_rows(self) -> Iterator[_Held]:
+    def _csv_rows(self) -> Iterator[_Item]:
         for case, row in self.rows():
             for cell in row.cells:
                 yield case, row, cell

@@ -247,11 +247,11 @@ def slowest_mode(M: Array, stiffness: Array) -> tuple[float, Array, float]:
     however stiff the other springs are.
     """
     root = np.sqrt(stiffness)
-    found: tuple[Any, Any] = np.linalg.eigh(M / root[:, None] / root)
-    shape = found[1][:, -1] / root
+    squares, shapes = np.linalg.eigh(M / root[:, None] / root)
+    shape = shapes[:, -1] / root
     inverse = np.linalg.inv(M)
     fastest = float(np.sqrt(np.abs(np.linalg.eigvals(inverse * stiffness)).max()))
-    return float(found[0][-1] ** -0.5), shape / shape[0], fastest
+    return float(squares[-1] ** -0.5), shape / shape[0], fastest
 
 
 # Exact motions of the pendulum and the cart-pole, in double.
@@ -429,8 +429,8 @@ def precession(
 ) -> tuple[Exact, Array, Array, float]:
     """Return quaternions (K, 4) of a symmetric top in steady precession, its start (4,) and (3,), and its rate.
 
-    The axis is the body's y. A Ω² cos θ - C ω₃ Ω + m g r = 0 (Landau, Lifshitz 1976, §35 problem 2), of which the
-    slow root is taken; below the horizontal (θ > π/2) there is one at any spin.
+    The axis is the body's y. A Ω² cos θ - C ω₃ Ω + m g r = 0 (Landau, Lifshitz 1976, §35 problem 2); the
+    result is the slow root; below the horizontal (θ > π/2) there is one at any spin.
 
     Parameters
     ----------
