@@ -56,18 +56,22 @@ class Stages(Protocol):
 class ArrayStages:
     """Rates of the stages of one state or a batch side by side: a row of a tableau times them is one product."""
 
-    def __init__(self, count: int, w: Array) -> None:
-        self._nv, self._count = w.shape[-1], 0
-        self._rates = np.empty((count, *w.shape[:-1], 2 * self._nv))
-        self._flat = self._rates.reshape(count, -1)
+    def __init__(self, count: int, shape: tuple[int, ...]) -> None:
+        self.shape, self._nv, self._count = shape, shape[-1], 0
+        self._moved = (*shape[:-1], 2 * self._nv)
+        self._rates = np.empty((count, *self._moved))
+        # Views, which are not free: a step of a small model takes some ten microseconds.
+        self._u, self._w = self._rates[..., : self._nv], self._rates[..., self._nv :]
+        flat = self._rates.reshape(count, -1)
+        self._known = [flat[:i] for i in range(count + 1)]
 
     def __len__(self) -> int:
         return self._count
 
     def append(self, u_rate: Array, w_rate: Array) -> None:
         """Add a stage."""
-        row = self._rates[self._count]
-        row[..., : self._nv], row[..., self._nv :] = u_rate, w_rate
+        self._u[self._count] = u_rate
+        self._w[self._count] = w_rate
         self._count += 1
 
     def keep(self, count: int) -> None:
@@ -76,7 +80,10 @@ class ArrayStages:
 
     def moved(self, h: float, weights: Array) -> tuple[Array, Array]:
         """Return h times the weighted sums of u̇ and ẇ."""
-        out = ((h * weights) @ self._flat[: self._count]).reshape(self._rates.shape[1:])
+        out = (h * weights) @ self._known[self._count]
+        if len(self._moved) == 1:
+            return out[: self._nv], out[self._nv :]
+        out = out.reshape(self._moved)
         return out[..., : self._nv], out[..., self._nv :]
 
     def squares(self, weights: Array, scales: tuple[Array, Array]) -> Any:

@@ -148,8 +148,9 @@ class Tableau:
         return len(self.b)
 
     @cached_property
-    def _times(self) -> list[float]:
-        return [float(x) for x in self.c]
+    def _rows(self) -> list[tuple[float, Array]]:
+        """Time and weights of each stage; of arrays, Python would make them anew in every step."""
+        return [(float(c), self.A[i, :i]) for i, c in enumerate(self.c)]
 
     @property
     def digest(self) -> str:
@@ -177,11 +178,12 @@ class Tableau:
         q, w, u
             The new state, which is the old q moved by u.
         """
-        for c, row in zip(self._times[len(stages) :], self.A[len(stages) :], strict=True):
-            if not len(stages):
+        for i in range(len(stages), self.stages):
+            if not i:
                 stages.append(*rates(t, q, None, w))
                 continue
-            u, dw = stages.moved(h, row[: len(stages)])
+            c, weights = self._rows[i]
+            u, dw = stages.moved(h, weights)
             stages.append(*rates(t + c * h, space.move(q, u), u, w + dw))
         u, dw = stages.moved(h, self.b)
         return space.move(q, u), w + dw, u

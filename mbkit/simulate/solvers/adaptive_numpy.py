@@ -71,7 +71,7 @@ class RungeKuttaAttempts:
         self._field = _OneOf(dyn, self._space)
         self._tableau = dormand_prince_853()
         self._least = duration * float(np.finfo(float).eps)
-        self._stages = ArrayStages(self._tableau.stages, np.empty(space.nv))
+        self._stages = ArrayStages(self._tableau.stages, (space.nv,))
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
         self._why = ""

@@ -168,12 +168,17 @@ def make_step(method: str, field: Field, space: Space) -> Step:
 
 def _explicit_step(formula: Tableau | SemiImplicitEuler, field: Field, space: Space) -> Step:
     """Return the step of a method with an explicit formula."""
+    stages: ArrayStages | None = None
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
             return w if u is None else space.rate(u, w), field.consistent(t, q, w, force)
 
-        q, w, _ = formula.step(space, rates, ArrayStages(formula.stages, w), t, h, q, w)
+        nonlocal stages
+        if stages is None or stages.shape != w.shape:
+            stages = ArrayStages(formula.stages, w.shape)
+        stages.keep(0)
+        q, w, _ = formula.step(space, rates, stages, t, h, q, w)
         return q, w
 
     return step
