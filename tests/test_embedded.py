@@ -22,8 +22,7 @@ from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import Event, Trajectory, at_section, simulate
 from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
-from mbkit.simulate.solvers.adaptive_numpy import RungeKuttaAttempts
-from mbkit.simulate.solvers.step_attempts import AcceptedSteps
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps, RungeKuttaAttempts
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 

@@ -21,8 +21,7 @@ from mbkit.model import ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import at_section, simulate
 from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
-from mbkit.simulate.solvers.adaptive_numpy import RosenbrockAttempts
-from mbkit.simulate.solvers.step_attempts import AcceptedSteps
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps, RosenbrockAttempts
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms

@@ -21,8 +21,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.adaptive_numpy import RungeKuttaAttempts
-from mbkit.simulate.solvers.step_attempts import AcceptedSteps, StepAttempts
+from mbkit.simulate.solvers.step_attempts import AcceptedSteps, RungeKuttaAttempts, StepAttempts
 from mbkit.simulate.solvers.trajectory_record import assemble_result, record_of
 from mbkit.simulate.solvers.vector_field import DIVERGED, is_bounded
 from mbkit.simulate.time_grid import Indices
@@ -91,7 +90,7 @@ def make_attempts(
             return CompiledAttempts(dyn, *given[1:], method)
     if method == "rodas5":
         # Its Jacobian loads CasADi.
-        from mbkit.simulate.solvers.adaptive_numpy import RosenbrockAttempts
+        from mbkit.simulate.solvers.step_attempts import RosenbrockAttempts
 
         return RosenbrockAttempts(*given)
     return RungeKuttaAttempts(*given)

@@ -1,7 +1,11 @@
-"""What tries the steps of an embedded pair, whichever way they are computed."""
+"""Attempted steps of an embedded method: the protocol of compiled and NumPy ones, and those in NumPy.
+
+The latter run stage by stage on any engine's forward dynamics and under any torque.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -9,10 +13,29 @@ from typing import Final, Protocol
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.methods.one_step import (
+    FIRST_ROOT,
+    MAX_GROWTH,
+    SCALARS,
+    ArrayStages,
+    elementary_factors,
+    embedded_error,
+    end_of_attempt,
+    next_step,
+    predictive_factors,
+    with_defect,
+)
 from mbkit.methods.registry import Tolerances
+from mbkit.methods.tableaus import dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
+from mbkit.model.manifold import unit_quaternions
+from mbkit.simulate.constraint_projection import LOOSEST
+from mbkit.simulate.diagnostics.linearization import Linearization
+from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field, Rates
+from mbkit.simulate.torque import Force, Torque
 
-__all__ = ["ROUNDS", "AcceptedSteps", "StepAttempts", "first_length"]
+__all__ = ["ROUNDS", "AcceptedSteps", "RosenbrockAttempts", "RungeKuttaAttempts", "StepAttempts", "first_length"]
 
 #: Tries between two looks at them, at most.
 ROUNDS: Final = 256
@@ -129,3 +152,343 @@ def first_length(
     steep = np.maximum(d1, d2)
     h1 = np.where(steep <= 1e-15, np.maximum(1e-6, h0 * 1e-3), (0.01 / steep) ** (1 / grows))
     return np.asarray(np.minimum(100 * h0, h1))
+
+
+class _OneOf(Field):
+    """The field of one member of a batch, on single states."""
+
+    def one(self, member: int) -> None:
+        self._use(self._dyn.of_samples([member]))
+
+    def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ beside a single state."""
+        return super().consistent(t, q, w, force).reshape(-1)
+
+    def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
+        """Return ẇ of a single state; one of a batch with parameters of its own is a batch of one."""
+        return super().__call__(t, q, w, force).reshape(-1)
+
+
+class RungeKuttaAttempts:
+    """Tries one step at a time, in NumPy; `StepAttempts` says what its methods do."""
+
+    width = rounds = 1
+    #: The power of a step's length with which its estimated error grows.
+    grows = 8
+    _factors = staticmethod(predictive_factors)
+
+    def __init__(
+        self,
+        dyn: Dynamics,
+        space: Space,
+        tolerances: Tolerances,
+        torque: Torque,
+        duration: float,
+        batch: int | None,
+    ) -> None:
+        self._space, self._tolerances, self._torque, self._batch = space, tolerances, torque, batch
+        self._field = _OneOf(dyn, self._space)
+        self._tableau = dormand_prince_853()
+        self._least = duration * float(np.finfo(float).eps)
+        self._stages = ArrayStages(self._tableau.stages, (space.nv,))
+        self._force: Force = np.zeros(space.nv)
+        self._h = self._t = self._stop = 0.0
+        self._why = ""
+        # What the tolerance is multiplied by.
+        self._slack = 1.0
+
+    @property
+    def evaluations(self) -> int:
+        """Of the forward dynamics so far."""
+        return self._field.evaluations
+
+    @property
+    def jacobians(self) -> int:
+        """Evaluated so far."""
+        return 0
+
+    def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
+        """Begin at a state."""
+        (member,) = which
+        if self._batch is not None:
+            self._field.one(member)
+        self._of_interval = self._torque.of_member(None if self._batch is None else member)
+        self._q, self._w, self._t, self._h = q[0], w[0], t, h
+        self._most, self._last, self._error = MAX_GROWTH, FIRST_ROOT, 0.0
+        self._dropped, self._fresh = False, True
+
+    def hold(self, k: int, stop: float) -> None:
+        """Go on to a time; where nothing else says so, with a first step."""
+        self._force, self._stop, self._fresh = self._of_interval(k), stop, True
+        if not self._h and not self._dropped:
+            self._h = self._first()
+
+    def _first(self) -> float:
+        def probe(q: Array, w: Array) -> Array:
+            return self._field(self._t, q[0], w[0], self._force)[None]
+
+        q, w = self._q[None], self._w[None]
+        try:
+            h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self.grows)[0])
+        except DivergenceError:
+            h = math.nan
+        # Where there is no rate, the step finds that out. At the least length no step
+        # would be tried at all, and nobody be told.
+        return max(h if h > 0 else 1e-6 * (self._stop - self._t), 2 * self._least)
+
+    def advance(self) -> list[tuple[int, AcceptedSteps]]:
+        """Try one step."""
+        if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
+            return []
+        t = end_of_attempt(SCALARS, self._t, self._h, self._stop)
+        step = t - self._t
+        before = [self._t], [self._q], [self._w]
+        q, w, self._error = self._try(step)
+        good = self._error < 1 and step > 0
+        self._settle(step, good)
+        if good:
+            q, w = self._field.settled(t, q, w)
+            self._t, self._q, self._w, self._fresh = t, q, w, True
+            for row, x in zip(before, (t, q, w), strict=True):
+                row.append(x)
+        return [(0, AcceptedSteps(np.array(before[0]), np.array(before[1]), np.array(before[2]), 1))]
+
+    def _settle(self, step: float, good: bool) -> None:
+        if (
+            not good
+            and self._field.near_singular
+            and self._slack * self._tolerances.rtol < LOOSEST
+            and self._error >= 1
+        ):
+            # Near a singular pose shorter steps are no better: their stages are nearer to it, and rounding grows.
+            self._slack, self._h, self._most = 10 * self._slack, 0.8 * step, 1.0
+            return
+        self._slack = 1.0 if good else self._slack
+        factors = self._factors(SCALARS, np.float64(self._error if self._error >= 0 else math.nan), self._last)
+        # A step of no length, far from the time's zero, ends the run.
+        h, self._most, self._last = next_step(
+            SCALARS, factors, good, step, self._h if step > 0 else 0.0, self._most, self._last
+        )
+        self._h = float(h)
+
+    def _try(self, step: float) -> tuple[Array, Array, float]:
+        try:
+            made = self._tried(step)
+        except DivergenceError as error:
+            self._why, self._fresh = str(error), True
+            return self._q, self._w, math.nan
+        self._why, self._fresh = "", False
+        return made
+
+    def _tried(self, step: float) -> tuple[Array, Array, float]:
+        q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
+        space, (rtol, atol) = self._space, self._tolerances
+        sizes = np.maximum(space.sizes(self._q, u), space.sizes(q, u)), np.maximum(np.abs(self._w), np.abs(w))
+        by_u, by_w = (self._slack * (atol + rtol * x) for x in sizes)
+        error = embedded_error(SCALARS, self._tableau.errors, self._stages, (by_u, by_w), step, 2 * space.nv)
+        return q, w, float(error)
+
+    def _step(self, t: float, q: Array, w: Array, h: float, *, fresh: bool = True) -> tuple[Array, Array, Array]:
+        """Return q, w and u after h; the first stage is there already unless the start is fresh."""
+
+        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
+            if u is None:
+                return w, self._field(t, q, w, self._force)
+            return self._space.rate(u, w), self._field.consistent(t, q, w, self._force)
+
+        self._stages.keep(0 if fresh else 1)
+        return self._tableau.step(self._space, rates, self._stages, t, h, q, w)
+
+    def drop(self, place: int) -> None:  # noqa: ARG002  # there is one
+        """Stay here."""
+        self._dropped = True
+
+    def stuck(self, place: int) -> bool | None:  # noqa: ARG002
+        """Return whether the last try, too short to go on, was no number."""
+        return None if self._h > self._least or self._t >= self._stop else math.isnan(self._error)
+
+    def why(self, place: int) -> str:  # noqa: ARG002
+        """Return what the engine said."""
+        return self._why or DIVERGED
+
+    def tighten(self, place: int, tolerances: Tolerances) -> None:  # noqa: ARG002
+        """Go on with other tolerances."""
+        self._tolerances = tolerances
+
+    def rates(self, place: int, q: Array, w: Array) -> Array:  # noqa: ARG002
+        """Return ẇ at states."""
+        try:
+            return np.array([self._field(self._t, *state, self._force) for state in zip(q, w, strict=True)])
+        except DivergenceError:
+            return np.full(w.shape, np.nan)
+
+    def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        """Return states within steps."""
+        rows = zip(start.t.tolist(), start.q, start.w, times.tolist(), strict=True)
+        made = []
+        for t, q, w, end in rows:
+            try:
+                made.append(self._step(t, q, w, end - t)[:2])
+            except DivergenceError:
+                made.append((np.full(q.shape, np.nan), np.full(w.shape, np.nan)))
+        self._fresh = True
+        q, w = (np.array([pair[i] for pair in made]) for i in (0, 1))
+        return q, w
+
+
+# The Rosenbrock step stage by stage, on any engine's forward dynamics and under any torque.
+#
+# It acts on y = (q, v) with quaternions as four numbers, whose exact flow keeps their length, and takes the exact
+# Jacobian of `mbkit.simulate.diagnostics.linearization`. A state within a step is that of the method's own polynomial
+# of order 4,
+# whose error is a part of the one that the step is judged by; a shorter step would cost as much as the step.
+
+#: Of a step: how far apart the rates are that tell the time's own part, by a parabola.
+_APART: Final = 1e-3
+
+
+class RosenbrockAttempts(RungeKuttaAttempts):
+    """Tries one step at a time, in NumPy; `StepAttempts` says what its methods do."""
+
+    grows = 5
+    _factors = staticmethod(elementary_factors)
+
+    def __init__(
+        self,
+        dyn: Dynamics,
+        space: Space,
+        tolerances: Tolerances,
+        torque: Torque,
+        duration: float,
+        batch: int | None,
+    ) -> None:
+        super().__init__(dyn, space, tolerances, torque, duration, batch)
+        self._model = dyn.model
+        self._own_rates, self._exact = Rates(dyn), Linearization(dyn)
+        own = rodas5p()
+        self._gamma, self._A, self._C, self._b, self._d = own.gamma, own.A, own.C, own.b, own.d
+        self._ends, self._e = own.c.tolist(), own.error
+        self._timed = torque.callable or dyn.model.time_parameter is not None
+        # Each number of y is as large as itself, those of a quaternion as 1.
+        self._turning = np.zeros(dyn.model.nq + dyn.model.nv)
+        for start, _ in dyn.model.quaternions:
+            self._turning[start : start + 4] = 1.0
+        self._dense = own.dense
+        self._start: tuple[Array, Array, Array] | None = None
+        self._arrived: tuple[Array, Array] | None = None
+        # Of the last try: t and y at both ends, and the stages.
+        self._last_try: tuple[float, float, Array, Array, Array] | None = None
+
+    @property
+    def evaluations(self) -> int:
+        """Of the forward dynamics so far."""
+        return self._field.evaluations + self._own_rates.evaluations
+
+    @property
+    def jacobians(self) -> int:
+        """Evaluated so far."""
+        return self._exact.evaluations
+
+    def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
+        """Begin at a state."""
+        super().start(which, q, w, t, h)
+        if self._batch is not None:
+            self._own_rates.only(which[0])
+            self._exact.only(which[0])
+
+    def _tried(self, step: float) -> tuple[Array, Array, float]:
+        y, there, J = self._known()
+        k = self._increments(self._t, y, step, there, J)
+        y1, error = y + self._b @ k, self._e @ k
+        t1 = self._t + step
+        self._last_try = self._t, t1, y, y1, k
+        rtol, atol = self._tolerances
+        scale = atol + rtol * np.maximum(np.maximum(np.abs(y), np.abs(y1)), self._turning)
+        size = _norm(error / scale)
+        if size < 1:
+            rate = self._rate(t1, y1)
+            slope = (self._b - self._dense.sum(axis=0)) @ k
+            size = float(with_defect(SCALARS, size, _norm((step * rate - slope) / scale)))
+            self._arrived = y1, rate
+            if not math.isfinite(size):
+                raise DivergenceError(self._own_rates.why or DIVERGED)
+        return *self._state(y1), size
+
+    def _known(self) -> tuple[Array, Array, Array]:
+        """Return y, ẏ and ∂ẏ/∂y where the step starts, evaluated once for all tries from there."""
+        if self._fresh or self._start is None:
+            self._own_rates.why = ""
+            y = np.concatenate([self._q, self._space.leave(self._q, self._w)])
+            arrived, self._arrived = self._arrived, None
+            # Where the last step ended the rate is known, unless another force acts from there.
+            known = arrived is not None and np.array_equal(arrived[0], y)
+            rate = arrived[1] if known and arrived is not None else self._rate(self._t, y)
+            self._start = y, rate, self._exact(self._t, y, self._force)
+        return self._start
+
+    def hold(self, k: int, stop: float) -> None:
+        """Go on to a time, under the force of an interval."""
+        self._arrived = None
+        super().hold(k, stop)
+
+    def _rate(self, t: float, y: Array) -> Array:
+        return self._own_rates(t, y, self._force)
+
+    def _state(self, y: Array) -> tuple[Array, Array]:
+        nq = self._model.nq
+        q = unit_quaternions(self._model, y[:nq])[0]
+        return q, self._space.enter(q, y[nq:])
+
+    def _increments(self, t: float, y: Array, h: float, there: Array, J: Array) -> Array:
+        """Return what the stages of a step of length h come to, (s, n)."""
+        from scipy.linalg import lapack
+
+        g, n = self._gamma * h, len(y)
+        matrix = -g * J
+        matrix.flat[:: n + 1] += 1.0
+        lu, pivots, _ = lapack.dgetrf(matrix)
+        by_time = h * self._by_time(t, y, h, there) if self._timed else None
+        k = np.empty((len(self._b), n))
+        for i in range(len(k)):
+            rate = there if not i else self._rate(t + self._ends[i] * h, y + self._A[i, :i] @ k[:i])
+            right = g * rate + self._gamma * (self._C[i, :i] @ k[:i])
+            if by_time is not None:
+                right += (g * self._d[i]) * by_time
+            k[i], _ = lapack.dgetrs(lu, pivots, right)
+        # What was no number anywhere is none here.
+        if not np.isfinite(k).all():
+            raise DivergenceError(self._own_rates.why or DIVERGED)
+        return k
+
+    def _by_time(self, t: float, y: Array, h: float, there: Array) -> Array:
+        apart = _APART * h
+        near, far = self._rate(t + apart, y), self._rate(t + 2 * apart, y)
+        return (4 * near - far - 3 * there) / (2 * apart)
+
+    def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        """Return states within steps: of the last one by its polynomial, of others by shorter steps."""
+        made = [
+            self._within(t, q, w, end) for t, q, w, end in zip(start.t.tolist(), start.q, start.w, times, strict=True)
+        ]
+        q, w = (np.array([pair[i] for pair in made]) for i in (0, 1))
+        return q, w
+
+    def _within(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
+        last = self._last_try
+        try:
+            if last is not None and last[0] == t and end <= last[1]:
+                t0, t1, y0, y1, k = last
+                part = (end - t0) / (t1 - t0)
+                one, two, three = self._dense @ k
+                bend = (1 - part) * (one + part * (two + part * three))
+                return self._state((1 - part) * y0 + part * (y1 + bend))
+            self._own_rates.why = ""
+            y = np.concatenate([q, self._space.leave(q, w)])
+            k = self._increments(t, y, end - t, self._rate(t, y), self._exact(t, y, self._force))
+            return self._state(y + self._b @ k)
+        except DivergenceError:
+            return np.full(q.shape, np.nan), np.full(w.shape, np.nan)
+
+
+def _norm(x: Array) -> float:
+    return math.sqrt(float(x @ x) / max(len(x), 1))
