@@ -57,14 +57,14 @@ DOUBLE_BITS: Final = 53
 _NAMED: Final = 3
 
 
-def require_tree(model: Model, who: str) -> None:
-    """Refuse a model with loops or prescribed motions, where `who` takes trees alone."""
-    for feature, told in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
+def require_tree(model: Model, user: str) -> None:
+    """Raise `UnsupportedError` for a model with loops or prescribed motions, in the name of an engine or study."""
+    for feature, text in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
         parts = getattr(model, feature)
         if parts:
             names = ", ".join(repr(x.name) for x in parts[:_NAMED]) + (", ..." if parts[_NAMED:] else "")
             raise UnsupportedError(
-                f"{who}: {model.name} has {told} ({names}), and an engine takes the tree alone; "
+                f"{user}: {model.name} has {text} ({names}), and an engine takes the tree alone; "
                 "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
                 f"and model.without({feature!r}) is the tree without them"
             )
@@ -107,7 +107,7 @@ class ForwardDynamicsDerivatives(NamedTuple):
 
 
 class Dynamics(ABC):
-    """A model evaluated by one engine; made by `mbkit.dynamics`.
+    """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes,
     finite numbers and unit quaternions, and returns new arrays.
@@ -126,7 +126,7 @@ class Dynamics(ABC):
     engine: ClassVar[str]
     #: Quantities this engine cannot give, each with the reason.
     refuses: ClassVar[dict[str, str]] = {}
-    #: Whether parameters' values may still be missing when the engine is made.
+    #: Whether parameters may still be without values when the adapter is built.
     takes_parameters: ClassVar[bool] = False
     #: Whether a model may be energies without bodies.
     takes_written: ClassVar[bool] = False
@@ -160,8 +160,7 @@ class Dynamics(ABC):
     def at(self, /, **values: Any) -> Dynamics:
         """Return the same dynamics at other values of the model's named parameters.
 
-        The lagrangian engine takes the values as arguments of what it has derived and
-        compiled once; the others are made anew.
+        The lagrangian engine passes the values as arguments to its compiled functions; the others are built again.
 
         Parameters
         ----------
@@ -473,7 +472,7 @@ def through_inverse(inverse_derivatives: Array) -> Array:
     return np.asarray(np.linalg.solve(M, np.concatenate([-by_q, -by_v, unit], axis=-1)))
 
 
-# What was expected to be a system on an engine, and is not: told with the way to one.
+# Errors for arguments of another type
 
 
 def no_dynamics(given: Any, name: str = "dyn") -> InputError:

@@ -27,11 +27,10 @@ if TYPE_CHECKING:
 __all__ = ["LagrangianDynamics", "ParameterValues", "short_way"]
 
 
-# The short way into machine code: what the good path needs and nothing else.
+# Fast calls of machine code, without the checks of `Dynamics`
 #
-# The code itself finds NaN and infinity in all that it reads and writes. On any doubt
-# the answer is None, and the checked way of `Dynamics` repeats the call and says what
-# is wrong.
+# The code itself finds NaN and infinity in all that it reads and writes. A fast call returns None for arguments
+# that it does not take, and `Dynamics` repeats the call with its checks and messages.
 
 _FLOAT: Final = np.dtype(np.float64)
 _NEAR_UNIT: Final = 1e-9
@@ -79,8 +78,8 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
         run, watch = code.bound([given[:, part] for part in parts], [out])
         return [given[0, part] for part in parts], run, watch, trim(out.reshape(rows, columns)).copy
 
-    # A place belongs to one call at a time. Nobody waits for one: a forked child would
-    # for ever, if another thread held it when it forked.
+    # A place belongs to one call at a time. No call waits for a place: a forked child would wait for ever
+    # if another thread held it at the fork.
     free = [place()]
 
     def call(arguments: tuple[Any, ...]) -> Any:
@@ -169,7 +168,7 @@ class ParameterValues:
         return next((len(x) for x in self.batched.values()), None)
 
     def of_samples(self, which: ArrayLike) -> ParameterValues:
-        """Return the values of these samples, by index; one of them may stand many times."""
+        """Return the values of these samples, by index, which may repeat."""
         index = np.asarray(which)
         # A mask would be taken for the samples 0 and 1.
         if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
@@ -245,7 +244,7 @@ _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
 
 
 class LagrangianDynamics(Dynamics):
-    """Terms derived from T and V, each when it is first asked for.
+    """Terms derived from T and V, each at its first use.
 
     Parameters
     ----------
@@ -352,7 +351,7 @@ class LagrangianDynamics(Dynamics):
 
     def _with(self, parameters: ParameterValues) -> LagrangianDynamics:
         out = object.__new__(type(self))
-        # What is derived and compiled is shared, also what comes later.
+        # Both share what is derived and compiled, now and later.
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
         out._parameters, out.model = parameters, parameters.model
         return out

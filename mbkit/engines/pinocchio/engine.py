@@ -1,7 +1,7 @@
 """Pinocchio behind the protocol: CRBA for M, RNEA for nle, ABA for forward dynamics.
 
 Carpentier et al. 2019, "The Pinocchio C++ library"; the algorithms are those of
-Featherstone 2008, ch. 5 to 7. Single states take the short way of `pinocchio_direct`.
+Featherstone 2008, ch. 5 to 7. Single states go straight to Pinocchio, see `direct_calls`.
 """
 
 from __future__ import annotations
