@@ -15,8 +15,6 @@ from mbkit._check import finite_array, real, shown
 from mbkit.errors import InputError
 from mbkit.model import Expression, Model, Number, known, nominal
 
-__all__ = ["SWING", "Vector", "count", "down", "lengths", "moments", "nonnegative", "point", "positive", "system"]
-
 #: Three numbers.
 Vector = ArrayLike | Sequence[Number]
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from mbkit.catalog._parameters import SWING, Vector, down, moments, nonnegative, system
 from mbkit.model import Model, ModelBuilder, Number
 
-__all__ = ["acrobot", "cart_pole", "furuta_pendulum", "slider_crank"]
-
 
 @system
 def cart_pole(

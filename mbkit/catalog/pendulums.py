@@ -5,8 +5,6 @@ from __future__ import annotations
 from mbkit.catalog._parameters import SWING, down, system
 from mbkit.model import Model, ModelBuilder, Number, known, nominal
 
-__all__ = ["chain", "double_pendulum", "elastic_pendulum", "pendulum", "spherical_pendulum"]
-
 
 @system
 def pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81) -> Model:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from mbkit.catalog._parameters import Vector, down, lengths, moments, nonnegative, point, system
 from mbkit.model import Model, ModelBuilder, Number
 
-__all__ = ["free_body", "gyroscope", "heavy_top"]
-
 
 @system(sides=lengths)
 def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: Number = 0.0) -> Model:

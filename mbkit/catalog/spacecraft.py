@@ -12,9 +12,6 @@ from mbkit.catalog._parameters import Vector, moments, nonnegative, point, syste
 from mbkit.errors import InputError
 from mbkit.model import Model, ModelBuilder, Number
 
-__all__ = ["clamped_beam", "flexible_spacecraft", "spacecraft_with_wheels"]
-
-
 # A bending beam as rigid segments.
 #
 # n equal thin rods of length h stand behind a stub of length a h that belongs to what the beam is clamped

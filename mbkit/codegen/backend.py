@@ -19,8 +19,6 @@ from mbkit.errors import NoCompilerWarning
 if TYPE_CHECKING:
     from mbkit.codegen.compiled import Compiled
 
-__all__ = ["DERIVING", "compile_by_default", "executable", "has_compiler"]
-
 #: One thread derives at a time; a fork waits for it. Python 3.11's cached properties hold locks meanwhile.
 DERIVING: Final = fork_safe(threading.RLock())
 

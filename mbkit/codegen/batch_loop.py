@@ -23,8 +23,6 @@ from llvmlite import ir
 
 from mbkit.codegen.simd_kernel import BODY
 
-__all__ = ["MOST_ARRAYS", "RUN", "batch_code"]
-
 RUN: Final = "mbkit_run"
 #: Inputs, and outputs, of one function at most.
 MOST_ARRAYS: Final = 16

@@ -22,8 +22,6 @@ from mbkit.derivation.equations import FUNCTIONS, equations_of
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 
-__all__ = ["DEFAULT", "CFunction", "CSource", "c_code", "c_identifier", "export_c"]
-
 #: Quantity -> (name in C of its one output, what it is).
 _ONE_OUTPUT: Final = {
     "mass_matrix": ("M", "mass matrix M(q), symmetric"),

@@ -22,9 +22,6 @@ from mbkit.codegen.batch_loop import RUN
 from mbkit.codegen.program import program
 from mbkit.derivation.fingerprint import SOURCES
 
-__all__ = ["Call", "Compiled", "KernelSequence", "aligned", "compiled", "cores", "shared_object"]
-
-
 #: Operations on which a second thread is worth its start: about 100 µs.
 _SHARE: Final = 2_000_000
 #: Coordinate-major arrays with more rows than this are read in blocks: so many places

@@ -26,16 +26,6 @@ from typing import Any, Final, TypeVar
 
 from platformdirs import user_cache_path
 
-__all__ = [
-    "cached",
-    "folder",
-    "force_recompile",
-    "is_bypassed",
-    "key_of",
-    "read",
-    "write",
-]
-
 T = TypeVar("T")
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.

@@ -18,9 +18,6 @@ from mbkit._check import Array
 from mbkit.codegen.program import Program
 from mbkit.errors import InputError, UnsupportedError
 
-__all__ = ["BITS", "Arithmetic", "Backend", "Extended", "arithmetic", "digits", "mpmath_context", "product", "solve"]
-
-
 Backend = Literal["real128", "mpmath"]
 BITS: Final = 113
 

@@ -15,8 +15,6 @@ import numpy as np
 from mbkit._check import Array, all_finite
 from mbkit._fork import fork_safe
 
-__all__ = ["Machine"]
-
 
 class Machine:
     """A function of vectors, evaluated in CasADi's own machine.

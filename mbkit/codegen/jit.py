@@ -20,8 +20,6 @@ from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, batch_code
 from mbkit.codegen.program import Program
 from mbkit.codegen.simd_kernel import vector_code
 
-__all__ = ["COMPILING", "Host", "Loaded", "batch_object", "host", "load", "object_code", "program_object"]
-
 _SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
 

@@ -7,8 +7,6 @@ from typing import Final
 
 from mbkit.codegen.program import Program
 
-__all__ = ["CALLS", "LIMIT", "Text", "call", "declarations", "library", "number", "sincos"]
-
 
 def number(x: float) -> str:
     """Return a double in every lane, as LLVM writes it without loss."""

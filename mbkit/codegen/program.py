@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from mbkit.errors import UnsupportedError
 
-__all__ = ["Operation", "Program", "program"]
-
 #: CasADi's codes -> our names, of the operations that every backend knows.
 _UNARY: Final = {
     ca.OP_NEG: "neg",

@@ -22,8 +22,6 @@ import numpy as np
 from mbkit.codegen.llvm_ir import CALLS, Text, call, declarations, library, number
 from mbkit.codegen.program import Program
 
-__all__ = ["BODY", "Piece", "pieces_of", "slots_of", "vector_code"]
-
 BODY: Final = "mbkit_body"
 #: LLVM's time to compile one block grows faster than its length, most of all with
 #: what it stores. A program heavier than _WHOLE is compiled in pieces of _PIECE.

@@ -36,8 +36,6 @@ from mbkit.codegen.simd_kernel import Piece, pieces_of, slots_of
 from mbkit.derivation.fingerprint import SOURCES
 from mbkit.derivation.steps.fixed import Part
 
-__all__ = ["CompiledStepLoop", "compiled_step_loop", "width"]
-
 _NAME: Final = "mbkit_part"
 
 

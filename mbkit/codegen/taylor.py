@@ -31,8 +31,6 @@ from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.errors import UnsupportedError
 
-__all__ = ["PRECISIONS", "Precision", "TaylorSystem", "order_of", "precision", "rates", "taylor_system"]
-
 # A compiler's time for more is no longer spent unasked: 34,000 operations take 9 s.
 _MAX_OPERATIONS: Final = 100_000
 # Up to this many operations times order², the recurrences are written out: 2 to 3

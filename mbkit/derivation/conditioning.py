@@ -18,8 +18,6 @@ from mbkit.derivation.mass_matrix_solve import elimination_order, elimination_si
 from mbkit.model import Model
 from mbkit.spatial import skew
 
-__all__ = ["cancellation", "loses_digits"]
-
 #: Largest M_kk/D_k of the LᵀDL factorization, some 6 of 16 digits. Robots as their files describe them are below 1e5.
 _MAX_RATIO: Final = 5e5
 #: Largest count of multiplications of the sparse LᵀDL, some n³/3 for a chain: the orthogonal elimination takes several

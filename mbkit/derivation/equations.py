@@ -31,13 +31,6 @@ from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 from mbkit.model.joint_types import cross3
 
-__all__ = [
-    "FUNCTIONS",
-    "Equations",
-    "equations_of",
-]
-
-
 #: Name of each quantity -> the arguments of its function.
 FUNCTIONS: Final = {
     "mass_matrix": ("q",),

@@ -7,8 +7,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-__all__ = ["DECISIVE", "SOURCES", "fingerprint", "source_files"]
-
 #: What decides the compiled code: packages with all their sub-packages, and single modules, below mbkit's
 #: folder. Systems on paper bring equations of their own.
 DECISIVE: Final = (

@@ -16,19 +16,6 @@ from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
 from mbkit.model import Joint, JointCoupling, Model
 from mbkit.model.joint_types import cross3
 
-__all__ = [
-    "Kinematics",
-    "add",
-    "constant_times",
-    "constant_transposed_times",
-    "damping_forces",
-    "dot3",
-    "gravity_energy",
-    "kinetic_energy",
-    "spring_energy",
-]
-
-
 Vector = list[Any]
 
 

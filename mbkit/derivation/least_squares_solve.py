@@ -28,9 +28,6 @@ from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model import Body, Model
 from mbkit.model.joint_types import cross3
 
-__all__ = ["InertiaSquare", "LeastConstraint", "Squares", "has_squares", "inertia_squares", "squares"]
-
-
 # An inertia as a sum of squares of rates, in rational numbers.
 #
 # What the description's doubles say is rounded once, however thin the body: LᵀDL in doubles, or principal axes, would

@@ -16,8 +16,6 @@ import numpy as np
 from mbkit.derivation.model_values import scalar
 from mbkit.model import Model
 
-__all__ = ["Factors", "elimination_order", "elimination_size", "solve"]
-
 
 def elimination_order(model: Model) -> tuple[int, ...]:
     """Return the velocity indices with every parent before its children."""

@@ -18,9 +18,6 @@ from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model
 
-__all__ = ["Constants", "Scalar", "Values", "cos", "is_zero", "scalar", "sin"]
-
-
 # Expressions whose arithmetic is quick to write down, entry by entry.
 #
 # CasADi's operators first search a conversion of their operands, some 15 µs each;

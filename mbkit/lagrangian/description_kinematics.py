@@ -24,9 +24,6 @@ from mbkit.model import Joint, JointCoupling, Model
 from mbkit.model.joint_types import cross3
 from mbkit.model.parts import Loop, Prescribed
 
-__all__ = ["SymbolicKinematics", "angle", "closure", "instead_of_writing", "motion"]
-
-
 Vector = list[Any]
 #: (linear, angular) velocity per unit of one velocity.
 Column = tuple[Vector, Vector]

@@ -29,8 +29,6 @@ from mbkit.model.description import Needs
 from mbkit.model.joint_types import PRISMATIC
 from mbkit.model.parts import Body, Frame, Joint
 
-__all__ = ["EnergyModel", "abstract_parts", "energies_latex"]
-
 
 def energies_latex(form: EnergyForm) -> str:
     """Return T and V as inline LaTeX."""

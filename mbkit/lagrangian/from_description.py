@@ -16,8 +16,6 @@ from mbkit.lagrangian.printing.catalog_symbols import in_symbols
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.model import Model
 
-__all__ = ["from_model"]
-
 #: Velocities up to which equations are written out.
 _MOST: Final = 24
 #: The same with loops or motions in time. A row of 40 four-bars has 81 coordinates.

@@ -29,9 +29,6 @@ from mbkit.lagrangian.constraints.redundancy import require_few
 from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
 
-__all__ = ["SINGULAR", "Chart", "Embedded", "EmbeddedDynamics", "ReducedModel"]
-
-
 _MOST: Final = 25
 #: Places from which the next one is searched: more than a step has stages.
 _PLACES: Final = 32

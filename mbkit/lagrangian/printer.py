@@ -18,9 +18,6 @@ from sympy.printing.pretty.pretty_symbology import pretty_symbol
 
 from mbkit._escape import latex, one_line
 
-__all__ = ["Abbreviations", "ExpressionPrinter", "Printable", "aligned", "folded", "matrix", "spread", "written"]
-
-
 _FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
 _HIGH: Final = str.maketrans("0123456789-/", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ")
 _MASS: Final = re.compile(r"[mM](\d*|_\w+)")

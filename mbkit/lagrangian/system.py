@@ -30,8 +30,6 @@ from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quas
 from mbkit.lagrangian.reduction.routh import Routhian, routhian
 from mbkit.lagrangian.trig.simplify import tidy
 
-__all__ = ["Lagrangian", "QuasiLagrangian"]
-
 
 class Lagrangian(EnergyForm):
     """A system as its energies in generalized coordinates, to read and to run.

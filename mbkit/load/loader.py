@@ -22,9 +22,6 @@ from mbkit.load.xml_reader import expanded
 from mbkit.model import Model
 from mbkit.model.validation import scale_doubts
 
-__all__ = ["Robot", "load", "robots"]
-
-
 # A path has lost one of the strokes.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _GRAVITY: Final = (0.0, 0.0, -9.81)

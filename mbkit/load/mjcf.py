@@ -33,8 +33,6 @@ from mbkit.load.urdf_links import floated
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Model, ModelBuilder
 
-__all__ = ["model_of_mjcf"]
-
 _REFUSED: Final = {
     "attach": "it names another model; save the compiled model as one XML",
     "replicate": "write the copies out; MuJoCo's save as XML does",

@@ -19,20 +19,6 @@ from mbkit._check import Array
 from mbkit.errors import nearest
 from mbkit.load.xml_reader import Element, Reader
 
-__all__ = [
-    "HERE",
-    "ORIENTATIONS",
-    "Compiler",
-    "Defaults",
-    "Pose",
-    "about",
-    "check_names",
-    "has_length",
-    "pose",
-    "rules",
-    "z_to",
-]
-
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
 

@@ -21,8 +21,6 @@ from mbkit.load.mjcf_reader import Scene
 from mbkit.load.shapes import Lump
 from mbkit.load.xml_reader import MOST_BYTES, Element
 
-__all__ = ["infer_inertias", "infer_springs", "listed"]
-
 _BODIES: Final = ("default", "asset", "worldbody")
 _BODIES_AND_FORCES: Final = (*_BODIES, "tendon", "actuator")
 # Elements without effect on masses, springs and damping.

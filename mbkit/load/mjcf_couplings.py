@@ -22,8 +22,6 @@ from mbkit.load.xml_reader import LARGEST, Element, Reader
 from mbkit.model import Joint, JointCoupling, Model, PointSpring
 from mbkit.model.validation import sample_mass_matrix
 
-__all__ = ["Transmissions", "coupled"]
-
 _ACTUATORS: Final = (
     "general",
     "motor",

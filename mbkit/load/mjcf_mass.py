@@ -18,8 +18,6 @@ from mbkit.load.mjcf_attributes import ORIENTATIONS, Compiler, Pose, has_length,
 from mbkit.load.shapes import NOTHING, SIZES, Lump, solid, together
 from mbkit.load.xml_reader import Element, Reader
 
-__all__ = ["body_lump", "counts"]
-
 # MuJoCo 4.0.0 counts geoms above this mass, in kg.
 _LEAST_MASS: Final = 1e-14
 

@@ -15,8 +15,6 @@ from mbkit.load.mjcf_mass import body_lump, counts
 from mbkit.load.shapes import NOTHING, Lump
 from mbkit.load.xml_reader import Element, Reader
 
-__all__ = ["KINDS", "MjcfBody", "MjcfJoint", "Scene", "unfolded", "walk"]
-
 KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
 _NAMED: Final = {"body": "body", "joint": "joint", "freejoint": "joint", "site": "site"}
 

@@ -10,8 +10,6 @@ from typing import Final, NamedTuple
 
 from mbkit.errors import LoadError, UnknownNameError
 
-__all__ = ["Entry", "canonical", "entries", "find", "unknown"]
-
 _PACKAGE: Final = "example-robot-data"
 
 # Names of example-robot-data's own loaders, and others in common use, for files whose

@@ -21,8 +21,6 @@ from mbkit.load.mjcf_attributes import Compiler, Defaults
 from mbkit.load.urdf_links import floated, with_base
 from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, expanded
 
-__all__ = ["Stripped", "strip"]
-
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
 #: What names other files, or is nothing without what does.
 _GONE: Final = {

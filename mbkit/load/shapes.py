@@ -11,8 +11,6 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.spatial import skew
 
-__all__ = ["NOTHING", "SIZES", "Lump", "solid", "together"]
-
 # How many sizes each shape takes; half lengths and radii. With two end points the
 # length is theirs.
 SIZES: Final = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}

@@ -19,9 +19,6 @@ from mbkit.load.urdf_check import UrdfFile, UrdfJoint, unbounded
 from mbkit.model import Body, Mimic, Model, ModelBuilder
 from mbkit.model.validation import body_fault
 
-__all__ = ["Snapper", "model_of"]
-
-
 # Zeros and ones that rounding has blurred, set right once, when a file is loaded.
 #
 # A rotation by exactly half a turn, written 3.141592653589793, becomes a matrix with

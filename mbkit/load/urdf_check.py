@@ -21,9 +21,6 @@ from mbkit.load.xml_reader import Element, Reader, misspelt
 from mbkit.model import Body, Mimic
 from mbkit.model.validation import body_fault
 
-__all__ = ["UrdfFile", "UrdfJoint", "check_mimics", "check_names", "check_size", "check_tree", "examine", "unbounded"]
-
-
 # The tree of a URDF: names, parents, loops, and joints that follow others.
 
 # The parser in C++ recurses over the tree, and its tables grow as the square.

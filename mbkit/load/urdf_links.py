@@ -22,9 +22,6 @@ from mbkit.load.urdf_check import examine, unbounded
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Mimic, Model, ModelBuilder
 
-__all__ = ["BASE_JOINT", "floated", "urdf_links", "with_base"]
-
-
 # A description whose base stands still, written so that parsers can let it go.
 
 #: The joint on which a floating base moves.

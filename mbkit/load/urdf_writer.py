@@ -13,8 +13,6 @@ from mbkit._escape import xml_attribute, xml_comment
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
 
-__all__ = ["urdf_text"]
-
 _TYPES: Final = {
     "fixed": "fixed",
     "revolute": "revolute",

@@ -18,20 +18,6 @@ from xml.parsers import expat
 
 from mbkit.errors import LoadError
 
-__all__ = [
-    "LARGEST",
-    "MOST_BYTES",
-    "MOST_ELEMENTS",
-    "MOST_LEVELS",
-    "Element",
-    "Reader",
-    "expanded",
-    "misspelt",
-    "parse",
-    "read",
-]
-
-
 #: Far above any robot, far below what would exhaust memory or the stack.
 MOST_BYTES: Final = 64 * 2**20
 MOST_ELEMENTS: Final = 500_000

@@ -19,9 +19,6 @@ from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
 from mbkit.model.validation import body_faults, grouped, static_bodies, structure_faults, suspects
 
-__all__ = ["ArgumentReader", "ModelBuilder", "expect_model", "shape_of"]
-
-
 # The squares of sums of such lengths still fit a double.
 _LONGEST: Final = 1e150
 _LONGEST_NAME: Final = 1000

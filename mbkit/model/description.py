@@ -22,8 +22,6 @@ from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
 
-__all__ = ["Description", "Layout", "Needs", "digest", "expect_name"]
-
 
 def _plain(value: Any) -> Any:
     if is_dataclass(value):

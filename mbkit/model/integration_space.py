@@ -7,8 +7,6 @@ from typing import Any
 from mbkit.model import quaternions as rotation
 from mbkit.model.model import Model
 
-__all__ = ["Space"]
-
 
 class Space:
     """Configurations and velocities of one model as the integrators hold them.

@@ -21,20 +21,6 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import InputError, UnsupportedError
 
-__all__ = [
-    "FIXED",
-    "FREE",
-    "KINDS",
-    "PRISMATIC",
-    "JointKind",
-    "JointType",
-    "Scalars",
-    "cross3",
-    "kind_of",
-    "register_joint_type",
-]
-
-
 Scalars = Sequence[Any]
 Rows = list[list[Any]]
 _IDENTITY: Final[Rows] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

@@ -11,17 +11,6 @@ from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model.description import Description
 
-__all__ = [
-    "check_quaternions",
-    "difference",
-    "integrate",
-    "limits_box",
-    "magnitude",
-    "neutral",
-    "random_state",
-    "unit_quaternions",
-]
-
 # A quaternion is data of the caller: rounding is accepted, a rotation that
 # engines would read differently is not.
 _UNIT = 1e-9

@@ -18,9 +18,6 @@ from mbkit.model.parameters import Binding, Parameter
 from mbkit.model.parts import Joint
 from mbkit.model.validation import check_substituted
 
-__all__ = ["Model"]
-
-
 _PER_VELOCITY: Final = {
     "damping": "damping",
     "springs": "stiffness",

@@ -13,9 +13,6 @@ from mbkit._check import real, shown
 from mbkit.errors import InputError
 from mbkit.model.parts import Joint
 
-__all__ = ["Binding", "Expression", "Number", "Parameter", "known", "nominal", "split", "with_numbers"]
-
-
 _OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "add": operator.add,
     "sub": operator.sub,

@@ -13,8 +13,6 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 
-__all__ = ["Body", "Frame", "Joint", "JointCoupling", "Loop", "Mimic", "PointSpring", "Prescribed"]
-
 
 class _Frozen:
     """Read-only arrays, equality by content, and pickling that keeps both."""

@@ -15,20 +15,6 @@ from typing import Any, Final
 
 import numpy as np
 
-__all__ = [
-    "ARRAYS",
-    "FLOATS",
-    "Arithmetic",
-    "Components",
-    "cross",
-    "dexp_inverse",
-    "exponential",
-    "product",
-    "rotate",
-    "rotate_back",
-    "unit",
-]
-
 Components = Sequence[Any]
 
 # Below these angles squared the series are exact to rounding (as in mbkit.spatial).

@@ -16,20 +16,6 @@ from mbkit.model.description import Description
 from mbkit.model.parts import Body, Joint, JointCoupling, Loop
 from mbkit.spatial import skew
 
-__all__ = [
-    "body_fault",
-    "body_faults",
-    "check_substituted",
-    "grouped",
-    "idle_joints",
-    "sample_mass_matrix",
-    "scale_doubts",
-    "static_bodies",
-    "structure_faults",
-    "suspects",
-]
-
-
 # Names in a message.
 _MAX_NAMES: Final = 40
 # M of so many velocities takes 200 MB.

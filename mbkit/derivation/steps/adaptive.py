@@ -16,8 +16,6 @@ from mbkit.derivation.steps.fixed import SYMBOLS, Part, SymbolicSpace, SymbolicS
 from mbkit.methods.one_step import StepFactors, embedded_error, end_of_attempt, larger, next_step, predictive_factors
 from mbkit.methods.tableaus import EmbeddedTableau
 
-__all__ = ["STATE", "AttemptParts", "embedded_parts"]
-
 #: A round reads these and writes the same names with a 1 behind, from which the next one
 #: starts. `h` is the length to try, `most` what it may grow by at most, `last` the 32nd
 #: root of the last accepted error, `end` the time not to pass. `error` is that of the

@@ -25,18 +25,6 @@ from mbkit.methods.tableaus import Tableau
 from mbkit.model.integration_space import Space
 from mbkit.model.quaternions import Arithmetic
 
-__all__ = [
-    "SYMBOLS",
-    "Part",
-    "SymbolicSpace",
-    "SymbolicStages",
-    "choose",
-    "function_of",
-    "march",
-    "march_in_stages",
-    "step",
-]
-
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
 

@@ -37,8 +37,6 @@ from mbkit.derivation.steps.fixed import Part, SymbolicSpace, function_of
 from mbkit.derivation.steps.rosenbrock import Factors
 from mbkit.model import quaternions
 
-__all__ = ["GUESS", "LEAST", "MOST", "SMALL", "Midpoint"]
-
 #: Weights of the velocities of the last steps in the first guess of the next one: the
 #: parabola through them, continued.
 GUESS: Final = (3.0, -3.0, 1.0)

@@ -32,8 +32,6 @@ from mbkit.derivation.steps.fixed import SYMBOLS, Part, SymbolicSpace, SymbolicS
 from mbkit.methods.one_step import elementary_factors, with_defect
 from mbkit.methods.tableaus import RosenbrockTableau
 
-__all__ = ["Factors", "rosenbrock_parts"]
-
 
 def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> tuple[Part, ...]:
     """Return the parts of one attempt, in order.

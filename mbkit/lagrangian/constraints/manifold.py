@@ -15,8 +15,6 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
 
-__all__ = ["Manifold", "least_change", "manifold_of"]
-
 _EPS: Final = float(np.finfo(float).eps)
 #: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
 _CONSISTENT: Final = 1e-8

@@ -20,8 +20,6 @@ from mbkit.lagrangian.constraints.manifold import Manifold, least_change, manifo
 from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.model import Model
 
-__all__ = ["is_judged", "refuse_unreachable", "require_few", "require_independent"]
-
 #: Random starts from which a consistent configuration is searched.
 _STARTS: Final = 12
 #: Configurations near a pose at which J is evaluated too, and how far they are away, rad or m.

@@ -16,8 +16,6 @@ from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.sympy_to_casadi import Conversion
 from mbkit.model import Model
 
-__all__ = ["ConstraintTerms", "EnergyEquations"]
-
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
 _TINY: Final = 1e-300

@@ -29,17 +29,6 @@ from mbkit.lagrangian.energies.symbols import (
 from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
 from mbkit.lagrangian.trig.zero_test import is_zero
 
-__all__ = [
-    "EnergyForm",
-    "acting_forces",
-    "parameter_values",
-    "read_expression",
-    "require_values",
-    "symbols_of",
-    "timed_parameters",
-    "vanish",
-]
-
 
 class EnergyForm:
     """T, V, forces and constraints in plain symbols, checked; arguments and attributes are those of `Lagrangian`.

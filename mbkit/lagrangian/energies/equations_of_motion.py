@@ -18,8 +18,6 @@ from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, Printable
 from mbkit.lagrangian.trig.shortest_form import complexity
 from mbkit.lagrangian.trig.simplify import gradient, slope, tidy, tidy_matrix
 
-__all__ = ["EquationsOfMotion", "christoffel", "equations_of_motion", "printed_equations"]
-
 
 @dataclass(frozen=True, repr=False)
 class EquationsOfMotion(Printable):

@@ -17,9 +17,6 @@ from mbkit.lagrangian.trig.shortest_form import complexity
 from mbkit.lagrangian.trig.simplify import LARGE, tidy
 from mbkit.lagrangian.trig.zero_test import DIGITS, RandomEvaluation
 
-__all__ = ["KineticSplit", "Squares", "blocks", "inverse", "require_inertia", "split"]
-
-
 #: Lines through the velocities, and places on each.
 _LINES: Final = 4
 _STEPS: Final = (3, 1, -1, -3)

@@ -16,8 +16,6 @@ from mbkit.errors import InputError
 from mbkit.lagrangian.energies.sympy_to_casadi import Conversion
 from mbkit.lagrangian.trig.simplify import tidy
 
-__all__ = ["QuasiVelocities", "VelocityMap"]
-
 
 @dataclass(frozen=True, eq=False)
 class QuasiVelocities:

@@ -17,19 +17,6 @@ from sympy.core.function import AppliedUndef
 
 from mbkit.errors import InputError
 
-__all__ = [
-    "PlainSymbols",
-    "acceleration_of",
-    "by_name",
-    "expression",
-    "fits",
-    "free_name",
-    "listed",
-    "name_of",
-    "plain",
-    "velocity_of",
-]
-
 
 def velocity_of(coordinate: sp.Symbol) -> sp.Symbol:
     """Return the symbol of a coordinate's velocity: theta1 -> thetadot1, which prints as θ̇₁."""

@@ -13,9 +13,6 @@ from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
 from mbkit.errors import UnsupportedError
 
-__all__ = ["Conversion", "Numeric"]
-
-
 _UNARY: Final[dict[Any, Callable[[Any], Any]]] = {
     sp.sin: ca.sin,
     sp.cos: ca.cos,

@@ -16,8 +16,6 @@ from mbkit.errors import MbkitError
 from mbkit.load.urdf import Snapper
 from mbkit.model import Expression, Model, Parameter
 
-__all__ = ["in_symbols", "letters", "with_plain_turns"]
-
 #: Of each system's arguments: a name, or three for a vector.
 _SYMBOLS: Final[dict[str, dict[str, str | tuple[str, str, str]]]] = {
     "acrobot": {"com1": "l_c1", "com2": "l_c2", "inertia1": "I1", "inertia2": "I2"},

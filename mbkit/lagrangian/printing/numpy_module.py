@@ -13,8 +13,6 @@ from mbkit._version import __version__
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.system import Lagrangian
 
-__all__ = ["python_code"]
-
 #: Names that the module itself uses, beside Python's own.
 _TAKEN: Final = {"np", "q", "v", "tau", "t", "M", "h", "out", "given", "unknown", "parameters", "PARAMETERS"}
 _FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}

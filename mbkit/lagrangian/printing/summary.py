@@ -15,8 +15,6 @@ from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equ
 from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, folded, matrix, spread, written
 from mbkit.lagrangian.system import Lagrangian
 
-__all__ = ["SystemSummary"]
-
 #: Operations of T above which C and the equations are left out of a page.
 _READABLE: Final = 1500
 #: And above which M is.

@@ -19,16 +19,6 @@ from mbkit._escape import terminal
 from mbkit.lagrangian.energies.energy_form import EnergyForm, acting_forces, vanish
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable
 
-__all__ = [
-    "JACOBI",
-    "ConservedQuantity",
-    "conserved_momenta",
-    "conserved_quantities",
-    "energy_function",
-    "is_energy",
-    "keeps_energy",
-]
-
 #: Meaning of h where it is not the energy.
 JACOBI: Final = "Jacobi's integral T2 - T0 + V, not the energy T + V"
 

@@ -39,9 +39,6 @@ from mbkit.lagrangian.reduction.conserved import ConservedQuantity
 from mbkit.lagrangian.trig.simplify import slope, tidy
 from mbkit.lagrangian.trig.zero_test import is_zero
 
-__all__ = ["CanonicalEquations", "Hamiltonian", "bracket", "hamiltonian", "momentum_symbols", "shorter"]
-
-
 # Canonical momenta as symbols, and Poisson's bracket on coordinates and momenta.
 
 # Operations up to which a bracket is tidied.

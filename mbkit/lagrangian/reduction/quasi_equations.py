@@ -30,8 +30,6 @@ from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities
 from mbkit.lagrangian.energies.symbols import fits
 from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
 
-__all__ = ["QuasiEquationsOfMotion", "in_quasi_velocities", "quasi_equations"]
-
 
 @dataclass(frozen=True, repr=False)
 class QuasiEquationsOfMotion(EquationsOfMotion):

@@ -38,8 +38,6 @@ from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction.hamilton import momentum_symbols
 from mbkit.lagrangian.trig.simplify import tidy
 
-__all__ = ["Motion", "ReducedState", "Routhian", "reconstructed", "routhian"]
-
 FormT = TypeVar("FormT", bound=EnergyForm)
 
 

@@ -23,9 +23,6 @@ from mbkit.errors import InputError, NumericalError
 from mbkit.lagrangian.statics.force_balance import BALANCED, Balance, SmallMotion
 from mbkit.lagrangian.system import Lagrangian
 
-__all__ = ["Equilibrium", "equilibrium", "find_equilibrium"]
-
-
 # The search for a configuration at rest: Newton's iteration, damped after Levenberg and Marquardt far from the end.
 
 _MOST: Final = 200

@@ -15,8 +15,6 @@ from mbkit.errors import InputError, UnknownNameError
 from mbkit.lagrangian.constraints.manifold import manifold_of
 from mbkit.lagrangian.constraints.redundancy import refuse_unreachable, require_independent
 
-__all__ = ["BALANCED", "Balance", "SmallMotion", "small_motion"]
-
 #: Of the forces that balance: what rounding leaves of them.
 BALANCED: Final = 1e-11
 # rad or m: a neighbourhood, in which stiffness that vanishes at a threshold does not.

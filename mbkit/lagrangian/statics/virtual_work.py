@@ -12,8 +12,6 @@ from mbkit.lagrangian.energies.symbols import PlainSymbols, expression, listed, 
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.trig.simplify import tidy
 
-__all__ = ["check_places", "from_particles", "generalized_force", "vectors"]
-
 
 def generalized_force(
     forces: Any,

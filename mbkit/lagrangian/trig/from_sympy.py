@@ -18,8 +18,6 @@ from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, quotient
 from mbkit.lagrangian.trig.shortest_form import shortest_form
 
-__all__ = ["forms", "shortened"]
-
 #: Products of terms that one expression may cost: about half a second.
 _MOST: Final = 40_000
 _HIGHEST: Final = 12

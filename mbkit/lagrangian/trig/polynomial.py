@@ -15,9 +15,6 @@ import sympy as sp
 
 from mbkit.errors import UnsupportedError
 
-__all__ = ["MOST", "TrigPolynomial", "TrigRing", "quotient"]
-
-
 #: Products of terms that one system may cost. A robot with six joints costs 10,000, a planar chain of 19 twice that.
 MOST: Final = 200_000
 

@@ -16,8 +16,6 @@ import sympy as sp
 
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 
-__all__ = ["complexity", "number", "shortest_form"]
-
 #: Terms up to which products of cosines and sines are looked for.
 _SMALL: Final = 60
 #: Forms of fewest terms whose operations are counted.

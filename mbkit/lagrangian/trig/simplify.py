@@ -11,9 +11,6 @@ from sympy.functions.elementary.trigonometric import TrigonometricFunction
 from mbkit.lagrangian.trig.from_sympy import forms
 from mbkit.lagrangian.trig.shortest_form import complexity
 
-__all__ = ["LARGE", "gradient", "slope", "tidy", "tidy_matrix"]
-
-
 #: Operations up to which an expression is simplified.
 LARGE: Final = 2000
 # Roots of cosines: their factors often read better as they were.

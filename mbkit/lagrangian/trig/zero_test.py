@@ -14,8 +14,6 @@ import sympy as sp
 from mpmath.libmp import NoConvergence
 from numpy.random import default_rng
 
-__all__ = ["DIGITS", "RandomEvaluation", "is_zero"]
-
 #: Digits of values, and of the second evaluation of a zero test.
 DIGITS: Final = 30
 _MORE: Final = 60
