@@ -98,13 +98,13 @@ def check(
         processors=(recorded.processor, processor),
         strict=strict,
     )
-    found = _changes(recorded, model, recorded.target if target is None else target, path_of(path))
-    meant = tuple(c for c in found if not c.rounding)
+    changed = _changes(recorded, model, recorded.target if target is None else target, path_of(path))
+    meant = tuple(c for c in changed if not c.rounding)
     if not meant and not moved_versions and processor == recorded.processor:
         # Another parser or processor may round otherwise; neither is another, so somebody wrote another number.
-        meant = found
-    notes = tuple(f"only rounding: {c.text}" for c in found if c not in meant)
-    if not found and model.digest != recorded.digest:
+        meant = changed
+    notes = tuple(f"only rounding: {c.text}" for c in changed if c not in meant)
+    if not changed and model.digest != recorded.digest:
         notes = ("the digest is another, though no parameter is",)
     plain = with_values(model)
     if meant:
@@ -134,11 +134,11 @@ def check(
 def _changes(recorded: Baseline, model: Model, target: str, path: Path) -> tuple[Change, ...]:
     """Return what differs in the descriptions, by the links' own names where a file tells them."""
     old, new = recorded.description, described(model)
-    found = changes({k: x for k, x in old.items() if k not in LINK_SECTIONS}, new)
-    if not found or "links" not in old:
-        return found
+    changed = changes({k: x for k, x in old.items() if k not in LINK_SECTIONS}, new)
+    if not changed or "links" not in old:
+        return changed
     links = links_of(model, target, recorded.options, path)
-    return without_consequences(changes(old, new | links), old) if links else found
+    return without_consequences(changes(old, new | links), old) if links else changed
 
 
 def _require_same_robot(recorded: Baseline, model: Model, path: str) -> None:
@@ -212,11 +212,11 @@ def _shared(rows: list[Moved], built: dict[str, Dynamics]) -> tuple[str, ...]:
     )
 
 
-def _effect(recorded: Baseline, model: Model, found: tuple[Change, ...]) -> str:
+def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> str:
     """Return what a changed description does to the terms, by the first engine at hand."""
     if tuple(model.coordinate_names) != recorded.coordinates or tuple(model.velocity_names) != recorded.velocities:
         return "the coordinates are others, so no number can be compared"
-    if all(c.section == "expressions" for c in found):
+    if all(c.section == "expressions" for c in changed):
         return ""
     for name in recorded.engines:
         built, _, _ = build_engines(model, [name])
@@ -265,9 +265,9 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
     rows: list[Moved] = []
     if not notes:
         rows = _rows(a, b)
-    found = without_consequences(changes(a.description, b.description), a.description)
+    changed = without_consequences(changes(a.description, b.description), a.description)
     moved = tolerance.moved(a.versions, b.versions)
-    status: Status = "description" if found else "numbers" if rows or notes else "versions" if moved else "same"
+    status: Status = "description" if changed else "numbers" if rows or notes else "versions" if moved else "same"
     return BaselineResult(
         question="diff",
         model=a.model,
@@ -275,7 +275,7 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
         against=os.fspath(path_b),
         status=status,
         engines=tuple(e for e in a.engines if e in b.engines),
-        changes=found,
+        changes=changed,
         moved=tuple(rows),
         versions=moved,
         processors=(a.processor, b.processor),

@@ -246,12 +246,12 @@ def _engine_names(engines: Sequence[str] | None) -> tuple[str, ...]:
 
 def build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[Refusal], list[Refusal]]:
     """Return the engines that hold a model, those that refuse it, and those that are not installed."""
-    found: dict[str, Dynamics] = {}
+    engines: dict[str, Dynamics] = {}
     refused: list[Refusal] = []
     missing: list[Refusal] = []
     for name in names:
         try:
-            found[name] = dynamics(model, name, **find_engine(name).brief)
+            engines[name] = dynamics(model, name, **find_engine(name).brief)
         except UnsupportedError as error:
             absent = isinstance(error.__cause__, ModuleNotFoundError)
             if absent:
@@ -260,4 +260,4 @@ def build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamic
                 refused.append(Refusal.of(name, error))
         except MbkitError as error:
             refused.append(Refusal.of(name, error))
-    return found, refused, missing
+    return engines, refused, missing

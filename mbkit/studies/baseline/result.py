@@ -160,9 +160,9 @@ class BaselineResult(ResultTable):
         return f"<BaselineResult of {self.model!r}: {one_line(self.verdict)}>"
 
 
-def _one(found: Sequence[object]) -> bool:
-    return len(found) == 1
+def _one(items: Sequence[object]) -> bool:
+    return len(items) == 1
 
 
-def _count(found: Sequence[object], noun: str) -> str:
-    return f"{len(found)} {noun}{'' if _one(found) else 's'}"
+def _count(items: Sequence[object], noun: str) -> str:
+    return f"{len(items)} {noun}{'' if _one(items) else 's'}"
