@@ -11,7 +11,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Frame, Model
-from mbkit.simulate.torque import Held, Sampled
+from mbkit.simulate.torque import PiecewiseConstantTorque, SampledTorque
 
 __all__ = [
     "along",
@@ -90,7 +90,7 @@ def potential_energy(dyn: Dynamics, q: Array) -> Array:
     return along(dyn, (), lambda own, q: own.potential_energy(q), q)
 
 
-def work(dyn: Dynamics, t: Array, q: Array, v: Array, force: Held | Sampled | None) -> Array:
+def work(dyn: Dynamics, t: Array, q: Array, v: Array, force: PiecewiseConstantTorque | SampledTorque | None) -> Array:
     """Return the work of τ and of dampers since the first state; (K,) or (N, K).
 
     A force that was held does τ·Δq over each interval, exactly, where v = q̇. On
@@ -100,7 +100,7 @@ def work(dyn: Dynamics, t: Array, q: Array, v: Array, force: Held | Sampled | No
     integrated by the cubic through four of them, of fourth order too where it is smooth.
     """
     h = np.diff(t)
-    if isinstance(force, Sampled):
+    if isinstance(force, SampledTorque):
         power = np.sum((force.values + _damping(dyn, q, v)) * v, axis=-1)
         steps = _by_cubics(t, power)
     else:

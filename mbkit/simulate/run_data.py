@@ -16,7 +16,7 @@ from mbkit.model import Model
 from mbkit.simulate.along_trajectory import canonical_momentum, kinetic_energy, momentum, potential_energy, work
 from mbkit.simulate.events import Hit
 from mbkit.simulate.result import Stats
-from mbkit.simulate.torque import Applied, Asked, Held, Sampled
+from mbkit.simulate.torque import Applied, PiecewiseConstantTorque, SampledTorque, TorqueCallback
 
 __all__ = ["RunData", "RunSettings"]
 
@@ -79,7 +79,7 @@ class RunData:
         # An engine that a name can make is not sent along: a process pool would derive it for every trajectory.
         known = self.engine in ENGINES and (self._dyn is None or self._dyn.samples is None)
         applied = self._applied
-        if isinstance(applied, Asked):
+        if isinstance(applied, TorqueCallback):
             # Functions can seldom be pickled; their values can.
             applied = applied.sampled(self.t, self.q, self.v, strict=False)
         dyn = None if known else self._dyn
@@ -124,7 +124,7 @@ class RunData:
         acted = self._acted()
         if acted is None:
             return np.zeros(self.v.shape)
-        if isinstance(acted, Sampled):
+        if isinstance(acted, SampledTorque):
             return acted.values.copy()
         rows = np.broadcast_to(acted.at(self.t), self.v.shape)
         return np.where(np.isfinite(self.v).all(-1, keepdims=True), rows, np.nan)
@@ -191,11 +191,11 @@ class RunData:
         assert self._dyn is not None
         return self._dyn
 
-    def _acted(self) -> Held | Sampled | None:
-        if isinstance(self._applied, Asked):
+    def _acted(self) -> PiecewiseConstantTorque | SampledTorque | None:
+        if isinstance(self._applied, TorqueCallback):
             strict = self.stats.ended != "function_failed"
             answers = self._applied.sampled(self.t, self.q, self.v, strict=strict)
             object.__setattr__(self, "_applied", answers)
         acted = self._applied
-        assert not isinstance(acted, Asked)
+        assert not isinstance(acted, TorqueCallback)
         return acted

@@ -1,4 +1,4 @@
-"""The generalized force of a run: none, an array held over each step, or a callable."""
+"""The generalized force of a run: zero, an array held over each step, or a function of the state."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ from mbkit.errors import InputError, TorqueError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.time_grid import Indices
 
-__all__ = ["Applied", "Asked", "Force", "Held", "Sampled", "Torque", "TorqueFunction"]
+__all__ = ["Applied", "Force", "PiecewiseConstantTorque", "SampledTorque", "Torque", "TorqueCallback", "TorqueFunction"]
 
-
-# What pushed a run: rows held over its steps, a function that is asked, or what that one answered.
 
 #: torque(t, q, v) -> (nv,), of one state
 TorqueFunction = Callable[[float, Array, Array], ArrayLike]
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class PiecewiseConstantTorque:
     """A generalized force that is constant, or jumps at known times.
 
     Attributes
@@ -39,16 +37,16 @@ class Held:
     starts: Array | None
 
     def at(self, t: Array) -> Array:
-        """Return what acts from each time on: (nv,), (K, nv) or (N, K, nv). The last row has no end."""
+        """Return the force from each time on: (nv,), (K, nv) or (N, K, nv). The last row has no end."""
         return self.rows if self.starts is None else self.rows[..., self._row(t), :]
 
     def between(self, t: Array) -> Array:
-        """Return what acts between neighbouring times: (nv,), (K - 1, nv) or (N, K - 1, nv).
+        """Return the force between neighbouring times: (nv,), (K - 1, nv) or (N, K - 1, nv).
 
         Raises
         ------
         UnsupportedError
-            It changes between two of the times.
+            The force changes between two of the times.
         """
         if self.starts is None:
             return self.rows
@@ -70,14 +68,14 @@ class Held:
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
-    """What a function of the state gave at the saved states, (K, nv) or (N, K, nv)."""
+class SampledTorque:
+    """Values of a torque function at the saved states, (K, nv) or (N, K, nv)."""
 
     values: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class TorqueCallback:
     """A user's function of (t, q, v).
 
     Attributes
@@ -91,7 +89,7 @@ class Asked:
     nv: int
 
     def one(self, t: float, q: Array, v: Array, member: int | None = None) -> Array:
-        """Return what acts on one state.
+        """Return the force on one state.
 
         Raises
         ------
@@ -100,32 +98,29 @@ class Asked:
         """
         when = f"at t = {t:.9g} s" + ("" if member is None else f" for trajectory {member}")
         try:
-            # Copies, so that nothing it writes there matters.
-            given: Any = self.function(t, q.copy(), v.copy())
+            # Copies: the function may write into them.
+            value: Any = self.function(t, q.copy(), v.copy())
         except Exception as error:
             raise TorqueError(f"torque: the callable raised {type(error).__name__} {when}: {error}") from error
         try:
-            return finite_array("torque", given, (self.nv,))
+            return finite_array("torque", value, (self.nv,))
         except InputError as error:
             raise TorqueError(f"{error}; it is what the callable returned {when}") from None
         except Exception as error:
             raise TorqueError(
-                f"torque: expected an array of numbers, got {type(given).__name__}; "
+                f"torque: expected an array of numbers, got {type(value).__name__}; "
                 f"it is what the callable returned {when}"
             ) from error
 
     def many(self, t: float, q: Array, v: Array, members: Indices) -> Array:
-        """Return what acts on these members of a batch, (n, nv)."""
+        """Return the force on these members of a batch, (n, nv)."""
         rows = [self.one(t, *state) for state in zip(q, v, members.tolist(), strict=True)]
         return np.array(rows).reshape(-1, self.nv)
 
-    def sampled(self, t: Array, q: Array, v: Array, *, strict: bool) -> Sampled:
-        """Ask again at the saved states of a run; NaN where a state is none.
+    def sampled(self, t: Array, q: Array, v: Array, *, strict: bool) -> SampledTorque:
+        """Return the values at the saved states of a run; NaN where a state is not finite.
 
-        Parameters
-        ----------
-        strict : bool
-            Whether a function that fails raises, or leaves NaN.
+        With `strict` a function that fails raises; else it leaves NaN.
         """
         out = np.full(v.shape, np.nan)
         for index in np.ndindex(v.shape[:-1]):
@@ -136,18 +131,18 @@ class Asked:
                 except TorqueError:
                     if strict:
                         raise
-        return Sampled(out)
+        return SampledTorque(out)
 
 
-Applied = Held | Asked | Sampled
+Applied = PiecewiseConstantTorque | TorqueCallback | SampledTorque
 
 
-#: What acts during one step: an array, or a function of (t, q, v) of one state or a batch.
+#: The force during one step: an array, or a function of (t, q, v) of one state or a batch.
 Force = Array | Callable[[float, Array, Array], Array]
 
 
 class Torque:
-    """What a caller gave as `torque`, checked, and read step by step.
+    """The argument `torque` of a run, checked, and read step by step.
 
     Parameters
     ----------
@@ -158,33 +153,26 @@ class Torque:
     batch : int or None
         Number of trajectories, None for a single state.
     steps : int or None
-        Rows that an array must have; None where there are no rows, so that only
-        one constant (nv,) can be held.
+        Rows that an array must have; None where only a constant (nv,) is possible.
 
     Raises
     ------
     InputError
-        Wrong shape or not finite, here for an array; a callable's is a `TorqueError`
-        during the run, as is whatever else it raises.
+        An array of wrong shape or not finite; a callable raises `TorqueError` during the run.
     """
 
     def __init__(
         self, torque: ArrayLike | TorqueFunction | None, model: Model, batch: int | None, steps: int | None
     ) -> None:
         self._nv, self._name = model.nv, model.name
-        self._batch = batch
-        self._function: TorqueFunction | None = None
+        self._function: TorqueFunction | None = torque if callable(torque) else None
         self._zero = np.zeros(self._nv) if batch is None else np.zeros((batch, self._nv))
         self._rows: Array | None = None
-        if torque is None:
-            return
-        if callable(torque):
-            self._function = torque
-            return
-        self._read(torque, steps)
+        if torque is not None and not callable(torque):
+            self._read(torque, batch, steps)
 
-    def _read(self, torque: ArrayLike, steps: int | None) -> None:
-        nv, batch = self._nv, self._batch
+    def _read(self, torque: ArrayLike, batch: int | None, steps: int | None) -> None:
+        nv = self._nv
         shape = _shape(torque)
         allowed: list[tuple[int, ...]] = [(nv,)]
         if steps is not None:
@@ -205,18 +193,19 @@ class Torque:
 
     @property
     def held(self) -> bool:
-        """Whether it jumps between steps."""
+        """Whether the force jumps between steps."""
         return self._rows is not None
 
     @property
     def callable(self) -> bool:
-        """Whether a function of the state gives it."""
+        """Whether the force is a function of the state."""
         return self._function is not None
 
     def during(self, k: int, members: Indices | None) -> Force:
-        """Return what acts during step k on a single state, or on these members of a batch."""
+        """Return the force during step k on a single state, or on these members of a batch."""
         if self._function is not None:
-            return self._asked(members)
+            callback = TorqueCallback(self._function, self._nv)
+            return callback.one if members is None else lambda t, q, v: callback.many(t, q, v, members)
         if self._rows is None:
             return self._zero if members is None else self._zero[members]
         if self._rows.ndim == 3:
@@ -225,12 +214,12 @@ class Torque:
         return row if members is None else np.broadcast_to(row, (len(members), self._nv))
 
     def of_member(self, i: int | None) -> Callable[[int], Force]:
-        """Return a function of the step that gives what acts on one state (of a batch)."""
+        """Return a function of the step that returns the force on one state (of a batch)."""
         if i is None:
             return lambda k: self.during(k, None)
         if self._function is not None:
-            asked = Asked(self._function, self._nv)
-            return lambda _: partial(asked.one, member=i)
+            callback = TorqueCallback(self._function, self._nv)
+            return lambda _: partial(callback.one, member=i)
         return lambda k: np.asarray(self.during(k, np.array([i])))[0]
 
     def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
@@ -252,8 +241,8 @@ class Torque:
         one = self._zero if self._zero.ndim == 1 else self._zero[0]
         return np.broadcast_to(one, (stop - start, self._nv)).copy()
 
-    def applied(self, bounds: Array | None) -> Held | Asked | None:
-        """Return what acted, for a finished run to read; None where nothing did.
+    def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | TorqueCallback | None:
+        """Return the force of a finished run; None where it was zero.
 
         Parameters
         ----------
@@ -261,20 +250,13 @@ class Torque:
             Times between which the rows of an array were held, s.
         """
         if self._function is not None:
-            return Asked(self._function, self._nv)
+            return TorqueCallback(self._function, self._nv)
         if self._rows is not None:
             assert bounds is not None  # rows are read only where there are intervals
-            return Held(self._rows, bounds[:-1])
+            return PiecewiseConstantTorque(self._rows, bounds[:-1])
         if not self._zero.any():
             return None
-        return Held(self._zero if self._zero.ndim == 1 else self._zero[0], None)
-
-    def _asked(self, members: Indices | None) -> Force:
-        assert self._function is not None
-        asked = Asked(self._function, self._nv)
-        if members is None:
-            return asked.one
-        return lambda t, q, v: asked.many(t, q, v, members)
+        return PiecewiseConstantTorque(self._zero if self._zero.ndim == 1 else self._zero[0], None)
 
 
 def _shape(value: Any) -> tuple[int, ...]:

@@ -23,7 +23,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time, no_dynamics
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.integration_space import Space
-from mbkit.simulate.torque import Asked, TorqueFunction
+from mbkit.simulate.torque import TorqueCallback, TorqueFunction
 
 __all__ = ["Stiffness", "linearized", "stiffness", "stiffness_of"]
 
@@ -176,7 +176,7 @@ def _of_one(
     member: int | None,
 ) -> Stiffness:
     model = dyn.model
-    force = Asked(tau, model.nv).one if callable(tau) else tau
+    force = TorqueCallback(tau, model.nv).one if callable(tau) else tau
     if not model.nv:
         return Stiffness(np.zeros(0, dtype=complex), 0.0, member=member)
     if dyn.derived:
