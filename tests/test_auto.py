@@ -17,8 +17,9 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, TorqueError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Trajectory, at_section, simulate, stiffness
-from mbkit.simulate.solvers.auto import Gauge
+from mbkit.simulate.solvers.auto import StepRateMonitor
 from mbkit.simulate.solvers.step_attempts import AcceptedSteps
+from mbkit.studies.stress.cases import stiffness as stiffness_cases
 from mbkit.studies.stress.cases.exact_motions import cart_pole as light_cart_pole
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms
@@ -110,6 +111,17 @@ def test_a_stiffness_without_damping_is_passed_over_where_it_does_not_ring() -> 
     assert run.q[:, 0] == pytest.approx(rigid, abs=1e-7)
     assert "rodas5 from there" in run.stats.chosen
     assert run.stats.evaluations < 1500
+
+
+def test_rodas5_is_tried_where_many_steps_are_to_come_though_stability_does_not_hold_them() -> None:
+    """A conical pendulum on a stiff damped spring, whose h|λ| is 1.3: rk853 alone takes 700,000 evaluations."""
+    problem = next(case for case in stiffness_cases.CASES if case.name == "damped_point_spring").make(1e8)
+    times = problem.duration * np.linspace(0.0, 0.98, 11)
+    dyn = dynamics(problem.model, "lagrangian", compile=True)
+    run = simulate(dyn, problem.q, problem.v, times[-1], "auto", rtol=1e-8, save=times)
+    assert np.abs(run.q - problem.exact(times)).max() < 1e-6 * problem.scale
+    assert "rodas5 got further with a trial" in run.stats.chosen
+    assert run.stats.evaluations < 100_000
 
 
 def test_an_oscillation_is_followed_and_its_errors_do_not_add_up() -> None:
@@ -252,7 +264,7 @@ def test_bad_input_is_named() -> None:
 
 
 def test_the_pace_is_that_of_the_later_half() -> None:
-    gauge = Gauge(0.0, 4, 2)
+    gauge = StepRateMonitor(0.0, 4, 2)
     for k in range(8):
         t = np.array([k, k + 1.0]) if k < 4 else np.array([4 + (k - 4) / 10, 4 + (k - 3) / 10])
         gauge.saw(AcceptedSteps(t, np.zeros((2, 1)), np.zeros((2, 1)), 1))

@@ -131,7 +131,8 @@ def test_start_times_without_digits_are_refused() -> None:
             simulate(dynamics_for(method), [0.1], [0.3], 1e-320, method, **saved(method, 0.0))
 
 
-@pytest.mark.parametrize("method", METHODS)
+# One method with a step and one with a tolerance: arguments are read before the method is looked at.
+@pytest.mark.parametrize("method", ["rk4", "rk853"])
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -173,10 +174,23 @@ def test_start_times_without_digits_are_refused() -> None:
         ({"progress": "yes"}, "progress: expected None, True or a callable"),
     ],
 )
-def test_bad_input_is_named_by_every_method(method: str, change: dict[str, Any], message: str) -> None:
+def test_bad_input_is_named(method: str, change: dict[str, Any], message: str) -> None:
     arguments = {"q0": [0.1], "v0": [0.0], "duration": END, "method": method, **saved(method), **change}
     with pytest.raises(InputError, match=message):
         simulate(dynamics_for(method), **arguments)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_checks_its_arguments(method: str) -> None:
+    arguments = {"q0": [0.1], "v0": [0.0], "duration": END, "method": method, **saved(method)}
+    for change, message in (
+        ({"duration": np.nan}, "duration: expected a finite number"),
+        ({"save": [0.0, 2 * END]}, "save: expected times between 0 and 0.1"),
+        ({"torque": [np.nan]}, "torque: nan at index"),
+        ({"torque": np.zeros((7, 1))}, r"torque: expected shape .*got \(7, 1\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulate(dynamics_for(method), **{**arguments, **change})
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -216,12 +230,14 @@ class _Hostile:
         raise RuntimeError("no array")
 
 
-@pytest.mark.parametrize("method", ASKING)
-@pytest.mark.parametrize("states", [[0.1], [[0.1], [0.2], [0.3]]])
-@pytest.mark.parametrize("t0", [-1.0, 0.0305])
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
+ONE, THREE = [0.1], [[0.1], [0.2], [0.3]]
+RAISED = (raises, r"torque: the callable raised ZeroDivisionError at t = .*: mine")
+#: A function that raises, with every method; whatever else it may return, with one of each kind.
+FAILURES: list[Any] = [(m, states, t0, *RAISED) for m in ASKING for states in (ONE, THREE) for t0 in (-1.0, 0.0305)]
+FAILURES += [
+    (method, ONE, 0.0305, wrong, message)
+    for method in ("rk4", "rk853")
+    for wrong, message in (
         (lambda: [0.0, 0.0], r"torque: expected shape \(1,\), got \(2,\); it is what the callable returned at t = "),
         (lambda: 0.0, r"torque: expected shape \(1,\), got \(\); .*callable returned at t = "),
         (lambda: [np.nan], r"torque: nan at index .*callable returned at t = "),
@@ -229,9 +245,11 @@ class _Hostile:
         (lambda: "push", r"torque: expected real numbers, .*callable returned at t = "),
         (lambda: None, r"torque: expected real numbers, .*callable returned at t = "),
         (lambda: _Hostile(), r"torque: expected an array of numbers, got _Hostile; .*callable returned at t = "),
-        (raises, r"torque: the callable raised ZeroDivisionError at t = .*: mine"),
-    ],
-)
+    )
+]
+
+
+@pytest.mark.parametrize(("method", "states", "t0", "wrong", "message"), FAILURES)
 def test_a_torque_that_fails_leaves_the_run_up_to_then(
     method: str, states: Any, t0: float, wrong: Any, message: str
 ) -> None:
