@@ -18,22 +18,6 @@ from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Joint, Model
 
-__all__ = [
-    "DOUBLE_BITS",
-    "QUANTITIES",
-    "Dynamics",
-    "ForwardDynamicsDerivatives",
-    "InverseDynamicsDerivatives",
-    "at_time",
-    "at_times",
-    "no_dynamics",
-    "per_sample",
-    "require_tree",
-    "through_inverse",
-    "unknown_joint",
-]
-
-
 QUANTITIES: Final = (
     "mass_matrix",
     "coriolis_matrix",

@@ -17,8 +17,6 @@ from mbkit._check import Array
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 
-__all__ = ["IMPORTERS", "Beside", "Imported", "Importer", "check_installed", "checked", "reader", "unused", "written"]
-
 
 class Importer(NamedTuple):
     """Where an engine's importer is.

@@ -14,8 +14,6 @@ from typing import Final
 
 from mbkit.errors import KnownDefectWarning
 
-__all__ = ["CORIOLIS", "KINETIC_ENERGY", "TENDON_ARMATURE", "TINY_MASS", "Defect", "announce"]
-
 
 @dataclass(frozen=True)
 class Defect:

@@ -24,9 +24,6 @@ from mbkit.model import Model
 if TYPE_CHECKING:
     from mbkit.codegen.compiled import Compiled
 
-__all__ = ["LagrangianDynamics", "ParameterValues", "short_way"]
-
-
 # Fast calls of machine code, without the checks of `Dynamics`
 #
 # The code itself finds NaN and infinity in all that it reads and writes. A fast call returns None for arguments

@@ -29,8 +29,6 @@ from mbkit.engines.base import Dynamics, ForwardDynamicsDerivatives, InverseDyna
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 
-__all__ = ["OracleDynamics"]
-
 #: Quantity -> its arguments, as in `Dynamics`.
 _ARGUMENTS: Final = {
     "mass_matrix": ("q",),

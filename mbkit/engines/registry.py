@@ -17,22 +17,6 @@ from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 
-__all__ = [
-    "DERIVED",
-    "ENGINES",
-    "INDEPENDENT",
-    "MUJOCO",
-    "PINOCCHIO",
-    "REFERENCE",
-    "STANDARD",
-    "EngineInfo",
-    "compared",
-    "dynamics",
-    "find_engine",
-    "register_engine",
-    "registered_engines",
-]
-
 #: Group of the entry points that name an `EngineInfo`, or a module that calls `register_engine`.
 ENTRY_POINTS: Final = "mbkit.engines"
 
@@ -264,6 +248,7 @@ def _registered(name: str, *values: Any) -> EngineInfo:
 
 @cache
 def load_entry_points() -> None:
+    """Register the engines that installed packages name, once."""
     for point in entry_points(group=ENTRY_POINTS):
         loaded = point.load()
         if isinstance(loaded, EngineInfo) and loaded.name not in ENGINES:

@@ -26,8 +26,6 @@ from mbkit.report.formatting import count_text, error_text, mark, model_facts, r
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 
-__all__ = ["failures", "headline", "omission_state", "robots_view", "view"]
-
 # Rounding stays far below this, and anything that acts is far above.
 _VISIBLE: Final = 1e-6
 _MAX_FAILURES: Final = 12

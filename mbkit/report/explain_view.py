@@ -13,8 +13,6 @@ from mbkit.studies.baseline import BaselineResult
 from mbkit.studies.explain.result import Cause, Explanation, grouped
 from mbkit.studies.importers.result import DECIDING, TERMS, Parsed, ParserComparison, Stage
 
-__all__ = ["baseline_view", "explanation_view", "importers_view", "meaning"]
-
 
 def explanation_view(result: Explanation) -> Document:
     """Return the document of an explanation: verdict, terms, causes and notes."""

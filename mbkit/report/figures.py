@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["PAGE", "by_term", "canvas", "digits", "page_style", "robots", "svg", "term_costs"]
-
-
 # Figures as SVG that takes its colours from the page, so that light and dark both read.
 #
 # Matplotlib draws with stand-in colours; each is then replaced by a variable of the

@@ -9,8 +9,6 @@ from typing import Any, Final
 from mbkit.report.document import Bullet, Span, Text
 from mbkit.studies.results import Refusal
 
-__all__ = ["choice", "count_text", "error_text", "mark", "model_facts", "refusals", "time_text"]
-
 _UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
 

@@ -12,8 +12,6 @@ from mbkit import _interrupt
 from mbkit.errors import OutputError
 from mbkit.studies.results import write_whole
 
-__all__ = ["check_replaceable", "check_writable", "file_stem", "write"]
-
 
 def file_stem(name: str) -> str:
     """Return a model's name as the stem of a file in the folder, whatever the name holds."""

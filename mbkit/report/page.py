@@ -15,8 +15,6 @@ from mbkit.studies.stress.result import StressResult
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["render", "stress_page"]
-
 
 def render(shown: Document, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
     """Return a document as a page.

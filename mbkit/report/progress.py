@@ -11,8 +11,6 @@ from typing import Any
 from mbkit import _interrupt
 from mbkit._escape import one_line
 
-__all__ = ["Bar"]
-
 _PATIENCE = 2.0  # s before the bar appears
 
 

@@ -21,8 +21,6 @@ from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_te
 from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, engines_of, name_of, place
 from mbkit.studies.stress.result import StressResult
 
-__all__ = ["FILTERS", "content", "section"]
-
 _MEASURES: Final = {
     "motion": "the largest difference of q along the run, over the size of the motion",
     "energy": "the largest relative error of the energy along the run",

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["against_theory", "kinds", "rules", "stable_steps", "steps"]
-
-
 #: What a fact's name begins with that a step is to be short against: "fastest frequency", "fastest rate".
 _FASTEST: Final = "fastest"
 #: Ends that say nothing about stability.

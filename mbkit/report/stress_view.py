@@ -27,10 +27,6 @@ from mbkit.studies.stress.measurements import (
 )
 from mbkit.studies.stress.result import StressResult
 
-__all__ = ["HOW", "Overview", "avoid", "bars", "families", "headline", "held_text", "methods", "overview", "ranks"]
-__all__ += ["remarks", "silences", "value_text", "view"]
-
-
 #: Outcomes in words that follow "then".
 HOW: Final[dict[Outcome, str]] = {
     "held": "held",

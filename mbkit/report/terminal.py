@@ -15,8 +15,6 @@ from mbkit._escape import one_line, terminal
 from mbkit.report import document
 from mbkit.report.document import Bullet, Document, Items, Paragraph, Span, Style
 
-__all__ = ["columns", "render", "robots"]
-
 _STYLES: Final[dict[Style, str]] = {
     "good": "green",
     "bad": "bold red",

@@ -29,8 +29,6 @@ from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import USEFUL, figure
 from mbkit.studies.work_precision.result import WorkPrecision
 
-__all__ = ["error_against_time", "picture", "sections", "view"]
-
 #: An observed order farther than this from the method's own is flagged.
 ORDER_TOLERANCE: Final = 0.2
 _EXPONENTS: Final = range(-2, -15, -2)

@@ -29,8 +29,6 @@ from mbkit.engines.drake.model import build
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Model
 
-__all__ = ["DrakeDynamics", "DrakeRun"]
-
 
 class DrakeDynamics(Dynamics):
     """Drake on a description.

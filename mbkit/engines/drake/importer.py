@@ -30,8 +30,6 @@ from mbkit.model import Body, Joint, Model
 from mbkit.model.joint_types import kind_of
 from mbkit.spatial import skew
 
-__all__ = ["read"]
-
 _KINDS: Final = {
     "weld": "fixed",
     "revolute": "revolute",

@@ -24,8 +24,6 @@ from mbkit.model import Body, Joint, Model
 from mbkit.model.parts import PointSpring
 from mbkit.model.validation import static_bodies
 
-__all__ = ["DrakeModel", "build"]
-
 _X, _Y, _Z = np.eye(3)
 _TURN: Final = 2 * np.pi
 

@@ -28,9 +28,6 @@ from mbkit.engines.mujoco.rollout import Rollout
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
 
-__all__ = ["MujocoDynamics"]
-
-
 #: Quantities that M is part of.
 _OF_MASS: Final = ("mass_matrix", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
 

@@ -26,8 +26,6 @@ from mbkit.load.urdf_links import BASE_JOINT
 from mbkit.model import Body, Joint, JointCoupling, Model, PointSpring
 from mbkit.model.joint_types import kind_of
 
-__all__ = ["read"]
-
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
 #: What changes no smooth term, and may take long or leave a part of the tree out.
 _OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)

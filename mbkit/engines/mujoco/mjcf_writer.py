@@ -21,8 +21,6 @@ from mbkit.engines.mujoco.model import JOINT_TYPES, MujocoModel, Placed, heard_w
 from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 
-__all__ = ["ReadBack", "mjcf_text", "read_back"]
-
 _TYPES: Final = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
     int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",

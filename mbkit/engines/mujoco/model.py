@@ -26,9 +26,6 @@ from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.validation import static_bodies
 
-__all__ = ["JOINT_TYPES", "MujocoModel", "Placed", "build", "full_mass_matrix", "heard_warnings", "mapped", "specified"]
-
-
 # What differs between versions of MuJoCo and what is global in it, in one place.
 #
 # 4.0 is the first whose Runge–Kutta on rotations is of fourth order, and the lower

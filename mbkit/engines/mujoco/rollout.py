@@ -18,8 +18,6 @@ from mbkit.engines.mujoco.model import MujocoModel, heard_warnings
 from mbkit.errors import DoubtfulRunWarning, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 
-__all__ = ["INTEGRATORS", "Rollout"]
-
 # All but RK4 are of first order. "euler" takes damping as it is, because the description
 # is built with MuJoCo's implicit damping off; the three implicit ones take it at the
 # step's end, "discrete" springs too: stable at any stiffness, by damping what the step

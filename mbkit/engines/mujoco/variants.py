@@ -12,8 +12,6 @@ from mbkit._check import Array
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import build
 
-__all__ = ["Variant"]
-
 
 class Variant:
     """MuJoCo with some features on.

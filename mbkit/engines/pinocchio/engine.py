@@ -21,9 +21,6 @@ from mbkit.engines.base import Dynamics, per_sample
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
 from mbkit.model import Model
 
-__all__ = ["PinocchioDynamics", "direct_calls", "unread_coordinates"]
-
-
 # Single states passed straight to Pinocchio, with the fewest checks that are safe.
 #
 # Arguments have to be plain vectors of native doubles: Pinocchio reads the memory of a

@@ -19,8 +19,6 @@ from mbkit.load.urdf_links import BASE_JOINT
 from mbkit.model import Body, Joint, Model
 from mbkit.model.joint_types import kind_of
 
-__all__ = ["read"]
-
 _ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous", "H": "helical"}
 _UNALIGNED: Final = {
     "RevoluteUnaligned": "revolute",

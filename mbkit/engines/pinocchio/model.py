@@ -19,9 +19,6 @@ from mbkit._check import Array
 from mbkit.engines.base import unknown_joint
 from mbkit.model import Body, Joint, Model, PointSpring
 
-__all__ = ["JointPassive", "PinModel", "PointSprings", "build"]
-
-
 _X, _Y, _Z = np.eye(3)
 
 

@@ -25,8 +25,6 @@ from mbkit.studies.baseline.result import BaselineResult, Status
 from mbkit.studies.baseline.tolerance import FINE, OWN, ROUNDING, Comparator, Moved, VersionChange, allowed
 from mbkit.studies.results import Refusal
 
-__all__ = ["check", "diff"]
-
 _NAN = float("nan")
 
 

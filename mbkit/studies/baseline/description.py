@@ -22,20 +22,6 @@ from mbkit.load.urdf_links import read_links
 from mbkit.model import Model
 from mbkit.studies._targets import resolved
 
-__all__ = [
-    "FLAT",
-    "LINK_SECTIONS",
-    "SECTIONS",
-    "Change",
-    "Description",
-    "changes",
-    "described",
-    "links_of",
-    "moving_mass",
-    "without_consequences",
-]
-
-
 Part = dict[str, Any]
 #: Section -> part -> field -> number, text or list of numbers; a flat section has one part without name.
 Description = dict[str, dict[str, Part]]

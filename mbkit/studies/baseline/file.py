@@ -27,19 +27,6 @@ from mbkit.studies.baseline.description import FLAT, SECTIONS, Description, movi
 from mbkit.studies.compare.terms import States
 from mbkit.studies.results import Refusal, write_whole
 
-__all__ = [
-    "ROLLOUT",
-    "Baseline",
-    "Rollout",
-    "check_replaceable",
-    "is_baseline",
-    "path_of",
-    "read",
-    "store",
-    "text_of",
-]
-
-
 #: The name of a rollout's end among the terms: q, then v, (nq + nv,).
 ROLLOUT: Final = "rollout"
 

@@ -27,9 +27,6 @@ from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.results import Refusal
 from mbkit.studies.study_runs import quiet_simulate
 
-__all__ = ["build_engines", "checked_model", "evaluate", "record"]
-
-
 # What is recorded, evaluated: the states, every term at them, and where a short rollout ends.
 
 _METHOD: Final = "rk4"

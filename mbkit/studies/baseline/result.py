@@ -11,8 +11,6 @@ from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.tolerance import Moved, VersionChange
 from mbkit.studies.results import Block, Items, Refusal, ResultTable, Title, columns_of
 
-__all__ = ["BaselineResult", "Status"]
-
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
 # A person acts on the first few; the rest is in the data.
 _MOST: Final = 5

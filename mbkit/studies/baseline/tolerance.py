@@ -24,20 +24,6 @@ from mbkit.studies.baseline.file import ROLLOUT, Baseline
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States
 
-__all__ = [
-    "FINE",
-    "OWN",
-    "ROUNDING",
-    "Comparator",
-    "Moved",
-    "VersionChange",
-    "allowed",
-    "moved",
-    "of_engine",
-    "relevant",
-]
-
-
 FINE: Final = 8.0 * float(np.finfo(float).eps)
 ROUNDING: Final = 1e-9
 OWN: Final = 1e-12

@@ -21,8 +21,6 @@ from mbkit.studies.compare.result import Comparison
 from mbkit.studies.compare.study import compare
 from mbkit.studies.worker import run
 
-__all__ = ["RobotOutcome", "Sweep", "all_robots"]
-
 Status = Literal["agree", "differ", "refused", "failed"]
 STATUSES: Final[tuple[Status, ...]] = ("agree", "differ", "refused", "failed")
 

@@ -26,8 +26,6 @@ import numpy as np
 
 from mbkit._check import Array
 
-__all__ = ["Errors", "Scales", "acceleration_errors", "energy_errors", "force_errors", "interleaved", "matrix_errors"]
-
 
 @dataclass(frozen=True)
 class Scales:

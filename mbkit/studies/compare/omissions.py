@@ -17,8 +17,6 @@ from mbkit.studies.compare.errors import interleaved
 from mbkit.studies.compare.result import Omission
 from mbkit.studies.study_runs import state_within_limits
 
-__all__ = ["omissions"]
-
 # Accelerations of the same model with one more feature compiled in differ by the
 # order of a few sums, amplified by the conditioning that both share.
 _UNCHANGED: Final = 1e-9

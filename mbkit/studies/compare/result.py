@@ -12,8 +12,6 @@ from mbkit._escape import one_line
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
 from mbkit.studies.work_precision.result import WorkPrecision
 
-__all__ = ["Comparison", "Omission", "RolloutRow", "Row"]
-
 
 @dataclass(frozen=True)
 class Row:

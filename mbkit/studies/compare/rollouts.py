@@ -23,8 +23,6 @@ from mbkit.simulate import Trajectory
 from mbkit.studies.compare.result import RolloutRow
 from mbkit.studies.study_runs import quiet_simulate, start_state
 
-__all__ = ["rollouts"]
-
 DURATION: Final = 1.0
 STEP: Final = 1e-3
 TOLERANCE: Final = 1e-12

@@ -29,9 +29,6 @@ from mbkit.studies.results import Refusal, model_info
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.work_precision.study import work_precision
 
-__all__ = ["Judge", "announced", "compare"]
-
-
 # Every term in every engine, judged against the oracle.
 
 _EPS: Final = float(np.finfo(float).eps)

@@ -24,9 +24,6 @@ from mbkit.studies.compare.errors import (
     matrix_errors,
 )
 
-__all__ = ["TERMS", "States", "Term", "power_rows", "states"]
-
-
 # States at which engines are compared: random ones, and the hard ones.
 
 # An angle this far from gimbal lock loses four digits in anything that divides

@@ -15,8 +15,6 @@ from mbkit.engines.imported import IMPORTERS, Beside, Imported, Importer, reader
 from mbkit.model import Model
 from mbkit.studies.worker import WALL_PER_CPU, Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
 
-__all__ = ["ImporterError", "Reading", "one_at_a_time"]
-
 #: Seconds more than all importers may take, after which a process ends that nobody waits for any more.
 _GRACE: Final = 30.0
 #: The most seconds that a reading may have; the system's calls take no more.

@@ -11,8 +11,6 @@ from mbkit._escape import one_line
 from mbkit.studies.explain.result import Explanation, grouped
 from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title
 
-__all__ = ["DECIDING", "MISSING", "TERMS", "Parsed", "ParserComparison", "Stage"]
-
 #: The terms that each engine computes by itself, on its own model.
 TERMS: Final = ("M", "g", "nle", "passive")
 #: The version of an importer that is not there; it has refused nothing.

@@ -33,9 +33,6 @@ from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_t
 from mbkit.studies.importers.process import ImporterError, Reading, one_at_a_time
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 
-__all__ = ["OwnTerms", "compare_parsers", "measured", "own_terms", "stages", "unmimicked", "written"]
-
-
 # The stages at which a reading of a file is compared with another, and what an engine's own terms hold beside it.
 #
 # An engine may hold more than bodies and joints: tendons, actuators, a fluid, gravity compensation. What

@@ -12,9 +12,6 @@ from mbkit._check import Array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
 
-__all__ = ["Case", "Family", "Measure", "Problem", "Truth", "problem_of", "step_of", "times_of"]
-
-
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "long", "step"]
 #: The error of q along a run, of the energy along a run, or of terms at states.
 Measure = Literal["motion", "energy", "terms"]

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["ROOMY", "SHADES", "WORDS", "cell_text", "error_short", "figure", "number_text", "shade"]
-
 #: Where one shade ends and the next begins, in digits of error.
 _DIGITS: Final = (12.0, 9.0, 6.0, 3.0)
 #: The shades on white paper: h held and w did not, by digits from many to few; grossly wrong;

@@ -35,8 +35,6 @@ from mbkit.studies.stress.reference import (
 from mbkit.studies.study_runs import TooLongError, patience, quiet_simulate
 from mbkit.studies.worker import report_stage
 
-__all__ = ["Prepared", "Setting", "condition_number", "measure", "prepare"]
-
 #: Processor time: the wall's is also other processes'. A run has one thread, and Linux gives the time of the whole
 #: process to some milliseconds only, unless there is a timer on it.
 _clock = time.thread_time

@@ -13,25 +13,6 @@ from typing import Final, Literal
 from mbkit.engines.registry import DERIVED, PINOCCHIO
 from mbkit.studies._figure_style import engine_index
 
-__all__ = [
-    "BAR",
-    "OUT_OF_TIME",
-    "BreakingPoint",
-    "CaseResult",
-    "End",
-    "Line",
-    "Measurement",
-    "Outcome",
-    "Row",
-    "best",
-    "engines_of",
-    "furthest",
-    "lines",
-    "name_of",
-    "place",
-    "recommended",
-]
-
 #: How a run or an evaluation ended, before its error is judged.
 End = Literal["finished", "diverged", "nan", "refused", "slow", "died", "not run"]
 #: With its error: held; above the bar, yet within `GROSS`; grossly wrong with a warning or without one; finished, with

@@ -33,8 +33,6 @@ from mbkit.studies.stress.case import Problem, Truth
 from mbkit.studies.study_runs import TooLongError, quiet_simulate
 from mbkit.studies.work_precision.reference import gap, reference
 
-__all__ = ["TERMS", "ReferenceSearch", "Terms", "condition", "cpu_limit", "error_of", "reference_terms"]
-
 #: Seconds after which the signal is sent again, for C++ code may lose it.
 _REPEAT: Final = 0.25
 

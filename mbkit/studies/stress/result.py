@@ -18,8 +18,6 @@ from mbkit.studies.stress.measurements import OUT_OF_TIME, CaseResult, Measureme
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Breaking", "SilentFailure", "StressResult"]
-
 
 @dataclass(frozen=True)
 class Breaking:

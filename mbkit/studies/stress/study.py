@@ -25,8 +25,6 @@ from mbkit.studies.work_precision.result import InterruptedSweepError
 from mbkit.studies.work_precision.settings import pairs
 from mbkit.studies.worker import CallError, in_worker, processors
 
-__all__ = ["stress"]
-
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}
 _BUDGET: Final = {True: 100.0, False: 1700.0}

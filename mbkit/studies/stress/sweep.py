@@ -29,8 +29,6 @@ from mbkit.studies.worker import (
     describe,
 )
 
-__all__ = ["CaseSweep", "Limits", "run_sweeps"]
-
 #: Times a run's seconds that making the problem and the engine, and compiling, may take; and at the least, s.
 _MAKING: Final = 15.0
 _MIN_MAKING: Final = 6.0

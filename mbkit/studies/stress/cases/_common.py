@@ -12,22 +12,6 @@ from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Family, Problem
 
-__all__ = [
-    "DOWN",
-    "EPS",
-    "RK4_IMAGINARY",
-    "RK4_REAL",
-    "SWING",
-    "Exact",
-    "Make",
-    "largest_step",
-    "powers",
-    "register",
-    "rods",
-    "stable_steps",
-    "terms_at",
-]
-
 #: From times (K,) to q (K, nq).
 Exact = Callable[[Array], Array]
 Make = Callable[[float], Problem]

@@ -16,22 +16,6 @@ from scipy.special import ellipj, ellipkinc, ellipkm1, elliprf, elliprj
 from mbkit._check import Array
 from mbkit.studies.stress.cases._common import Exact
 
-__all__ = [
-    "HangingChain",
-    "cart_pole",
-    "free_rotor",
-    "modal",
-    "past_gimbal_lock",
-    "pendulum",
-    "precession",
-    "released",
-    "ringing_spring",
-    "slow_motion",
-    "slowest_mode",
-    "turning",
-]
-
-
 # Slow motions of stiff systems, by collocation in variables in which nothing is stiff.
 #
 # Where a spring of stiffness k all but holds a coordinate s, k s stays of the size of a force. In it the

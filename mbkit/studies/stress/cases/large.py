@@ -17,8 +17,6 @@ from mbkit.studies.stress.cases._common import EPS, powers, register, terms_at
 from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum
 from mbkit.studies.stress.cases.spin import tumbling
 
-__all__ = ["CASES"]
-
 CASES: Final[list[Case]] = []
 _case = partial(register, CASES, "large")
 

@@ -17,8 +17,6 @@ from mbkit.studies.stress.case import Case, Problem
 from mbkit.studies.stress.cases._common import powers, register, rods, terms_at
 from mbkit.studies.stress.cases.exact_motions import HangingChain
 
-__all__ = ["CASES", "LENGTH_CASES", "straight_inertia"]
-
 CASES: Final[list[Case]] = []
 _case = partial(register, CASES, "mass ratio")
 

@@ -17,8 +17,6 @@ from mbkit.studies.stress.case import Case, Problem
 from mbkit.studies.stress.cases._common import EPS, powers, register, rods, terms_at
 from mbkit.studies.stress.cases.exact_motions import past_gimbal_lock
 
-__all__ = ["CASES"]
-
 CASES: Final[list[Case]] = []
 _case = partial(register, CASES, "near-singular")
 

@@ -14,8 +14,6 @@ from mbkit.studies.stress.case import Case, Problem
 from mbkit.studies.stress.cases._common import EPS, Exact, powers, register
 from mbkit.studies.stress.cases.exact_motions import free_rotor, precession, turning
 
-__all__ = ["CASES", "box_spin", "tumbling"]
-
 CASES: Final[list[Case]] = []
 _case = partial(register, CASES, "spin")
 

@@ -16,8 +16,6 @@ from mbkit.studies.stress.cases._common import EPS, Make, largest_step, powers, 
 from mbkit.studies.stress.cases.exact_motions import released
 from mbkit.studies.stress.cases.stiffness import conical, hinge
 
-__all__ = ["CASES", "LONG_CASES"]
-
 CASES: Final[list[Case]] = []
 
 #: Enough for what grows by a fifth a step to grow beyond any bar; few enough for what is evaluated slowly.

@@ -23,8 +23,6 @@ from mbkit.studies.stress.cases.exact_motions import (
     slowest_mode,
 )
 
-__all__ = ["CASES", "conical", "hinge"]
-
 CASES: Final[list[Case]] = []
 _case = partial(register, CASES, "stiffness")
 
