@@ -1,9 +1,7 @@
-"""A trajectory that others are measured by, known to a stated number of digits for a stated time.
+"""Reference trajectories, known to a stated number of digits up to a stated time.
 
-Two runs of one motion are made so that they share no error but the description: in
-extended precision by Taylor series of different orders, or in double by two engines
-with a method each. Where they stop agreeing, because of chaos or because one gave up,
-the reference ends and says so.
+Two runs of one motion share no error but that of the description: Taylor series of different orders in extended
+precision, or two engines with a method each in double precision. Where they part, the reference ends.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ from mbkit.simulate.torque import Torque, TorqueFunction
 __all__ = ["Deadline", "Known", "LateError", "Motion", "Reference", "gap", "reference", "taylor_pair", "two_engines"]
 
 
-# Pairs of runs of one motion: by their difference it is told how well either is known.
+# Pairs of runs of one motion: their difference bounds the error of either.
 
 # Times between which two engines march on by turns: enough to stop soon after they
 # part, few enough for a method's start to cost nothing.
@@ -56,46 +54,50 @@ _ROADS: Final = (
 
 
 class LateError(Exception):
-    """The time is up; never leaves `mbkit.studies`."""
+    """The time is up; internal to `mbkit.studies`."""
 
 
 class Deadline:
-    """What is left of the time that a search may take, and how far it is.
+    """The time limit and the progress of a search.
 
     Parameters
     ----------
     seconds : float
     tell : callable
         Gets the fraction done.
+    clock : callable
+        Seconds.
     """
 
-    def __init__(self, seconds: float, tell: Callable[[float], None]) -> None:
-        self._end, self._tell = time.perf_counter() + seconds, tell
+    def __init__(
+        self, seconds: float, tell: Callable[[float], None], clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        self._end, self._tell, self._clock = clock() + seconds, tell, clock
         self._start, self._length = 0.0, 1.0
-        # Seconds that did not count, of all parts together, and those before this part.
+        # Seconds that do not count, of all parts together, and those before this part.
         self._uncounted, self._before = [0.0], 0.0
 
     @property
     def left(self) -> float:
         """Seconds."""
-        return self._end + self._uncounted[0] - self._before - time.perf_counter()
+        return self._end + self._uncounted[0] - self._before - self._clock()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Do not count the time within, for this and all parts: what is derived and compiled."""
-        start = time.perf_counter()
+        """Stop the clock of this and all parts, for derivation and compilation."""
+        start = self._clock()
         yield
-        self._uncounted[0] += time.perf_counter() - start
+        self._uncounted[0] += self._clock() - start
 
     def part(self, start: float, length: float, seconds: float | None = None) -> Deadline:
-        """Return the same for a part of the way, with a shorter time of its own if given."""
-        out = Deadline(self.left if seconds is None else min(seconds, self.left), self._tell)
+        """Return the limit for a part of the way, with a shorter time if given."""
+        out = Deadline(self.left if seconds is None else min(seconds, self.left), self._tell, self._clock)
         out._uncounted, out._before = self._uncounted, self._uncounted[0]
         out._start, out._length = self._start + start * self._length, length * self._length
         return out
 
     def look(self, done: float) -> None:
-        """Tell the fraction done of this part, and raise `LateError` when its time is up."""
+        """Report the fraction done of this part, and raise `LateError` when its time is up."""
         self._tell(min(self._start + self._length * done, 1.0))
         if self.left < 0:
             raise LateError
@@ -103,7 +105,7 @@ class Deadline:
 
 @dataclass(frozen=True)
 class Motion:
-    """What is to be known: start, end, times from 0 and what acts."""
+    """The motion: model, start, duration, saved times from 0, and applied torque."""
 
     model: Model
     q0: Array
@@ -127,7 +129,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Known:
-    """What a pair of runs says, at as many of the times as both reached.
+    """The states of a pair of runs, at the times that both reached.
 
     Attributes
     ----------
@@ -530,7 +532,7 @@ def _quadruple_seconds(motion: Motion, steps: float) -> float:
 
 
 def _cut(motion: Motion, known: Known) -> Reference:
-    """Return what a pair of runs says, up to where they part."""
+    """Return the reference from a pair of runs, up to where they part."""
     model, (q, q_low), (v, v_low) = motion.model, known.q, known.v
     moved = gap(model, q, np.broadcast_to(q[:1], q.shape))
     # What rests has no size; it is then known absolutely.
@@ -561,7 +563,7 @@ def _cut(motion: Motion, known: Known) -> Reference:
 
 
 def _witness(motion: Motion, found: Reference) -> str:
-    """Return what another engine says of the formulas along a motion."""
+    """Return a text that compares accelerations along a motion with those of another engine."""
     which = np.unique(np.linspace(0, len(found.t) - 1, min(_WITNESSED, len(found.t))).astype(int))
     q, v = found.q[which], found.v[which]
     force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
@@ -576,4 +578,4 @@ def _witness(motion: Motion, found: Reference) -> str:
             continue
         apart = np.abs(a - other).max() / (np.abs(a).max() or 1.0)
         return f"; accelerations along it differ by {apart:.1e} from those of {engine}"
-    return "; no other engine holds the model, so nobody but the own derivation vouches for its formulas"
+    return "; no other engine holds the model, so its formulas were checked by no other derivation"
