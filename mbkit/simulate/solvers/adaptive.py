@@ -16,7 +16,8 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
-from mbkit.methods.registry import Tolerances
+from mbkit.methods.registry import Tolerances, method_of
+from mbkit.methods.tableaus import RosenbrockTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
@@ -88,7 +89,7 @@ def make_attempts(
             from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
 
             return CompiledAttempts(dyn, *given[1:], method)
-    if method == "rodas5":
+    if isinstance(method_of(method).formula, RosenbrockTableau):
         # Its Jacobian loads CasADi.
         from mbkit.simulate.solvers.step_attempts import RosenbrockAttempts
 

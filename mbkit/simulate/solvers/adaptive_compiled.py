@@ -19,8 +19,8 @@ from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.rosenbrock import rosenbrock_parts
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.one_step import FIRST_ROOT, MAX_GROWTH
-from mbkit.methods.registry import Tolerances
-from mbkit.methods.tableaus import dormand_prince_853, rodas5p
+from mbkit.methods.registry import ADAPTIVE_METHOD, Tolerances, method_of
+from mbkit.methods.tableaus import RosenbrockTableau, dormand_prince_853
 from mbkit.model.integration_space import Space
 from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, first_length
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
@@ -63,8 +63,8 @@ class _Scheme:
 
 @cache
 def _scheme(method: str) -> _Scheme:
-    if method == "rodas5":
-        own = rodas5p()
+    own = method_of(method).formula
+    if isinstance(own, RosenbrockTableau):
         tables = own.A, own.C, own.b, own.error, own.dense
         return _Scheme(
             own.name,
@@ -140,7 +140,7 @@ class CompiledAttempts:
         torque: Torque,
         duration: float,
         batch: int | None,
-        method: str = "rk853",
+        method: str = ADAPTIVE_METHOD,
     ) -> None:
         self._dyn, self._tolerances, self._torque, self._batch = dyn, tolerances, torque, batch
         self._space, self._parameters = space, dyn.parameter_values

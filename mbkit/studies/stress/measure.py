@@ -18,7 +18,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError, MbkitWarning
-from mbkit.methods.registry import METHODS
+from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, METHODS, STIFF_METHOD
 from mbkit.simulate import Trajectory, simulate
 from mbkit.studies.compare.errors import interleaved
 from mbkit.studies.stress.case import Case, Truth, problem_of, step_of, times_of
@@ -45,7 +45,7 @@ _REPEATS: Final = 3
 #: Solvers that do not poll the deadline are interrupted so much later.
 _LATER: Final = 1.1
 #: Methods that another may switch to, which are compiled before it is timed.
-_SWITCHES_TO: Final = {"auto": ("rk853", "rodas5")}
+_SWITCHES_TO: Final = {AUTOMATIC_METHOD: (ADAPTIVE_METHOD, STIFF_METHOD)}
 #: Times the run's seconds that an untimed run may take, which compiles what it needs on its way.
 _UNTIMED: Final = 2.0
 #: Part of an interval that is integrated to compile a method; however stiff the system, steps are few in it.

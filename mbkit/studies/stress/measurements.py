@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Final, Literal
 
 from mbkit.engines.registry import DERIVED, PINOCCHIO
+from mbkit.methods.registry import AUTOMATIC_METHOD
 from mbkit.studies._figure_style import engine_index
 
 #: How a run or an evaluation ended, before its error is judged.
@@ -185,7 +186,7 @@ class CaseResult:
 # How far each row held
 
 #: The method that mbkit recommends, and the engines that it is recommended on.
-RECOMMENDED: Final = "auto"
+RECOMMENDED: Final = AUTOMATIC_METHOD
 #: Outcomes of use, if not to the bar.
 _USABLE: Final = ("held", "inaccurate")
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from mbkit._escape import one_line
+from mbkit.methods.registry import METHODS
 from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, log_ticks, style
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 
@@ -20,7 +21,7 @@ _Place = tuple[float, float]
 _Measure = Callable[[PrecisionPoint], float]
 
 #: MuJoCo's own integrators stand in the panel of the same formula.
-_SAME_FORMULA: Final = {"mujoco_rk4": "rk4", "mujoco_euler": "semi_implicit_euler"}
+_SAME_FORMULA: Final = {m.name: m.own for m in METHODS.values() if m.own}
 _COLUMNS: Final = 5
 _WIDTH: Final = 10.4
 _TOP: Final = 4.4

@@ -22,7 +22,7 @@ _FINEST: Final = 1e-7
 #: Ratio of neighbouring steps, by the method's order: an error falls by 4 to 16 at each.
 _RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
 #: Methods that call the dynamics from Python on every engine, and the cost of such a call in compiled ones.
-_FROM_PYTHON: Final = frozenset({"dop853", "radau", "bdf", "lsoda", "gauss4", "gauss6"})
+_FROM_PYTHON: Final = frozenset(m.name for m in METHODS.values() if not m.compiled and not m.engines)
 _PYTHON_CALL: Final = 8
 
 
@@ -99,7 +99,7 @@ def plans(
 
 def _tolerances(method: Method) -> tuple[float, ...]:
     # A Taylor series is compiled for each order that a tolerance needs.
-    return tuple(float(f"1e-{k}") for k in range(3, 16, 4 if method.name == "taylor" else 1))
+    return tuple(float(f"1e-{k}") for k in range(3, 16, 4 if method.extended else 1))
 
 
 def _steps(method: Method, interval: float) -> tuple[float, ...]:
