@@ -52,17 +52,7 @@ def instead_of_writing(model: Model) -> str:
 
 
 class SymbolicKinematics:
-    """T's mass matrix, V and the dissipation of a model of coordinate velocities.
-
-    Parameters
-    ----------
-    model : Model
-        Without ball and free joints. Loops stay open here, and what is prescribed is a coordinate.
-    coordinates, velocities : list of sympy.Symbol
-    parameters : dict of str to sympy.Symbol
-    progress : callable
-        Called with a fraction and a text.
-    """
+    """Mass matrix, V and dissipation of a model, with loops open and prescribed coordinates free."""
 
     def __init__(
         self,
@@ -407,18 +397,12 @@ _MEETS: Final = 1e-9
 
 
 def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
-    """Return expressions that are zero where a loop is closed.
+    """Return expressions that are zero where a loop is closed; InputError if its ends never meet or never move.
 
-    Of points, and of the frames' origins: r_a - r_b, three rows or those that are independent, so that their
-    multipliers are the force on body a. Of orientations, where all axes in the loop are parallel:
-    2 sin(φ/2) of the angle φ from frame b to frame a, which is zero at whole turns only and has the torque on body
-    a for its multiplier (its negative after an odd number of turns). Else ½ Σ b_k x a_k of the frames'
-    axes, the sine of their angle about its axis; it is zero at half a turn too, where its rows depend on each other.
-
-    Raises
-    ------
-    InputError
-        The ends can never meet, or nothing moves between them.
+    Points and frames' origins: r_a - r_b, with the force on body a as multipliers. Orientations with parallel axes:
+    2 sin(φ/2) of the angle φ from frame b to frame a, zero at whole turns only; its multiplier is the torque on body a
+    (its negative after an odd number of turns). Others: ½ Σ b_k x a_k of the frames' axes, the sine of their angle; it
+    is zero at half a turn too, where its rows depend on each other.
     """
     ends = _ways(kin, loop)
     rows = _meeting(kin, loop, ends)

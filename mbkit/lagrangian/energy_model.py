@@ -80,16 +80,7 @@ _DRAWS = 50
 class EnergyModel(Model):
     """A system of energies as a model: coordinates that add, named parameters, and no bodies.
 
-    Parameters
-    ----------
-    form : EnergyForm
-    values : mapping of str to float or None, optional
-        Of its parameters, instead of their own.
-
-    Raises
-    ------
-    UnsupportedError
-        Quasi-velocities whose D holds parameters.
+    To run quasi-velocities, D must hold coordinates and numbers only (UnsupportedError).
     """
 
     def __init__(self, form: EnergyForm, values: Mapping[str, float | None] | None = None) -> None:
@@ -204,10 +195,7 @@ class EnergyModel(Model):
         )
 
     def random_state(self, rng: np.random.Generator | int, size: int | None = None) -> tuple[Array, Array]:
-        """Draw a random state as `Model.random_state` does; under constraints the consistent one that is nearest.
-
-        Singular poses are drawn again.
-        """
+        """Draw a random state; under constraints the nearest consistent one, and not a singular pose."""
         if not self.constrained:
             return super().random_state(rng, size)
         rng = generator("rng", rng)
@@ -226,10 +214,7 @@ class EnergyModel(Model):
         return self._states.project(*super().random_state(rng))
 
     def require_independent(self, q: Array, *, once: bool = False) -> None:
-        """Refuse constraints that depend on each other at a configuration; see `Model.require_independent`.
-
-        Not while a parameter has no value, on which it may depend.
-        """
+        """Refuse constraints that depend on each other at q, once all parameters have values."""
         if not self.constrained or not len(q) or None in self.parameters.values():
             return
         if not (once and is_judged(self.form, self)):

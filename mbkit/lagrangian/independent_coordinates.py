@@ -42,13 +42,7 @@ Indices = NDArray[np.intp]
 
 
 class ReducedModel(Model):
-    """The independent coordinates of a system, as integrators see a model.
-
-    Parameters
-    ----------
-    whole : Model
-    names : sequence of str
-    """
+    """The independent coordinates of a system, as integrators see a model."""
 
     def __init__(self, whole: Model, names: tuple[str, ...]) -> None:
         # The parts of a frozen class are set once, here.
@@ -84,16 +78,7 @@ class _Memory:
 
 
 class EmbeddedDynamics(Dynamics):
-    """The equation on one chart; time runs from `begin`.
-
-    Parameters
-    ----------
-    model : ReducedModel
-    whole : LagrangianDynamics
-    chart : Chart
-    begin : float
-        s.
-    """
+    """The equation on one chart; time runs from `begin`, in s."""
 
     engine = "embedded"
     refuses: ClassVar = dict.fromkeys(
@@ -120,13 +105,7 @@ class EmbeddedDynamics(Dynamics):
         return out
 
     def remember(self, q: Array) -> None:
-        """Take a consistent configuration as the place from which the next one is searched.
-
-        Raises
-        ------
-        InputError
-            The dependent coordinates are not determined there.
-        """
+        """Start the next search at a consistent q; refuse one that leaves dependent coordinates undetermined."""
         J = self._manifold.jacobian(q)
         sign = self._sign(J)
         if not sign:

@@ -46,14 +46,7 @@ def aligned(pairs: Iterable[tuple[str, str]]) -> str:
 
 
 class ExpressionPrinter:
-    """How expressions of one system are written, on one line of text or in LaTeX.
-
-    Parameters
-    ----------
-    *groups : sequences of sympy.Symbol
-        What moves, in the order in which factors are written: coordinates, velocities, accelerations, momenta.
-    time : sympy.Symbol, optional
-    """
+    """Expressions on one line of text or in LaTeX; `groups` of moving symbols give the order of factors."""
 
     def __init__(self, *groups: Iterable[sp.Symbol], time: sp.Symbol | None = None) -> None:
         self._moving = {s: k for k, group in enumerate(groups) for s in group}
@@ -340,19 +333,7 @@ _OFTEN: Final = 3
 
 
 class Abbreviations:
-    """Letters for the long roots among some expressions.
-
-    Parameters
-    ----------
-    expressions : iterable of sympy.Expr
-    taken : iterable of sympy.Symbol
-        Whose names are no letters to take.
-
-    Attributes
-    ----------
-    roots : dict of sympy.Symbol to sympy.Expr
-        ρ -> what it stands for; ρ1, ρ2 where there are several.
-    """
+    """Letters for the long roots among some expressions: `roots` holds ρ, or ρ1, ρ2, ..., and what each stands for."""
 
     def __init__(self, expressions: Iterable[sp.Expr], taken: Iterable[sp.Symbol]) -> None:
         counts: Counter[sp.Expr] = Counter()

@@ -104,13 +104,7 @@ class _Terms:
 
 
 class Manifold:
-    """The consistent states of dynamics with constraints, by number.
-
-    Parameters
-    ----------
-    dyn : LagrangianDynamics
-        Of a model that was written with constraints.
-    """
+    """The consistent states of dynamics with constraints, in numbers."""
 
     def __init__(self, dyn: LagrangianDynamics) -> None:
         self.dyn = dyn
@@ -156,13 +150,7 @@ class Manifold:
     # Consistency
 
     def check(self, q: Array, v: Array) -> None:
-        """Refuse an inconsistent state, of one or a batch.
-
-        Raises
-        ------
-        InputError
-            With the residuals.
-        """
+        """Refuse an inconsistent state, of one or a batch, with the residuals (InputError)."""
         states = zip(np.atleast_2d(q), np.atleast_2d(v), strict=True)
         for k, (one_q, one_v) in enumerate(states):
             terms = self.member(k)._terms(one_q, one_v)
@@ -189,8 +177,7 @@ class Manifold:
     def pulled(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the consistent state beside one that has drifted a little, or of each of a batch.
 
-        Newton's iteration with the mass matrix as the weight; what is far from the
-        constraints, or no number, comes back as it is or as NaN.
+        A state that is far from the constraints or not finite comes back as it is or as NaN.
         """
         for _ in range(4):
             q, v, f, scale = self.call("constraint_step", q, v)
@@ -201,13 +188,7 @@ class Manifold:
         return q, v
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the nearest consistent state of one, in the metric of the mass matrix there.
-
-        Raises
-        ------
-        InputError
-            None was found from here.
-        """
+        """Return the nearest consistent state, in the metric of the mass matrix there; InputError if none is found."""
         x = self.restored(q, v)
         M = self._terms(q, v).M
         # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.

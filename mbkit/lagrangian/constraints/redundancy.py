@@ -58,22 +58,9 @@ def _values(model: Model) -> tuple[float, ...]:
 
 
 def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) -> None:
-    """Refuse constraints whose Jacobian has dependent rows at a configuration.
+    """Refuse constraints whose Jacobian has dependent rows around q (InputError) or at q alone (NumericalError).
 
-    Parameters
-    ----------
-    dyn : Dynamics
-        Of a written model with constraints, at one value of each parameter.
-    q : (nq,) array
-    everywhere : bool
-        Whether a singular pose is allowed: then only a set that is redundant around `q` is refused.
-
-    Raises
-    ------
-    InputError
-        The rows depend on each other around `q` too, or nothing satisfies them; with the rows by number.
-    NumericalError
-        They depend on each other at `q` alone, a singular pose.
+    With `everywhere` a singular pose is allowed: only a set that is redundant around q is refused.
     """
     model, manifold = dyn.model, manifold_of(dyn)
     form = manifold.equations.form
@@ -101,18 +88,9 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
 
 
 def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
-    """Refuse constraints that no configuration satisfies, or that are redundant where one does.
+    """Refuse constraints that no configuration satisfies, or that are redundant where one does (InputError).
 
-    Parameters
-    ----------
-    dyn : Dynamics
-    q : (nq,) array, optional
-        A first start of the search, before random ones.
-
-    Raises
-    ------
-    InputError
-        None was found, with the rows that are left over.
+    The search starts at q, then at random configurations.
     """
     manifold, model = manifold_of(dyn), dyn.model
     written = [str(c) for c in manifold.equations.form.constraints]

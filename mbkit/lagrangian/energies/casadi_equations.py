@@ -24,21 +24,7 @@ _REFINED: Final = 2
 
 
 class ConstraintTerms:
-    """f and its derivatives, of (q, v); f̈ = J v̇ + γ.
-
-    Attributes
-    ----------
-    value : (m, 1) casadi.SX
-        f.
-    jacobian : (m, n) casadi.SX
-        J = ∂f/∂q.
-    by_time : (m, 1) casadi.SX
-        ∂f/∂t.
-    rate : (m, 1) casadi.SX
-        ḟ = J v + ∂f/∂t.
-    gamma : (m, 1) casadi.SX
-        γ = f̈ at v̇ = 0: J̇ v and the time's own terms.
-    """
+    """f(q, t) and its derivatives J = ∂f/∂q, ∂f/∂t, rate ḟ = J v + ∂f/∂t and γ, with f̈ = J v̇ + γ."""
 
     def __init__(self, value: ca.SX, q: ca.SX, v: ca.SX, time: Any) -> None:
         self.value = value
@@ -52,9 +38,8 @@ class ConstraintTerms:
     def stiffening(self, M: Any) -> Any:
         """Return s > 0, (m, 1), so that W = M + Jᵀ diag(s) J has an inverse where M has it on J's null space.
 
-        With J v̇ given, the added term changes neither v̇ nor λ, and coordinates that move no mass need no other way.
-        Of a row, s is the mean of two masses that are felt along it, the sum's and the lightest coordinate's: W keeps
-        the digits of both, in a loop with a light rod as of a light body on a heavy one.
+        With J v̇ given, the term changes neither v̇ nor λ. s is the geometric mean of the sum's and the lightest
+        coordinate's mass along a row: W keeps the digits of both, of a light rod in a loop as of a heavy body.
         """
         masses = ca.diag(M)
         masses = masses + _MASSLESS / masses.shape[0] * ca.sum1(masses)
@@ -69,13 +54,10 @@ class ConstraintTerms:
 
 
 def _constrained_motion(c: ConstraintTerms, M: Any, force: Any, order: tuple[int, ...]) -> tuple[Any, Any]:
-    """Return v̇ and λ of M v̇ - Jᵀ λ = force, J v̇ = -γ.
+    """Return v̇ and λ of M v̇ - Jᵀ λ = force, J v̇ = -γ, by the factors of W and J W⁻¹ Jᵀ and by refinement.
 
-    By the factors of W = M + Jᵀ diag(s) J in an elimination order, then by those of J W⁻¹ Jᵀ, and by refinement with
-    the residuals of both equations: near a singular pose of J, and with masses that differ by decades, the factors
-    lose the square of the digits that the equations themselves lose. The acceleration holds f̈ = 0 only: integrators
-    project states that drift off the constraints (`mbkit.simulate.constraint_projection`), so that no gains as
-    Baumgarte's are needed.
+    Near a singular pose, and with masses that differ by decades, the factors lose the square of the digits that the
+    equations lose. Only f̈ = 0 holds: integrators project drifted states (`mbkit.simulate.constraint_projection`).
     """
     J, m = c.jacobian, c.value.shape[0]
     s = c.stiffening(M)
@@ -98,16 +80,7 @@ def _constrained_motion(c: ConstraintTerms, M: Any, force: Any, order: tuple[int
 
 
 class EnergyEquations(Equations):
-    """The equations derived from T and V.
-
-    Parameters
-    ----------
-    model : Model
-        Of the coordinates and parameters of the energies.
-    form : EnergyForm
-    constants : {"literal", "symbol"}
-        How numbers stand in the expressions.
-    """
+    """The equations derived from T and V; `constants` says how numbers stand in the expressions."""
 
     def __init__(self, model: Model, form: EnergyForm, constants: Constants = "literal") -> None:
         values = Values(model, constants)

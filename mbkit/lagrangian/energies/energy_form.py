@@ -31,13 +31,7 @@ from mbkit.lagrangian.trig.zero_test import is_zero
 
 
 class EnergyForm:
-    """T, V, forces and constraints in plain symbols, checked; arguments and attributes are those of `Lagrangian`.
-
-    Attributes
-    ----------
-    quasi : QuasiVelocities or None
-        Where the velocities are not the coordinates' rates.
-    """
+    """T, V, forces and constraints in plain symbols, checked; arguments and attributes are those of `Lagrangian`."""
 
     quasi: QuasiVelocities | None = None
 
@@ -188,13 +182,7 @@ def timed_parameters(form: EnergyForm) -> tuple[sp.Symbol, ...]:
 
 
 def parameter_values(form: EnergyForm, values: Mapping[str, float], what: str) -> Array:
-    """Return the numbers of the parameters in their order, with some replaced.
-
-    Raises
-    ------
-    InputError, UnknownNameError
-        A parameter without a value; no such parameter.
-    """
+    """Return the numbers of the parameters in their order, with some replaced; refuse one without a value."""
     numbers = {s.name: x for s, x in form.parameters.items()}
     for name in values:
         if name not in numbers:
@@ -223,10 +211,7 @@ def read_expression(
 ) -> sp.Expr:
     """Return an expression in a system's own symbols, from symbols of the same names or dynamicsymbols.
 
-    Raises
-    ------
-    InputError
-        It holds symbols that are neither the system's nor in `also`, unless `others` are allowed.
+    Symbols that are neither the system's nor in `also` are refused, unless `others` are allowed.
     """
     own = [*symbols_of(form), *also]
     known = {s.name: s for s in own}

@@ -212,10 +212,7 @@ def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> Equatio
 
 
 def christoffel(M: Any, coordinates: Any, velocities: Any) -> sp.ImmutableMatrix:
-    """Return C_ij = ½ Σ_k (∂M_ij/∂q_k + ∂M_ik/∂q_j - ∂M_jk/∂q_i) v_k.
-
-    Spong, Hutchinson, Vidyasagar 2006, Robot Modeling and Control, eq. (7.63).
-    """
+    """Return C_ij = ½ Σ_k (∂M_ij/∂q_k + ∂M_ik/∂q_j - ∂M_jk/∂q_i) v_k (Spong, Hutchinson, Vidyasagar 2006, eq. 7.63)."""
     n = len(coordinates)
     dM = [sp.Matrix(M).applyfunc(lambda x, q=q: slope(x, q)) for q in coordinates]
 

@@ -26,21 +26,7 @@ _ROUNDED: Final = 1e-20
 
 @dataclass(frozen=True)
 class KineticSplit:
-    """T = T2 + T1 + T0, of second, first and zeroth degree in the velocities.
-
-    Attributes
-    ----------
-    T2, T1, T0 : sympy.Expr
-        T2 = ½ vᵀ M v, T1 = bᵀ v.
-    M : (n, n) sympy.Matrix
-        ∂²T/∂v².
-    b : (n, 1) sympy.Matrix
-        ∂T/∂v at v = 0; not zero only where time or a drift carries the system along.
-
-    References
-    ----------
-    Goldstein, Poole, Safko 2002, Classical Mechanics, eq. (1.73); Lanczos 1970, ch. V.
-    """
+    """T = T2 + T1 + T0 with T2 = ½ vᵀ M v and T1 = bᵀ v (Goldstein et al. 2002, eq. 1.73; Lanczos 1970, ch. V)."""
 
     T2: sp.Expr
     T1: sp.Expr
@@ -50,13 +36,7 @@ class KineticSplit:
 
 
 def split(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> KineticSplit:
-    """Return the parts of T.
-
-    Raises
-    ------
-    InputError
-        T is not of second degree in the velocities; the offending term is named.
-    """
+    """Return the parts of T; InputError names a term that is not of second degree in the velocities."""
     n = len(velocities)
     p = [sp.diff(T, w) for w in velocities]
     seconds = {(i, j): sp.diff(p[i], velocities[j]) for i in range(n) for j in range(i, n)}
@@ -124,14 +104,9 @@ _SHOWN: Final = 200
 def require_inertia(
     M: sp.ImmutableMatrix, coordinates: Sequence[sp.Symbol], velocities: Sequence[sp.Symbol], constraints: Sequence[Any]
 ) -> None:
-    """Refuse a mass matrix that is singular everywhere, unless constraints bind its massless directions.
+    """Refuse a mass matrix that is singular everywhere, unless constraints bind its massless directions (InputError).
 
     M + Jᵀ J has an inverse exactly where M v̇ - Jᵀ λ = f, J v̇ = -γ determines v̇.
-
-    Raises
-    ------
-    InputError
-        With the velocities that have no kinetic energy.
     """
     n = len(velocities)
     J = sp.Matrix(len(constraints), 1, list(constraints)).jacobian(coordinates) if constraints else sp.zeros(0, n)
@@ -184,22 +159,7 @@ _BY_COFACTORS: Final = 4
 
 
 def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
-    """Return A⁻¹ with each entry tidied.
-
-    Rows and columns that are coupled with no others are inverted by themselves, which
-    keeps the answer as short as the matrix allows.
-
-    Parameters
-    ----------
-    A : (n, n) sympy.Matrix
-    what : str
-        Its name, for the message.
-
-    Raises
-    ------
-    InputError
-        The matrix is singular everywhere.
-    """
+    """Return A⁻¹ with each entry tidied, coupled block by coupled block; InputError names `what` if A is singular."""
     A = sp.Matrix(A)
     out = sp.zeros(*A.shape)
     for block in blocks(A):
@@ -244,19 +204,7 @@ _LONG: Final = 250
 
 
 class Squares:
-    """The inverse of a symmetric positive definite matrix, each set of coupled coordinates by itself.
-
-    Parameters
-    ----------
-    M : (n, n) sympy.Matrix
-    what : str
-        Its name, for the message.
-
-    Raises
-    ------
-    InputError
-        The matrix is singular everywhere.
-    """
+    """The inverse of a symmetric positive definite matrix, each set of coupled coordinates by itself."""
 
     def __init__(self, M: Any, what: str) -> None:
         self._blocks: list[tuple[list[int], _Eliminated | _Cofactors]] = []

@@ -19,17 +19,7 @@ from mbkit.lagrangian.trig.simplify import tidy
 
 @dataclass(frozen=True, eq=False)
 class QuasiVelocities:
-    """q̇ = D w in symbols.
-
-    Attributes
-    ----------
-    D, W : (n, n) sympy.Matrix
-        W = D⁻¹.
-    coordinates, rates : tuple of sympy.Symbol
-        q and q̇.
-    input_forces : (n, 1) sympy.Matrix
-        Dᵀ u of the coordinates' inputs u.
-    """
+    """q̇ = D w in symbols, with W = D⁻¹; `input_forces` are Dᵀ u of the coordinates' inputs u."""
 
     D: sp.ImmutableMatrix
     W: sp.ImmutableMatrix
@@ -54,13 +44,7 @@ class QuasiVelocities:
 
 
 class VelocityMap:
-    """q̇ = D(q) v and its consequences, on arrays of one state or a batch and on CasADi's symbols.
-
-    Parameters
-    ----------
-    quasi : QuasiVelocities
-        Whose D holds coordinates and numbers only.
-    """
+    """q̇ = D(q) v and its consequences, on arrays of one state or a batch and on CasADi's symbols."""
 
     def __init__(self, quasi: QuasiVelocities) -> None:
         n = len(quasi.coordinates)

@@ -45,24 +45,8 @@ def free_name(name: str, taken: Collection[str]) -> str:
 class PlainSymbols:
     """The plain symbols of coordinates, velocities and time, and their dynamicsymbols.
 
-    Attributes
-    ----------
-    coordinates, velocities : tuple of sympy.Symbol
-    time : sympy.Symbol or None
-
-    Parameters
-    ----------
-    coordinates, velocities, time
-        As `Lagrangian` takes them.
-    among : iterable of sympy.Symbol
-        Symbols that velocities which are not given may have already, by their names.
-    named : iterable of sympy.Symbol
-        Others that are known by their names.
-
-    Notes
-    -----
-    A name stands for one thing, whatever is assumed of it: ``Symbol("m", positive=True)`` in an expression is the
-    parameter ``Symbol("m")``, as engines know parameters by their names.
+    Velocities that are not given may be in `among` already. A name stands for one thing: `Symbol("m", positive=True)`
+    is the parameter `Symbol("m")` of `named`, as engines know parameters by their names.
     """
 
     def __init__(

@@ -45,14 +45,7 @@ _COMPARED: Final[dict[Any, Callable[[Any, Any], Any]]] = {
 
 
 class Conversion:
-    """From SymPy to CasADi, each subexpression once.
-
-    Parameters
-    ----------
-    symbols : mapping of sympy.Symbol to casadi.SX
-    number : callable
-        What stands for a float: itself, or a symbol where no number may be rounded.
-    """
+    """From SymPy to CasADi, each subexpression once; `number` returns what stands for a float, maybe a symbol."""
 
     def __init__(self, symbols: Mapping[sp.Symbol, Any], number: Callable[[float], Any]) -> None:
         self._done: dict[Any, Any] = dict(symbols)
@@ -160,14 +153,7 @@ def _repeated(x: Any, n: int) -> Any:
 
 
 class Numeric:
-    """A matrix of expressions as a function of vectors of symbols.
-
-    Parameters
-    ----------
-    expressions : (m, n) sympy.Matrix
-    *arguments : sequence of sympy.Symbol
-        One for each argument; not all of them are empty.
-    """
+    """A matrix of SymPy expressions as a function of arrays, one argument per sequence of symbols."""
 
     def __init__(self, expressions: Any, *arguments: Sequence[sp.Symbol]) -> None:
         given = [ca.SX.sym(f"x{k}", len(symbols)) for k, symbols in enumerate(arguments)]

@@ -61,11 +61,9 @@ _SAME: Final = 1e-13
 
 
 def in_symbols(model: Model) -> Model | None:
-    """Return a catalog system with a parameter for each argument, at the values of a model; None of other models.
+    """Return a catalog system with a parameter for each argument, at the values of a model; None for other models.
 
-    It does not matter how the model was built: a system of the same form is built with
-    parameters, their values are solved from the model's numbers, and every number is compared.
-    An argument of zero stays the number zero.
+    The values are solved from the model's numbers. An argument of zero stays the number zero.
     """
     system = next((n for n in catalog.systems() if model.name == n or _numbered(model.name, n)), None)
     if system is None or model.parameters:
@@ -104,15 +102,9 @@ def letters(model: Model) -> list[str] | None:
 
 
 def with_plain_turns(model: Model, reach: float) -> tuple[Model, str | None]:
-    """Return a model for reading, without the last digits of rounded quarter turns, and a note if it is another one.
+    """Return a model whose rotations within `reach` of 0, 1 or -1 are exact, and a note if that changed it.
 
-    A file's 1.57079632679 for π/2 leaves 5e-12 where a zero is meant, and with it a term in every equation.
-
-    Parameters
-    ----------
-    model : Model
-    reach : float
-        How near to 0, 1 or -1 an entry of a rotation matrix or an axis is set to it.
+    A file's 1.57079632679 for π/2 leaves 5e-12 instead of zero, and with it a term in every equation.
     """
     snap = Snapper(reach)
     joints = tuple(

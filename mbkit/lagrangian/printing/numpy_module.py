@@ -21,13 +21,7 @@ _FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}
 def python_code(system: Lagrangian) -> str:
     """Return a module with `mass_matrix`, `nonlinear` and `forward_dynamics` of M(q) v̇ + h(q, v) = τ.
 
-    Common subexpressions are computed once. The module's functions take one state,
-    and parameters by keyword where they differ from the module's ``PARAMETERS``.
-
-    Raises
-    ------
-    UnsupportedError
-        The system has constraints.
+    Its functions take one state, and parameters by keyword. Constraints are refused (UnsupportedError).
     """
     if system.constraints:
         raise UnsupportedError(f"{system.name}: a system with constraints cannot be written as a Python module yet")

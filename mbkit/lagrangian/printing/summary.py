@@ -26,13 +26,7 @@ _LONG: Final = 800
 class SystemSummary:
     """A system's energies, matrices and equations as text, LaTeX or data.
 
-    Parameters
-    ----------
-    system : Lagrangian
-    names : mapping of str to str, optional
-        Name of each coordinate in its model.
-    progress : callable, optional
-        Gets the fraction done and the part that is next.
+    `names` are the coordinates' names in their model; `progress` gets the fraction done and the next part.
     """
 
     def __init__(
@@ -172,10 +166,7 @@ class SystemSummary:
     # Data
 
     def data(self) -> dict[str, Any]:
-        """Return everything as text that `sympy.sympify` reads, with the equations in LaTeX too.
-
-        SymPy evaluates text as Python, so a symbol whose name is no Python name has underscores in it here.
-        """
+        """Return everything as text that `sympy.sympify` reads, with Python names, and the equations in LaTeX too."""
         s, e = self.system, self.equations
         names = self._python_names()
 

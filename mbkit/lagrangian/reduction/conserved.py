@@ -87,19 +87,7 @@ def keeps_energy(system: EnergyForm) -> bool:
 def conserved_quantities(
     system: EnergyForm, momenta: Mapping[sp.Symbol, sp.Expr], energy: sp.Expr, moving: tuple[sp.Symbol, ...]
 ) -> tuple[ConservedQuantity, ...]:
-    """Return the conserved momenta, and the energy or Jacobi's integral if that is constant.
-
-    Parameters
-    ----------
-    system : EnergyForm
-        In its coordinates' rates.
-    momenta : mapping of sympy.Symbol to sympy.Expr
-        Cyclic coordinate -> its momentum, in `moving`.
-    energy : sympy.Expr
-        The energy function h, in `moving`.
-    moving : tuple of sympy.Symbol
-        The velocities (or quasi-velocities) in which both are written.
-    """
+    """Return the conserved momenta, and the energy or Jacobi's integral if it is constant, in `moving` velocities."""
     symbols = (system.coordinates, moving)
     out = [
         ConservedQuantity(f"p_{q.name}", p, f"momentum of {q.name}, which is cyclic", symbols)

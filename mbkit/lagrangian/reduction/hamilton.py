@@ -56,10 +56,7 @@ def momentum_symbols(system: EnergyForm, coordinates: Iterable[sp.Symbol]) -> tu
 
 
 def bracket(f: Any, g: Any, coordinates: Sequence[sp.Symbol], momenta: Sequence[sp.Symbol]) -> sp.Expr:
-    """Return {f, g} = Σ ∂f/∂q ∂g/∂p - ∂f/∂p ∂g/∂q, tidied, so that {q, p} = 1.
-
-    Goldstein, Poole, Safko 2002, Classical Mechanics, eq. (9.67).
-    """
+    """Return {f, g} = Σ ∂f/∂q ∂g/∂p - ∂f/∂p ∂g/∂q, tidied (Goldstein, Poole, Safko 2002, eq. 9.67)."""
     terms = (
         sp.diff(f, q) * sp.diff(g, p) - sp.diff(f, p) * sp.diff(g, q) for q, p in zip(coordinates, momenta, strict=True)
     )
@@ -301,13 +298,7 @@ class Hamiltonian(Printable):
 
 
 def hamiltonian(system: EnergyForm) -> Hamiltonian:
-    """Return H of a system.
-
-    Raises
-    ------
-    UnsupportedError
-        Constraints act, whose forces no H holds.
-    """
+    """Return H of a system; constraints are refused (UnsupportedError), as no H holds their forces."""
     if system.constraints:
         raise UnsupportedError(
             f"hamiltonian: {system.name} has constraints, whose forces no H holds; embed them first, or leave them out"

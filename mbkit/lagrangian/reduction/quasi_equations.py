@@ -92,10 +92,9 @@ def _along(quasi: QuasiVelocities, x: Any) -> list[Any]:
 
 
 def _coriolis_matrix(system: EnergyForm, quasi: QuasiVelocities) -> sp.ImmutableMatrix:
-    """Return C_ij = ½ Σ_k (D_k M_ij + D_j M_ik - D_i M_jk + c_ikj - c_jki - c_kji) w_k.
+    """Return C_ij = ½ Σ_k (D_k M_ij + D_j M_ik - D_i M_jk + c_ikj - c_jki - c_kji) w_k (Koszul's formula).
 
-    Koszul's formula for the connection of M in the frame of D's columns, with D_k the derivative
-    along a column and c_lij = Σ_h M_lh γ^h_ij.
+    D_k is the derivative along a column of D, and c_lij = Σ_h M_lh γ^h_ij.
     """
     M, n, gamma = system.kinetic.M, len(system.coordinates), quasi.hamel_coefficients
     slopes = _along(quasi, sp.Matrix(M))
@@ -113,15 +112,7 @@ def _coriolis_matrix(system: EnergyForm, quasi: QuasiVelocities) -> sp.Immutable
 
 
 def in_quasi_velocities(system: EnergyForm, D: Any, names: Any) -> tuple[dict[str, Any], KineticSplit, QuasiVelocities]:
-    """Return the arguments of the system in velocities w with q̇ = D w, the parts of its T, and D with its inverse.
-
-    Raises
-    ------
-    InputError
-        D of another shape, with other symbols, or singular everywhere; names that are taken.
-    UnsupportedError
-        Constraints act on the system.
-    """
+    """Return the arguments of the system in velocities w with q̇ = D w, the parts of its T, and D with its inverse."""
     if system.constraints:
         raise UnsupportedError(
             f"quasi_velocities: {system.name} has constraints, whose multipliers act on coordinates; embed them first"

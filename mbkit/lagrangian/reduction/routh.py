@@ -42,14 +42,7 @@ FormT = TypeVar("FormT", bound=EnergyForm)
 
 
 class ReducedState(NamedTuple):
-    """A state of the reduced system.
-
-    Attributes
-    ----------
-    q, v : (r,) or (N, r) arrays
-    values : dict of str to float or (N,) array
-        The momenta that stay, by name, as ``routhian.lagrangian.dynamics(**values)`` takes them.
-    """
+    """A state (r,) or (N, r) of the reduced system, and its constant momenta by name as keywords of `dynamics`."""
 
     q: Array
     v: Array
@@ -175,20 +168,7 @@ class Routhian(Printable, Generic[FormT]):
 
 
 def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
-    """Return the reduction of a system by some or all of its cyclic coordinates.
-
-    Parameters
-    ----------
-    system : Lagrangian
-    cyclic : sympy.Symbol or sequence of them, optional
-        Coordinates to ignore; all that are cyclic and unforced when not given.
-
-    Raises
-    ------
-    InputError
-        None is left to ignore, none would remain, one is not cyclic or is acted on, or a
-        force on the others holds an ignored coordinate.
-    """
+    """Return the reduction of a system by the `cyclic` coordinates, or by all that are cyclic and unforced."""
     ignored = _chosen(system, cyclic)
     kept = [q for q in system.coordinates if q not in ignored]
     r, c = ([system.coordinates.index(q) for q in part] for part in (kept, ignored))
@@ -296,14 +276,7 @@ _SAME: Final = 1e-9
 
 
 class Motion(NamedTuple):
-    """States in time.
-
-    Attributes
-    ----------
-    t : (K,) array
-        s.
-    q, v : (K, n) arrays
-    """
+    """States in time: t (K,) in s, q and v (K, n)."""
 
     t: Array
     q: Array

@@ -29,13 +29,7 @@ _MOST: Final = 200
 
 
 def find_equilibrium(balance: Balance, starts: list[Array], tau: Array) -> tuple[Array, Array]:
-    """Return the first configuration at rest that is found, and λ there.
-
-    Raises
-    ------
-    NumericalError
-        None, with the least force that is left over and where.
-    """
+    """Return the first configuration at rest that is found, and λ there; NumericalError names the least force left."""
     least: tuple[float, Array, Array] | None = None
     for start in starts:
         q, multipliers, left = _solved(balance, start, tau)

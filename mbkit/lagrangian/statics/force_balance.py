@@ -26,16 +26,7 @@ _SAME: Final = 1e-9
 
 
 class Balance:
-    """What balances at rest, at one time.
-
-    Parameters
-    ----------
-    dyn : Dynamics
-    wrenches : mapping of str to (6,) array
-        On frames, by name.
-    t : float
-        s; where the system depends on it.
-    """
+    """The forces that balance at rest at time t, s, with a wrench (6,) on each frame by name."""
 
     def __init__(self, dyn: Dynamics, wrenches: Mapping[str, Array], t: float = 0.0) -> None:
         self._whole = dyn
@@ -163,13 +154,7 @@ class Balance:
         return M, D, K
 
     def changes(self, q: Array, tau: Array, multipliers: Array) -> bool:
-        """Return whether the small motions change with the time.
-
-        Raises
-        ------
-        InputError
-            The forces do, or the constraints: there is no rest.
-        """
+        """Return whether the small motions change with the time; refuse forces or constraints that do (InputError)."""
         if self.model.time_parameter is None:
             return False
         now, moved = self._linear(q, multipliers), False
@@ -227,20 +212,10 @@ class SmallMotion:
 
 
 def small_motion(M: Array, D: Array, K: Array, scale: float = 0.0) -> SmallMotion:
-    """Return the eigenvalues of a linear system and its stability.
+    """Return the eigenvalues of M δq̈ + D δq̇ + K δq = 0 and its stability; massless coordinates have none.
 
-    Parameters
-    ----------
-    M, D, K : (n, n) arrays
-        M may be singular, as of coordinates that move no mass there: those eigenvalues
-        are left out.
-    scale : float
-        Size of K in the neighbourhood: entries that are rounding beside it count as zero.
-
-    References
-    ----------
-    Merkin 1997, Introduction to the Theory of Stability, ch. 3 (Lagrange and Dirichlet)
-    and 6 (Kelvin and Tait).
+    Entries of K that are rounding beside `scale` count as zero. Merkin 1997, Introduction to the Theory of Stability,
+    ch. 3 (Lagrange and Dirichlet) and 6 (Kelvin and Tait).
     """
     n = len(M)
     if not n:

@@ -35,11 +35,7 @@ _QUOTIENTS: Final[dict[Any, Callable[[sp.Expr], sp.Expr]]] = {
 
 
 def shortened(x: sp.Expr) -> sp.Expr | None:
-    """Return a short form of a sum, with roots and denominators as they stand; None of a long one.
-
-    Cosines and sines of sums are combined, and cancel where they do, without the search of
-    `sympy.trigsimp`.
-    """
+    """Return a short form of a sum, with roots and denominators as they stand; None of a long one."""
     try:
         return _Reading(x).as_it_stands()
     except UnsupportedError:
@@ -68,16 +64,7 @@ def _plain(x: sp.Expr) -> sp.Expr:
 
 @dataclass
 class _Power:
-    """The meaning of a generator: a root of a sum, or one over it.
-
-    Attributes
-    ----------
-    base : sympy.Expr
-    root : bool
-        √base; else 1/base.
-    sum : TrigPolynomial
-        The base.
-    """
+    """The meaning of a generator: the root of a base or one over it, with the base as an exact sum."""
 
     base: sp.Expr
     root: bool

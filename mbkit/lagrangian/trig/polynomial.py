@@ -23,19 +23,9 @@ Key = tuple[int, tuple[int, ...], tuple[int, ...]]
 
 
 class TrigRing:
-    """The angles and generators of a system's terms.
+    """The angles and generators (parameters, coordinates, other expressions) of a system's terms.
 
-    Parameters
-    ----------
-    name : str
-        The system's, for messages.
-    angles, generators : sequence of sympy.Expr
-        Arguments of cosines and sines, and the variables of the coefficients: parameters, coordinates and other
-        expressions.
-    most : int
-        Products of terms that are not too many.
-    instead : str
-        Advice of the message where there are more.
+    More than `most` products of terms are refused; `instead` is the advice of that message.
     """
 
     def __init__(

@@ -56,13 +56,7 @@ def _without(n: int, p: int) -> int:
 def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = True) -> sp.Expr:
     """Return a sum of cosines and sines as a SymPy expression that is short to read.
 
-    Parameters
-    ----------
-    x : TrigPolynomial
-    whole : bool
-        Whether what all terms share is taken out of the sum.
-    decimals : bool
-        Whether numbers such as 9.81 are decimals; else all are fractions.
+    With `whole`, factors that all terms share are taken out; without `decimals`, 9.81 is a fraction.
     """
     if not x:
         return sp.Integer(0)
@@ -330,10 +324,7 @@ def product(poly: Poly, x: sp.Expr) -> list[sp.Expr]:
 
 
 def _irreducible(poly: Poly) -> bool:
-    """Return whether a sum surely has no factors: those of Q a + R are the ones that Q and R share.
-
-    At random whole numbers for the other atoms Q and R share no factor either, most of the time.
-    """
+    """Return whether a sum surely has no factors: those of Q a + R are shared by Q and R, tested at random numbers."""
     atoms = list(dict.fromkeys(a for powers in poly for a, _ in powers))
     rows = [tuple(dict(powers).get(a, 0) for a in atoms) for powers in poly]
     # Without what all terms share, which is no factor that is looked for.

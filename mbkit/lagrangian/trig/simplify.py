@@ -19,11 +19,9 @@ _WORTH: Final = 0.7
 
 @lru_cache(1024)
 def tidy(x: sp.Expr) -> sp.Expr:
-    """Return a shorter form of an expression; a large one as it is.
+    """Return the shortest of several forms of an expression; a large one as it is.
 
-    The shortest of several forms, so that no rewriting makes it worse. Cosines and sines are
-    combined exactly (`mbkit.lagrangian.trig.from_sympy`): `sympy.simplify` and `trigsimp` search, with no bound on
-    their time.
+    `sympy.simplify` and `trigsimp` search with no bound on their time.
     """
     if not x.free_symbols or x.count_ops() > LARGE:
         return x
@@ -47,10 +45,10 @@ _LONG: Final = 150
 
 
 def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
-    """Return ∂x/∂q, tidied: of a product of powers, what all terms share is in front.
+    """Return ∂x/∂q, tidied; factors that all terms share stay in front.
 
-    A slider-crank's inertia m r² λ² sin² θ has the slope 2 m r² λ (λ cos θ + λ′ sin θ) sin θ, a form that is lost
-    once it is multiplied out.
+    A slider-crank's inertia m r² λ² sin² θ has the slope 2 m r² λ (λ cos θ + λ′ sin θ) sin θ, which is lost
+    when it is multiplied out.
     """
     broken = [f for f in x.atoms(sp.Pow) if f.base.has(q) and (not f.exp.is_Integer or f.exp.is_negative)]
     if all(f.base.is_Symbol for f in broken):

@@ -27,14 +27,7 @@ _SIGNED: Final = 8
 
 
 class RandomEvaluation:
-    """Expressions as numbers at random places.
-
-    Parameters
-    ----------
-    expressions : sequence of sympy.Expr
-    symbols : iterable of sympy.Symbol, optional
-        Where places have values of their own besides those that the expressions hold.
-    """
+    """Expressions as numbers at random places, of their symbols and of further ones."""
 
     def __init__(self, expressions: Sequence[sp.Expr], symbols: Iterable[sp.Symbol] = ()) -> None:
         held: set[Any] = set(symbols).union(*(x.free_symbols for x in expressions))
@@ -63,10 +56,7 @@ class RandomEvaluation:
 
 
 def is_zero(x: sp.Expr) -> bool:
-    """Return whether an expression is zero everywhere.
-
-    A piecewise expression may be zero in some pieces only; it counts as zero where SymPy knows it.
-    """
+    """Return whether an expression is zero everywhere; a piecewise one only where SymPy knows it."""
     if not x.free_symbols or x.is_zero is not None or x.has(sp.Piecewise, sp.Max, sp.Min):
         return bool(x == 0 or x.is_zero)
     broken = x.has(sp.Abs, sp.sign) or any(not p.exp.is_Integer for p in x.atoms(sp.Pow))
