@@ -2,8 +2,6 @@
 
 from mbkit import _interrupt
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Run the command."""

@@ -9,8 +9,6 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-__all__ = ["make_callable"]
-
 
 def make_callable(package: str, function: Callable[..., Any]) -> None:
     """Let a package be called as one of its functions.

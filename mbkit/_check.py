@@ -16,19 +16,6 @@ _MAX_SUMMED: Final = 64
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
 
-__all__ = [
-    "Array",
-    "all_finite",
-    "batch_of",
-    "count",
-    "finite_array",
-    "generator",
-    "real",
-    "require_finite",
-    "rows",
-    "shown",
-]
-
 
 def all_finite(array: Array) -> bool:
     """Return whether an array holds only finite numbers."""

@@ -16,22 +16,6 @@ import unicodedata
 from collections.abc import Callable, Container
 from typing import Final
 
-__all__ = [
-    "c_comment",
-    "csv_text",
-    "html",
-    "identifier",
-    "json_text",
-    "latex",
-    "markdown",
-    "one_line",
-    "python_docstring",
-    "terminal",
-    "xml_attribute",
-    "xml_comment",
-    "xml_holds",
-]
-
 
 def terminal(text: str) -> str:
     """Return text with everything spelled out that a terminal would obey; line feeds stay."""

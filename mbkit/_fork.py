@@ -11,8 +11,6 @@ from itertools import count
 from typing import Any, Final, TypeVar
 from weakref import WeakValueDictionary
 
-__all__ = ["fork_safe"]
-
 Lock = TypeVar("Lock")
 
 #: In the order of their creation, so that two threads that fork at once take them in the same order.

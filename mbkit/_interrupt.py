@@ -20,8 +20,6 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["GRACE", "INTERRUPTED", "at_end", "ending", "keeping", "raise_again", "received", "uninterrupted"]
-
 #: Exit status of an interrupted command.
 INTERRUPTED = 130
 #: Seconds in which an interrupted command may close its files.

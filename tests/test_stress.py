@@ -28,10 +28,9 @@ from mbkit.report.stress_view import headline
 from mbkit.studies import InterruptedSweepError, StressResult
 from mbkit.studies.stress import Case, CaseResult, Measurement, Row, stress
 from mbkit.studies.stress.measure import Prepared, condition_number, measure, prepare
-from mbkit.studies.stress.measurements import OUT_OF_TIME
 from mbkit.studies.stress.reference import ReferenceSearch, condition, cpu_limit
 from mbkit.studies.stress.sweep import CaseSweep, Limits
-from mbkit.studies.study_runs import TooLongError
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
 from mbkit.studies.worker import WorkerDiedError, WorkerTimeoutError
 from tests import stress_cases as own
 

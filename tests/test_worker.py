@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -122,6 +127,44 @@ def test_another_thread_can_close_it():
             call.result()
     with pytest.raises(WorkerClosedError):
         worker.call(abs, 1)
+
+
+_PARENT = """
+import os, sys, threading
+from pathlib import Path
+from mbkit.studies.worker import Worker
+
+hang, *home = sys.argv[1:]
+worker = Worker(*map(Path, home))
+print(worker.call(os.getpid), worker.call(os.getcwd), flush=True)
+if hang == "yes":
+    worker.begin(exec, "while True: pass")
+    print("begun", flush=True)
+threading.Event().wait()
+"""
+
+
+@pytest.mark.parametrize(("hang", "own_home"), [("no", False), ("yes", True)])
+def test_a_worker_whose_parent_is_killed_ends_and_removes_its_folder(hang, own_home, tmp_path):
+    home = tmp_path / "home"
+    home.mkdir()
+    command = [sys.executable, "-c", _PARENT, hang, *([str(home)] if own_home else [])]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        pid, folder = parent.stdout.readline().split(maxsplit=1)
+        if hang == "yes":
+            assert parent.stdout.readline() == "begun\n"
+        parent.send_signal(signal.SIGKILL)
+    gone = home if own_home else Path(folder.strip())
+    while gone.exists() or _runs(int(pid)):
+        time.sleep(0.01)
+
+
+def _runs(pid: int) -> bool:
+    """Return whether a process runs; one that ended and that no parent has read the status of does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def test_no_calls_take_no_workers():

@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -15,7 +16,8 @@ from mbkit.model import Model
 from mbkit.model.manifold import limits_box
 from mbkit.simulate import Trajectory, simulate
 
-__all__ = ["TooLongError", "free_of_mimic", "patience", "quiet_simulate", "start_state", "state_within_limits"]
+#: The note of what was left out because no time was left.
+OUT_OF_TIME: Final = "not run: the time allowed was used up"
 
 
 def state_within_limits(model: Model, rng: np.random.Generator, share: float = 0.5) -> tuple[Array, Array]:

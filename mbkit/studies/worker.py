@@ -13,6 +13,7 @@ import faulthandler
 import os
 import pickle
 import re
+import select
 import shutil
 import signal
 import socket
@@ -35,24 +36,6 @@ from mbkit import _interrupt
 from mbkit.engines.registry import registered_engines
 from mbkit.errors import MbkitError, UnsupportedError
 
-__all__ = [
-    "OUT_OF_MEMORY",
-    "WALL_PER_CPU",
-    "CallError",
-    "RemoteError",
-    "Worker",
-    "WorkerClosedError",
-    "WorkerDiedError",
-    "WorkerPool",
-    "WorkerStartError",
-    "WorkerTimeoutError",
-    "describe",
-    "in_worker",
-    "processors",
-    "report_stage",
-    "run",
-]
-
 T = TypeVar("T")
 
 OUT_OF_MEMORY: Final = "it took more memory than allowed"
@@ -68,10 +51,13 @@ _IDLE: Final = 900.0
 _TAIL: Final = 20_000
 #: Linux's prctl: the signal that a process gets when the thread that started it is gone.
 _PR_SET_PDEATHSIG: Final = 1
+#: That signal, SIGUSR1. Its handler is alarm(2), which takes the signal's number as seconds: time to remove the
+#: folder, after which the kernel ends even a process that hangs in a library.
+_PARENT_GONE: Final = 10
 #: The folders of modules are known before the worker changes into its own folder.
 _PROGRAM: Final = (
-    "import sys; numbers = map(int, sys.argv[1:4]); sys.path[:] = sys.argv[4:]; "
-    "from mbkit.studies.worker import _serve; _serve(*numbers)"
+    "import sys; folder, *numbers = sys.argv[1:5]; sys.path[:] = sys.argv[5:]; "
+    "from mbkit.studies.worker import _serve; _serve(folder, *map(int, numbers))"
 )
 
 
@@ -128,7 +114,7 @@ class Worker:
     Parameters
     ----------
     home : Path, optional
-        Where its folder is made.
+        A folder of the caller's own in which the worker has its folder. The worker removes it if the caller is killed.
     memory : int
         Bytes that it may take (Linux); 0 for no limit.
     environment : mapping of str to str, optional
@@ -256,9 +242,9 @@ class Worker:
 
     def _start(self) -> None:
         ours, its = socket.socketpair()
-        numbers = (its.fileno(), self._memory, int(self._follow))
-        command = [sys.executable, "-c", _PROGRAM, *map(str, numbers), *map(os.path.abspath, sys.path)]
         self._folder = Path(tempfile.mkdtemp(prefix="mbkit-", dir=self._home))
+        arguments = (self._home or self._folder, its.fileno(), self._memory, int(self._follow))
+        command = [sys.executable, "-c", _PROGRAM, *map(str, arguments), *map(os.path.abspath, sys.path)]
         try:
             with its, (self._folder / "output").open("wb") as output:
                 self._process = subprocess.Popen(
@@ -421,31 +407,42 @@ def report_stage(name: str) -> None:
         _to_parent.send(("stage", name))
 
 
-def _serve(handle: int, memory: int, follow: int) -> None:
-    """Answer calls from a file descriptor until the parent is gone."""
+def _serve(folder: str, handle: int, memory: int, follow: int) -> None:
+    """Answer calls from a file descriptor until the parent is gone; then remove the folder."""
     global _to_parent
     # Ctrl-C is the parent's.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if follow and sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        libc = ctypes.CDLL(None)
+        libc.signal(_PARENT_GONE, libc.alarm)
+        libc.prctl(_PR_SET_PDEATHSIG, _PARENT_GONE)
     faulthandler.enable()
     _limit_memory(memory)
     _to_parent = channel = Connection(handle)
-    channel.send(("ready", None))
-    while True:
-        try:
-            request = channel.recv() if channel.poll(_IDLE) else None
-        except EOFError:
-            request = None
-        if request is None:
-            # Destructors of loaded libraries could only fail.
-            os._exit(0)
-        main, call, alarm = request
-        # What hangs does not see that its parent is gone; the kernel ends it then.
-        signal.setitimer(signal.ITIMER_REAL, alarm)
-        answer = _answer(main, call)
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        channel.send_bytes(answer)
+    ending = threading.Thread(target=_end_after_parent, args=(os.path.abspath(folder), handle), daemon=True)
+    ending.start()
+    try:
+        channel.send(("ready", None))
+        while channel.poll(_IDLE):
+            main, call, alarm = channel.recv()
+            # What hangs does not see that its parent is gone; the kernel ends it then.
+            signal.setitimer(signal.ITIMER_REAL, alarm)
+            answer = _answer(main, call)
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            channel.send_bytes(answer)
+    except (EOFError, OSError):
+        ending.join()
+    # Destructors of loaded libraries could only fail.
+    os._exit(0)
+
+
+def _end_after_parent(folder: str, handle: int) -> None:
+    """Wait until the parent is gone, even if it was killed; remove the folder, end this process and what it started."""
+    hang_up = select.poll()
+    hang_up.register(handle, 0)
+    hang_up.poll()
+    shutil.rmtree(folder, ignore_errors=True)
+    os.killpg(0, signal.SIGKILL)
 
 
 def _answer(main: dict[str, Any], call: bytes) -> bytes:

@@ -27,8 +27,6 @@ BAR: Final = 1e-6
 #: Where an answer is no longer inaccurate but wrong: a hundredth of the motion, or of the term. A method of low order
 #: misses the bar with every affordable step, and misleads nobody by that.
 GROSS: Final = 1e-2
-#: The note of a cell that was left out when there was no time left.
-OUT_OF_TIME: Final = "not run: the time allowed was used up"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from mbkit._check import real
 from mbkit.errors import UnknownNameError
 from mbkit.studies.results import NO_LIMIT, Block, Column, ResultTable, Table, Title
 from mbkit.studies.stress.figure import figure
-from mbkit.studies.stress.measurements import OUT_OF_TIME, CaseResult, Measurement, Outcome, Row
+from mbkit.studies.stress.measurements import CaseResult, Measurement, Outcome, Row
+from mbkit.studies.study_runs import OUT_OF_TIME
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,8 +16,8 @@ from typing import Final, Literal
 from mbkit.methods.registry import METHODS
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.measure import Prepared, Setting, condition_number, measure, prepare
-from mbkit.studies.stress.measurements import OUT_OF_TIME, CaseResult, End, Measurement, Row
-from mbkit.studies.study_runs import TooLongError
+from mbkit.studies.stress.measurements import CaseResult, End, Measurement, Row
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
 from mbkit.studies.worker import (
     OUT_OF_MEMORY,
     CallError,

@@ -26,14 +26,13 @@ from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
 from mbkit.studies.results import Refusal
-from mbkit.studies.study_runs import TooLongError, patience, quiet_simulate
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, patience, quiet_simulate
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
 from mbkit.studies.work_precision.settings import Settings
 from mbkit.studies.worker import run
 
 __all__ = ["CurveMeasurement", "Problem", "Sweep", "TimeBudget", "first_run", "repetitions"]
 
-OUT_OF_TIME: Final = "not run: the time allowed was used up"
 #: A run shorter than this is repeated within a round, s.
 _SHORT: Final = 2e-3
 _MAX_IN_A_ROUND: Final = 100
