@@ -20,7 +20,7 @@ import mbkit as mb
 from mbkit.cli import cli
 from mbkit.codegen.c_source import c_code, export_c
 from mbkit.derivation import FUNCTIONS
-from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, MbkitError, OutputError, UnknownNameError, UnsupportedError
 from tests.random_trees import off, random_tree, states
 
 CC, CXX = shutil.which("cc"), shutil.which("c++")
@@ -271,6 +271,9 @@ def test_bad_names_are_told():
         export_c(model, [])
     with pytest.raises(InputError, match="list of names"):
         export_c(model, "nle")
+    for quantities in (5, None, ["nle", 5]):
+        with pytest.raises(MbkitError, match=f"quantit.*{5 if quantities else quantities}"):
+            export_c(model, quantities)
     for name in ("", "2link", "a b", "é", "a;b", "../x"):
         with pytest.raises(InputError, match="name: expected letters"):
             export_c(model, ["nle"], name=name)

@@ -12,12 +12,13 @@ from mbkit.engines import ENGINES, QUANTITIES
 from mbkit.errors import KnownDefectWarning, UnsupportedError
 from mbkit.model import KINDS, Model, kind_of
 from tests.joint_of_ones_own import OWN
+from tests.random_trees import off, random_tree, states
 
 BUILT_IN = tuple(name for name, joint_type in KINDS.items() if joint_type.built_in and joint_type.nv)
 DERIVATIVES = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
 ARGUMENTS = {
     **dict.fromkeys(("mass_matrix", "gravity", "potential_energy"), "q"),
-    **dict.fromkeys(("coriolis_force", "nle", "passive", "kinetic_energy"), "qv"),
+    **dict.fromkeys(("coriolis_matrix", "coriolis_force", "nle", "passive", "kinetic_energy"), "qv"),
     **dict.fromkeys(("inverse_dynamics", "inverse_dynamics_derivatives"), "qva"),
     **dict.fromkeys(("forward_dynamics", "forward_dynamics_derivatives"), "qvt"),
 }
@@ -55,7 +56,7 @@ def state(model: Model) -> dict[str, np.ndarray]:
 
 def value(dyn, quantity: str, at: dict[str, np.ndarray]) -> np.ndarray:
     if quantity in ("pose", "jacobian"):
-        return np.asarray(getattr(dyn, quantity)(at["q"], "b2"))
+        return np.asarray(getattr(dyn, quantity)(at["q"], dyn.model.bodies[-1].name))
     return np.asarray(getattr(dyn, quantity)(*(at[name] for name in ARGUMENTS[quantity])))
 
 
@@ -93,6 +94,46 @@ def test_each_quantity_is_right_or_refused(kind):
     assert not {"lagrangian", "oracle"} & {*refused}
     assert all(kind in text for key, text in refused.items() if isinstance(key, str)), refused
     assert all(key[0] in text for key, text in refused.items() if not isinstance(key, str)), refused
+
+
+FLOATING = ("free", "ball", "revolute", "prismatic")
+NOTHING = {"springs": False, "damping": False, "armature": False}
+#: Two bodies have no point spring; with more of them, random trees have two.
+FEATURES = {
+    "nothing": random_tree(3, 4, FLOATING, **NOTHING),
+    "dampers": random_tree(4, 2, ("free", "revolute"), **NOTHING | {"damping": True}),
+    "dampers of hinges": random_tree(4, 2, ("revolute", "universal"), **NOTHING | {"damping": True}),
+    "joint springs": random_tree(5, 2, ("free", "prismatic"), **NOTHING | {"springs": True}),
+    "point springs": random_tree(6, 4, FLOATING, **NOTHING | {"springs": True, "damping": True}),
+    "armature": random_tree(7, 4, ("revolute", "prismatic", "ball"), **NOTHING | {"armature": True}),
+    "mimic": random_tree(8, 5, ("free", "revolute", "prismatic"), **NOTHING, mimic=True),
+    "all": random_tree(9, 6, FLOATING, mimic=True),
+}
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+@pytest.mark.parametrize("engine", [*ENGINES, "compiled"])
+@pytest.mark.filterwarnings("ignore::mbkit.errors.KnownDefectWarning")
+def test_one_state_has_the_values_of_its_row_in_a_batch(engine, feature):
+    """Single states have calls of their own, with other code than batches."""
+    model = FEATURES[feature]
+    compiled = engine == "compiled"
+    dyn = mb.dynamics(model, "lagrangian", compile=True) if compiled else mb.dynamics(model, engine)
+    batch = dict(zip("qvat", states(model, 3), strict=True))
+    M = dyn.mass_matrix(batch["q"])
+    # Derivatives as machine code are compiled for seconds, and tests/test_derivatives.py has their batches.
+    for quantity in (*QUANTITIES, *DERIVATIVES[: 0 if compiled else 2]):
+        if quantity == "function":
+            continue
+        try:
+            whole = value(dyn, quantity, batch)
+        except UnsupportedError:
+            continue
+        rows = [value(dyn, quantity, {name: x[i] for name, x in batch.items()}) for i in range(3)]
+        if quantity in DERIVATIVES:
+            whole = np.moveaxis(whole, 1, 0)
+        tolerance = 1e-13 * (np.linalg.cond(M).max() if quantity.startswith("forward") else 1.0)
+        assert off(rows, whole) < tolerance, quantity
 
 
 @pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])

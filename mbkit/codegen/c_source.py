@@ -429,8 +429,10 @@ def _described(name: str, function: ca.Function, quantity: str) -> CFunction:
 def _checked(quantities: Iterable[str]) -> list[str]:
     if isinstance(quantities, str):
         raise InputError(f"quantities: expected a list of names, got the text {quantities!r}; write [{quantities!r}]")
-    # Each once, in the order asked for.
-    wanted = list(dict.fromkeys(quantities))
+    if not isinstance(quantities, Iterable):
+        raise InputError(f"quantities: expected a list of names, got {quantities!r}; write ['nle'], for example")
+    # Each once, in the caller's order.
+    wanted = list(dict.fromkeys(map(str, quantities)))
     for quantity in wanted:
         if quantity not in FUNCTIONS:
             raise UnknownNameError("quantity", quantity, FUNCTIONS)
