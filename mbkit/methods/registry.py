@@ -5,9 +5,11 @@ What other code asks of a method is an attribute of it: no method is told apart 
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
@@ -44,6 +46,7 @@ __all__ = [
     "Tolerances",
     "method_of",
     "register_method",
+    "registered_methods",
 ]
 
 _EPS: Final = 2.0**-52
@@ -355,6 +358,7 @@ METHODS: Final[dict[str, Method]] = {
         _drake("implicit_euler", 1, "Drake's own implicit Euler with error control"),
     )
 }
+_BUILT_IN: Final = frozenset(METHODS)
 
 
 def method_of(name: object) -> Method:
@@ -367,7 +371,7 @@ def method_of(name: object) -> Method:
 
 
 def register_method(method: Method | Tableau) -> Method:
-    """Add a Runge-Kutta method with a fixed step to `METHODS`, for this process.
+    """Add a Runge-Kutta method with a fixed step to `METHODS`, for this process and the workers of its studies.
 
     Every engine runs it; where the Lagrangian engine compiles and the method is explicit, as machine code.
 
@@ -419,6 +423,18 @@ def register_method(method: Method | Tableau) -> Method:
         )
     METHODS[name] = method
     return method
+
+
+def registered_methods() -> tuple[Method, ...]:
+    """Return the methods of `register_method` that can be sent to another process."""
+    out = []
+    for method in METHODS.values():
+        if method.name not in _BUILT_IN:
+            with suppress(Exception):  # pickle raises errors of several kinds
+                sent = replace(method, formula_source=method.formula)
+                pickle.dumps(sent)
+                out.append(sent)
+    return tuple(out)
 
 
 def _runge_kutta(tableau: Tableau) -> Method:

@@ -35,6 +35,7 @@ from weakref import WeakSet
 from mbkit import _interrupt
 from mbkit.engines.registry import registered_engines
 from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.methods.registry import METHODS, registered_methods
 
 T = TypeVar("T")
 
@@ -196,7 +197,7 @@ class Worker:
         """
         if self._closed.is_set():
             raise WorkerClosedError
-        call = pickle.dumps((registered_engines(), function, args))
+        call = pickle.dumps((registered_engines(), registered_methods(), function, args))
         # As multiprocessing has its children import the script that they were started from.
         main = spawn.get_preparation_data("mbkit") if b"__main__" in call else {}
         main = {k: x for k, x in main.items() if k.startswith("init_main")}
@@ -449,9 +450,11 @@ def _answer(main: dict[str, Any], call: bytes) -> bytes:
     try:
         if main:
             spawn.prepare(main)
-        _, function, args = pickle.loads(call)
+        # Unpickling registers the engines.
+        _, methods, function, args = pickle.loads(call)
     except Exception as error:  # a user's module may raise anything
         return pickle.dumps(("error", CallError(describe(error))))
+    METHODS.update((method.name, method) for method in methods)
     try:
         return pickle.dumps(("result", function(*args)))
     except BaseException as error:
