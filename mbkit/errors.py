@@ -1,7 +1,6 @@
 """The errors and warnings that mbkit raises, all in one place.
 
-Every message names the argument or the body, says what was expected and what
-came, and what to do next.
+Every message names the argument or the body, says what was expected and what came, and what to do next.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Rotations, quaternions (x, y, z, w) and rigid motions, on batches.
 
-Functions of arrays work along the last axes and broadcast over leading ones; the two
-that begin with a matrix or three angles take one at a time.
-Series replace closed forms near zero where those lose digits; each says where.
+Functions of arrays work along the last axes and broadcast over leading ones; the two that begin with a matrix or three
+angles take one at a time. Series replace closed forms near zero where those lose digits; each says where.
 """
 
 from __future__ import annotations
@@ -79,8 +78,7 @@ def matrix_from_quaternion(quaternion: Array) -> Array:
 def quaternion_from_matrix(R: Array) -> Array:
     """Return the unit quaternion of one rotation matrix, with w >= 0.
 
-    Shepperd's method: the largest of the four squares is taken, so that no
-    component is found by a small divisor.
+    Shepperd's method: the largest of the four squares is taken, so that no component is found by a small divisor.
     """
     trace = float(np.trace(R))
     squares = np.array([*(1 + 2 * np.diag(R) - trace), 1 + trace])

@@ -149,8 +149,7 @@ def assert_baseline(
     path : path
         What `mbkit.baseline.record` wrote.
     strict : bool, optional
-        Whether an engine that was recorded and is not installed fails; by default what
-        ``MBKIT_TEST_STRICT`` says.
+        Whether an engine that was recorded and is not installed fails; by default what ``MBKIT_TEST_STRICT`` says.
     target : str, optional
         What the model was loaded from, where that is not what was recorded.
     remedy : str

@@ -1,10 +1,9 @@
 """Textbook and published systems, each a function that returns a `Model`.
 
-Every function takes keyword parameters in SI units, numbers or `mbkit.Parameter`;
-its docstring gives the coordinates, the zero pose and the source. Planar systems move in the x-z plane,
-gravity along -z, with angles from the downward vertical that grow towards +x: a
-right-handed turn about -y. Planar systems without gravity move in the x-y plane. Engines take all but
-`slider_crank`, which has a loop: `mbkit.lagrangian.from_model` solves it.
+Every function takes keyword parameters in SI units, numbers or `mbkit.Parameter`; its docstring gives the coordinates,
+the zero pose and the source. Planar systems move in the x-z plane, gravity along -z, with angles from the downward
+vertical that grow towards +x: a right-handed turn about -y. Planar systems without gravity move in the x-y plane.
+Engines take all but `slider_crank`, which has a loop: `mbkit.lagrangian.from_model` solves it.
 """
 
 from __future__ import annotations

@@ -12,9 +12,8 @@ def cart_pole(
 ) -> Model:
     """Return a cart on a horizontal rail that carries a pole with a point mass at its end.
 
-    Two coordinates: ``x``, the cart's position along +x, and ``theta``, the pole's
-    angle from the downward vertical, growing towards +x. At zero the cart is at
-    the origin and the mass at (0, 0, -length).
+    Two coordinates: ``x``, the cart's position along +x, and ``theta``, the pole's angle from the downward vertical,
+    growing towards +x. At zero the cart is at the origin and the mass at (0, 0, -length).
 
     Parameters
     ----------
@@ -54,10 +53,9 @@ def acrobot(
 ) -> Model:
     """Return two rigid links, one below the other, with a motor at the elbow only.
 
-    Two coordinates: ``theta1``, the angle of the first link from the downward vertical,
-    and ``theta2``, the angle of the second link from the first. At zero both hang down.
-    The motor's torque stands in the second entry of the generalized forces; the first
-    is zero.
+    Two coordinates: ``theta1``, the angle of the first link from the downward vertical, and ``theta2``, the angle of
+    the second link from the first. At zero both hang down. The motor's torque stands in the second entry of the
+    generalized forces; the first is zero.
 
     Parameters
     ----------
@@ -74,9 +72,8 @@ def acrobot(
 
     References
     ----------
-    Spong 1995, The swing up control problem for the acrobot, whose numbers are the
-    defaults (his first angle is from the horizontal); Tedrake, Underactuated Robotics,
-    ch. 3.1, whose coordinates these are.
+    Spong 1995, The swing up control problem for the acrobot, whose numbers are the defaults (his first angle is from
+    the horizontal); Tedrake, Underactuated Robotics, ch. 3.1, whose coordinates these are.
     """
     b = ModelBuilder("acrobot", gravity=down(gravity))
     b.add_body("link1", mass=mass1, com=(0.0, 0.0, -com1), inertia=(inertia1, inertia1, 0.0))
@@ -123,10 +120,9 @@ def furuta_pendulum(
 
     References
     ----------
-    Furuta, Yamakita, Kobayashi 1992, Swing-up control of inverted pendulum using
-    pseudo-state feedback; Cazzolato, Prime 2011, On the dynamics of the Furuta
-    pendulum, which keeps all the moments of inertia. The default values are those of thin
-    rods on a desk, of no particular device.
+    Furuta, Yamakita, Kobayashi 1992, Swing-up control of inverted pendulum using pseudo-state feedback; Cazzolato,
+    Prime 2011, On the dynamics of the Furuta pendulum, which keeps all the moments of inertia. The default values are
+    those of thin rods on a desk, of no particular device.
     """
     b = ModelBuilder("furuta_pendulum", gravity=down(gravity))
     b.add_body("arm body", mass=arm_mass, com=(arm_com, 0.0, 0.0), inertia=(0.0, arm_inertia, arm_inertia))

@@ -75,9 +75,8 @@ def double_pendulum(
 def spherical_pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81) -> Model:
     """Return a point mass on a massless rod that hangs in a Cardan suspension.
 
-    Two coordinates: ``alpha``, the turn of the massless fork about -y, which swings
-    the mass towards +x, and ``beta``, the turn of the rod in the fork about the
-    fork's +x, which swings it towards +y. The mass is at length (sin α cos β,
+    Two coordinates: ``alpha``, the turn of the massless fork about -y, which swings the mass towards +x, and ``beta``,
+    the turn of the rod in the fork about the fork's +x, which swings it towards +y. The mass is at length (sin α cos β,
     sin β, -cos α cos β): at zero it hangs at (0, 0, -length).
 
     Parameters
@@ -91,12 +90,10 @@ def spherical_pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Num
 
     Notes
     -----
-    The textbooks' coordinates, azimuth φ and angle ϑ from the downward vertical, have no
-    inverse of their mass matrix, m l² diag(sin² ϑ, 1), where the mass hangs at
-    rest, which is where every study begins. These have m l² diag(cos² β, 1),
-    singular where the mass lies on the y axis. tan φ = tan β / sin α,
-    cos ϑ = cos α cos β. A ball joint would let a point mass spin about the rod,
-    with no inertia.
+    The textbooks' coordinates, azimuth φ and angle ϑ from the downward vertical, have no inverse of their mass matrix,
+    m l² diag(sin² ϑ, 1), where the mass hangs at rest, which is where every study begins. These have m l² diag(cos² β,
+    1), singular where the mass lies on the y axis. tan φ = tan β / sin α, cos ϑ = cos α cos β. A ball joint would let a
+    point mass spin about the rod, with no inertia.
 
     References
     ----------
@@ -117,11 +114,10 @@ def elastic_pendulum(
 ) -> Model:
     """Return a point mass that slides on a massless rod against a spring.
 
-    Two coordinates: ``theta``, the angle of the rod from the downward vertical, and
-    ``stretch``, how much longer than `length` the spring is. The mass is at
-    (length + stretch) (sin θ, 0, -cos θ): at zero it hangs at (0, 0, -length) and the
-    spring is at rest. The mass matrix is singular where the mass reaches the pivot: the
-    lower limit of ``stretch``, half the (nominal) length, keeps random states away from there.
+    Two coordinates: ``theta``, the angle of the rod from the downward vertical, and ``stretch``, how much longer than
+    `length` the spring is. The mass is at (length + stretch) (sin θ, 0, -cos θ): at zero it hangs at (0, 0, -length)
+    and the spring is at rest. The mass matrix is singular where the mass reaches the pivot: the lower limit of
+    ``stretch``, half the (nominal) length, keeps random states away from there.
 
     Parameters
     ----------
@@ -163,9 +159,8 @@ def chain(*, n: int = 5, length: Number = 1.0, mass: Number = 1.0, gravity: Numb
     """Return n equal thin rods hinged end to end, hanging from the origin.
 
     The model's name is ``chain_5`` for five. n coordinates: ``theta1``, the angle of the first rod from the downward
-    vertical, and ``theta2`` ... , the angle of each rod from the one before. At zero
-    the chain hangs straight down. Each rod has its centre of mass in its middle
-    and the inertia m L²/12 across, none along.
+    vertical, and ``theta2`` ... , the angle of each rod from the one before. At zero the chain hangs straight down.
+    Each rod has its centre of mass in its middle and the inertia m L²/12 across, none along.
 
     Parameters
     ----------

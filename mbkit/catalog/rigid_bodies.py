@@ -10,9 +10,8 @@ from mbkit.model import Model, ModelBuilder, Number
 def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: Number = 0.0) -> Model:
     """Return a homogeneous box that floats freely.
 
-    One free joint, ``float``: q is the centre's position and the quaternion
-    (x, y, z, w), v the linear then angular velocity in body axes. At zero the centre
-    is at the origin and the box's edges lie along the world's axes.
+    One free joint, ``float``: q is the centre's position and the quaternion (x, y, z, w), v the linear then angular
+    velocity in body axes. At zero the centre is at the origin and the box's edges lie along the world's axes.
 
     Parameters
     ----------
@@ -25,9 +24,8 @@ def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: 
 
     References
     ----------
-    Gazebo's "boxes" benchmark, complex case without gravity: it starts with
-    ω = (0.1, 5, 0.1) rad/s about the middle axis and tumbles, as Dzhanibekov saw a wing nut
-    do (Ashbaugh, Chicone, Cushman 1991, The twisting tennis racket).
+    Gazebo's "boxes" benchmark, complex case without gravity: it starts with ω = (0.1, 5, 0.1) rad/s about the middle
+    axis and tumbles, as Dzhanibekov saw a wing nut do (Ashbaugh, Chicone, Cushman 1991, The twisting tennis racket).
     """
     a, b, c = point("sides", sides)
     inertia = tuple(mass / 12 * x for x in (b * b + c * c, a * a + c * c, a * a + b * b))
@@ -47,9 +45,8 @@ def heavy_top(
 ) -> Model:
     """Return a rigid body with one point fixed at the origin.
 
-    One ball joint, ``spin``: q is the quaternion (x, y, z, w) of the body's attitude, v
-    the angular velocity in body axes. At the identity the body's axes are the
-    world's; with the default `com` the top lies along +y.
+    One ball joint, ``spin``: q is the quaternion (x, y, z, w) of the body's attitude, v the angular velocity in body
+    axes. At the identity the body's axes are the world's; with the default `com` the top lies along +y.
 
     Parameters
     ----------
@@ -64,9 +61,8 @@ def heavy_top(
 
     References
     ----------
-    Terze, Müller, Zlatar 2016, Singularity-free time integration of rotational
-    quaternions using non-redundant ordinary differential equations: the default
-    values; it starts from the identity with ω = (0, 150, -4.61538) rad/s.
+    Terze, Müller, Zlatar 2016, Singularity-free time integration of rotational quaternions using non-redundant ordinary
+    differential equations: the default values; it starts from the identity with ω = (0, 150, -4.61538) rad/s.
     """
     b = ModelBuilder("heavy_top", gravity=down(gravity))
     b.add_body("top", mass=mass, com=com, inertia=inertia)
@@ -88,12 +84,11 @@ def gyroscope(
 ) -> Model:
     """Return a symmetric rotor in two gimbals, with its centre of mass on its axis beside the gimbals' centre.
 
-    Three coordinates: ``precession``, the turn α of the outer gimbal about +z, ``nutation``, the
-    turn β of the inner gimbal about the outer one's +x, and ``spin``, the turn γ of the rotor
-    about the inner gimbal's +y. β is the elevation of the rotor's axis above the horizontal: that axis
-    points along (-sin α cos β, cos α cos β, sin β). At zero it lies along +y, where the three axes are at right angles;
-    at β = ±π/2 it stands upright and the outer and the rotor's axis are one. All
-    gimbals have their centre of mass in the centre.
+    Three coordinates: ``precession``, the turn α of the outer gimbal about +z, ``nutation``, the turn β of the inner
+    gimbal about the outer one's +x, and ``spin``, the turn γ of the rotor about the inner gimbal's +y. β is the
+    elevation of the rotor's axis above the horizontal: that axis points along (-sin α cos β, cos α cos β, sin β). At
+    zero it lies along +y, where the three axes are at right angles; at β = ±π/2 it stands upright and the outer and the
+    rotor's axis are one. All gimbals have their centre of mass in the centre.
 
     Parameters
     ----------
@@ -102,8 +97,7 @@ def gyroscope(
     rotor_axial, rotor_across : float or Parameter
         Moments of the rotor about its axis, and across it about its centre of mass, kg m².
     offset : float or Parameter
-        Distance of the rotor's centre of mass from the gimbals' centre, along its
-        axis, m: 0 is the balanced gyroscope.
+        Distance of the rotor's centre of mass from the gimbals' centre, along its axis, m: 0 is the balanced gyroscope.
     inner_inertia : (3,) array_like
         Principal moments of the inner gimbal, about its hinge, about the rotor's axis and across both, kg m².
     outer_inertia : float or Parameter

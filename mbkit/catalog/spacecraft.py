@@ -14,14 +14,13 @@ from mbkit.model import Model, ModelBuilder, Number
 
 # A bending beam as rigid segments.
 #
-# n equal thin rods of length h stand behind a stub of length a h that belongs to what the beam is clamped
-# to, so h = L/(n + a). Between rods lies a spring EI/h: a hinge's turn δ stands for the curvature
-# δ/h along one h. Such rods carry waves with an error of h⁴, since the rods' inertia errs by
-# the same 1 - (k h)²/6 as the springs; what errs by h² is the clamped end. The first hinge stands for
-# the bending of the stub and half a rod, so its spring is EI/((a + ½) h). For a beam with
-# w = c x²/2 + d x³/6 at the wall that leaves, seen from the rods, a displacement
-# -c (a h)²/2 and a slope d (3 a² - 1) h²/6 there, which change an eigenvalue by c d (1/6 - a²) h²:
-# by nothing for a = 1/√6. What remains is of third order in h.
+# n equal thin rods of length h stand behind a stub of length a h that belongs to what the beam is clamped to, so h =
+# L/(n + a). Between rods lies a spring EI/h: a hinge's turn δ stands for the curvature δ/h along one h. Such rods carry
+# waves with an error of h⁴, since the rods' inertia errs by the same 1 - (k h)²/6 as the springs; what errs by h² is
+# the clamped end. The first hinge stands for the bending of the stub and half a rod, so its spring is EI/((a + ½) h).
+# For a beam with w = c x²/2 + d x³/6 at the wall that leaves, seen from the rods, a displacement -c (a h)²/2 and a
+# slope d (3 a² - 1) h²/6 there, which change an eigenvalue by c d (1/6 - a²) h²: by nothing for a = 1/√6. What remains
+# is of third order in h.
 #
 # With a = 0, a spring 2 EI/h at the wall itself, the first frequency of eight segments errs by 7e-3, with
 # a = 1/√6 by 1.4e-4.
@@ -48,23 +47,7 @@ def _add_beam(
     root: Number = 0.0,
     backwards: bool = False,
 ) -> None:
-    """Add the segments of a beam in the x-y plane, whose hinges turn about +z; the stub is the parent's.
-
-    Parameters
-    ----------
-    b : ModelBuilder
-    name : str
-        Joints are ``name1``, ``name2`` ... from the clamped end.
-    segments : int
-    length, mass, bending_stiffness : float or Expression
-        Of the whole beam: m, kg and N m².
-    parent : str
-        Body to which the beam is clamped.
-    root : float or Expression
-        Where the beam begins, along its direction from the parent's origin, m.
-    backwards : bool
-        Whether it points along -x instead of +x.
-    """
+    """Add a beam's segments in the x-y plane, hinged about +z, from `root` along ±x of the parent; the stub is its."""
     h = length / (segments + _STUB)
     share = mass / (segments + _STUB)
     across = share * h**2 / 12
@@ -169,11 +152,10 @@ def spacecraft_with_wheels(
 ) -> Model:
     """Return a free rigid body that carries equal reaction wheels, without gravity.
 
-    One free joint, ``base``: q is the hub's centre and the quaternion (x, y, z, w), v the linear then
-    angular velocity in body axes; then ``wheel1``, ``wheel2`` ... , the turn of each wheel about
-    its axis. The wheels are thin discs about axes through the hub's centre. A wheel's motor
-    torque stands in its own entry of the generalized forces; what acts on the hub is its
-    reaction, by itself.
+    One free joint, ``base``: q is the hub's centre and the quaternion (x, y, z, w), v the linear then angular velocity
+    in body axes; then ``wheel1``, ``wheel2`` ... , the turn of each wheel about its axis. The wheels are thin discs
+    about axes through the hub's centre. A wheel's motor torque stands in its own entry of the generalized forces; what
+    acts on the hub is its reaction, by itself.
 
     Parameters
     ----------
@@ -253,9 +235,8 @@ def flexible_spacecraft(
 
     References
     ----------
-    Junkins, Kim 1993, Introduction to Dynamics and Control of Flexible Structures, for the
-    hub with two appendages. The default values are those of no particular craft; the beams' first
-    frequency, clamped, is 0.96 rad/s.
+    Junkins, Kim 1993, Introduction to Dynamics and Control of Flexible Structures, for the hub with two appendages. The
+    default values are those of no particular craft; the beams' first frequency, clamped, is 0.96 rad/s.
     """
     along, across, about = point("hub_inertia", hub_inertia)
     stub, share = _STUB / (segments + _STUB) * length, _STUB / (segments + _STUB) * mass

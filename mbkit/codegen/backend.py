@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 #: One thread derives at a time; a fork waits for it. Python 3.11's cached properties hold locks meanwhile.
 DERIVING: Final = fork_safe(threading.RLock())
 
-#: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not
-#: spent unasked: a Coriolis matrix of a hundred joints has twice as many, and is
-#: interpreted in 0.5 ms.
+#: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not spent unasked: a Coriolis
+#: matrix of a hundred joints has twice as many, and is interpreted in 0.5 ms.
 _MAX_OPERATIONS: Final = 200_000
 
 
@@ -34,17 +33,10 @@ def compile_by_default() -> bool:
 
 
 def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile: bool) -> Compiled | Machine:  # noqa: A002  # the word that users look for
-    """Return a function ready to run.
+    """Return a function ready to run; `name` is all that it depends on but mbkit's code, `make` derives it.
 
-    Parameters
-    ----------
-    name : sequence of str
-        All that it depends on but the code of mbkit, for the cache.
-    make : callable
-        Derives it; not called if its machine code is in the cache.
-    compile : bool
-        Whether to compile; where there is no compiler a `NoCompilerWarning` says so
-        once, and CasADi's machine runs it. It also runs very large functions.
+    Without a compiler a `NoCompilerWarning` says so once, and CasADi's interpreter runs it, as it does very large
+    functions.
     """
     if not compile or not _compiler():
         return Machine(make())

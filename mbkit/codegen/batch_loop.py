@@ -1,18 +1,16 @@
 """LLVM code of the loop that takes a body through a batch, whatever the arrays' strides.
 
-One vector of states at a time: an array whose samples are neighbours (coordinate-major)
-is handed to the body where it is; rows of an ordinary C-ordered array are transposed in
-registers on their way into a small tile; anything else, and the end of a batch, is
-gathered entry by entry. Lanes beyond the end repeat the last state, so that a state's
-result never depends on its place in the batch.
+One vector of states at a time: an array whose samples are neighbours (coordinate-major) is handed to the body where it
+is; rows of an ordinary C-ordered array are transposed in registers on their way into a small tile; anything else, and
+the end of a batch, is gathered entry by entry. Lanes beyond the end repeat the last state, so that a state's result
+never depends on its place in the batch.
 
 The function has the signature ::
 
     void run(int64 *table, double *work, int64 first, int64 last)
 
-where ``table`` holds the numbers of inputs and outputs, the body's own share of the work
-space, and for each array its address, rows, stride between rows and stride between
-samples, counted in doubles. Tiles follow the body's share.
+where ``table`` holds the numbers of inputs and outputs, the body's own share of the work space, and for each array its
+address, rows, stride between rows and stride between samples, counted in doubles. Tiles follow the body's share.
 """
 
 from __future__ import annotations

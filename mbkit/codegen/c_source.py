@@ -74,28 +74,15 @@ Calls
 
 @dataclass(frozen=True)
 class CFunction:
-    """One exported function.
-
-    Attributes
-    ----------
-    name : str
-        In C.
-    quantity : str
-    inputs : tuple of (str, int)
-        Name and entries of each, in order.
-    outputs : tuple of (str, (int, int))
-        Name, rows and columns of each; they follow the inputs, stored by columns.
-    operations : int
-        Arithmetic operations of one call, a sine counted as one.
-    stack : int
-        Bytes of local variables where the compiler does not optimise, copies of the inputs among them.
-    """
+    """One exported function: name in C, inputs (name, entries) and outputs (name, (rows, columns)), by columns."""
 
     name: str
     quantity: str
     inputs: tuple[tuple[str, int], ...]
     outputs: tuple[tuple[str, tuple[int, int]], ...]
+    #: Arithmetic operations of one call, a sine counted as one.
     operations: int
+    #: Bytes of local variables where the compiler does not optimise, copies of the inputs among them.
     stack: int
 
     @property
@@ -244,15 +231,7 @@ _PROLOGUE: Final = """\
 
 
 def c_code(prefix: str, functions: Mapping[str, ca.Function]) -> str:
-    """Return C99 definitions of functions of CasADi that take plain arrays: the inputs, then the outputs.
-
-    Parameters
-    ----------
-    prefix : str
-        Of CasADi's internal names.
-    functions : mapping of str to casadi.Function
-        Dense functions of SX, by their names in C.
-    """
+    """Return C99 definitions of dense SX functions, by their names in C, that take plain arrays: inputs, outputs."""
     generator = ca.CodeGenerator(prefix, {"with_export": False})
     wrappers = []
     for name, function in functions.items():
@@ -298,8 +277,7 @@ class CSource:
         `Model.digest` of what they compute.
     functions : tuple of CFunction
     header, source : str
-        Texts of ``<name>.h`` and ``<name>.c``; the same bytes for the same model and
-        versions of mbkit and casadi.
+        Texts of ``<name>.h`` and ``<name>.c``; the same bytes for the same model and versions of mbkit and casadi.
     versions : dict of str to str
     """
 
@@ -318,8 +296,7 @@ class CSource:
         folder : path
             Made if it is not there.
         force : bool
-            Replace files that mbkit did not write. Those that it wrote are replaced
-            in any case.
+            Replace files that mbkit did not write. Those that it wrote are replaced in any case.
 
         Raises
         ------
@@ -352,13 +329,11 @@ class CSource:
 def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | None = None) -> CSource:
     """Return C99 code that computes quantities of a model.
 
-    Each becomes one function without heap or state, such as
-    ``void panda_forward_dynamics(const double q[], const double v[], const double tau[],
-    double a[])``; named parameters of the model are a last input. The header states
-    units, layouts, conventions and the order of the joints. Compilers take long for
-    long functions: with ``gcc -O2`` about a second for Panda's forward dynamics (4,000
-    operations), four for Talos' (18,000), over a minute for the two-armed Tiago's
-    (72,000), which ``-O0`` compiles in two seconds.
+    Each becomes one function without heap or state, such as ``void panda_forward_dynamics(const double q[], const
+    double v[], const double tau[], double a[])``; named parameters of the model are a last input. The header states
+    units, layouts, conventions and the order of the joints. Compilers take long for long functions: with ``gcc -O2``
+    about a second for Panda's forward dynamics (4,000 operations), four for Talos' (18,000), over a minute for the
+    two-armed Tiago's (72,000), which ``-O0`` compiles in two seconds.
 
     Parameters
     ----------

@@ -51,37 +51,24 @@ def _readable(x: Array) -> Array:
 
 
 class Compiled:
-    """Machine code of a function whose arguments are vectors.
-
-    Attributes
-    ----------
-    inputs : tuple of int
-        Entries of each argument.
-    shapes : tuple of (int, int)
-        Rows and columns of each result.
-    operations : int
-        Scalar operations of one evaluation.
-    work_size : int
-        Doubles of work space that a call needs.
-    loaded : jit.Loaded
-        The code itself.
-    """
+    """Machine code of a function whose arguments are vectors."""
 
     def __init__(self, about: dict[str, Any], code: bytes) -> None:
+        #: Entries of each argument, and rows and columns of each result.
         self.inputs = tuple(about["inputs"])
         self.shapes = tuple((r, c) for r, c in about["shapes"])
         self.operations = int(about["operations"])
         self.loaded = jit.load(_batch_object(), code)
         self._share = int(about["work"])
         tiles = sum(self.inputs) + sum(rows * columns for rows, columns in self.shapes)
+        #: Doubles of work space that a call needs.
         self.work_size = self._share + tiles * jit.host().width
         self._local = threading.local()
 
     def __call__(self, *arguments: Array, threads: int | None = None) -> list[Array]:
-        """Return each result with shape (rows, columns) or (N, rows, columns).
+        """Return each result, (rows, columns) or (N, rows, columns), of arguments that are all vectors or all (N, n).
 
-        Arguments are all vectors or all (N, n), with any strides. Results are
-        coordinate-major if all arguments of more than one entry are.
+        Results are coordinate-major if all arguments of more than one entry are.
         """
         return self.call_checked(*arguments, threads=threads)[0]
 
@@ -105,19 +92,7 @@ class Compiled:
         return ([x[0] for x in results] if single else results), finite
 
     def run(self, inputs: Sequence[Array], outputs: Sequence[Array], threads: int | None = None) -> bool:
-        """Fill outputs, without checks.
-
-        Parameters
-        ----------
-        inputs, outputs : sequences of (N, n) float64 arrays
-            With any strides; transposed coordinate-major ones are used in place.
-        threads : int, optional
-
-        Returns
-        -------
-        bool
-            Whether every number read and written is finite.
-        """
+        """Fill (N, n) outputs of any strides, without checks; return whether all read and written is finite."""
         n = inputs[0].shape[0]
         if n == 0:
             return True
@@ -157,11 +132,7 @@ class Compiled:
 
     @staticmethod
     def _cache_line_offset(arrays: Sequence[Array], first: int, last: int) -> int:
-        """Return where vectors of coordinate-major arrays begin to lie on whole cache lines.
-
-        NumPy's large arrays start 16 bytes beyond one, and a vector on two lines
-        fetches each line twice where rows are a power of two apart.
-        """
+        """Return where vectors of coordinate-major arrays begin to lie on whole cache lines, each fetched once."""
         for x in arrays:
             if x.strides[0] == 8 and x.strides[1] % 64 == 0:
                 return min(first + -(x.ctypes.data // 8 + first) % 8, last)
@@ -175,19 +146,10 @@ class Compiled:
         return np.array(table, dtype=np.int64)
 
     def bound(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> tuple[Callable[[], None], Array]:
-        """Return a call that reads and writes these very arrays, for many calls of few states.
+        """Return a call that reads and writes these very (N, n) arrays, and a flag, for many calls of few states.
 
-        Parameters
-        ----------
-        inputs, outputs : sequences of (N, n) float64 arrays
-            As in `run`.
-
-        Returns
-        -------
-        callable
-            Takes nothing and returns nothing; one thread may be in it at a time.
-        array
-            Zero until a number read or written is not finite; may be set to zero again.
+        One thread may be in the call at a time. The flag is zero until a number read or written is not finite; it may
+        be reset.
         """
         table, work = self.table(inputs, outputs), aligned(self.work_size)
         watch = work[: jit.host().width]
@@ -237,15 +199,9 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
-    """Return machine code of a function: kept in this process, from disk, or compiled now.
+    """Return machine code of a function: kept in this process, from disk, or derived by `make` and compiled now.
 
-    Parameters
-    ----------
-    name : sequence of str
-        All that the function depends on but the code of mbkit: the model's digest,
-        the quantity.
-    make : callable
-        Derives the function; called only if it has not been compiled before.
+    `name` is all that the function depends on but the code of mbkit: the model's digest, the quantity.
     """
     key = disk.key_of(*name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, jit.host()))
     with jit.COMPILING:
@@ -269,9 +225,8 @@ _HELD: Final[WeakValueDictionary[str, Compiled]] = WeakValueDictionary()
 
 # Compiled functions called one after another without going back to Python in between.
 
-# With the signature of a compiled function's own loop, so that it is loaded like one:
-# the list holds, for each call, the addresses of loop, table and work space, and the
-# number of states.
+# With the signature of a compiled function's own loop, so that it is loaded like one: the list holds, for each call,
+# the addresses of loop, table and work space, and the number of states.
 _CODE: Final = f"""
 define void @{RUN}(ptr %list, ptr %unused, i64 %first, i64 %last) nounwind {{
 entry:
@@ -307,15 +262,7 @@ class Call(NamedTuple):
 
 
 class KernelSequence:
-    """Calls of compiled functions on fixed arrays, in order; one thread may run it at a time.
-
-    Parameters
-    ----------
-    calls : sequence of Call
-        Their arrays are kept alive, and may be changed between runs.
-    times : int
-        How often they stand in the sequence, one round after another.
-    """
+    """Calls on fixed arrays, kept alive, in order, repeated `times`; one thread may run it at a time."""
 
     def __init__(self, calls: Sequence[Call], times: int = 1) -> None:
         self._calls = tuple(calls)

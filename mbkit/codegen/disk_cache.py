@@ -1,9 +1,8 @@
 """Machine code kept on disk between processes.
 
-The folder belongs to the user alone (0700), an entry is written under another name
-and then renamed, so that any number of processes may write at once, and an entry
-is used only if its SHA-256, its key and its owner are right. A faulty entry counts as
-absent.
+The folder belongs to the user alone (0700), an entry is written under another name and then renamed, so that any number
+of processes may write at once, and an entry is used only if its SHA-256, its key and its owner are right. A faulty
+entry counts as absent.
 
 ``MBKIT_CACHE_DIR`` moves the folder; set to the empty string it switches this off. A
 folder that is open to others and holds other files belongs to the user: its mode is
@@ -65,10 +64,7 @@ def folder() -> Path | None:
 
 @contextmanager
 def force_recompile() -> Iterator[None]:
-    """Compile each entry again within the block, once, in this thread.
-
-    It serves to measure a first run at any time. New entries are kept as usual.
-    """
+    """Compile each entry again within the block, once, in this thread: a first run can be measured at any time."""
     token = _RECOMPILED.set(set())
     try:
         yield
@@ -140,18 +136,7 @@ def cached(
     restore: Callable[[dict[str, Any], bytes], T],
     make: Callable[[], tuple[dict[str, Any], bytes]],
 ) -> T:
-    """Return compiled code: held in this process, from disk, or compiled now and written.
-
-    Parameters
-    ----------
-    key : str
-    held : mutable mapping
-        What this process has in use, by key.
-    restore : callable
-        From the description and the code of an entry.
-    make : callable
-        Compiles: returns the description and the code.
-    """
+    """Return compiled code: held in this process, from disk, or compiled by `make` now and written."""
     found = None if is_bypassed(key) else held.get(key)
     if found is None:
         found = _restored(key, restore)

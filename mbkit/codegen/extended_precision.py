@@ -1,8 +1,7 @@
 """Arrays of numbers with 113 bits, about 34 digits: heyoka's or mpmath's.
 
-Both round to the format of IEEE 754's binary128. heyoka's `real128` is a NumPy type
-whose loops run in C; where heyoka is not installed, or its build has no `real128`,
-arrays hold mpmath's numbers, some twenty times slower.
+Both round to the format of IEEE 754's binary128. heyoka's `real128` is a NumPy type whose loops run in C; where heyoka
+is not installed, or its build has no `real128`, arrays hold mpmath's numbers, some twenty times slower.
 """
 
 from __future__ import annotations
@@ -49,26 +48,14 @@ _LARGEST: Final = 16384
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """What computes with arrays of 113-bit numbers.
-
-    Attributes
-    ----------
-    name : {"real128", "mpmath"}
-    dtype : type
-        Of the arrays.
-    number : callable
-        From a float to one number, exactly.
-    divide : callable
-        Of arrays; sums, differences and products are NumPy's own operators.
-    functions : mapping of str to callable
-        Of arrays, by their names in C: sqrt, sin, ..., pow. Outside of its domain a
-        function is no number.
-    """
+    """Arithmetic of arrays of 113-bit numbers; sums, differences and products are NumPy's own operators."""
 
     name: Backend
     dtype: Any
+    #: From a float to one number, exactly.
     number: Callable[[float], Any]
     divide: Callable[[Any, Any], Any]
+    #: By their names in C; NaN outside of the domain.
     functions: Mapping[str, Callable[..., Any]] = field(compare=False, repr=False)
 
     def sqrt(self, x: Any) -> Any:
@@ -101,15 +88,7 @@ class Arithmetic:
 
 @cache
 def arithmetic(name: Backend | None = None) -> Arithmetic:
-    """Return a backend; by default the faster one that is at hand.
-
-    Raises
-    ------
-    InputError
-        No backend of this name.
-    UnsupportedError
-        heyoka, or its `real128`, is not installed.
-    """
+    """Return a backend, by default the faster one installed; `UnsupportedError` without heyoka's `real128`."""
     if name not in (None, "real128", "mpmath"):
         raise InputError(f"arithmetic: expected 'real128' or 'mpmath', got {name!r}")
     if name == "mpmath":
@@ -191,23 +170,16 @@ def digits(x: Any, own: Arithmetic) -> Any:
 
 # Run a program on arrays of 113-bit numbers, a batch of states at once.
 #
-# Nothing is compiled: each operation is one loop over the states. Temporaries are
-# dropped with their last use. What does not depend on the state is computed once: an
-# argument that is the same for all states is given as one row, and NumPy's
-# broadcasting does the rest.
+# Nothing is compiled: each operation is one loop over the states. Temporaries are dropped with their last use. What
+# does not depend on the state is computed once: an argument that is the same for all states is given as one row, and
+# NumPy's broadcasting does the rest.
 
 # States per pass: enough to share the interpreter's work, few enough for memory.
 _LANES: Final = 128
 
 
 class Extended:
-    """A program in extended precision.
-
-    Parameters
-    ----------
-    program : Program
-    arithmetic : Arithmetic
-    """
+    """A program in extended precision."""
 
     def __init__(self, program: Program, arithmetic: Arithmetic) -> None:
         self.program, self.arithmetic = program, arithmetic
@@ -235,13 +207,7 @@ class Extended:
                 self._steps.append((k, functions[operation.name], operation.arguments, dying[k]))
 
     def __call__(self, *arguments: Any) -> list[Any]:
-        """Return each output, shape (N, rows, columns), as 113-bit numbers.
-
-        Parameters
-        ----------
-        *arguments : (N, n) or (1, n) array
-            float64 or 113-bit; a single row stands for all states.
-        """
+        """Return each output, (N, rows, columns), as 113-bit numbers; arguments are (N, n), or (1, n) for all."""
         n = max((len(x) for x in arguments), default=1) if all(len(x) for x in arguments) else 0
         own = self.arithmetic
         outputs = [np.empty((n, *shape), dtype=own.dtype) for shape in self.program.shapes]
@@ -314,16 +280,9 @@ def product(M: Any, x: Any) -> Any:
 
 
 def solve(M: Any, f: Any, pattern: Array, order: Sequence[int], own: Arithmetic) -> Any:
-    """Return M⁻¹ f, shape (N, n); not finite where M is singular.
+    """Return M⁻¹ f, (N, n), for M (N, n, n) and f (N, n) of 113-bit numbers; not finite where M is singular.
 
-    Parameters
-    ----------
-    M, f : (N, n, n) and (N, n) arrays of 113-bit numbers
-    pattern : (n, n) bool array
-        Where M can be other than zero.
-    order : sequence of int
-        The indices with every parent before its children.
-    own : Arithmetic
+    `pattern` (n, n) says where M can be other than zero; `order` has every parent before its children.
     """
     n = len(order)
     zero = own.zeros((1,))

@@ -17,19 +17,9 @@ from mbkit._fork import fork_safe
 
 
 class Machine:
-    """A function of vectors, evaluated in CasADi's own machine.
+    """A function of vectors, evaluated in CasADi's interpreter.
 
-    A C-ordered batch ``(N, n)`` is CasADi's column-major ``n`` by ``N``, so arrays
-    are handed over as they are.
-
-    Attributes
-    ----------
-    inputs : tuple of int
-        Entries of each argument.
-    shapes : tuple of (int, int)
-        Rows and columns of each result.
-    operations : int
-        Instructions of one evaluation.
+    A C-ordered batch ``(N, n)`` is CasADi's column-major ``n`` by ``N``, so arrays are handed over as they are.
     """
 
     def __init__(self, function: ca.Function) -> None:

@@ -38,8 +38,7 @@ class Loaded:
 
     def __init__(self, engine: Any) -> None:
         self._engine = engine
-        #: Called with the addresses of table and work space and a range of samples;
-        #: other Python threads run meanwhile.
+        #: Called with the addresses of table and work space and a range of samples; other Python threads run meanwhile.
         self.run = _SIGNATURE(engine.get_function_address(RUN))
 
 

@@ -73,13 +73,11 @@ class Text:
 
 # Sine and cosine of a whole vector, as LLVM code.
 #
-# Reduction by Cody and Waite with π/2 in three parts: the first difference is exact in
-# a fused multiply-add, the second by Knuth's exact sum, so that the reduced angle has
-# twice the working precision. On [-π/4, π/4] the minimax polynomials of Ng's
-# ``__kernel_sin`` and ``__kernel_cos`` (Sun's fdlibm, 1993) take that tail into
-# account. Measured against 70 digits: at most 0.76 ulp below `LIMIT`, next to multiples
-# of π/2 too; beyond it a lane takes the C library's value. Its neighbours keep theirs:
-# no state's bits depend on what stands beside it.
+# Reduction by Cody and Waite with π/2 in three parts: the first difference is exact in a fused multiply-add, the second
+# by Knuth's exact sum, so that the reduced angle has twice the working precision. On [-π/4, π/4] the minimax
+# polynomials of Ng's ``__kernel_sin`` and ``__kernel_cos`` (Sun's fdlibm, 1993) take that tail into account. Measured
+# against 70 digits: at most 0.76 ulp below `LIMIT`, next to multiples of π/2 too; beyond it a lane takes the C
+# library's value. Its neighbours keep theirs: no state's bits depend on what stands beside it.
 #
 # The function's name is not the C library's ``sincos``, which LLVM may call for a sine
 # and a cosine of one angle, and which it would take ours for.

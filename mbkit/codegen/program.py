@@ -1,9 +1,8 @@
 """A CasADi function as a list of scalar operations, the input of all backends.
 
-CasADi's own list reuses places in a work vector; here every operation has a value
-of its own (single static assignment), so that a compiler may order them freely. Repeated
-operations are computed once (value numbering), which takes a tenth of the time
-of CasADi's own search for common subexpressions.
+CasADi's own list reuses places in a work vector; here every operation has a value of its own (single static
+assignment), so that a compiler may order them freely. Repeated operations are computed once (value numbering), which
+takes a tenth of the time of CasADi's own search for common subexpressions.
 """
 
 from __future__ import annotations
@@ -68,47 +67,27 @@ _BINARY: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One scalar operation.
+    """One scalar operation: an input, a constant, or one of `_UNARY` and `_BINARY`.
 
-    Attributes
-    ----------
-    name : str
-        "input", "const", or one that computes. Arithmetic: add, sub, mul, div, neg, sq, twice, inv, fabs,
-        sign (0 of 0), fmin, fmax. Functions, as C names them: sqrt, sin, cos, tan, asin, acos, atan, atan2,
-        exp, expm1, log, log1p, sinh, cosh, tanh, asinh, acosh, atanh, pow, hypot. Decisions, 1 or 0: lt
-        (a < b), le, eq, ne, and, or, not; if_else_zero (b where a is not 0, else 0).
-
-        fmin and fmax propagate NaN; every comparison with NaN is false except ne, and in a
-        logical operation it counts as true, as in C.
-    arguments : tuple of int
-        Indices of earlier operations; of an input, (which argument, which entry).
-    value : float
-        Of a constant.
+    Decisions are 1 or 0; if_else_zero is b where a is not 0, else 0. fmin and fmax propagate NaN; every comparison with
+    NaN is false except ne, and in a logical operation NaN counts as true, as in C.
     """
 
     name: str
+    #: Indices of earlier operations; of an input, (which argument, which entry).
     arguments: tuple[int, ...] = ()
     value: float = 0.0
 
 
 @dataclass(frozen=True)
 class Program:
-    """What a function computes, as operations in an order that can be run.
+    """Operations of a function, in an order that can be run."""
 
-    Attributes
-    ----------
-    inputs : tuple of int
-        Entries of each argument, all of them vectors.
-    shapes : tuple of (int, int)
-        Rows and columns of each output.
-    operations : tuple of Operation
-    outputs : tuple of (rows, columns) int arrays
-        Index of the operation that gives each entry.
-    """
-
+    #: Entries of each argument, all of them vectors, and rows and columns of each output.
     inputs: tuple[int, ...]
     shapes: tuple[tuple[int, int], ...]
     operations: tuple[Operation, ...]
+    #: (rows, columns): index of the operation that gives each entry.
     outputs: tuple[NDArray[np.intp], ...]
 
     @cached_property
@@ -122,15 +101,7 @@ _Entry = tuple[str, tuple[int, ...], float]
 
 
 def program(function: ca.Function) -> Program:
-    """Return the operations of an expanded function with dense outputs.
-
-    Raises
-    ------
-    ValueError
-        A sparse output.
-    UnsupportedError
-        An operation that the backends do not have.
-    """
+    """Return the operations of an expanded function with dense outputs."""
     where: dict[int, int] = {}
     operations: list[Operation] = []
     entry: _Entry

@@ -104,9 +104,8 @@ def _is_zero(program: Program, k: int) -> bool:
 def _seen(program: Program) -> set[tuple[int, ...]]:
     """Return the entries of the arguments whose NaN or infinity shows in some result.
 
-    An entry that the program reads shows where no operation hides it: sums, products, sines,
-    roots and logarithms of NaN or infinity are not finite. An entry that is itself a result
-    shows too, because every result but a finite constant is watched.
+    An entry that is read shows where no operation hides it; one that is itself a result shows because results are
+    watched.
     """
     if any(o.name in _HIDING for o in program.operations):
         return set()

@@ -1,20 +1,17 @@
 """Parts of a step run round after round on a few states side by side, in one piece of machine code.
 
-A single state uses one lane of a vector, and a loop around each part would cost as
-much as the parts. So all that the parts read and write has a fixed place in one array,
-the arena, and the loop over rounds is compiled with them: a function that stands
-several times among the parts, the forward dynamics, is compiled once and called. Vectors are
-of four numbers, which for one state are faster than eight: shorter divisions and
-roots, and less to keep aside.
+A single state uses one lane of a vector, and a loop around each part would cost as much as the parts. So all that the
+parts read and write has a fixed place in one array, the arena, and the loop over rounds is compiled with them: a
+function that stands several times among the parts, the forward dynamics, is compiled once and called. Vectors are of
+four numbers, which for one state are faster than eight: shorter divisions and roots, and less to keep aside.
 
 The function has the signature ::
 
     void run(double *arena, int64 *ways, int64 first, int64 last)
 
-Every round it fetches the rows of the state from ``ways[0] + round * ways[1]``, runs the
-parts, and copies the rows of the new state to ``ways[2] + round * bytes``. The number of
-rounds done is left in ``ways[3]``: all, or as many as were made before no lane of the
-new state's last row was other than zero, if ``ways[4]`` asks to look.
+Every round it fetches the rows of the state from ``ways[0] + round * ways[1]``, runs the parts, and copies the rows of
+the new state to ``ways[2] + round * bytes``. The number of rounds done is left in ``ways[3]``: all, or as many as were
+made before no lane of the new state's last row was other than zero, if ``ways[4]`` asks to look.
 """
 
 from __future__ import annotations
@@ -69,18 +66,10 @@ class CompiledStepLoop:
 def compiled_step_loop(
     name: Sequence[str], make: Callable[[], Sequence[Part]], state: Sequence[str]
 ) -> CompiledStepLoop:
-    """Return machine code of parts: kept in this process, from disk, or compiled now.
+    """Return machine code of parts: kept in this process, from disk, or derived by `make` and compiled now.
 
-    Parameters
-    ----------
-    name : sequence of str
-        All that the parts depend on but the code of mbkit.
-    make : callable
-        Derives the parts, in order; one name among them is one function, which reads
-        the same each time. Called only if they have not been compiled before.
-    state : sequence of str
-        The names at the start of a round. The last part writes these names with a 1 behind,
-        in this order.
+    `name` is all that the parts depend on but the code of mbkit. Parts of one name are one function. `state` has the
+    names at the start of a round; the last part writes these names with a 1 behind, in this order.
     """
     key = disk.key_of("lanes", *name, __version__, ca.CasadiMeta.version(), SOURCES, *map(str, (*jit.host(), width())))
     return disk.cached(key, _HELD, CompiledStepLoop, lambda: _compile(make(), state))

@@ -1,15 +1,12 @@
 """The equations of motion as Taylor integrators of heyoka's, in double and beyond.
 
-A Taylor step expands the solution to the order that its tolerance asks for, by
-automatic differentiation of every operation (Jorba and Zou 2005, A software package
-for the numerical integration of ODEs by means of high-order Taylor methods;
-Biscani and Izzo 2021, Revisiting high-order Taylor methods for astrodynamics and
-celestial mechanics). So the graph that CasADi made is handed over operation by
-operation, and q̇ = D(q) v and v̇ of it are compiled together.
+A Taylor step expands the solution to the order that its tolerance asks for, by automatic differentiation of every
+operation (Jorba and Zou 2005, A software package for the numerical integration of ODEs by means of high-order Taylor
+methods; Biscani and Izzo 2021, Revisiting high-order Taylor methods for astrodynamics and celestial mechanics). So the
+graph that CasADi made is handed over operation by operation, and q̇ = D(q) v and v̇ of it are compiled together.
 
-Rotations see unit quaternions: each is divided by its norm before it enters the
-dynamics, while its rate D(q) v stays linear in it. Its norm is then a constant of
-the exact flow, and whatever it drifts by never bends the motion.
+Rotations see unit quaternions: each is divided by its norm before it enters the dynamics, while its rate D(q) v stays
+linear in it. Its norm is then a constant of the exact flow, and whatever it drifts by never bends the motion.
 """
 
 from __future__ import annotations
@@ -57,17 +54,7 @@ _REMEDY: Final = "method='rk853' and method='dop853' go without it"
 
 @dataclass(frozen=True)
 class Precision:
-    """A format of numbers.
-
-    Attributes
-    ----------
-    bits : int
-        Of the significand: 53, 64 or 113.
-    dtype : type
-        Of the arrays.
-    eps : float
-        Spacing of the numbers at 1.
-    """
+    """A format of numbers: bits of the significand (53, 64 or 113) and the type of arrays."""
 
     bits: int
     dtype: Any
@@ -94,13 +81,7 @@ PRECISIONS: Final = {53: "double", 64: "80-bit extended", 113: "quadruple"}
 
 
 def precision(bits: int) -> Precision:
-    """Return a format that heyoka computes in here.
-
-    Raises
-    ------
-    UnsupportedError
-        heyoka is not installed, or this machine or build does not have the format.
-    """
+    """Return a format of heyoka's numbers; `UnsupportedError` where heyoka or this machine does not have it."""
     heyoka = _heyoka()
     if bits == 53:
         return Precision(53, np.float64)
@@ -126,11 +107,7 @@ def _heyoka() -> Any:
 
 
 def order_of(tolerance: float) -> int:
-    """Return the order of the Taylor series that a tolerance asks for (Jorba and Zou 2005, eq. 3.4).
-
-    The length of a step follows from the series, so that tolerances of one order make
-    the same run.
-    """
+    """Return the order of the Taylor series that a tolerance asks for (Jorba and Zou 2005, eq. 3.4)."""
     return max(2, math.ceil(1 - math.log(tolerance) / 2))
 
 
@@ -150,29 +127,10 @@ def rates(equations: Equations) -> ca.Function:
 class TaylorSystem:
     """A model's equations of motion, ready to be compiled for any tolerance and format.
 
-    Parameters
-    ----------
-    equations : Equations
-        With literal constants for double; with symbols, which keep all their digits,
-        for more than double.
-
-    Attributes
-    ----------
-    operations : int
-        Scalar operations of one evaluation.
-    rates : casadi.Function
-        As `rates` gives it.
-    kinked : bool
-        Whether a length, an absolute value, a decision or a function with branches enters,
-        where forces can jump. A series goes on analytically there, as if nothing had
-        happened.
-    clock : int or None
-        Place of the time among the arguments behind tau, where it enters.
-
-    Raises
-    ------
-    UnsupportedError
-        heyoka is not installed, or the forward dynamics is too large to be written out.
+    `UnsupportedError` where heyoka is not installed or the forward dynamics is too large. Beyond double the equations
+    need symbols for constants, which keep all digits. `kinked`: a length, an absolute value, a decision or a function
+    with branches enters, where forces can jump and a series goes on analytically. `clock`: place of the time among the
+    arguments behind tau, or None.
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -225,11 +183,7 @@ class TaylorSystem:
 
     @contextmanager
     def integrator(self, kind: Precision, tolerance: float) -> Iterator[Any]:
-        """Lend a `heyoka.taylor_adaptive` for exclusive use.
-
-        Its state, time and parameters are whatever the last user left. It is compiled
-        when all are in use; heyoka keeps what it compiled in memory and on disk.
-        """
+        """Lend a `heyoka.taylor_adaptive` for exclusive use, in the state in which its last user left it."""
         key = (kind.bits, order_of(tolerance))
         idle = self._idle.setdefault(key, [])
         try:

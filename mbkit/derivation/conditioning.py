@@ -36,9 +36,8 @@ _SHRINK, _LAST_REACH = 0.3, 1e-4
 def loses_digits(model: Model) -> bool:
     """Return whether forward dynamics by LᵀDL of the mass matrix loses more than some 6 digits at some pose.
 
-    Decided at the nominal values of parameters, the same for the same description. False for a system of energies, for
-    a parameter without a value, for a tree too large to be written out, for a mass matrix that is singular at every
-    pose, and for inertias that are no sum of squares.
+    Decided at nominal parameters. False where the orthogonal solver is not available: energies, a parameter without a
+    value, a tree too large, a mass matrix singular at every pose, inertias that are no sum of squares.
     """
     if not model.has_bodies or not model.nv or elimination_size(model) > _MAX_SIZE:
         return False

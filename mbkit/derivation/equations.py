@@ -92,9 +92,8 @@ class Equations:
     def kept(self) -> dict[str, Any]:
         """What integrators make of these equations once, by names of their own.
 
-        It lives as long as the equations, which all dynamics of one model at different values
-        of its parameters share. A table from equations to what refers to them, weak or not,
-        would keep both for ever.
+        It lives as long as the equations, which all dynamics of one model at different values of its parameters share.
+        A table from equations to what refers to them, weak or not, would keep both for ever.
         """
         return {}
 
@@ -173,9 +172,8 @@ class Equations:
     def coriolis_matrix(self) -> Any:
         """Christoffel's C = ½ ∂(C v)/∂v + ½ M A(v).
 
-        A holds the quasi-velocities' structure, -Aᵀ p = hamel(v, p): [[ω̂, v̂], [0, ω̂]] for a free joint
-        and ω̂ for a ball joint, zero where v = q̇. A(v) v = 0 leaves C v as it is, and
-        the second term makes Ṁ - 2C skew.
+        A holds the quasi-velocities' structure, -Aᵀ p = hamel(v, p): [[ω̂, v̂], [0, ω̂]] for a free joint and ω̂ for a
+        ball joint, zero where v = q̇. A(v) v = 0 leaves C v as it is, and the second term makes Ṁ - 2C skew.
         """
         half = 0.5 * ca.jacobian(self.coriolis_force, self.v)
         if not self.model.quaternions:

@@ -23,13 +23,7 @@ _ROOT: Final = Path(__file__).parent.parent
 
 
 def source_files(root: Path = _ROOT, listed: Iterable[str] = DECISIVE) -> tuple[Path, ...]:
-    """Return the files of listed packages and modules, in order.
-
-    Raises
-    ------
-    FileNotFoundError
-        A listed package or module holds no code; the list has to follow what moves.
-    """
+    """Return the files of listed packages and modules, in order; `FileNotFoundError` where one holds no code."""
     out: list[Path] = []
     for name in listed:
         path = root / name

@@ -40,15 +40,7 @@ def constant_transposed_times(A: list[Vector], x: Vector) -> Vector:
 
 
 class Kinematics:
-    """Symbols q and v of a model, and what moves with them.
-
-    Attributes
-    ----------
-    q, v : casadi.SX
-        The model's own (reduced) coordinates and velocities.
-    values : Values
-        The model's numbers.
-    """
+    """Symbols q and v, the model's reduced coordinates and velocities, and what moves with them."""
 
     def __init__(self, model: Model, constants: Constants = "literal") -> None:
         self.model = model
@@ -184,8 +176,7 @@ def kinetic_energy(kin: Kinematics) -> Any:
 def gravity_energy(kin: Kinematics) -> Any:
     """Return V = -Σ m g · p_com, zero with every centre of mass at the world's origin.
 
-    The first moments of the bodies are gathered from the leaves to the root, so
-    that each joint costs one rotation of a vector.
+    First moments are gathered from the leaves to the root: each joint costs one rotation of a vector.
     """
     model = kin.model
     moments: dict[str, list[Any]] = {"world": [0.0] * 3}

@@ -37,18 +37,9 @@ _PAIRS: Final = tuple(combinations_with_replacement(range(3), 2))
 
 
 class InertiaSquare(NamedTuple):
-    """One of the rates u · ω with Σ weight u uᵀ = I.
+    """One of the rates u · ω with Σ weight u uᵀ = I; forms c in ω have Σ weight u c = ω × I ω."""
 
-    Attributes
-    ----------
-    weight : float
-        kg m². Below zero by rounding, where the doubles' matrix is so.
-    direction : tuple of 3 floats
-        u.
-    turning : tuple of ((int, int), float)
-        A form in ω: the rows' forms c have Σ weight u c = ω × I ω.
-    """
-
+    #: kg m²; below zero by rounding, where the doubles' matrix is so.
     weight: float
     direction: tuple[float, ...]
     turning: tuple[tuple[tuple[int, int], float], ...]
@@ -111,23 +102,14 @@ def _torque(I: list[list[Fraction]]) -> list[_Form]:
 
 @dataclass(frozen=True)
 class Squares:
-    """The rows of the sum, those that move.
-
-    Attributes
-    ----------
-    weights : list of scalars
-        w, floats or expressions of parameters.
-    jacobian : (rows, nv) casadi.SX
-        J = ∂ẋ/∂v.
-    drifts : list of scalars
-        ẍ - ẍ_free at v̇ = 0.
-    force : (nv,) casadi.SX
-        Of the turning of bodies whose inertia is a parameter, which may become zero: a force on the left, like nle.
-    """
+    """The rows of the sum, those that move."""
 
     weights: list[Any]
+    #: J = ∂ẋ/∂v, (rows, nv).
     jacobian: Any
+    #: ẍ - ẍ_free at v̇ = 0.
     drifts: list[Any]
+    #: (nv,), of the turning of bodies whose inertia is a parameter, which may become zero: on the left, like nle.
     force: Any
 
 

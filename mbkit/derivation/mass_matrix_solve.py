@@ -48,16 +48,9 @@ def elimination_size(model: Model) -> int:
 
 
 def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
-    """Return M⁻¹ f.
+    """Return M⁻¹ f for a sparse positive definite M and right-hand sides f, (n,) or (n, k).
 
-    Parameters
-    ----------
-    M : (n, n) casadi.SX
-        Symmetric positive definite, sparse.
-    f : (n,) or (n, k) casadi.SX
-        Right-hand sides; structural zeros are kept where possible.
-    order : sequence of int
-        The indices with every parent before its children.
+    `order` has every parent before its children; structural zeros of f are kept where possible.
     """
     return Factors(M, order).solve(f)
 

@@ -1,9 +1,8 @@
 """The numbers of a description as the equations read them: floats, or symbols.
 
-This is the one place through which a number of the model enters an expression.
-With literal constants a number is a float, and CasADi folds it in double while the
-graph is built. With symbols it is an argument, so that the graph can be evaluated
-in any precision: no two of them meet in double on the way.
+This is the one place through which a number of the model enters an expression. With literal constants a number is a
+float, and CasADi folds it in double while the graph is built. With symbols it is an argument, so that the graph can be
+evaluated in any precision: no two of them meet in double on the way.
 """
 
 from __future__ import annotations
@@ -20,9 +19,8 @@ from mbkit.model import Frame, Joint, Model
 
 # Expressions whose arithmetic is quick to write down, entry by entry.
 #
-# CasADi's operators first search a conversion of their operands, some 15 µs each;
-# `SX.binary` takes 2. A tree's kinematics are tens of thousands of them. This module
-# replaces CasADi in the formulas of the joint types.
+# CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2. A tree's
+# kinematics are tens of thousands of them. This module replaces CasADi in the formulas of the joint types.
 
 
 class Scalar(ca.SX):
@@ -132,8 +130,7 @@ class Values:
     parameters : (p, 1) casadi.SX
         In the order of `model.parameters`; empty where they are among the constants.
     constants : (k, 1) casadi.SX
-        The symbols that stand for numbers: the parameters, then the others, of which
-        equal ones share a symbol.
+        The symbols that stand for numbers: the parameters, then the others, of which equal ones share a symbol.
     constant_values : (k,) array
         What they stand for.
     """

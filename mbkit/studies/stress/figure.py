@@ -106,27 +106,7 @@ def _exponent(text: str) -> str:
 
 
 def figure(cases: Sequence[CaseResult], case: str | None = None, palette: Palette = PLAIN) -> Figure:
-    """Draw the map of one case, or how far each engine held in all of them.
-
-    Parameters
-    ----------
-    cases : sequence of CaseResult
-    case : str, optional
-        Name of the case whose map is drawn; by default, how far each engine held in every case, or the map
-        of the only one.
-    palette : Palette
-        By default for white paper.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Without a window; ``savefig`` writes it, and a notebook shows it.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such case.
-    """
+    """Draw the map of one case, by default of the only one, or how far each engine held in every case."""
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib import rc_context
 

@@ -62,42 +62,24 @@ _MAX_ERROR: Final = 1e300
 
 @dataclass(frozen=True)
 class Prepared:
-    """The reference of one value.
-
-    Attributes
-    ----------
-    how : str
-        How the truth is known, or why it is not.
-    truth : Truth or Terms or None
-    facts : dict
-    dt : float or None
-        Step that the problem prescribes, s.
-    """
+    """The reference of one value; `how` says how it is known, or why it is not."""
 
     how: str
     truth: Truth | Terms | None = None
     facts: Mapping[str, float] = field(default_factory=dict)
+    #: Step that the problem prescribes, s.
     dt: float | None = None
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How a cell is computed.
-
-    Attributes
-    ----------
-    engine, method : str
-        For terms, the method is the term.
-    dt, rtol : float
-        Of fixed-step and of adaptive methods.
-    seconds, compile_seconds : float
-        Processor time of the run, and of deriving and compiling for it.
-    """
+    """How a cell is computed; for terms, the method is the term."""
 
     engine: str
     method: str
     dt: float
     rtol: float
+    #: Processor time of the run, and of deriving and compiling for it.
     seconds: float
     compile_seconds: float
 
@@ -241,10 +223,7 @@ def _integrate(cache: _ValueCache, setting: Setting, dyn: Dynamics, truth: Truth
 
 
 def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
-    """Return the largest change of the energy, relative to T or to the change of V.
-
-    NaN where there are dampers, where time enters, and where rounding hides it.
-    """
+    """Return the largest energy change relative to T or the change of V; NaN with dampers, time or much rounding."""
     model = dyn.model
     if model.needs.damping or model.time_parameter is not None:
         return math.nan

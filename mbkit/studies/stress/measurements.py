@@ -191,24 +191,14 @@ _USABLE: Final = ("held", "inaccurate")
 
 @dataclass(frozen=True)
 class Line:
-    """One row of a case, read from mild to extreme.
-
-    Attributes
-    ----------
-    row : Row
-    size : int
-        Number of the case's values.
-    outcomes : tuple of Outcome
-        Of the row's cells.
-    broken : BreakingPoint
-    reach, usable : int
-        How many values held before the first that did not; and stayed at least usable.
-    """
+    """One row of a case, read from mild to extreme."""
 
     row: Row
+    #: Number of the case's values.
     size: int
     outcomes: tuple[Outcome, ...]
     broken: BreakingPoint
+    #: How many values held before the first that did not, and how many stayed at least usable.
     reach: int
     usable: int
 
@@ -298,10 +288,9 @@ def furthest(case: CaseResult) -> int:
 
 
 def place(values: Sequence[float], x: float) -> float:
-    """Return where a number stands among the values of a sweep, as a fractional index.
+    """Return where a number stands among a sweep's values, as a fractional index; decades are even if all are positive.
 
-    Decades are even where all are positive. -1 and the number of values stand for what is beyond the ends; NaN for
-    no number, and where the values are in no order.
+    -1 and the number of values stand for what is beyond the ends; NaN for no number, and for values in no order.
     """
     if math.isnan(x) or not values or not all(map(math.isfinite, values)):
         return math.nan

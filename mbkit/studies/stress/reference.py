@@ -39,10 +39,9 @@ _REPEAT: Final = 0.25
 
 @contextmanager
 def cpu_limit(seconds: float) -> Iterator[None]:
-    """Raise `TooLongError` after so many seconds of processor time.
+    """Raise `TooLongError` after so many seconds of processor time; only in the main thread, which gets signals.
 
-    Interrupts Python anywhere, and CasADi, which looks for signals while CVODES runs. Other C++ code goes on until its
-    process is ended. Only the main thread gets signals; others have no limit.
+    Interrupts Python, and CasADi while CVODES runs. Other C++ code goes on until its process is ended.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -105,17 +104,7 @@ class ReferenceSearch:
         self._ways: list[_Way] = [partial(_two_runs, _EXPLICIT), partial(_two_runs, _IMPLICIT), _taylor_series]
 
     def truth(self, problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
-        """Return the truth of a motion, or None, and how it is known or why it is not.
-
-        Parameters
-        ----------
-        problem : Problem
-        times : (K,) array
-        wanted : float
-            How well it should be known, rad or m.
-        seconds : float
-            Processor time of the search.
-        """
+        """Return the truth of a motion to `wanted`, rad or m, or None, and how it is known or why it is not."""
         if problem.exact is not None:
             return _closed_form(problem, times)
         end = time.thread_time() + seconds
@@ -228,23 +217,14 @@ _MAX_ERROR: Final = 1e300
 
 @dataclass(frozen=True)
 class Terms:
-    """The states of a problem, and the oracle's values there.
-
-    Attributes
-    ----------
-    at : States
-    values : dict
-        Term -> high and low part.
-    missing : dict
-        Term -> why the oracle has no value.
-    scales : Scales
-        In units of 2**exponent kg, m and s, in which nothing overflows.
-    exponent : int
-    """
+    """The states of a problem, and the oracle's values there."""
 
     at: States
+    #: Term -> high and low part.
     values: dict[str, tuple[Array, Array]]
+    #: Term -> why the oracle has no value.
     missing: dict[str, str]
+    #: In units of 2**exponent kg, m and s, in which nothing overflows.
     scales: Scales
     exponent: int
 
@@ -306,10 +286,7 @@ def _acceleration_errors(error: Array, reference: Array, scales: Scales) -> Arra
 
 
 def condition(oracle: OracleDynamics, q: Array) -> float:
-    """Return the condition number of M in the 2-norm and SI units, the largest of the states; NaN where M is singular.
-
-    Beyond 1e15 it comes from M with 34 digits.
-    """
+    """Return the largest condition number of M (2-norm, SI) of the states; NaN if singular, 34 digits beyond 1e15."""
     high, low = oracle.extended("mass_matrix", np.atleast_2d(q))
     exponent = _exponent(high)
     high, low = np.ldexp(high, exponent), np.ldexp(low, exponent)

@@ -67,16 +67,14 @@ class Limits:
 
 @dataclass
 class _Row:
-    """The cells of one engine and method by the index of their value.
-
-    `stopped` says why no more are computed; it is empty while more are.
-    """
+    """The cells of one engine and method by the index of their value."""
 
     engine: str
     method: str
     setting: str
     theory: float | None
     cells: dict[int, Measurement] = field(default_factory=dict)
+    #: Why no more are computed; empty while more are.
     stopped: str = ""
 
     @property
@@ -96,23 +94,7 @@ class _Row:
 
 
 class CaseSweep:
-    """A case with its values, truths and rows.
-
-    Parameters
-    ----------
-    case : Case
-    values : sequence of float
-        From mild to extreme.
-    rows : sequence of (engine, method)
-    bar : float
-    limits : Limits
-    report : callable
-        Takes a sentence about each step.
-    deadline : float
-        Of the study, on the clock.
-    clock : callable
-        Seconds.
-    """
+    """A case with its values from mild to extreme, truths and rows of (engine, method)."""
 
     def __init__(
         self,
@@ -287,12 +269,10 @@ def _with_grace(seconds: float) -> float:
 
 @dataclass(eq=False)
 class _Task:
-    """The truths of a case, or one engine on it; `work` takes a worker and a time, and returns whether all is done.
-
-    `after` has to be begun before, once more than this one, unless it is done.
-    """
+    """The truths of a case, or one engine on it; `work` takes a worker and a time, and returns whether all is done."""
 
     work: Callable[[Worker, float], bool]
+    #: Has to be begun before, once more than this one, unless it is done.
     after: _Task | None = None
     rounds: int = 0
     state: Literal["waiting", "running", "done"] = "waiting"

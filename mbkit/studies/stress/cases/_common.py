@@ -36,10 +36,7 @@ def register(
     quick: tuple[float, ...],
     **more: Any,
 ) -> Callable[[Make], Make]:
-    """Return a decorator that adds a function as a case.
-
-    The function's name is the case's name, and its docstring, one sentence, says what the case is about.
-    """
+    """Return a decorator that adds a function as a case, with its name and its docstring of one sentence."""
 
     def add(make: Make) -> Make:
         about = " ".join((make.__doc__ or "").split())
@@ -131,17 +128,7 @@ _UNLIMITED: Final = ("implicit_midpoint", "gauss4", "gauss6", "mujoco_discrete")
 
 
 def largest_step(method: str, frequency: float, damping: float) -> float | None:
-    """Return the largest stable step, s: infinite where there is none; None for methods without a step.
-
-    Parameters
-    ----------
-    method : str
-        mbkit's step of MuJoCo's Euler takes dampers explicitly.
-    frequency : float
-        ω, rad/s.
-    damping : float
-        ζ: 0 for none, or at least 1, with two real rates.
-    """
+    """Return the largest stable step, s, at ω and ζ (0, or at least 1); infinite where none, None without a step."""
     if method in _EXPLICIT:
         return 2 * (math.sqrt(damping**2 + 1) - damping) / frequency
     if method in _DAMPER_IMPLICIT:

@@ -32,17 +32,7 @@ Residual = Callable[[Any, Any], Any]
 
 
 def slow_motion(residual: Residual, start: Array, duration: float, steps: int) -> Callable[[Array], Array]:
-    """Return y, (K, n), of F(y, ẏ) = 0 up to the duration.
-
-    Parameters
-    ----------
-    residual : callable
-        From y and ẏ, (s, n) each, to F, (s, n); analytic, for it is differentiated by a complex step.
-    start : (n,) array
-    duration : float
-        s.
-    steps : int
-    """
+    """Return y, (K, n), of F(y, ẏ) = 0 up to the duration; F is analytic, for a complex step differentiates it."""
     points, slopes = _radau()
     h = duration / steps
     pieces: list[Array] = []
@@ -119,18 +109,10 @@ _STEPS: Final = 200
 
 
 class HangingChain:
-    """Rods of 1 m, hinged end to end, and a load at the last end.
+    """Rods of 1 m with masses in kg, hinged end to end, and a load at the last end.
 
-    In angles φ from the vertical, Σ_j a_ij (cos(φ_i - φ_j) φ̈_j + sin(φ_i - φ_j) φ̇_j²) + g w_i sin φ_i = 0, where
-    a_ij sums m f_ki f_kj over the rods k, f being 1 above rod k and ½ on it, and m/12 for its own turn; w_i
-    sums m f_ki (a Lagrangian exercise).
-
-    Parameters
-    ----------
-    masses : sequence of float
-        Of the rods, kg.
-    load : float
-        kg.
+    In angles φ from the vertical, Σ_j a_ij (cos(φ_i - φ_j) φ̈_j + sin(φ_i - φ_j) φ̇_j²) + g w_i sin φ_i = 0, where a_ij
+    sums m f_ki f_kj over the rods k, f being 1 above rod k and ½ on it, and m/12 for its own turn; w_i sums m f_ki.
     """
 
     def __init__(self, masses: Sequence[float], load: float = 0.0) -> None:
@@ -140,10 +122,7 @@ class HangingChain:
         self._w = m @ below + load
 
     def taut(self, angle: float) -> Array:
-        """Return the angles q, from rod to rod, at which it begins to turn as one, let go at rest.
-
-        Near the straight line where the end is heavy; from there the light rods hardly ring.
-        """
+        """Return the angles q at which a chain let go at rest begins to turn as one: light rods then hardly ring."""
         n = len(self._w)
         # The common acceleration, and the angles below the first rod's.
         x = np.array([-_GRAVITY * np.sin(angle) / n, *[angle] * (n - 1)])
@@ -181,16 +160,7 @@ _DIGITS: Final = 50
 
 
 def released(start: float, square: float, rate: float) -> Exact:
-    """Return q of q̈ + 2 a q̇ + ω² q = 0, let go at rest (Landau, Lifshitz 1976, §25).
-
-    Parameters
-    ----------
-    start : float
-    square : float
-        ω², 1/s².
-    rate : float
-        a, 1/s.
-    """
+    """Return q of q̈ + 2 a q̇ + ω² q = 0, let go at rest, from ω² and a (Landau, Lifshitz 1976, §25)."""
     discriminant = square - rate * rate
     if discriminant > 0:
         w = np.sqrt(discriminant)
@@ -204,10 +174,7 @@ def released(start: float, square: float, rate: float) -> Exact:
 
 
 def modal(M: Array, C: Array, K: Array, q0: Array, v0: Array) -> Exact:
-    """Return q of M q̈ + C q̇ + K q = 0, by the eigenvalues of the companion matrix with 50 digits.
-
-    No two of them may be the same (critical damping).
-    """
+    """Return q of M q̈ + C q̇ + K q = 0, by 50-digit eigenvalues of the companion matrix, no two the same."""
     n = len(M)
     with mp.workdps(_DIGITS):
         inverse = mp.matrix(M.tolist()) ** -1
@@ -227,8 +194,7 @@ def modal(M: Array, C: Array, K: Array, q0: Array, v0: Array) -> Exact:
 def slowest_mode(M: Array, stiffness: Array) -> tuple[float, Array, float]:
     """Return the slowest frequency of M q̈ + diag(k) q = 0, its shape, and the fastest frequency.
 
-    1/ω² are the eigenvalues of k^-½ M k^-½. Of those, the largest one and its shape are known to rounding,
-    however stiff the other springs are.
+    The largest eigenvalue 1/ω² of k^-½ M k^-½ and its shape are known to rounding, however stiff other springs are.
     """
     root = np.sqrt(stiffness)
     squares, shapes = np.linalg.eigh(M / root[:, None] / root)
@@ -339,15 +305,9 @@ def turning(axis: Array, speed: float) -> Exact:
 def free_rotor(inertia: Array, spin: Array) -> tuple[Exact, float]:
     """Return quaternions (K, 4) of a torque-free body from the identity, and the period of its angular velocity.
 
-    Landau, Lifshitz 1976, §37: with A < B < C, or A > B > C where L² < 2 E B, ω = (a cn, b sn, c dn); the third axis
-    goes round L at φ̇ = (L/C)(1 + (C - A)/A / (1 - n sn²)), an integral of the third kind (Carlson 1979 for it).
-
-    Parameters
-    ----------
-    inertia : (3,) array
-        Three different principal moments, kg m².
-    spin : (3,) array
-        At the start, in body axes, rad/s; about none of the axes alone.
+    Three different principal moments, kg m², and a spin about more than one body axis, rad/s. Landau, Lifshitz 1976,
+    §37: with A < B < C, or A > B > C where L² < 2 E B, ω = (a cn, b sn, c dn); the third axis goes round L at φ̇ =
+    (L/C)(1 + (C - A)/A / (1 - n sn²)), an integral of the third kind (Carlson 1979 for it).
     """
     order = np.argsort(inertia)
     (A, B, C), (x, y, z) = inertia[order], spin[order]
@@ -413,19 +373,8 @@ def precession(
 ) -> tuple[Exact, Array, Array, float]:
     """Return quaternions (K, 4) of a symmetric top in steady precession, its start (4,) and (3,), and its rate.
 
-    The axis is the body's y. A Ω² cos θ - C ω₃ Ω + m g r = 0 (Landau, Lifshitz 1976, §35 problem 2); the
-    result is the slow root; below the horizontal (θ > π/2) there is one at any spin.
-
-    Parameters
-    ----------
-    spin : float
-        ω₃, the angular velocity's part along the axis, rad/s.
-    tilt : float
-        θ of the axis from the upward vertical, rad.
-    moment : float
-        m g r, N m.
-    across, along : float
-        A, about the fixed point, and C, kg m².
+    The axis is the body's y, at `tilt` from the upward vertical. A Ω² cos θ - C ω₃ Ω + m g r = 0 (Landau, Lifshitz
+    1976, §35 problem 2) with ω₃ = spin, m g r = moment, A = across and C = along; the result is the slow root.
     """
     root = math.sqrt((along * spin) ** 2 - 4 * across * moment * math.cos(tilt))
     slow = 2 * moment / (along * spin + root)
@@ -444,15 +393,8 @@ def precession(
 def past_gimbal_lock(distance: float, speed: float) -> tuple[Exact, Array]:
     """Return the angles about z, y and x, (K, 3), of a turn about one axis, and their rates at the start.
 
-    From the identity about (0, cos d, sin d): after a quarter of a turn the pitch is π/2 - d, and the other two angles
-    jump by nearly π within the time that it takes to turn by some d. For less than half a turn.
-
-    Parameters
-    ----------
-    distance : float
-        d, rad.
-    speed : float
-        rad/s.
+    From the identity about (0, cos d, sin d), less than half a turn: after a quarter of a turn the pitch is π/2 - d,
+    and the other angles jump by nearly π within the time of a turn by some d.
     """
     sd, cd = math.sin(distance), math.cos(distance)
 
@@ -522,10 +464,7 @@ def ringing_spring(square: float, radius: float, push: float, turn: float) -> tu
 
 
 def _turning_points(square: float, energy: float, momentum: float) -> tuple[float, float]:
-    """Return the two roots of r² ṙ² = (2 E - ω² (r - 1)²) r² - L² between which it moves.
-
-    By Newton's method from outside: neither the spring nor the turning alone has energy for more.
-    """
+    """Return the roots of r² ṙ² = (2 E - ω² (r - 1)²) r² - L² between which it moves, by Newton's method."""
     ends = []
     for bound in (momentum / math.sqrt(2 * energy), 1 + math.sqrt(2 * energy / square)):
         r, last = bound, math.inf

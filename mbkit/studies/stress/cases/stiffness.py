@@ -121,8 +121,7 @@ def stiff_joint(stiffness: float) -> Problem:
 def conical(stiffness: float, damping: float) -> tuple[Problem, float]:
     """Return a mass that circles on a point spring of 1 m, without ringing, for 2 s; and its angular velocity.
 
-    The spring's length stays, so its damper does nothing to the exact motion. Coordinates are the mass' place, in which
-    the stiff direction turns.
+    The spring's length stays, so its damper is idle. The stiff direction turns in the mass' coordinates.
     """
     g, cosine, sine = 1.0, 0.8, 0.6
     length = 1 + g / (stiffness * cosine)
