@@ -44,28 +44,8 @@ _HOME = {
     "generalized_force": "mbkit.lagrangian.statics.virtual_work",
 }
 
-__all__ = [
-    "FUNCTIONS",
-    "CSource",
-    "CanonicalEquations",
-    "ConservedQuantity",
-    "Embedded",
-    "Equations",
-    "EquationsOfMotion",
-    "Equilibrium",
-    "ForwardDynamicsDerivatives",
-    "Hamiltonian",
-    "InverseDynamicsDerivatives",
-    "Lagrangian",
-    "QuasiEquationsOfMotion",
-    "QuasiLagrangian",
-    "Routhian",
-    "export_c",
-    "from_model",
-    "from_particles",
-    "generalized_force",
-    "systems",
-]
+__all__ = ["FUNCTIONS", "CSource", "Equations", "ForwardDynamicsDerivatives", "InverseDynamicsDerivatives", "export_c"]
+__all__ += ["systems", *_HOME]
 
 
 def __getattr__(name: str) -> Any:

@@ -43,34 +43,14 @@ def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint,
     """Return massless bodies and prismatic joints of these names."""
     # One coordinate a joint, each on the one before: the pattern of a full mass matrix.
     joints = tuple(_coordinate(name, before) for name, before in zip(names, ["world", *names], strict=False))
-    return tuple(_massless(name) for name in names), joints
+    return tuple(Body(name, 0.0, np.zeros(3), np.zeros((3, 3))) for name in names), joints
 
 
 def _coordinate(name: str, before: str) -> Joint:
-    zero, endless = np.zeros(1), np.full(1, np.inf)
-    return Joint(
-        name=name,
-        kind=PRISMATIC.name,
-        parent=before,
-        child=name,
-        rotation=np.eye(3),
-        translation=np.zeros(3),
-        axes=np.array([[1.0, 0.0, 0.0]]),
-        pitch=0.0,
-        lower=-endless,
-        upper=endless,
-        velocity_limit=endless,
-        effort_limit=endless,
-        armature=zero,
-        damping=zero,
-        friction=zero,
-        stiffness=zero,
-        rest=zero,
-    )
-
-
-def _massless(name: str) -> Body:
-    return Body(name=name, mass=0.0, com=np.zeros(3), inertia=np.zeros((3, 3)))
+    fields: dict[str, Any] = dict.fromkeys(("upper", "velocity_limit", "effort_limit"), np.full(1, np.inf))
+    fields |= dict.fromkeys(("armature", "damping", "friction", "stiffness", "rest"), np.zeros(1))
+    fields |= {"rotation": np.eye(3), "translation": np.zeros(3), "axes": np.array([[1.0, 0.0, 0.0]]), "pitch": 0.0}
+    return Joint(name=name, kind=PRISMATIC.name, parent=before, child=name, lower=np.full(1, -np.inf), **fields)
 
 
 #: Random states that are drawn, each of which may be too far from the constraints.

@@ -136,10 +136,6 @@ class EnergyForm:
             "name": self.name,
         }
 
-    def _like(self, **changes: Any) -> Self:
-        """Return the same system with other arguments."""
-        return type(self)(**{**self._arguments(), **changes})
-
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> Self:
         """Return the same system with numbers for some parameters."""
         own = {s.name: s for s in self.parameters}
@@ -149,19 +145,16 @@ class EnergyForm:
             if symbol is None:
                 raise InputError(f"values: {given} is no parameter; they are {plain(self.parameters) or 'none'}")
             put[symbol] = sp.sympify(x)
-        forces = {q: self.inputs.get(q, x.subs(put)) for q, x in zip(self.coordinates, self.forces, strict=True)}
-        return self._like(
-            T=self.T.subs(put),
-            V=self.V.subs(put),
-            dissipation=self.dissipation.subs(put),
-            forces=forces,
-            constraints=[c.subs(put) for c in self.constraints],
-            parameters={s: x for s, x in self.parameters.items() if s not in put},
-        )
+        out = self._arguments()
+        out |= {name: out[name].subs(put) for name in ("T", "V", "dissipation")}
+        out["forces"] = {q: x if q in self.inputs else x.subs(put) for q, x in out["forces"].items()}
+        out["constraints"] = [c.subs(put) for c in self.constraints]
+        out["parameters"] = {s: x for s, x in self.parameters.items() if s not in put}
+        return type(self)(**out)
 
     def conservative(self) -> Self:
         """Return the same system without dissipation and forces; inputs stay."""
-        return self._like(dissipation=0, forces=dict(self.inputs))
+        return type(self)(**{**self._arguments(), "dissipation": 0, "forces": dict(self.inputs)})
 
 
 def vanish(parts: Iterable[sp.Expr]) -> bool:

@@ -13,29 +13,14 @@ from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
 from mbkit.errors import UnsupportedError
 
+_SAME_NAME: Final = "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log sign"
 _UNARY: Final[dict[Any, Callable[[Any], Any]]] = {
-    sp.sin: ca.sin,
-    sp.cos: ca.cos,
-    sp.tan: ca.tan,
-    sp.asin: ca.asin,
-    sp.acos: ca.acos,
-    sp.atan: ca.atan,
-    sp.sinh: ca.sinh,
-    sp.cosh: ca.cosh,
-    sp.tanh: ca.tanh,
-    sp.asinh: ca.asinh,
-    sp.acosh: ca.acosh,
-    sp.atanh: ca.atanh,
-    sp.exp: ca.exp,
-    sp.log: ca.log,
+    **{getattr(sp, name): getattr(ca, name) for name in _SAME_NAME.split()},
     sp.Abs: ca.fabs,
-    sp.sign: ca.sign,
     sp.sec: lambda x: 1 / ca.cos(x),
     sp.csc: lambda x: 1 / ca.sin(x),
     sp.cot: lambda x: ca.cos(x) / ca.sin(x),
 }
-
-
 _COMPARED: Final[dict[Any, Callable[[Any, Any], Any]]] = {
     sp.StrictLessThan: lambda a, b: a < b,
     sp.LessThan: lambda a, b: a <= b,
@@ -54,14 +39,14 @@ class Conversion:
     def __call__(self, x: Any) -> Any:
         """Return an expression."""
         if x not in self._done:
-            self._done[x] = self._made(x)
+            self._done[x] = self._converted(x)
         return self._done[x]
 
     def matrix(self, x: Any) -> Any:
         """Return a column of expressions."""
         return ca.vertcat(ca.SX(0, 1), *(ca.SX(self(e)) for e in x))
 
-    def _made(self, x: Any) -> Any:
+    def _converted(self, x: Any) -> Any:
         if x.is_Rational:
             # Two whole numbers are exact where one quotient is rounded.
             top = self._whole(int(x.p))

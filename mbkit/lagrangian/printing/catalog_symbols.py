@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from typing import Any, Final
@@ -16,37 +17,17 @@ from mbkit.errors import MbkitError
 from mbkit.load.urdf import Snapper
 from mbkit.model import Expression, Model, Parameter
 
-#: Of each system's arguments: a name, or three for a vector.
-_SYMBOLS: Final[dict[str, dict[str, str | tuple[str, str, str]]]] = {
-    "acrobot": {"com1": "l_c1", "com2": "l_c2", "inertia1": "I1", "inertia2": "I2"},
-    "cart_pole": {"cart_mass": "m_c", "pole_mass": "m_p"},
-    "clamped_beam": {"length": "L", "bending_stiffness": "EI"},
-    "flexible_spacecraft": {
-        "length": "L",
-        "bending_stiffness": "EI",
-        "hub_mass": "m_h",
-        "hub_inertia": ("J_x", "J_y", "J"),
-        "hub_radius": "r",
-    },
-    "furuta_pendulum": {
-        "arm_length": "L",
-        "arm_mass": "m_a",
-        "arm_com": "l_a",
-        "arm_inertia": "J_a",
-        "pendulum_mass": "m",
-        "pendulum_com": "l",
-        "pendulum_inertia": ("J_x", "J_y", "J_z"),
-    },
-    "gyroscope": {
-        "rotor_mass": "m",
-        "rotor_axial": "C",
-        "rotor_across": "A",
-        "offset": "l",
-        "gimbal_mass": "m_g",
-        "inner_inertia": ("A_i", "B_i", "C_i"),
-        "outer_inertia": "J_o",
-    },
-    "slider_crank": {"crank": "L1", "rod": "L2", "crank_mass": "m1", "rod_mass": "m2", "piston_mass": "m3"},
+#: Textbook symbols of arguments whose symbol is not the usual one: argument=symbol, or three symbols of a vector.
+_SYMBOLS: Final = {
+    "acrobot": "com1=l_c1 com2=l_c2 inertia1=I1 inertia2=I2",
+    "cart_pole": "cart_mass=m_c pole_mass=m_p",
+    "clamped_beam": "length=L bending_stiffness=EI",
+    "flexible_spacecraft": "length=L bending_stiffness=EI hub_mass=m_h hub_inertia=J_x,J_y,J hub_radius=r",
+    "furuta_pendulum": "arm_length=L arm_mass=m_a arm_com=l_a arm_inertia=J_a "
+    "pendulum_mass=m pendulum_com=l pendulum_inertia=J_x,J_y,J_z",
+    "gyroscope": "rotor_mass=m rotor_axial=C rotor_across=A offset=l gimbal_mass=m_g "
+    "inner_inertia=A_i,B_i,C_i outer_inertia=J_o",
+    "slider_crank": "crank=L1 rod=L2 crank_mass=m1 rod_mass=m2 piston_mass=m3",
 }
 #: Of coordinates that the catalog calls by a word.
 _LETTERS: Final = {
@@ -68,23 +49,19 @@ def in_symbols(model: Model) -> Model | None:
     system = next((n for n in catalog.systems() if model.name == n or _numbered(model.name, n)), None)
     if system is None or model.parameters:
         return None
-    for counts in _counts(catalog.systems()[system], model.nv):
+    for size in range(1, model.nv + 1):
         try:
-            symbolic = _with_parameters(system, counts)
+            symbolic = _with_parameters(system, size)
         except (MbkitError, TypeError):
             # A system of another size, or one that takes no parameters.
             continue
-        if _form(symbolic) != _form(model):
-            continue
-        values = _solved(symbolic, model)
-        try:
-            moved = symbolic.with_nominal(values)
-        except MbkitError:
+        if _form(symbolic) == _form(model):
+            values = _solved(symbolic, model)
+            with suppress(MbkitError):
+                moved = symbolic.with_nominal(values)
+                zeros = {name: 0.0 for name, x in values.items() if x == 0.0}
+                return (moved.with_parameters(**zeros) if zeros else moved) if _same(moved, model) else None
             return None
-        if not _same(moved, model):
-            return None
-        nothing = {name: 0.0 for name, x in values.items() if x == 0.0}
-        return moved.with_parameters(**nothing) if nothing else moved
     return None
 
 
@@ -120,26 +97,20 @@ def _numbered(name: str, system: str) -> bool:
     return name.startswith(f"{system}_") and name.removeprefix(f"{system}_").isdigit()
 
 
-def _counts(function: Callable[..., Model], most: int) -> Iterator[dict[str, int]]:
-    """Yield the arguments that count parts, for each size that there may be."""
-    names = [n for n, p in inspect.signature(function).parameters.items() if type(p.default) is int]
-    if not names:
-        yield {}
-    for n in range(1, most + 1) if names else ():
-        yield dict.fromkeys(names, n)
-
-
-def _with_parameters(system: str, counts: Mapping[str, int]) -> Model:
-    function, own = catalog.systems()[system], _SYMBOLS.get(system, {})
-    given: dict[str, Any] = dict(counts)
+def _with_parameters(system: str, size: int) -> Model:
+    """Return a catalog system with a parameter for each number; arguments that count parts are the size."""
+    function, own = catalog.systems()[system], dict(x.split("=") for x in _SYMBOLS.get(system, "").split())
+    arguments: dict[str, Any] = {}
     for name, argument in inspect.signature(function).parameters.items():
         default, symbol = argument.default, own.get(name) or _usual(name)
-        if isinstance(default, float):
-            given[name] = Parameter(str(symbol), default)
+        if type(default) is int:
+            arguments[name] = size
+        elif isinstance(default, float):
+            arguments[name] = Parameter(symbol, default)
         elif isinstance(default, tuple) and all(isinstance(x, float) for x in default):
-            names = symbol if isinstance(symbol, tuple) else [f"{symbol}_{axis}" for axis in "xyz"]
-            given[name] = [Parameter(n, x) for n, x in zip(names, default, strict=True)]
-    return function(**given)
+            names = symbol.split(",") if name in own else [f"{symbol}_{axis}" for axis in "xyz"]
+            arguments[name] = [Parameter(n, x) for n, x in zip(names, default, strict=True)]
+    return function(**arguments)
 
 
 def _usual(name: str) -> str:
@@ -199,24 +170,24 @@ def _number(model: Model, binding: Any) -> float:
     return float(value[binding.index] if binding.index else value)
 
 
+#: Numbers of each kind of part that two descriptions share if they are the same.
+_NUMBERS: Final = {
+    "bodies": ("mass", "com", "inertia"),
+    "joints": ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness", "rest"),
+    "springs": ("point_a", "point_b", "stiffness", "rest_length", "damping"),
+    "couplings": ("factors", "stiffness", "rest_length", "damping", "armature"),
+    "loops": ("rotation_a", "translation_a", "rotation_b", "translation_b"),
+}
+
+
 def _same(a: Model, b: Model) -> bool:
     """Return whether all numbers of two descriptions of one form are equal to rounding."""
-    for x, y in zip(_numbers(a), _numbers(b), strict=True):
-        if not np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0))):
-            return False
-    return True
+    pairs = [(getattr(x, f), getattr(y, f)) for w, fs in _NUMBERS.items() for x, y in _parts(a, b, w) for f in fs]
+    return all(
+        np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0)))
+        for x, y in [(a.gravity, b.gravity), *pairs]
+    )
 
 
-def _numbers(model: Model) -> Iterator[np.ndarray]:
-    yield model.gravity
-    for b in model.bodies:
-        yield from (np.array(b.mass), b.com, b.inertia)
-    for j in model.joints:
-        yield from (j.rotation, j.translation, j.axes, np.array(j.pitch))
-        yield from (j.armature, j.damping, j.stiffness, j.rest)
-    for s in model.springs:
-        yield from (s.point_a, s.point_b, np.array([s.stiffness, s.rest_length, s.damping]))
-    for c in model.couplings:
-        yield np.array([*c.factors, c.stiffness, c.rest_length, c.damping, c.armature])
-    for x in model.loops:
-        yield from (x.rotation_a, x.translation_a, x.rotation_b, x.translation_b)
+def _parts(a: Model, b: Model, where: str) -> Iterator[tuple[Any, Any]]:
+    return zip(getattr(a, where), getattr(b, where), strict=True)
