@@ -9,6 +9,7 @@ from pathlib import Path
 import mbkit
 from mbkit.engines.registry import ENGINES
 from mbkit.model.joint_types import KINDS
+from mbkit.simulate import METHODS
 
 ROOT = Path(mbkit.__file__).parent
 FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("*.py"))}
@@ -34,8 +35,18 @@ ENGINE_NAMES = (
 #: Files and folders that may write the name of a joint type. Models are described with the public builder, and
 #: formats have tables from their words to ours.
 JOINT_NAMES = ("model/joint_types.py", "engines/", "load/", "catalog/", "studies/stress/cases/")
-#: Names of joint types that are ordinary words too: a method with fixed steps, ``mimic="free"``.
-WORDS = ("fixed", "free", "ball")
+#: Files and folders that may write the name of a method of integration.
+METHOD_NAMES = (
+    "methods/",
+    # Which methods studies run on an engine, and an engine's own names of its integrators.
+    "engines/",
+    # The integrator's name in CasADi.
+    "simulate/solvers/cvodes.py",
+    # The closed form of a method's error on a case, as for joint types.
+    "studies/stress/cases/",
+)
+#: Names that are ordinary words too: a method with fixed steps, ``mimic="free"``, MJCF's ``autolimits="auto"``.
+WORDS = ("fixed", "free", "ball", "auto")
 
 
 def literals(path: Path) -> Iterator[tuple[int, str]]:
@@ -71,6 +82,10 @@ def test_names_of_engines_stand_in_the_registry():
 def test_names_of_joint_types_stand_with_the_joint_types():
     names = (n for n, joint_type in KINDS.items() if joint_type.built_in and n not in WORDS)
     assert uses(names, JOINT_NAMES, literals) == []
+
+
+def test_names_of_methods_stand_with_the_methods():
+    assert uses((n for n in METHODS if n not in WORDS), METHOD_NAMES, literals) == []
 
 
 def test_no_joint_is_asked_for_the_name_of_its_type():

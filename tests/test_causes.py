@@ -16,7 +16,7 @@ from mbkit import spatial
 from mbkit.engines.base import per_sample
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
-from mbkit.errors import InputError, MbkitWarning
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.model import Body, Joint, Loop, Mimic, Model
 from mbkit.studies.explain.merged_model import merge
 from mbkit.studies.importers.study import written
@@ -578,6 +578,18 @@ def test_what_nothing_explains_is_narrowed_to_its_joints() -> None:
     assert found.subtree == ("j1", "j2")
     assert "no usual cause" in found.verdict
     assert [g.term for g in found.left if g.relative > found.tolerance] == ["M"]
+
+
+def test_an_engine_without_a_mass_matrix_is_refused_by_name() -> None:
+    class Forces(PinocchioDynamics):
+        engine = "forces"
+
+        def _mass_matrix(self, _q: np.ndarray) -> np.ndarray:
+            raise UnsupportedError("forces: no mass matrix")
+
+    for pair in ((mb.dynamics(arm()), Forces(arm())), (Forces(arm()), mb.dynamics(arm()))):
+        with pytest.raises(UnsupportedError, match=r"explain: forces: expected the mass matrix of arm.* g, nle"):
+            mb.explain(*pair)
 
 
 def test_bad_input_is_refused() -> None:

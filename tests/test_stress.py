@@ -140,7 +140,7 @@ def test_terms_are_measured_against_34_digits(study):
     assert outcomes(study, "masses", "inverse_dynamics") == ["held", "held"]
     for row in case.rows:
         assert row.cells[0].error < 1e-14
-        assert 0 < row.cells[0].seconds < 1e-2
+        assert row.cells[0].seconds > 0
     # Pinocchio 4.1.0 adds up inertias as if no mass were below eps.
     assert outcomes(study, "masses", "mass_matrix")[1] == "warned"
     assert "known defect of pinocchio" in study.case("masses").rows[0].cells[1].warnings[0]

@@ -12,7 +12,6 @@ import multiprocessing
 import os
 import pickle
 import sys
-import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from types import SimpleNamespace
@@ -31,7 +30,7 @@ from mbkit.studies import InterruptedSweepError, Reference, work_precision
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.settings import plans
-from mbkit.studies.work_precision.sweep import _without_heyoka_cache, first_run, repetitions
+from mbkit.studies.work_precision.sweep import Problem, _without_heyoka_cache, first_run, repetitions
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]
 STEPS = [0.1 / 2**k for k in range(6)]
@@ -49,6 +48,17 @@ def study(*args, **more):
     """A study of few points, against the exact motion."""
     usual = {"reference": swing, "repeats": 1, "steps": STEPS, "tolerances": [1e-7, 1e-13]}
     return work_precision(mb.catalog.pendulum(), *args, **{**usual, **more})
+
+
+def set_clock(monkeypatch, seconds_per_look):
+    """Let the clocks of a sweep advance by so much at each look, whatever the machine does meanwhile."""
+    looks = itertools.count()
+
+    def clock():
+        return seconds_per_look * next(looks)
+
+    sweep = sys.modules["mbkit.studies.work_precision.sweep"]
+    monkeypatch.setattr(sweep, "time", SimpleNamespace(perf_counter=clock, process_time=clock))
 
 
 def errors(result):
@@ -122,14 +132,14 @@ def test_repetitions_give_a_spread():
 
 
 def test_the_grids_of_our_own_end_where_finer_ones_bring_nothing():
-    # Long enough for the sweep to end by itself, which takes a second.
-    result = study(["pinocchio"], ["gauss6", "rk853"], steps=None, tolerances=None, seconds=60.0)
+    # Long enough for the sweep to end by itself.
+    result = study(["pinocchio"], ["gauss6", "rk853"], steps=None, tolerances=None, seconds=1e4)
     for curve in result.curves:
         found = [p.error for p in curve.points]
         assert min(found) < 1e-13
         assert found.index(min(found)) >= len(found) - 4
         assert len(found) > 5
-    assert result.seconds < 30
+    assert not result.shortened
 
 
 def test_coarse_tolerances_that_bind_no_step_do_not_end_a_grid():
@@ -161,14 +171,9 @@ def test_a_slow_machine_measures_the_same_points(monkeypatch):
     def few_runs():
         return study(("pinocchio", "mujoco"), ("rk4", "rk853", "mujoco_rk4"), steps=None, tolerances=None, work=4000)
 
+    set_clock(monkeypatch, seconds_per_look=1e-4)
     quick = few_runs()
-    clocks = {name: getattr(time, name) for name in ("perf_counter", "process_time")}
-    starts = {name: clock() for name, clock in clocks.items()}
-    slow = SimpleNamespace(
-        perf_counter=lambda: 40 * clocks["perf_counter"]() - 39 * starts["perf_counter"],
-        process_time=lambda: 40 * clocks["process_time"]() - 39 * starts["process_time"],
-    )
-    monkeypatch.setattr(sys.modules["mbkit.studies.work_precision.sweep"], "time", slow)
+    set_clock(monkeypatch, seconds_per_look=40e-4)
     assert errors(few_runs()) == errors(quick)
     assert not quick.shortened
     # Work is counted, and a call from Python counts eight.
@@ -190,30 +195,57 @@ def test_a_seed_starts_elsewhere():
     assert a.floor < 1e-15
 
 
-def test_what_is_compiled_once_is_no_run_time_and_is_timed_again_each_time(monkeypatch):
+@pytest.fixture
+def compiled(monkeypatch):
+    """One entry for each compilation to machine code."""
+    from mbkit.codegen import jit
+
     monkeypatch.setenv("MBKIT_COMPILE", "1")
+    object_code, calls = jit.object_code, []
+
+    def counted(text):
+        calls.append("compile")
+        return object_code(text)
+
+    monkeypatch.setattr(jit, "object_code", counted)
+    return calls
+
+
+def test_what_is_compiled_once_is_no_run_time_and_is_compiled_again_each_time(monkeypatch, compiled):
+    solve, in_runs = Problem.solve, []
+
+    def counted(*args):
+        before = len(compiled)
+        run = solve(*args)
+        in_runs.append(len(compiled) - before)
+        return run
+
+    monkeypatch.setattr(Problem, "solve", counted)
     for _ in range(2):
+        compiled.clear()
         (curve,) = study(["lagrangian"], ["rk4"], steps=[0.05]).curves
-        assert curve.compile > 5e-3
-        assert curve.points[0].seconds < 0.5 * curve.compile
+        assert curve.compile > 0
+        assert compiled
+    assert in_runs == [0] * len(in_runs)
+    assert len(in_runs) >= 4
 
 
 @pytest.mark.parametrize("method", ["rk853", "dop853", "gauss4"])
-def test_nothing_that_is_kept_shortens_a_first_run(method, monkeypatch):
-    monkeypatch.setenv("MBKIT_COMPILE", "1")
+def test_nothing_that_is_kept_shortens_a_first_run(method, compiled):
     model = mb.catalog.double_pendulum()
-    made = []
 
     def first(dyn):
-        made.append(dyn)
         mb.simulate(dyn, [0.1, 0.2], [0.0, 0.0], 1e-3, method, save=[1e-3])
 
-    told = [first_run(model, "lagrangian", method, first)[1] for _ in range(3)]
-    # A compiler's time, not that of finding what it made: half a millisecond.
-    assert min(told) > 5e-3
-    begun = time.perf_counter()
+    counts = []
+    for _ in range(3):
+        compiled.clear()
+        assert first_run(model, "lagrangian", method, first)[1] >= 0
+        counts.append(len(compiled))
+    assert counts[1] == counts[2] > 0
+    compiled.clear()
     first(mb.dynamics(model, "lagrangian"))
-    assert time.perf_counter() - begun < max(told)
+    assert not compiled
 
 
 def test_a_step_too_large_is_noted_and_does_not_end_the_sweep():
@@ -337,17 +369,17 @@ def test_an_engine_that_breaks_loses_no_other(monkeypatch):
     assert [(c.engine, c.method) for c in result.curves] == [("pinocchio", "rk4"), ("mujoco", "rk4")]
 
 
-def test_what_there_was_no_time_for_is_said():
+def test_what_there_was_no_time_for_is_said(monkeypatch):
+    set_clock(monkeypatch, seconds_per_look=1e-3)
     result = study(["pinocchio"], ["rk4"], steps=[0.1, 1e-6], seconds=0.5)
     coarse, fine = result.curves[0].points
     assert coarse.error < 1e-3
     assert math.isnan(fine.error)
-    assert "time allowed was used up" in fine.note or "given up after" in fine.note
+    assert "time allowed was used up" in fine.note
     assert result.complete
     early = study(("pinocchio", "lagrangian"), ["rk853", "rk4"], steps=None, tolerances=None, seconds=1e-3)
     assert early.shortened
     assert early.shortened[0] in repr(early)
-    assert result.seconds < 5
 
 
 def test_a_tolerance_that_no_run_takes_is_said():

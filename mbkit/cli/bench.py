@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
 
@@ -29,21 +29,8 @@ from mbkit.cli._shared import (
     stem_of,
 )
 
-if TYPE_CHECKING:
-    pass
-
 __all__ = ["bench"]
 
-#: One of each kind, and MuJoCo's own beside the same formulas.
-_QUICK_METHODS: Final = (
-    "rk4",
-    "semi_implicit_euler",
-    "rk853",
-    "dop853",
-    "mujoco_rk4",
-    "mujoco_euler",
-    "mujoco_implicitfast",
-)
 _QUICK: Final[dict[str, Any]] = {"repeats": 3, "work": 24_000}
 _USUAL: Final[dict[str, Any]] = {"repeats": 5, "work": None}
 
@@ -81,7 +68,7 @@ def bench(
     TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written.
     Ctrl-C ends the study early, and what is finished is written.
     """
-    from mbkit.methods.registry import METHODS, method_of
+    from mbkit.methods.registry import METHODS, QUICK_METHODS, method_of
     from mbkit.report import work_precision_view
     from mbkit.report.output_folder import check_writable
     from mbkit.report.progress import Bar
@@ -98,7 +85,7 @@ def bench(
     prepare(out, stem, "json", "csv", "png", "html", force=force)
     if quick and not methods:
         # Those that none of the engines has would be refused as asked for in error.
-        methods = tuple(m for m in _QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
+        methods = tuple(m for m in QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
     usual = _QUICK if quick else _USUAL
     try:
         with _interrupt.keeping, Bar(f"bench {model.name}") as bar, _workers(jobs) as executor:

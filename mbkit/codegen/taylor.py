@@ -220,9 +220,9 @@ class TaylorSystem:
 
 def taylor_system(equations: Equations) -> TaylorSystem:
     """Return the Taylor system of equations, made once for all dynamics that share them."""
-    if "taylor" not in equations.kept:
-        equations.kept["taylor"] = TaylorSystem(equations)
-    made: TaylorSystem = equations.kept["taylor"]
+    if "series" not in equations.kept:
+        equations.kept["series"] = TaylorSystem(equations)
+    made: TaylorSystem = equations.kept["series"]
     return made
 
 

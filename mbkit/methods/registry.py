@@ -36,10 +36,15 @@ from mbkit.methods.tableaus import (
 __all__ = [
     "ADAPTIVE_METHOD",
     "AUTOMATIC_METHOD",
+    "BDF_METHOD",
     "DEFAULT_METHOD",
     "EULER_METHOD",
+    "GAUSS_METHOD",
     "IMPLICIT_METHODS",
     "METHODS",
+    "QUICK_METHODS",
+    "SCIPY_METHOD",
+    "SCIPY_STIFF_METHOD",
     "SERIES_METHOD",
     "STIFF_METHOD",
     "Method",
@@ -62,6 +67,23 @@ STIFF_METHOD: Final = "rodas5"
 AUTOMATIC_METHOD: Final = "auto"
 #: The most accurate one; with 34 digits on the oracle.
 SERIES_METHOD: Final = "taylor"
+#: SciPy's, on any engine: for motions that are not stiff, and for stiff ones.
+SCIPY_METHOD: Final = "dop853"
+SCIPY_STIFF_METHOD: Final = "radau"
+#: SUNDIALS' multistep method for stiff systems.
+BDF_METHOD: Final = "cvodes"
+#: The most accurate implicit one with a fixed step.
+GAUSS_METHOD: Final = "gauss6"
+#: One of each kind, and MuJoCo's own beside the same formulas.
+QUICK_METHODS: Final = (
+    DEFAULT_METHOD,
+    EULER_METHOD,
+    ADAPTIVE_METHOD,
+    SCIPY_METHOD,
+    "mujoco_rk4",
+    "mujoco_euler",
+    "mujoco_implicitfast",
+)
 
 #: With a fixed step, on any engine, for a sentence.
 IMPLICIT_METHODS: Final = "'gauss4' and 'gauss6'"
@@ -150,6 +172,10 @@ class Method:
         """The step in mbkit's own code: `formula_source`, constructed."""
         source = self.formula_source
         return source() if callable(source) else source
+
+    def runs_compiled(self, *, derived: bool) -> bool:
+        """Return whether no evaluation is a call from Python, on an engine with mbkit's own derivation or without."""
+        return bool(self.engines) or (self.compiled and derived)
 
     @property
     def code_name(self) -> str:
@@ -299,9 +325,9 @@ METHODS: Final[dict[str, Method]] = {
             extended=True,
             compiled=True,
         ),
-        _scipy("dop853", "DOP853", 8, "SciPy's DOP853 (Hairer, Nørsett, Wanner 1993, II.5)", stages=12),
+        _scipy(SCIPY_METHOD, "DOP853", 8, "SciPy's DOP853 (Hairer, Nørsett, Wanner 1993, II.5)", stages=12),
         _scipy(
-            "radau",
+            SCIPY_STIFF_METHOD,
             "Radau",
             5,
             "SciPy's Radau IIA, implicit (Hairer, Wanner 1996, IV.8)",
@@ -327,7 +353,7 @@ METHODS: Final[dict[str, Method]] = {
             multistep=True,
         ),
         _adaptive(
-            "cvodes",
+            BDF_METHOD,
             None,
             "SUNDIALS' CVODES through CasADi: BDF, orders 1 to 5 (Hindmarsh and others 2005)",
             "cvodes:run_cvodes",

@@ -15,6 +15,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import compared, find_engine
 from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import results
@@ -29,7 +30,7 @@ from mbkit.studies.study_runs import quiet_simulate
 
 # What is recorded, evaluated: the states, every term at them, and where a short rollout ends.
 
-_METHOD: Final = "rk4"
+_METHOD: Final = DEFAULT_METHOD
 #: Of the motion of a robot an excerpt, in which rounding does not grow.
 _ROLLOUT: Final = Rollout(dt=2e-3, steps=25)
 # States are written in a file for people: of these decimals every double is its own shortest text.

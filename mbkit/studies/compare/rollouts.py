@@ -18,6 +18,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
+from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
 from mbkit.studies.compare.result import RolloutRow
@@ -34,7 +35,8 @@ _CHAOS: Final = 1e-9 / (_ROUNDINGS * _EPS)
 _DISTURBANCE: Final = 1e-8
 #: Steps below which a rollout says nothing.
 _FEWEST: Final = 50
-_PAIRS: Final = (("rk4", "mujoco_rk4"), ("semi_implicit_euler", "mujoco_euler"))
+#: MuJoCo's own method of the same formula.
+_NATIVE: Final = {m.own: m.name for m in METHODS.values() if m.own}
 
 
 def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str) -> tuple[RolloutRow, ...]:
@@ -47,7 +49,8 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
         return ()
     rows = []
     q0, v0 = start_state(model, seed)
-    for method, native in _PAIRS:
+    for method in (DEFAULT_METHOD, EULER_METHOD):
+        native = _NATIVE[method]
         theirs = quiet_simulate(engines[MUJOCO], q0, v0, DURATION, native, STEP)
         condition = _condition(engines[MUJOCO], engines[ours_on[0]], native, theirs)
         last = _safe(condition)
@@ -132,7 +135,7 @@ def _row(
 def _implicit_damping(model: Model, dyn: Dynamics, q0: Array, v0: Array) -> RolloutRow:
     """Show what MuJoCo's Euler does by default: damping taken implicitly, another formula."""
     steps = round(DURATION / STEP)
-    begun = quiet_simulate(dyn, q0, v0, DURATION, "mujoco_euler", STEP)
+    begun = quiet_simulate(dyn, q0, v0, DURATION, _NATIVE[EULER_METHOD], STEP)
     q, _ = dyn.rollout("euler", q0, v0, STEP, None, steps, euler_damping=True)  # type: ignore[attr-defined]
     n = int(min(len(begun.t), np.isfinite(q).all(axis=1).sum()))
     difference = float(np.abs(model.difference(begun.q[:n], q[:n])).max())

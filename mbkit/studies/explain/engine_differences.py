@@ -18,7 +18,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
-from mbkit.errors import KnownDefectWarning, MbkitError
+from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, Lump
 from mbkit.model import Model
 from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes, number_text
@@ -261,6 +261,12 @@ class _Engines:
         self.at = states_of(self.model, out.samples, out.seed)
         self.owners = velocity_joints(self.model)
         own, self.wanted = evaluated(a, self.at), evaluated(b, self.at)
+        for dyn, values in ((a, own), (b, self.wanted)):
+            if "M" not in values:
+                raise UnsupportedError(
+                    f"explain: {dyn.engine}: expected the mass matrix of {self.model.name}, by which differences are "
+                    f"scaled, got only {', '.join(values) or 'no term'}; compare another engine"
+                )
         self.before = self.after = self._gaps(own)
         self.more: list[Gap] = []
         # Pinocchio is fast: it answers for the first engine where both say the same.

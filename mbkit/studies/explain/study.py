@@ -83,6 +83,13 @@ def explain(
     -------
     Explanation
 
+    Raises
+    ------
+    InputError
+        An unusable argument, a parameter without a value, or a model in which nothing moves.
+    UnsupportedError
+        A model that was written as energies, or an engine without the mass matrix.
+
     Examples
     --------
     >>> import mbkit as mb

@@ -26,7 +26,14 @@ from mbkit.engines import dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import DERIVED, INDEPENDENT, PINOCCHIO
 from mbkit.errors import MbkitError, NumericalError
-from mbkit.methods.registry import METHODS
+from mbkit.methods.registry import (
+    ADAPTIVE_METHOD,
+    BDF_METHOD,
+    GAUSS_METHOD,
+    METHODS,
+    SCIPY_METHOD,
+    SCIPY_STIFF_METHOD,
+)
 from mbkit.studies.compare.errors import Errors, Scales, force_errors, matrix_errors
 from mbkit.studies.compare.terms import States
 from mbkit.studies.stress.case import Problem, Truth
@@ -81,14 +88,14 @@ _WORTHLESS: Final = 1e-3
 _PARTS: Final = (0.35, 0.5, 1.0)
 #: Engine, method, and tolerance or number of steps; the third stands in for the second where that is not installed.
 _EXPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
-    (DERIVED, "rk853", 1e-14),
-    *((engine, "dop853", 1e-13) for engine in INDEPENDENT),
+    (DERIVED, ADAPTIVE_METHOD, 1e-14),
+    *((engine, SCIPY_METHOD, 1e-13) for engine in INDEPENDENT),
 )
 _IMPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
-    (DERIVED, "cvodes", 1e-12),
-    (DERIVED, "gauss6", 1000),
-    (PINOCCHIO, "radau", 1e-11),
-    (DERIVED, "gauss6", 4000),
+    (DERIVED, BDF_METHOD, 1e-12),
+    (DERIVED, GAUSS_METHOD, 1000),
+    (PINOCCHIO, SCIPY_STIFF_METHOD, 1e-11),
+    (DERIVED, GAUSS_METHOD, 4000),
 )
 
 #: q at the times, how well it is known, and how it was computed.

@@ -26,7 +26,7 @@ from mbkit.engines import dynamics
 from mbkit.engines.base import require_tree
 from mbkit.engines.registry import DERIVED, INDEPENDENT
 from mbkit.errors import InputError, MbkitError, MbkitWarning, UnsupportedError
-from mbkit.methods.registry import METHODS
+from mbkit.methods.registry import ADAPTIVE_METHOD, METHODS, SCIPY_METHOD, SERIES_METHOD
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.simulate.progress import Progress, ProgressFunction
@@ -48,8 +48,8 @@ _LEGS: Final = 20
 _COARSER: Final = 8.0
 #: Engine and method of each of two independent roads, best first.
 _ROADS: Final = (
-    ((DERIVED, "taylor"), (DERIVED, "rk853"), (DERIVED, "dop853")),
-    tuple((engine, "dop853") for engine in INDEPENDENT),
+    tuple((DERIVED, method) for method in (SERIES_METHOD, ADAPTIVE_METHOD, SCIPY_METHOD)),
+    tuple((engine, SCIPY_METHOD) for engine in INDEPENDENT),
 )
 
 

@@ -21,8 +21,7 @@ _COARSEST: Final = 0.05
 _FINEST: Final = 1e-7
 #: Ratio of neighbouring steps, by the method's order: an error falls by 4 to 16 at each.
 _RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
-#: Methods that call the dynamics from Python on every engine, and the cost of such a call in compiled ones.
-_FROM_PYTHON: Final = frozenset(m.name for m in METHODS.values() if not m.compiled and not m.engines)
+#: An evaluation called from Python costs so many compiled ones.
 _PYTHON_CALL: Final = 8
 
 
@@ -54,8 +53,7 @@ class Settings:
 
     def work(self, steps: int, evaluations: int) -> int:
         """Return the cost of a run in compiled evaluations of the forward dynamics, equal on every machine."""
-        compiled = self.info.kind == "native" or self.method.startswith("drake_") or find_engine(self.engine).derived
-        each = 1 if compiled and self.method not in _FROM_PYTHON else _PYTHON_CALL
+        each = 1 if self.info.runs_compiled(derived=find_engine(self.engine).derived) else _PYTHON_CALL
         return each * (evaluations or steps * max(self.info.stages, 1))
 
 
