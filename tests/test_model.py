@@ -19,6 +19,7 @@ import mbkit as mb
 from mbkit.engines import ENGINES
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, UnknownNameError
 from mbkit.model import KINDS, Mimic
+from mbkit.model.manifold import unit_quaternions
 from mbkit.model.validation import idle_joints, sample_mass_matrix
 from tests.random_trees import off, random_tree, states
 
@@ -242,6 +243,19 @@ def test_random_states_repeat_and_have_the_asked_shape():
 
 
 # Frozen data
+
+
+def test_quaternions_of_a_batch_are_scaled_as_those_of_each_state():
+    model = random_tree(0, 4, ("ball", "revolute", "free"))
+    q = 3.0 * model.random_state(np.random.default_rng(0), 6)[0].reshape(2, 3, -1)
+    unit, lengths = unit_quaternions(model, q)
+    model.check_q(unit.reshape(6, -1))
+    assert lengths.shape == (2, 3, len(model.quaternions))
+    for i in np.ndindex(2, 3):
+        one, own = unit_quaternions(model, q[i])
+        np.testing.assert_allclose(unit[i], one, rtol=4e-16)
+        np.testing.assert_allclose(lengths[i], own, rtol=4e-16)
+    assert unit_quaternions(pendulum().build(), np.zeros((5, 1)))[1].shape == (5, 0)
 
 
 def test_a_model_is_frozen_and_survives_pickling_and_comparison():

@@ -804,3 +804,14 @@ def test_a_start_beyond_a_joints_limits_is_warned_of(recwarn: pytest.WarningsRec
     batch = np.stack([np.zeros(6), q])
     with pytest.warns(MbkitWarning, match=r"trajectory 1: .*elbow_joint = 90"):
         simulate(dyn, batch, np.zeros(6), 0.01)
+
+
+@pytest.mark.parametrize("call", [mb.simulate, mb.simulate.simulate])
+def test_warnings_point_at_the_line_that_called(call):
+    b = ModelBuilder("slider")
+    b.add_body("mass", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), lower=-1.0, upper=1.0)
+    with pytest.warns(MbkitWarning) as heard:
+        call(dynamics(b.build(), "pinocchio"), [2.0], [1e155], 0.01, "rk4")
+    assert len(heard) == 2
+    assert {warning.filename for warning in heard} == {__file__}

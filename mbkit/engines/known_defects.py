@@ -7,11 +7,10 @@ a version that has mended it stays silent.
 
 from __future__ import annotations
 
-import sys
-import warnings
 from dataclasses import dataclass
 from typing import Final
 
+from mbkit._warn import warn
 from mbkit.errors import KnownDefectWarning
 
 
@@ -76,7 +75,4 @@ TENDON_ARMATURE: Final = Defect(
 
 def announce(defect: Defect, where: str) -> None:
     """Warn, at the line that called the library, that a value is the engine's own and wrong."""
-    level, frame = 1, sys._getframe(0)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mbkit."):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(f"{defect}; returned as it is, because of {where}", KnownDefectWarning, stacklevel=level)
+    warn(f"{defect}; returned as it is, because of {where}", KnownDefectWarning)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import shown
+from mbkit._warn import warn
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, ModelError
 from mbkit.load import robot_data, xml_reader
 from mbkit.load.robot_data import entries
@@ -132,7 +133,7 @@ def load(
         raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
     doubts = scale_doubts(made)
     if doubts:
-        warnings.warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning, stacklevel=2)
+        warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
     return replace(made, notes=(*root.notes, *made.notes)) if root.notes else made
 
 

@@ -115,13 +115,16 @@ def difference(model: Description, q0: Array, q1: Array) -> Array:
 
 
 def unit_quaternions(model: Description, q: Array) -> tuple[Array, Array]:
-    """Return q with unit quaternions, and the lengths that they had."""
+    """Return q, (..., nq), with unit quaternions, and the lengths that they had, (..., number of quaternions)."""
+    lengths = np.empty((*q.shape[:-1], len(model.quaternions)))
     if not model.quaternions:
-        return q, np.empty(0)
-    q, lengths = q.copy(), np.empty(len(model.quaternions))
+        return q, lengths
+    q = q.copy()
     for i, (start, _) in enumerate(model.quaternions):
-        lengths[i] = np.linalg.norm(q[start : start + 4])
-        q[start : start + 4] /= lengths[i]
+        x = q[..., start : start + 4]
+        # Without an axis NumPy rounds otherwise.
+        lengths[..., i] = np.linalg.norm(x) if q.ndim == 1 else np.linalg.norm(x, axis=-1)
+        x /= lengths[..., i, None]
     return q, lengths
 
 

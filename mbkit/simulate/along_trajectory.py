@@ -16,11 +16,11 @@ from mbkit.simulate.torque import PiecewiseConstantTorque, SampledTorque
 __all__ = [
     "along",
     "canonical_momentum",
+    "dynamics_of_trajectory",
     "kinetic_energy",
     "momentum",
     "moved",
     "potential_energy",
-    "record_of",
     "work",
 ]
 
@@ -214,10 +214,12 @@ def momentum(dyn: Dynamics, q: Array, v: Array) -> Array:
     if dyn.samples is None:
         return along(dyn, (6,), lambda own, q, v: _momentum(own, dyn.model, q, v), q, v)
     # Of a batch with values of its own, each trajectory is a system of its own.
-    return np.array([momentum(record_of(dyn, i), q[i], v[i]) for i in range(len(q))]).reshape(*q.shape[:-1], 6)
+    return np.array([momentum(dynamics_of_trajectory(dyn, i), q[i], v[i]) for i in range(len(q))]).reshape(
+        *q.shape[:-1], 6
+    )
 
 
-def record_of(dyn: Dynamics, i: int) -> Dynamics:
+def dynamics_of_trajectory(dyn: Dynamics, i: int) -> Dynamics:
     """Return the dynamics of one trajectory of a batch, with plain values of the parameters."""
     if dyn.samples is None:
         return dyn

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array
+from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.lagrangian.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
@@ -124,10 +125,9 @@ def integrate_on_charts(
         with bar:
             _stepped(system, run, q, v, Grid.of(start, duration, dt), method, force, save, bar)
     for t, value in run.near:
-        warnings.warn(
+        warn(
             f"{model.name}: {_NEAR} at t = {t:.6g} s: the smallest singular value there is {value:.3g} of the largest",
             MbkitWarning,
-            stacklevel=3,
         )
     end = start + duration if run.ended == "finished" else run.t[-1] if run.t else start
     doubts = (run.poses.told(),) if run.poses.times else ()

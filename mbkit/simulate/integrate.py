@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any, Final, Protocol, runtime_checkable
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real
+from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
@@ -172,13 +172,12 @@ def _warn_beyond_limits(model: Model, q: Array) -> None:
         row, i = np.argwhere(beyond)[0]
         which = f"trajectory {row}: " if q.ndim == 2 else ""
         more = np.count_nonzero(beyond) - 1
-        warnings.warn(
+        warn(
             f"{model.name}: q0: {which}{model.coordinate_names[i]} = {rows[row, i]:g} is beyond its limits "
             f"[{low[i]:g}, {high[i]:g}]"
             + (f", and {more} more" if more else "")
             + "; limits do not act in a run, and angles are in radians",
             MbkitWarning,
-            stacklevel=4,
         )
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
+from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
 from mbkit.errors import DoubtfulRunWarning, MbkitWarning
@@ -157,7 +157,7 @@ def simulate(
         raise error
     title = f"{run.model.name}: {run.method}"
     if run.stats.message and run.stats.ended != "event":
-        warnings.warn(f"{title} {run.stats.message}", MbkitWarning, stacklevel=2)
+        warn(f"{title} {run.stats.message}", MbkitWarning)
     for one in run.stats.doubts:
-        warnings.warn(f"{title}: {one}", DoubtfulRunWarning, stacklevel=2)
+        warn(f"{title}: {one}", DoubtfulRunWarning)
     return run

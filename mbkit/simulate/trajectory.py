@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from mbkit import _check
 from mbkit._escape import csv_text, html, one_line
 from mbkit.errors import InputError, OutputError
-from mbkit.simulate.along_trajectory import record_of
+from mbkit.simulate.along_trajectory import dynamics_of_trajectory
 from mbkit.simulate.events import Hit
 from mbkit.simulate.run_check import RunCheck, check_run
 from mbkit.simulate.run_data import RunData
@@ -102,7 +102,7 @@ class Trajectory(RunData):
         if member >= members:
             raise InputError(f"member: expected less than {members}, the number of trajectories, got {member}")
         # The description is enough: no engine is made.
-        model = self.model if self._dyn is None else record_of(self._dyn, member).model
+        model = self.model if self._dyn is None else dynamics_of_trajectory(self._dyn, member).model
         return picture(self, model, count, view, member)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit._warn import warn
 from mbkit.engines.mujoco.model import MujocoModel, heard_warnings
 from mbkit.errors import DoubtfulRunWarning, UnknownNameError, UnsupportedError
 from mbkit.model import Model
@@ -78,7 +78,7 @@ class Rollout:
             states = self._run(data, start, control, steps, progress)
         if any(d.warning.number[_SINGULAR] for d in data):
             told = "MuJoCo met a mass matrix that is too close to singular, and went on with another one"
-            warnings.warn(f"{self._description.name}: {told}; compare with rk853", DoubtfulRunWarning, stacklevel=6)
+            warn(f"{self._description.name}: {told}; compare with rk853", DoubtfulRunWarning)
         states[np.logical_not(self._alive(states, dt))] = np.nan
         q, v = self._read(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + self._m.nv])
         return (q[0], v[0]) if single else (q, v)

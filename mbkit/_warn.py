@@ -1,0 +1,16 @@
+"""Warnings that point at the user's line."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+__all__ = ["warn"]
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Warn at the line that called the library, however deep in it this is."""
+    level, frame = 1, sys._getframe(0)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == "mbkit":
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
