@@ -34,6 +34,7 @@ from mbkit.errors import (
 from mbkit.load import load, robots
 from mbkit.load.mjcf_attributes import rules as mjcf_rules
 from mbkit.load.robot_data import find
+from mbkit.load.sanitized_text import strip
 from mbkit.load.shapes import solid
 from mbkit.load.urdf import Snapper
 from mbkit.model import Mimic
@@ -970,6 +971,37 @@ def test_inertia_of_meshes(tmp_path, inertia, asset, compiler):
     assert "seen.obj" not in notes
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ['assetdir="a"'],
+        ['meshdir="" assetdir="a"'],
+        ['meshdir="b" assetdir="a"'],
+        ['meshdir="b"', 'assetdir="a"'],
+        ['assetdir="a"', 'meshdir=""'],
+        ['meshdir="b"', 'meshdir="" assetdir="a"'],
+    ],
+)
+def test_mesh_folders_are_those_of_mujoco(tmp_path, settings):
+    for folder, size in ((".", 1), ("a", 2), ("b", 3)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        scaled = "".join(
+            f"v {x * size} {y * size} {z * size}\n" for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+        )
+        (tmp_path / folder / "part.obj").write_text(scaled + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    text = (
+        f'<mujoco model="m">{"".join(f"<compiler {s}/>" for s in settings)}<asset><mesh file="part.obj"/></asset>'
+        '<worldbody><body name="a"><freejoint/><geom type="mesh" mesh="part"/></body></worldbody></mujoco>'
+    )
+    path = write(tmp_path, text, "robot.xml")
+    expected = mujoco.MjModel.from_xml_path(str(path)).body_mass[1]
+    assert load(path).mass == pytest.approx(expected, rel=1e-12)
+    stripped = strip(path)
+    assert mujoco.MjModel.from_xml_string(stripped.text, stripped.meshes).body_mass[1] == pytest.approx(
+        expected, rel=1e-12
+    )
+
+
 def test_only_meshes_that_give_an_inertia_are_opened(tmp_path):
     path = meshed(tmp_path, '<mesh file="part.obj"/>')
     model = load(path)
@@ -1168,7 +1200,7 @@ def test_mjcf_says_what_it_left_out(tmp_path):
         '<tendon><fixed><joint joint="j" coef="1"/></fixed></tendon></mujoco>'
     )
     notes = "\n".join(load(write(tmp_path, text, "r.xml")).notes)
-    for expected in ("actuators", "equality", "tendons", "gravity compensation", "ball joint", "fluid", "made up"):
+    for expected in ("actuators", "equality", "tendons", "gravity compensation", "ball joint", "fluid", "generated"):
         assert expected in notes
 
 

@@ -8,6 +8,7 @@ import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from types import NoneType
 from typing import Final, Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ from mbkit.load.xml_reader import expanded
 from mbkit.model import Model
 from mbkit.model.validation import scale_doubts
 
-# A path has lost one of the strokes.
+# `Path` drops one of the two slashes.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _GRAVITY: Final = (0.0, 0.0, -9.81)
 
@@ -96,14 +97,14 @@ def load(
     >>> mb.load("panda", mimic="free").nv
     9
     """
-    if not isinstance(mimic, str) or mimic not in ("reduce", "free"):
-        raise InputError(f"mimic: expected 'reduce' or 'free', got {shown(mimic)}")
-    if nonphysical is not None and (not isinstance(nonphysical, str) or nonphysical not in ("error", "warn")):
-        raise InputError(f"nonphysical: expected 'error', 'warn' or None, got {shown(nonphysical)}")
-    if not isinstance(floating_base, (bool, np.bool_)):
-        raise InputError(f"floating_base: expected True or False, got {shown(floating_base)}")
-    if not isinstance(meshes, str) or meshes not in ("auto", "never"):
-        raise InputError(f"meshes: expected 'auto' or 'never', got {shown(meshes)}")
+    for name, value, allowed, expected in (
+        ("mimic", mimic, ("reduce", "free"), "'reduce' or 'free'"),
+        ("nonphysical", nonphysical, ("error", "warn", None), "'error', 'warn' or None"),
+        ("floating_base", floating_base, (True, False), "True or False"),
+        ("meshes", meshes, ("auto", "never"), "'auto' or 'never'"),
+    ):
+        if not isinstance(value, (str, bool, np.bool_, NoneType)) or value not in allowed:
+            raise InputError(f"{name}: expected {expected}, got {shown(value)}")
     path, by_name = _resolved(source)
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml_reader.read(path)
@@ -114,7 +115,7 @@ def load(
         urdf = examine(
             root, str(path), floating_base=floating_base, mimic_matters=mimic == "reduce", lenient=policy == "warn"
         )
-        made = model_of(
+        model = model_of(
             urdf,
             str(path),
             floating_base=floating_base,
@@ -125,20 +126,20 @@ def load(
     elif root.tag == "mujoco":
         from mbkit.load.mjcf import model_of_mjcf
 
-        whole = expanded(root, path)
-        made = model_of_mjcf(
-            whole, path, floating_base=floating_base, nonphysical=policy, gravity=gravity, meshes=meshes
+        root_with_includes = expanded(root, path)
+        model = model_of_mjcf(
+            root_with_includes, path, floating_base=floating_base, nonphysical=policy, gravity=gravity, meshes=meshes
         )
     else:
         raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
-    doubts = scale_doubts(made)
+    doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
-    return replace(made, notes=(*root.notes, *made.notes)) if root.notes else made
+    return replace(model, notes=(*root.notes, *model.notes)) if root.notes else model
 
 
 def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
-    """Return the file, and whether it was asked for by a robot's name."""
+    """Return the file, and whether the source is a robot's name."""
     if not isinstance(source, (str, os.PathLike)):
         raise InputError(f"source: expected a robot's name or a path, got {shown(source)}")
     text = os.fspath(source)
@@ -153,20 +154,14 @@ def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
         robot = None if looks_like_path else robot_data.find(text)
         if robot is not None:
             return robot.path, True
-        separated = "/" in text or os.sep in text
-        if not looks_like_path and not separated and not os.path.exists(text):
-            raise robot_data.unknown(text)
-        if separated and not looks_like_path and not os.path.exists(text):
+        if not looks_like_path and not os.path.exists(text):
             raise robot_data.unknown(text)
     return Path(text), False
 
 
-# Records of the robots of example-robot-data, with their size or why they do not load.
-
-
 @dataclass(frozen=True)
 class Robot:
-    """A URDF of example-robot-data; its size is read when first asked for.
+    """A URDF of example-robot-data; the file is read at the first use of its size.
 
     Attributes
     ----------
@@ -221,7 +216,7 @@ def robots() -> tuple[Robot, ...]:
     -------
     tuple of Robot
         Each with ``name``, ``aliases``, ``path``, and ``nq``, ``nv``, ``mass`` or the
-        ``reason`` why it does not load; the last four are found when first asked for.
+        ``reason`` why it does not load; the last four load the file at their first use.
 
     Raises
     ------

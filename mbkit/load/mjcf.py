@@ -1,15 +1,9 @@
-"""MJCF to `Model`, element by element.
+"""MJCF to `Model`, element by element, by MuJoCo's rules (XML reference of 4.0).
 
-Pinocchio's own MJCF parser is not used. As of 4.1.0 it reads only the first body of
-the world, loses unnamed bodies, leaves the mass of geoms without contacts out, takes
-the ranges of slides for angles and knows no springs, all in silence. What follows
-keeps MuJoCo's rules (XML reference, docs of 4.0) and is tested against its compiler.
-
-A body's frame is its last joint's. Where that joint stands off the body's origin, a
-frame of the body's name keeps the origin, so that poses are MuJoCo's. A body with
-several joints becomes a chain of massless bodies. The coordinates are MuJoCo's: a
-hinge stands at its ``ref`` in the pose that is drawn, a free joint's are its place
-in the world.
+Pinocchio's MJCF parser (4.1.0) loses bodies, masses and springs without a message. A body's frame is its last
+joint's; a frame of the body's name keeps the body's origin. A body with several joints becomes a chain of massless
+bodies. Coordinates are MuJoCo's: a hinge is at its ``ref`` in the pose of the file, a free joint's are its pose in
+the world.
 """
 
 from __future__ import annotations
@@ -39,12 +33,11 @@ _REFUSED: Final = {
     "composite": "write its bodies out; MuJoCo's save as XML does",
     "flexcomp": "deformable bodies are not rigid; remove it",
 }
-# Sections that are read, or that say nothing about the motion.
-_READ: Final = ("compiler", "default", "option", "worldbody", "size", "visual", "statistic", "asset")
-# Sections with notes of their own.
-_NOTED: Final = ("tendon", "actuator", "equality")
-
-
+# Sections that are read, have notes of their own, or do not act on the motion.
+_READ: Final = (
+    *("compiler", "default", "option", "worldbody", "size", "visual", "statistic"),
+    *("asset", "tendon", "actuator", "equality"),
+)
 # Option flags that change the smooth equations; the others steer an engine.
 _HONOURED: Final = frozenset({"gravity", "spring", "damper", "actuation"})
 
@@ -58,9 +51,11 @@ def model_of_mjcf(
     gravity: ArrayLike | None,
     meshes: Literal["auto", "never"] = "never",
 ) -> Model:
-    """Describe the bodies and joints of a <mujoco> element; for the arguments see `mbkit.load.load`."""
+    """Return the model of a <mujoco> element; for the arguments see `mbkit.load.load`."""
     read = Reader()
-    _refuse(mujoco, read)
+    for element in mujoco.walk():
+        if element.tag in _REFUSED:
+            read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
     misspelt = check_names(mujoco, read)
     if floating_base:
         mujoco = floated(mujoco, read)
@@ -105,12 +100,6 @@ def model_of_mjcf(
     return transmissions.applied(model)
 
 
-def _refuse(mujoco: Element, read: Reader) -> None:
-    for element in mujoco.walk():
-        if element.tag in _REFUSED:
-            read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
-
-
 def _flags(mujoco: Element, read: Reader) -> dict[str, str]:
     """Return the option flags; later ones win."""
     out: dict[str, str] = {}
@@ -132,9 +121,6 @@ def _gravity(mujoco: Element, flags: Mapping[str, str], read: Reader) -> tuple[f
 def _total_scale(scene: Scene) -> float:
     wanted, total = scene.compiler.settotalmass, sum(b.lump.mass for b in scene.bodies)
     return wanted / total if wanted > 0 and total > 0 else 1.0
-
-
-# Describing it.
 
 
 def _describe(
@@ -183,41 +169,40 @@ def _add_joint(
 ) -> None:
     item, element, read = f"joint {joint.name!r}", joint.element, scene.read
     angle = scene.compiler.angle if joint.kind in ("hinge", "ball") else 1.0
-    given: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     if joint.kind in ("hinge", "slide"):
         axis = snap(joint.axis / np.linalg.norm(joint.axis))
-        given["axis"] = axis
+        values["axis"] = axis
         if joint.ref and joint.kind == "hinge":
             R = R @ about(axis, -joint.ref)
         elif joint.ref:
             p = p - R @ (joint.ref * axis)
-        given["rest"] = angle * read.number(element, "springref", item, 0.0)
+        values["rest"] = angle * read.number(element, "springref", item, 0.0)
         limits = _range(element, "range", "limited", item, scene)
         if limits:
-            given["lower"], given["upper"] = (angle * x for x in limits)
+            values["lower"], values["upper"] = (angle * x for x in limits)
         force = _range(element, "actuatorfrcrange", "actuatorfrclimited", item, scene)
         if force:
-            given["effort_limit"] = max(abs(x) for x in force)
+            values["effort_limit"] = max(abs(x) for x in force)
     elif joint.kind == "ball" and _range(element, "range", "limited", item, scene, ordered=False):
         scene.left_out["limit of a ball joint"] += 1
     for name in ("stiffness", "damping"):
-        given[name], *higher = read.numbers(element, name, item, count=3, least=1, default=(0.0,))
+        values[name], *higher = read.numbers(element, name, item, count=3, least=1, default=(0.0,))
         if any(higher):
             read.fault(f"{item}: {name} that depends on the position or speed; only constants are read", element)
     if joint.name in springs:
-        given["stiffness"], given["damping"] = springs[joint.name]
-    armature = read.number(element, "armature", item, 0.0)
+        values["stiffness"], values["damping"] = springs[joint.name]
+    values["armature"] = read.number(element, "armature", item, 0.0)
     if joint.kind in ("ball", "free"):
-        # They may come from a default class that was meant for hinges.
-        for name, value in (("stiffness", given["stiffness"]), ("armature", armature)):
+        # They may come from a default class for hinges.
+        for name, why in (("stiffness", "a joint of one coordinate"), ("armature", "a joint of one velocity")):
+            value = values.pop(name)
             if value:
-                why = "a joint of one coordinate" if name == "stiffness" else "a joint of one velocity"
                 read.fault(f"{item}: {name} {value:g} on a {joint.kind} joint; expected {why}; set it to 0", element)
-        given["stiffness"] = armature = 0.0
-    if read.number(element, "springyield", item, 0.0) and given["stiffness"]:
+    if read.number(element, "springyield", item, 0.0) and values.get("stiffness"):
         scene.left_out["yield of a spring"] += 1
-    if not given["stiffness"]:
-        given.pop("rest", None)
+    if not values.get("stiffness"):
+        values.pop("rest", None)
     b.add_joint(
         joint.name,
         KINDS[joint.kind],
@@ -225,9 +210,8 @@ def _add_joint(
         child=child,
         translation=p,
         rotation=snap(R),
-        armature=armature,
         friction=read.number(element, "frictionloss", item, 0.0),
-        **given,
+        **values,
     )
 
 
@@ -236,10 +220,10 @@ def _range(
 ) -> tuple[float, float] | None:
     """Return a range that applies, or None."""
     low, high = scene.read.numbers(element, range_, item, count=2, default=(0.0, 0.0), bounded=False)
-    said = scene.read.choice(element, limited, ("auto", "true", "false"))
-    if said == "auto" and (low or high) and not scene.compiler.autolimits:
+    applies = scene.read.choice(element, limited, ("auto", "true", "false"))
+    if applies == "auto" and (low or high) and not scene.compiler.autolimits:
         scene.read.fault(f"{item}: {range_} without {limited}, and autolimits is off; write {limited}", element)
-    if said == "false" or (said == "auto" and not low < high):
+    if applies == "false" or (applies == "auto" and not low < high):
         return None
     if ordered and not low < high:
         scene.read.fault(f"{item}: {range_} {low:g} {high:g}; expected the lower limit first", element)
@@ -247,7 +231,7 @@ def _range(
 
 
 def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], scale: float) -> list[str]:
-    """Say what was decided and what was left out."""
+    """Return the notes on decisions and on parts that were left out."""
     out = []
     files = list(dict.fromkeys(e.file for e in mujoco.walk() if e.file))
     if files:
@@ -255,7 +239,7 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
         outside = [f for f in files if not (path.parent / f).resolve().is_relative_to(path.parent.resolve())]
         if outside:
             out.append(f"included from outside the folder of {path.name}: {', '.join(outside)}")
-    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in (*_READ, *_NOTED))
+    sections = Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in _READ)
     if sections:
         listing = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
         out.append(f"sections left out, with whatever they do to the motion: {listing}")
@@ -268,7 +252,7 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
         out.append(f"option flags are an engine's, and were left out: {listing}")
     if scene.unnamed:
         listing = " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items()))
-        out.append(f"names were made up for what has none ({listing})")
+        out.append(f"names were generated for elements without one ({listing})")
     for setting, bodies in scene.bounded.items():
         what = "mass" if setting == "boundmass" else "inertia"
         out.append(f"compiler {setting} changed the {what} of {listed(bodies)}")
@@ -285,7 +269,7 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
 
 
 def _fluid_note(mujoco: Element, scene: Scene) -> list[str]:
-    """Say that the forces of a fluid act in MuJoCo, where its medium has density or viscosity."""
+    """Return a note where MuJoCo's medium has density or viscosity, whose forces are left out."""
     option: dict[str, str] = {}
     for element in mujoco.all("option"):
         option |= {k: v for k, v in element.attributes.items() if k in ("density", "viscosity", "wind")}

@@ -1,7 +1,6 @@
 """MJCF's elements: the schema of names, compiler settings, default classes, and the ways to write a pose.
 
-The schema is printed by `mujoco.mj_printSchema`. It leaves out <frame>, in which MuJoCo 4.0.0 checks no
-names: there mbkit is stricter.
+`mujoco.mj_printSchema` prints the schema. It leaves out <frame>, whose names only mbkit checks.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from pathlib import PurePosixPath
 from typing import Final
 
 import numpy as np
@@ -38,47 +38,35 @@ HERE: Final = Pose(np.eye(3), np.zeros(3))
 
 @dataclass(frozen=True)
 class Compiler:
-    """The settings of <compiler> that change a model's numbers.
+    """The settings of <compiler> that change a model's numbers or name its files."""
 
-    Attributes
-    ----------
-    angle : float
-        Radians per unit of angle in the file.
-    eulerseq : str
-        Three of xyzXYZ; small letters turn with the body, capitals stay.
-    autolimits : bool
-    inertiafromgeom : bool or None
-        None: only where there is no <inertial>.
-    groups : (float, float)
-        First and last geom group that has mass.
-    balanceinertia : bool
-    boundmass, boundinertia, settotalmass : float
-    """
-
-    angle: float = np.pi / 180
-    eulerseq: str = "xyz"
-    autolimits: bool = True
-    inertiafromgeom: bool | None = None
-    groups: tuple[float, float] = (0.0, 5.0)
-    balanceinertia: bool = False
-    boundmass: float = 0.0
-    boundinertia: float = 0.0
-    settotalmass: float = -1.0
+    angle: float  # radians per unit of angle in the file
+    eulerseq: str  # three of xyzXYZ; small letters turn with the body, capitals stay
+    autolimits: bool
+    inertiafromgeom: bool | None  # None: only where there is no <inertial>
+    groups: tuple[float, float]  # the first and last geom group that has mass
+    balanceinertia: bool
+    boundmass: float
+    boundinertia: float
+    settotalmass: float
+    meshdir: str
+    strippath: bool
 
     @classmethod
     def of(cls, mujoco: Element, read: Reader) -> Compiler:
         """Read every <compiler> of the file; later ones win."""
-        merged = Element("compiler", {}, mujoco.line)
+        merged, meshdir = Element("compiler", {}, mujoco.line), ""
         for element in mujoco.all("compiler"):
             merged.attributes.update(element.attributes)
             merged.line, merged.file = element.line, element.file
-        given = merged.attributes
-        item = "the file"
-        if given.get("coordinate", "local") != "local":
+            # An element's meshdir overrides its assetdir, even where it is empty.
+            meshdir = element.attributes.get("meshdir", element.attributes.get("assetdir", meshdir))
+        attributes, item = merged.attributes, "the file"
+        if attributes.get("coordinate", "local") != "local":
             read.fault("compiler coordinate: only 'local' is read; convert the file with MuJoCo 2.3.3", merged)
-        if given.get("alignfree", "false") != "false":
+        if attributes.get("alignfree", "false") != "false":
             read.fault("compiler alignfree moves the frames of free bodies; set it to false", merged)
-        seq = given.get("eulerseq", "xyz")
+        seq = attributes.get("eulerseq", "xyz")
         if len(seq) != 3 or set(seq.lower()) - set("xyz"):
             read.fault(f"compiler eulerseq: expected three of xyzXYZ, got {seq[:20]!r}", merged)
             seq = "xyz"
@@ -95,7 +83,26 @@ class Compiler:
             boundmass=read.number(merged, "boundmass", item, 0.0),
             boundinertia=read.number(merged, "boundinertia", item, 0.0),
             settotalmass=read.number(merged, "settotalmass", item, -1.0),
+            meshdir=meshdir.replace("\\", "/"),
+            strippath=attributes.get("strippath") == "true",
         )
+
+    def mesh_path(self, file: str) -> PurePosixPath:
+        """Return the path of a mesh, relative to the MJCF's folder unless the file writes an absolute one."""
+        path = PurePosixPath(file.replace("\\", "/"))
+        return PurePosixPath(self.meshdir) / (path.name if self.strippath else path)
+
+
+def mesh_assets(mujoco: Element) -> dict[str, Element]:
+    """Return the <mesh> elements by name; a mesh without one has the stem of its file."""
+    meshes = [e for section in mujoco.all("asset") for e in section.all("mesh")]
+    return {mesh_name(e): e for e in meshes}
+
+
+def mesh_name(mesh: Element) -> str:
+    """Return the name of a <mesh>."""
+    stem = PurePosixPath(mesh.attributes.get("file", "").replace("\\", "/")).stem
+    return mesh.attributes.get("name") or stem
 
 
 class Defaults:
@@ -144,18 +151,18 @@ def _over(values: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
 def pose(element: Element, compiler: Compiler, read: Reader, item: str) -> Pose:
     """Return the pose that an element's pos and orientation give."""
     p = np.array(read.numbers(element, "pos", item, count=3, default=(0, 0, 0)))
-    given = [name for name in ORIENTATIONS if name in element.attributes]
-    if not given:
+    names = [name for name in ORIENTATIONS if name in element.attributes]
+    if not names:
         return Pose(np.eye(3), p)
-    if len(given) > 1:
-        read.fault(f"{item}: {element.tag} has {' and '.join(given)}; keep one orientation", element)
+    if len(names) > 1:
+        read.fault(f"{item}: {element.tag} has {' and '.join(names)}; keep one orientation", element)
     before = len(read.faults)
-    values = np.array(read.numbers(element, given[0], item, count=ORIENTATIONS[given[0]]))
+    values = np.array(read.numbers(element, names[0], item, count=ORIENTATIONS[names[0]]))
     if len(read.faults) > before:
         return Pose(np.eye(3), p)
-    R = _rotation(given[0], values, compiler)
+    R = _rotation(names[0], values, compiler)
     if R is None:
-        read.fault(f"{item}: {element.tag} {given[0]}: expected directions of some length, got zeros", element)
+        read.fault(f"{item}: {element.tag} {names[0]}: expected directions of some length, got zeros", element)
         R = np.eye(3)
     return Pose(R, p)
 
@@ -207,16 +214,16 @@ def z_to(direction: Array) -> Array:
     return about(axis, float(np.arctan2(sine, z[2])))
 
 
-# Names that MuJoCo's schema does not have: misspelt ones, whose values would be lost.
+# Names that MuJoCo's schema does not have.
 
-# Where nothing acts on the smooth motion, an unknown name is a note.
+# These do not act on the smooth motion: an unknown name in them is a note.
 _ASIDE: Final = frozenset(
     {
         *("visual", "statistic", "size", "sensor", "custom", "keyframe", "extension", "contact"),
         *("texture", "material", "skin", "hfield", "camera", "light"),
     }
 )
-# These are refused or not read as a whole.
+# These are refused or not read.
 _UNREAD: Final = frozenset({"replicate", "attach", "composite", "flexcomp", "plugin"})
 _MOST_NOTED: Final = 6
 
@@ -280,21 +287,21 @@ def _hint(name: str, known: frozenset[str]) -> str:
 @lru_cache(maxsize=1)
 def rules() -> Rule:
     """Return the rule for <mujoco>, from MuJoCo's schema."""
-    # The first MJCF that is loaded pays for the import.
+    # Imported late: only an MJCF needs it.
     import mujoco
 
     # Lines are "name (how often)   attribute attribute", indented by level; longer ones go on below.
     root = Rule()
     open_rules: list[tuple[int, Rule]] = [(-1, root)]
-    found: list[tuple[int, str, str, list[str]]] = []
+    entries: list[tuple[int, str, str, list[str]]] = []
     for line in mujoco.mj_printSchema(False, False).splitlines():
-        begun = re.fullmatch(r"( *)(\S+) \((.)\)(.*)", line)
-        if begun:
-            indent, tag, often, attributes = begun.groups()
-            found.append((len(indent), tag.removeprefix("(world)"), often, attributes.split()))
-        elif found:
-            found[-1][3].extend(line.split())
-    for level, tag, often, names in found:
+        start = re.fullmatch(r"( *)(\S+) \((.)\)(.*)", line)
+        if start:
+            indent, tag, often, attributes = start.groups()
+            entries.append((len(indent), tag.removeprefix("(world)"), often, attributes.split()))
+        elif entries:
+            entries[-1][3].extend(line.split())
+    for level, tag, often, names in entries:
         rule = Rule(frozenset(names), once=often in "!?")
         while open_rules[-1][0] >= level:
             open_rules.pop()

@@ -1,7 +1,7 @@
 """Numbers of an MJCF that MuJoCo's compiler infers: the inertia of meshes and shells, and ``springdamper``.
 
-The compiler is given the description again, with less in it. Of all the files that it names, only the
-meshes stay that give a body its inertia. mbkit opens these, and hands over their bytes.
+The compiler reads a shortened description. mbkit opens the meshes that give a body its inertia, and passes
+their bytes; no other file is opened.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import hashlib
 import re
 import warnings
 from collections.abc import Iterable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Final
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from mbkit import spatial
+from mbkit.load.mjcf_attributes import mesh_assets
 from mbkit.load.mjcf_reader import Scene
 from mbkit.load.shapes import Lump
 from mbkit.load.xml_reader import MOST_BYTES, Element
@@ -40,12 +41,12 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
         return ""
     item = f"the inertia of {listed(scene.inferred)}"
     text = _Text(mujoco, path, scene)
-    made = text.compiled(_BODIES, item, scaled=False)
-    if made is None:
+    compiled = text.compiled(_BODIES, item, scaled=False)
+    if compiled is None:
         return ""
     for body in scene.bodies:
         if body.name in scene.inferred:
-            body.lump = _lump(made.body(body.name))
+            body.lump = _lump(compiled.body(body.name))
     bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
     within = f", within {' and '.join(bounds)}" if bounds else ""
     files = f"; mesh files read: {listed(text.opened)}" if text.opened else ""
@@ -69,15 +70,16 @@ def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[
             )
     if not joints or scene.read.faults:
         return {}
-    made = _Text(mujoco, path, scene).compiled(_BODIES_AND_FORCES, f"springdamper of {listed(joints)}", scaled=True)
-    if made is None:
+    item = f"springdamper of {listed(joints)}"
+    compiled = _Text(mujoco, path, scene).compiled(_BODIES_AND_FORCES, item, scaled=True)
+    if compiled is None:
         return {}
-    views = {name: made.joint(name) for name in joints}
+    views = {name: compiled.joint(name) for name in joints}
     return {n: (float(np.ravel(j.stiffness)[0]), float(np.ravel(j.damping)[0])) for n, j in views.items()}
 
 
 class _Text:
-    """A description as the compiler is given it, with the meshes that it needs."""
+    """A description as the compiler reads it, with the meshes that it needs."""
 
     def __init__(self, mujoco: Element, path: Path, scene: Scene) -> None:
         self.mujoco, self.path, self.scene = mujoco, path, scene
@@ -85,11 +87,7 @@ class _Text:
         for compiler in mujoco.all("compiler"):
             self.settings.update(compiler.attributes)
         self.counted = {id(geom) for geoms in scene.inferred.values() for geom, _ in geoms}
-        self.meshes: dict[str, Element] = {}
-        for asset in mujoco.all("asset"):
-            for mesh in asset.all("mesh"):
-                stem = PurePosixPath(mesh.attributes.get("file", "").replace("\\", "/")).stem
-                self.meshes[mesh.attributes.get("name") or stem] = mesh
+        self.meshes = mesh_assets(mujoco)
         self.needed: dict[int, dict[str, str]] = {}
         self.opened: list[str] = []
         self.assets: dict[str, bytes] = {}
@@ -108,10 +106,10 @@ class _Text:
         settings = {k: v for k, v in self.settings.items() if k not in unused}
         inside = "".join(self._written(e, None) for e in self.mujoco.children if e.tag in sections)
         text = f"<mujoco>{_tag('compiler', settings)}{inside}</mujoco>"
-        # Few files need the compiler.
+        # Imported late: few files need the compiler.
         import mujoco
 
-        heard = mujoco.get_mju_user_warning()
+        previous = mujoco.get_mju_user_warning()
         # Its warnings would be printed, and kept in a file of the working folder.
         mujoco.set_mju_user_warning(lambda _: None)
         try:
@@ -124,7 +122,7 @@ class _Text:
             read.fault(f"{item}: MuJoCo's compiler refuses: {listing}")
             return None
         finally:
-            mujoco.set_mju_user_warning(heard)
+            mujoco.set_mju_user_warning(previous)
 
     def _need(self, name: str, item: str, geom: Element) -> None:
         """Read the file of a mesh, once."""
@@ -140,40 +138,28 @@ class _Text:
         file = attributes.get("file")
         if file is None:
             return
-        found = self._file(file)
+        folder = self.path.parent
+        path = folder / self.scene.compiler.mesh_path(file)
         try:
             # A pipe or a device would be read for ever.
-            if not found.is_file():
-                read.fault(f"{item}: no such file: {found}", mesh)
+            if not path.is_file():
+                read.fault(f"{item}: no such file: {path}", mesh)
                 return
-            if found.stat().st_size > MOST_BYTES:
-                read.fault(f"{item}: {found}: expected up to {MOST_BYTES} bytes", mesh)
+            if path.stat().st_size > MOST_BYTES:
+                read.fault(f"{item}: {path}: expected up to {MOST_BYTES} bytes", mesh)
                 return
-            content = found.read_bytes()
+            content = path.read_bytes()
         except (OSError, ValueError) as error:
-            read.fault(f"{item}: {found}: cannot be read ({error})", mesh)
+            read.fault(f"{item}: {path}: cannot be read ({error})", mesh)
             return
-        self.opened.append(
-            str(found.relative_to(self.path.parent) if found.is_relative_to(self.path.parent) else found)
-        )
+        self.opened.append(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
         # MuJoCo caches meshes by name, so a name stands for its content.
-        attributes["file"] = hashlib.sha256(content).hexdigest() + found.suffix
+        attributes["file"] = hashlib.sha256(content).hexdigest() + path.suffix
         self.assets[attributes["file"]] = content
 
-    def _file(self, file: str) -> Path:
-        """Return the path of a mesh by MuJoCo's rules."""
-        relative = PurePosixPath(file.replace("\\", "/"))
-        if self.settings.get("strippath") == "true":
-            relative = PurePosixPath(relative.name)
-        folder = self.settings.get("meshdir", self.settings.get("assetdir", ""))
-        return self.path.parent / folder.replace("\\", "/") / relative
-
     def _written(self, element: Element, childclass: str | None) -> str:
-        """Return an element and its children, without those that the compiler does not need.
-
-        The class is that of the elements around it, in the <worldbody>.
-        """
-        tag, given = element.tag, {k: v for k, v in element.attributes.items() if k not in ("material", "texture")}
+        """Return an element of the enclosing class and its children, without those that the compiler does not need."""
+        tag, own = element.tag, {k: v for k, v in element.attributes.items() if k not in ("material", "texture")}
         if tag == "worldbody":
             childclass = "main"
         if tag == "geom" and childclass and id(element) not in self.counted:
@@ -182,12 +168,12 @@ class _Text:
                 return ""
         if id(element) in self.counted:
             # What does not collide needs no convex hull.
-            given |= {"contype": "0", "conaffinity": "0"}
-        childclass = given.get("childclass", given.get("class", childclass) if tag == "frame" else childclass)
-        given |= self.needed.get(id(element), {})
+            own |= {"contype": "0", "conaffinity": "0"}
+        childclass = own.get("childclass", own.get("class", childclass) if tag == "frame" else childclass)
+        own |= self.needed.get(id(element), {})
         if id(element) in self.scene.called:
-            given["name"] = self.scene.called[id(element)]
-        return _tag(tag, given, "".join(self._written(e, childclass) for e in self._kept(element)))
+            own["name"] = self.scene.called[id(element)]
+        return _tag(tag, own, "".join(self._written(e, childclass) for e in self._kept(element)))
 
     def _kept(self, element: Element) -> Iterator[Element]:
         for child in element.children:

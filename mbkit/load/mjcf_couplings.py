@@ -1,17 +1,16 @@
-"""Tendons, actuators and equality constraints of an MJCF: what acts linearly in q and v, and the names of the rest.
+"""Tendons and actuators of an MJCF as linear springs, dampers and rotors (XML reference of MuJoCo 4.0).
 
-The length of a fixed tendon is l = Σ coef q. Its spring, damper and armature become a `JointCoupling`, or numbers of
-the joint where there is only one. A spatial tendon straight between two sites is a `PointSpring`. The length of an
-actuator is gear times a joint's coordinate or a tendon's length. Its armature and damping act always. Its force at zero
-control and activation is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of stiffness -b1 and rest length
--b0/b1, and a damper of -b2 (XML reference of MuJoCo 4.0).
+A fixed tendon of length l = Σ coef q becomes a `JointCoupling`, or numbers of its only joint. A spatial tendon straight
+between two sites becomes a `PointSpring`. The length of an actuator is gear times a joint's coordinate or a tendon's
+length; its force at zero control and activation is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of
+stiffness -b1 and rest length -b0/b1, and a damper -b2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -23,36 +22,26 @@ from mbkit.model import Joint, JointCoupling, Model, PointSpring
 from mbkit.model.validation import sample_mass_matrix
 
 _ACTUATORS: Final = (
-    "general",
-    "motor",
-    "position",
-    "velocity",
-    "intvelocity",
-    "damper",
-    "cylinder",
-    "muscle",
-    "adhesion",
-    "dcmotor",
-    "pid",
-    "plugin",
+    *("general", "motor", "position", "velocity", "intvelocity", "damper"),
+    *("cylinder", "muscle", "adhesion", "dcmotor", "pid", "plugin"),
 )
-#: Limits and losses, whose forces are not linear, and what switches each on.
+#: Nonlinear limits and losses, and the attribute that switches each on.
 _TENDON_LIMITS: Final = {
     "range": "limited",
     "frictionloss": "",
     "springyield": "",
     "actuatorfrcrange": "actuatorfrclimited",
 }
-#: What equality constraints bind.
+#: Parts that equality constraints bind.
 _ENDS: Final = ("joint", "body", "tendon", "site", "flex")
 
 
 @dataclass(frozen=True)
 class _Actuator:
-    """An actuator as its default classes and its element have it, in the words of MuJoCo's `mjsActuator`.
+    """An actuator's settings, with those of its default classes, as in MuJoCo's `mjsActuator`.
 
-    Gain, bias and their types are inherited from a <general> and from an element of the same tag only, those of <pid>
-    from a <pid> only. `tag` is that of the last element of a class, and `parent` what the class inherits.
+    Gain, bias and their types come from a <general> or an element of the same tag only, those of <pid> from a <pid>
+    only. `tag` is that of the last element of a class, and `parent` the class that it inherits.
     """
 
     tag: str = "general"
@@ -70,8 +59,8 @@ class _Actuator:
     ctrlrange: tuple[float, ...] = ()
 
     def with_element(self, element: Element, item: str, read: Reader) -> _Actuator:
-        """Return these settings, changed by what an element says."""
-        given = element.attributes
+        """Return these settings, changed by an element's attributes."""
+        own = element.attributes
 
         def number(name: str, default: float) -> float:
             return read.number(element, name, item, default)
@@ -92,17 +81,15 @@ class _Actuator:
             damping=read.numbers(element, "damping", item, count=3, least=1, default=self.damping),
             group=number("group", self.group),
             forcerange=read.numbers(element, "forcerange", item, count=2, default=self.forcerange),
-            forcelimited=given.get("forcelimited", self.forcelimited),
+            forcelimited=own.get("forcelimited", self.forcelimited),
             ctrlrange=read.numbers(element, "ctrlrange", item, count=2, default=self.ctrlrange),
         )
         gain, (b0, b1, b2) = out.gain, out.bias
         if element.tag == "general":
-            if "gainprm" in given:
-                gain = read.numbers(element, "gainprm", item, count=10, least=1)[0]
-            if "biasprm" in given:
-                written = read.numbers(element, "biasprm", item, count=10, least=1)[:3]
-                b0, b1, b2 = (*written, *out.bias[len(written) :])
-            gaintype, biastype = given.get("gaintype", out.gaintype), given.get("biastype", out.biastype)
+            gain = read.numbers(element, "gainprm", item, count=10, least=1, default=(gain,))[0]
+            bias = read.numbers(element, "biasprm", item, count=10, least=1, default=out.bias)[:3]
+            b0, b1, b2 = (*bias, *out.bias[len(bias) :])
+            gaintype, biastype = own.get("gaintype", out.gaintype), own.get("biastype", out.biastype)
             return replace(out, gain=gain, bias=(b0, b1, b2), gaintype=gaintype, biastype=biastype)
         if element.tag in ("position", "intvelocity", "pid"):
             gain = number("kp", gain)
@@ -124,40 +111,23 @@ class _Actuator:
 
 @dataclass
 class _Acting:
-    """What a tendon or an actuator does.
+    """The forces of a tendon or an actuator."""
 
-    Attributes
-    ----------
-    item : str
-        Its name, or its number and its line.
-    name : str
-        Of the coupling.
-    factors : dict
-        Joint -> dl/dq; empty where l is no sum of coordinates.
-    ends : tuple of (str, array)
-        Bodies and points whose distance is l; empty for other lengths.
-    dampratio : float
-        Damping, as a part of the critical one at the pose of the file.
-    control : str
-        Description of an actuator's control, which is left out.
-    left_out : list of str
-    """
-
-    item: str
-    name: str
-    factors: dict[str, float]
+    item: str  # its name, or its number and its line
+    name: str  # of the coupling
+    factors: dict[str, float]  # joint -> dl/dq; empty where l is no sum of coordinates
     stiffness: float = 0.0
     rest_length: float = 0.0
     damping: float = 0.0
     armature: float = 0.0
-    dampratio: float = 0.0
-    ends: tuple[tuple[str, Array], ...] = ()
-    control: str = ""
+    dampratio: float = 0.0  # of the critical damping at the pose of the file
+    ends: tuple[tuple[str, Array], ...] = ()  # bodies and points whose distance is l, if any
+    control: str = ""  # description of an actuator's control, which is left out
     left_out: list[str] = field(default_factory=list)
 
     @property
     def acts(self) -> bool:
-        """Whether anything of it is a spring, damper or rotor."""
+        """Whether a part is a spring, damper or rotor."""
         return bool(self.stiffness or self.damping or self.armature or self.dampratio)
 
     def linear(self) -> None:
@@ -189,16 +159,7 @@ class _Acting:
 
 
 class Transmissions:
-    """Reads the tendons, actuators and equality constraints of a file.
-
-    Parameters
-    ----------
-    mujoco : Element
-    scene : Scene
-        With the bodies and joints. Faults go to its reader.
-    disabled : set of str
-        Option flags that the file switches off.
-    """
+    """Reads the tendons, actuators and equality constraints of a file; its option flags switch `disabled` off."""
 
     def __init__(self, mujoco: Element, scene: Scene, disabled: set[str]) -> None:
         self._scene, self._read = scene, scene.read
@@ -218,7 +179,7 @@ class Transmissions:
         self._factors = {e.attributes.get("name", ""): t.factors for e, t in zip(tendons, self._tendons, strict=True)}
         self._actuators = [self._actuator(e, k) for k, e in enumerate(actuators)]
         equalities = (e for section in mujoco.all("equality") for e in section.children)
-        self._equalities = [self._who(e, k) + f" ({_connected(e)})" for k, e in enumerate(equalities)]
+        self._equalities = [f"{_label(e, k)} ({_connected(e)})" for k, e in enumerate(equalities)]
 
     def _collect(self, element: Element, name: str) -> None:
         """Read the actuator defaults of a class and of the classes in it."""
@@ -229,10 +190,6 @@ class Transmissions:
             inner = child.attributes.get("class", "")
             self._classes[inner] = replace(self._classes[name], parent=self._classes[name])
             self._collect(child, inner)
-
-    def _who(self, element: Element, number: int) -> str:
-        name = element.attributes.get("name", "")
-        return repr(name) if name else f"number {number + 1} ({element.tag}, {element.place})"
 
     def _name(self, element: Element, kind: str, number: int) -> str:
         name = element.attributes.get("name") or f"{kind}{number + 1}"
@@ -246,8 +203,8 @@ class Transmissions:
     def _tendon(self, element: Element, number: int) -> _Acting:
         read = self._read
         full = replace(self._scene.defaults.filled(replace(element, tag="tendon"), None), tag=element.tag)
-        item = f"tendon {self._who(element, number)}"
-        out = _Acting(self._who(element, number), self._name(element, "tendon", number), {})
+        item = f"tendon {_label(element, number)}"
+        out = _Acting(_label(element, number), self._name(element, "tendon", number), {})
         for joint in element.all("joint") if element.tag == "fixed" else []:
             name = joint.attributes.get("joint", "")
             if self._scalar(name, item, joint):
@@ -266,7 +223,7 @@ class Transmissions:
         out.rest_length = first
         if first == -1.0 and all(x == -1.0 for x in second):
             out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
-            # Where the file draws the two points is not followed.
+            # The distance in the pose of the file is not computed.
             out.rest_length = -1.0 if out.ends else out.rest_length
         elif out.stiffness and second and second[0] != first:
             out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {second[0]:g}")
@@ -274,18 +231,16 @@ class Transmissions:
         out.stiffness *= self._springs
         out.damping *= self._dampers
         out.linear()
-        given = full.attributes
-        out.left_out += [
-            f"{n} {given[n]}" for n, on in _TENDON_LIMITS.items() if n in given and given.get(on) != "false"
-        ]
+        own = full.attributes
+        out.left_out += [f"{n} {own[n]}" for n, on in _TENDON_LIMITS.items() if n in own and own.get(on) != "false"]
         return out
 
     def _ends(self, element: Element) -> tuple[tuple[str, Array], ...]:
         """Return the two points that a tendon goes straight between, if it does."""
         if [e.tag for e in element.children] != ["site", "site"]:
             return ()
-        found = [self._sites.get(e.attributes.get("site", "")) for e in element.children]
-        ends = tuple(x for x in found if x is not None)
+        sites = [self._sites.get(e.attributes.get("site", "")) for e in element.children]
+        ends = tuple(x for x in sites if x is not None)
         return ends if len({body for body, _ in ends}) == 2 else ()
 
     def _scalar(self, name: str, item: str, element: Element) -> bool:
@@ -305,87 +260,85 @@ class Transmissions:
     # Actuators
 
     def _actuator(self, element: Element, number: int) -> _Acting:
-        item = f"actuator {self._who(element, number)}"
+        item = f"actuator {_label(element, number)}"
         class_ = self._scene.defaults.known(element.attributes.get("class"), element) or "main"
-        made = self._classes.get(class_, _Actuator()).with_element(element, item, self._read)
-        out = _Acting(self._who(element, number), self._name(element, "actuator", number), {})
-        out.armature = made.armature
-        out.factors = {joint: made.gear * c for joint, c in self._driven(element, item).items() if made.gear * c}
-        damping, *higher = made.damping
+        settings = self._classes.get(class_, _Actuator()).with_element(element, item, self._read)
+        out = _Acting(_label(element, number), self._name(element, "actuator", number), {})
+        out.armature = settings.armature
+        lengths = {joint: settings.gear * c for joint, c in self._driven(element, item).items()}
+        out.factors = {joint: factor for joint, factor in lengths.items() if factor}
+        damping, *higher = settings.damping
         out.damping = damping * self._dampers
         if any(higher):
             out.left_out.append("damping that depends on the rate")
             out.damping = 0.0
-        gain = f"gain {made.gain:g}" if made.gaintype == "fixed" else f"{made.gaintype} gain"
-        limits = f", range {made.ctrlrange[0]:g} {made.ctrlrange[1]:g}" if made.ctrlrange else ""
+        gain = f"gain {settings.gain:g}" if settings.gaintype == "fixed" else f"{settings.gaintype} gain"
+        limits = f", range {settings.ctrlrange[0]:g} {settings.ctrlrange[1]:g}" if settings.ctrlrange else ""
         at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
         out.control = f"{out.item} ({element.tag}, {gain}{limits}) on {at}"
-        if self._actuation and made.group not in self._groups:
-            self._bias(made, out)
+        if self._actuation and settings.group not in self._groups:
+            self._bias(settings, out)
         out.linear()
         return out
 
     def _driven(self, element: Element, item: str) -> dict[str, float]:
-        """Return the factors of the length before the gear; none where it is no sum of coordinates."""
-        given = element.attributes
-        name = given.get("joint", given.get("jointinparent", ""))
+        """Return the factors of the length before the gear; empty where it is no sum of coordinates."""
+        own = element.attributes
+        name, tendon = own.get("joint", own.get("jointinparent", "")), own.get("tendon")
         if name:
             joint = self._joints.get(name)
             if joint is None:
                 self._read.fault(f"{item}: joint {name!r} is not in the file", element)
             return {name: 1.0} if joint is not None and joint.kind in ("hinge", "slide") else {}
-        if "tendon" in given:
-            if given["tendon"] not in self._factors:
-                self._read.fault(f"{item}: tendon {given['tendon']!r} is not in the file", element)
-                return {}
-            return self._factors[given["tendon"]]
-        return {}
+        if tendon is not None and tendon not in self._factors:
+            self._read.fault(f"{item}: tendon {tendon!r} is not in the file", element)
+        return self._factors.get(tendon, {}) if tendon is not None else {}
 
-    def _bias(self, made: _Actuator, out: _Acting) -> None:
+    def _bias(self, settings: _Actuator, out: _Acting) -> None:
         """Add the force at zero control and activation."""
-        if made.biastype == "none":
+        if settings.biastype == "none":
             return
-        if made.biastype != "affine":
-            out.left_out.append(f"the force of a {made.biastype}")
+        if settings.biastype != "affine":
+            out.left_out.append(f"the force of a {settings.biastype}")
             return
-        b0, b1, b2 = made.bias
+        b0, b1, b2 = settings.bias
         rest = -b0 / b1 if b1 else 0.0
         if abs(rest) <= LARGEST:
             out.stiffness, out.rest_length = -b1, rest
         if b0 and (b1 >= 0 or abs(rest) > LARGEST):
             out.left_out.append(f"the constant force {b0:g}")
-        if b2 > 0 and made.gain == -b1 and made.gaintype in ("fixed", "pid"):
+        if b2 > 0 and settings.gain == -b1 and settings.gaintype in ("fixed", "pid"):
             out.dampratio = b2
         elif b2 <= 0:
             out.damping -= b2
         else:
             out.left_out.append(f"the force {b2:g} times the rate")
-        if made.forcerange and made.forcelimited != "false" and any((b0, b1, b2)):
-            out.left_out.append(f"force range {' '.join(f'{x:g}' for x in made.forcerange)}")
+        if settings.forcerange and settings.forcelimited != "false" and any((b0, b1, b2)):
+            out.left_out.append(f"force range {' '.join(f'{x:g}' for x in settings.forcerange)}")
 
-    # What becomes of them
+    # Their effect on the model
 
     def applied(self, model: Model) -> Model:
-        """Return the model with what acts, and with notes that name it and what was left out."""
+        """Return the model with these springs, dampers and rotors, and with notes on them and on parts left out."""
         acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
         springs = tuple(x.point_spring() for x in acting if x.ends)
         out = coupled(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
         ratios = []
         for x in acting:
             if x.dampratio:
-                # Of the critical damping at the pose that is drawn, with the inertia that the actuator moves there.
+                # Relative to the critical damping of the inertia that the actuator moves in the pose of the file.
                 inertia = self._reflected(out, x.coupling())
                 damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * inertia))
                 ratios.append(replace(x.coupling(), stiffness=0.0, armature=0.0, damping=damping))
         out = coupled(out, ratios)
-        torn = ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c))
-        own = [*self._notes()]
-        if torn:
-            own.append(f"the armature of {torn} acts between branches; MuJoCo 4.0 leaves it out of M there")
-        return replace(out, notes=(*model.notes, *own))
+        branched = ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c))
+        notes = [*model.notes, *self._notes()]
+        if branched:
+            notes.append(f"the armature of {branched} acts between branches; MuJoCo 4.0 leaves it out of M there")
+        return replace(out, notes=tuple(notes))
 
     def _reflected(self, model: Model, coupling: JointCoupling) -> float:
-        """Return the inertia that a coupling's length moves in the pose that is drawn; 0 where M is singular for it."""
+        """Return the inertia that a coupling's length moves in the pose of the file; 0 where M is singular for it."""
         q = model.neutral()
         for name, joint in self._joints.items():
             if joint.kind in ("hinge", "slide"):
@@ -401,16 +354,12 @@ class Transmissions:
         return 1 / mobility if mobility > 0 else 0.0
 
     def _notes(self) -> Iterator[str]:
-        for what, some in (("tendons", self._tendons), ("actuators", self._actuators)):
-            acting = "; ".join(x.description() for x in some if x.acts)
-            at = ", at zero control" if what == "actuators" else ""
-            if acting:
+        for what, at, some in (("tendons", "", self._tendons), ("actuators", ", at zero control", self._actuators)):
+            if acting := "; ".join(x.description() for x in some if x.acts):
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
-            lost = "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in some if x.left_out)
-            if lost:
+            if lost := "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in some if x.left_out):
                 yield f"left out of {what}: {lost}"
-            idle = ", ".join(x.item for x in some if not (x.acts or x.left_out or x.control))
-            if idle:
+            if idle := ", ".join(x.item for x in some if not (x.acts or x.left_out or x.control)):
                 yield f"{what} that exert no force of their own: {idle}"
         if self._actuators:
             controls = "; ".join(x.control for x in self._actuators)
@@ -422,8 +371,7 @@ class Transmissions:
 def coupled(model: Model, couplings: Iterable[JointCoupling]) -> Model:
     """Return the model with more couplings; one of a single joint becomes numbers of that joint.
 
-    A coupling that is there already gets the damping of another of its name. Two springs on one joint become one; the
-    constant by which its energy differs from theirs is left out.
+    Dampings of couplings of one name add. Two springs on one joint become one; a constant energy is left out.
     """
     joints: dict[str, Joint] = {j.name: j for j in model.joints}
     kept = {c.name: c for c in model.couplings}
@@ -466,6 +414,11 @@ def _disabled_groups(mujoco: Element, read: Reader) -> set[float]:
 
 
 def _connected(element: Element) -> str:
-    """Return what an equality constraint binds."""
-    ends: Any = (f"{k} {v!r}" for k, v in element.attributes.items() if k.rstrip("12") in _ENDS)
+    """Return the parts that an equality constraint binds."""
+    ends = (f"{k} {v!r}" for k, v in element.attributes.items() if k.rstrip("12") in _ENDS)
     return ", ".join([element.tag, *ends])
+
+
+def _label(element: Element, number: int) -> str:
+    name = element.attributes.get("name", "")
+    return repr(name) if name else f"number {number + 1} ({element.tag}, {element.place})"

@@ -1,9 +1,8 @@
 """Mass and inertia of an MJCF's bodies by MuJoCo's rules: written, or inferred from geoms.
 
-A geom counts where its group is in ``inertiagrouprange`` and its mass is above 1e-14 kg. Where one
-counts, and ``inertiafromgeom`` is "true", or "auto" without an <inertial>, the geoms decide. Else the
-<inertial> does. Then ``boundmass`` and ``boundinertia`` raise what is below them, and
-``balanceinertia`` makes an impossible inertia that of a sphere.
+Geoms with a group in ``inertiagrouprange`` and more than 1e-14 kg decide where ``inertiafromgeom`` is "true", or
+"auto" without an <inertial>; else the <inertial> does. Then ``boundmass`` and ``boundinertia`` raise smaller
+numbers, and ``balanceinertia`` replaces an impossible inertia by a sphere's.
 """
 
 from __future__ import annotations
@@ -30,18 +29,10 @@ def body_lump(
     read: Reader,
     item: str,
 ) -> tuple[Lump | None, list[str]]:
-    """Return a body's mass, centre of mass and inertia in its own axes, and the settings that changed them.
+    """Return a body's inertia in its own axes, and the settings that changed it; None where it is a mesh's or shell's.
 
-    None stands for an inertia that only MuJoCo's compiler can infer: of a mesh, or of a shell.
-
-    Parameters
-    ----------
-    inertials, geoms : list of (Element, Pose)
-        With the pose of the <frame> they stand in; defaults filled in. Geoms are those that `counts` lets through.
-    place : (3,) array
-        Of the body in its parent or <frame>, as it is written.
-    compiler, read, item
-        Settings, where faults go, and the element that messages name.
+    Elements have their defaults and the pose of their <frame>; geoms are those for which `counts` is true. `place`
+    is the body's written position.
     """
     if len(inertials) > 1:
         read.fault(f"{item}: {len(inertials)} <inertial> elements; keep one", inertials[1][0])
@@ -58,16 +49,13 @@ def body_lump(
         lump, changed = _bounded(NOTHING, compiler)
         # MuJoCo takes that place for the centre of mass in the body.
         return replace(lump, com=place) if changed else lump, changed
-    principal, placed = _written(*inertials[0], compiler, read, item)
+    principal, X = _written(*inertials[0], compiler, read, item)
     lump, changed = _bounded(principal, compiler, slack=1e-14 if "fullinertia" in inertials[0][0].attributes else 0.0)
-    return lump.moved(placed.R, placed.p), changed
+    return lump.moved(X.R, X.p), changed
 
 
 def _bounded(lump: Lump, compiler: Compiler, slack: float = 0.0) -> tuple[Lump, list[str]]:
-    """Return a lump after the compiler's bounds, and the settings that changed it.
-
-    `slack` is the relative rounding of the principal moments.
-    """
+    """Return a lump after the compiler's bounds, and the settings that changed it; moments have a relative `slack`."""
     mass, inertia, changed = lump.mass, lump.inertia, list[str]()
     if mass < compiler.boundmass > 0:
         mass = compiler.boundmass
@@ -104,36 +92,35 @@ def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, item: 
 def counts(geom: Element, compiler: Compiler, read: Reader, item: str) -> bool:
     """Return whether a geom, with its defaults filled in, may give its body mass."""
     first, last = compiler.groups
-    given = geom.attributes
     # A number that cannot be read is a fault where it is used.
-    amount = Reader().number(geom, "mass" if "mass" in given else "density", item, 1000.0)
+    amount = Reader().number(geom, "mass" if "mass" in geom.attributes else "density", item, 1000.0)
     inside = first <= read.number(geom, "group", item, 0.0) <= last
-    return inside and amount != 0 and given.get("type", "sphere") not in ("plane", "hfield")
+    return inside and amount != 0 and geom.attributes.get("type", "sphere") not in ("plane", "hfield")
 
 
 def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> Lump | None:
-    """Return what a geom adds to its body; None where only MuJoCo's compiler can tell."""
-    given = element.attributes
-    amount = read.number(element, "mass" if "mass" in given else "density", item, 1000.0)
+    """Return what a geom adds to its body; None for a mesh or a shell."""
+    own = element.attributes
+    amount = read.number(element, "mass" if "mass" in own else "density", item, 1000.0)
     if amount < 0:
         read.fault(f"{item}: a geom's mass or density is negative; expected 0 or more", element)
         return NOTHING
-    shape = given.get("type", "sphere")
-    if shape in ("mesh", "sdf") or "mesh" in given or given.get("shellinertia", "false") != "false":
+    shape = own.get("type", "sphere")
+    if shape in ("mesh", "sdf") or "mesh" in own or own.get("shellinertia", "false") != "false":
         return None
     if shape not in SIZES:
         read.fault(f"{item}: geom type {shape[:40]!r}; expected one of {', '.join((*SIZES, 'mesh'))}", element)
         return NOTHING
     before = len(read.faults)
-    size, placed = _sized(element, shape, compiler, read, item)
+    size, own_pose = _sized(element, shape, compiler, read, item)
     if len(read.faults) > before:
         return NOTHING
-    lump = solid(shape, size)
-    return lump.scaled(amount / lump.mass if "mass" in given else amount).moved((X @ placed).R, (X @ placed).p)
+    lump, placed = solid(shape, size), X @ own_pose
+    return lump.scaled(amount / lump.mass if "mass" in own else amount).moved(placed.R, placed.p)
 
 
 def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, item: str) -> tuple[tuple[float, ...], Pose]:
-    """Return the sizes of a geom and its pose; two end points may give length and pose."""
+    """Return the sizes of a geom and its pose; two end points may stand for length and pose."""
     needed = SIZES[shape]
     if "fromto" not in element.attributes:
         size = read.numbers(element, "size", item, count=3, least=needed)[:needed]

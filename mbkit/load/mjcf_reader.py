@@ -21,79 +21,50 @@ _NAMED: Final = {"body": "body", "joint": "joint", "freejoint": "joint", "site":
 
 @dataclass
 class MjcfJoint:
-    """A joint as the file has it.
-
-    Attributes
-    ----------
-    element : Element
-        With the defaults of its class filled in.
-    kind : str
-        hinge, slide, ball or free.
-    anchor, axis : (3,) arrays
-        In the body's axes.
-    ref : float
-        Where it stands in the pose that is drawn, rad or m.
-    """
+    """A joint as the file has it; anchor and axis are in the body's axes."""
 
     name: str
-    element: Element
-    kind: str
+    element: Element  # with the defaults of its class
+    kind: str  # hinge, slide, ball or free
     anchor: Array
     axis: Array
-    ref: float
+    ref: float  # its coordinate in the pose of the file, rad or m
 
 
 @dataclass
 class MjcfBody:
-    """A body as the file has it.
-
-    Attributes
-    ----------
-    pose : Pose
-        In the parent's axes, with the <frame> elements around it.
-    lump : Lump
-        In its own axes; nothing while ``Scene.inferred`` has the body.
-    sites : list of (str, Pose)
-    """
+    """A body as the file has it."""
 
     name: str
     parent: str
-    pose: Pose
+    pose: Pose  # in the parent's axes, with the <frame> elements around it
     joints: list[MjcfJoint]
-    lump: Lump
+    lump: Lump  # in its own axes; nothing while `Scene.inferred` has the body
     sites: list[tuple[str, Pose]]
 
     @property
     def anchor(self) -> Array:
-        """Where the frame of the `Model`'s body stands in the file's body."""
+        """Origin of the `Model`'s body in the file's body."""
         return self.joints[-1].anchor if self.joints else np.zeros(3)
 
 
 @dataclass
 class Scene:
-    """The state of the walk over the tree.
-
-    Attributes
-    ----------
-    called : dict
-        The names of bodies and joints, given or made up, by the id of the element.
-    inferred : dict
-        Bodies whose inertia MuJoCo's compiler infers, and the geoms with their meshes that count for it.
-    bounded : dict
-        The compiler's settings that changed a body's mass or inertia, and the bodies.
-    left_out : collections.Counter
-        What the file says about the motion and a `Model` does not hold.
-    """
+    """The state of the walk over the tree."""
 
     compiler: Compiler
     defaults: Defaults
     read: Reader
     bodies: list[MjcfBody] = field(default_factory=list)
     names: dict[str, set[str]] = field(default_factory=lambda: {"body": {"world"}, "joint": set(), "site": set()})
+    #: Names of bodies and joints, written or generated, by the element's id.
     called: dict[int, str] = field(default_factory=dict)
     unnamed: Counter[str] = field(default_factory=Counter)
+    #: Bodies whose inertia MuJoCo's compiler infers, and the geoms with their meshes that count for it.
     inferred: dict[str, list[tuple[Element, str]]] = field(default_factory=dict)
+    #: Settings of the compiler that changed a mass or inertia, and the bodies.
     bounded: dict[str, list[str]] = field(default_factory=dict)
+    #: Parts of the motion that a `Model` does not hold.
     left_out: Counter[str] = field(default_factory=Counter)
 
     def collect_names(self, world: Element) -> None:
@@ -116,7 +87,7 @@ class Scene:
         return name
 
     def unused(self, kind: str, name: str) -> str:
-        """Return this name, or a longer one that is free, and take it."""
+        """Reserve and return this name, or a longer one that is free."""
         while name in self.names[kind]:
             name += "_"
         self.names[kind].add(name)

@@ -12,8 +12,7 @@ from mbkit.errors import LoadError, UnknownNameError
 
 _PACKAGE: Final = "example-robot-data"
 
-# Names of example-robot-data's own loaders, and others in common use, for files whose
-# stem is another one. Each is a folder and a stem.
+# Common names of files with another stem: folder and stem.
 _SHORT: Final = {
     "alexander": "alexander_description/alexander_v1.lowerBodyOnly",
     "anymal": "anymal_b_simple_description/anymal",
@@ -43,7 +42,7 @@ _SHORT: Final = {
 
 
 class Entry(NamedTuple):
-    """A URDF of example-robot-data: folder and file, shorter names, and where it is."""
+    """A URDF of example-robot-data: its folder and file, shorter names, and path."""
 
     name: str
     aliases: tuple[str, ...]
@@ -61,7 +60,7 @@ def find(name: str) -> Entry | None:
 
 
 def canonical(name: str) -> str | None:
-    """Return a robot's name as it is listed, whatever its case here; None for no robot's name."""
+    """Return a robot's name as it is listed, whatever its case here; None for any other text."""
     robot = find(name)
     if robot is None:
         return None
@@ -107,16 +106,16 @@ def _table() -> tuple[tuple[Entry, ...], dict[str, Entry]]:
     files = _files()
     stems = Counter(_key(stem) for _, stem, _ in files)
     short = {_key(alias) for alias in _SHORT}
-    made = []
+    robots = []
     for folder, stem, path in files:
         name = f"{folder}/{stem}"
         aliases = [a for a, full in _SHORT.items() if full == name]
         if stems[_key(stem)] == 1 and _key(stem) not in short:
             aliases.append(stem)
-        made.append(Entry(name, tuple(aliases), path))
+        robots.append(Entry(name, tuple(aliases), path))
     by_key: dict[str, Entry] = {}
-    for robot in made:
+    for robot in robots:
         folder, stem = robot.name.split("/")
         for name in (robot.name, f"{_short_folder(folder)}/{stem}", *robot.aliases):
             by_key.setdefault(_key(name), robot)
-    return tuple(made), by_key
+    return tuple(robots), by_key

@@ -1,9 +1,7 @@
-"""A URDF or MJCF as it was written, less what would open another file.
+"""A URDF or MJCF without its references to other files, as the engines' parsers read it.
 
-Engines' parsers read this text. Its lines are those of the file: a removed element leaves empty lines.
-Meshes, textures and packages are gone, and with them the shapes that were made of them. Boxes,
-cylinders and spheres stay, because MuJoCo may take a body's inertia from them, and so does every other
-element. Meshes stay where a body of an MJCF takes its inertia from them: those files are read and handed over.
+Elements keep their lines. Meshes, textures and packages go, with the shapes that need them. Only the meshes
+that give a body of an MJCF its inertia stay: their files are read and passed on.
 """
 
 from __future__ import annotations
@@ -11,18 +9,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from typing import Final
 from xml.sax.saxutils import escape, quoteattr
 
 from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
-from mbkit.load.mjcf_attributes import Compiler, Defaults
+from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name
+from mbkit.load.mjcf_mass import counts
 from mbkit.load.urdf_links import floated, with_base
 from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, expanded
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
-#: What names other files, or is nothing without what does.
+#: Elements that name other files, or mean nothing without one that does.
 _GONE: Final = {
     "urdf": frozenset({"texture", "gazebo", "sensor"}),
     "mjcf": frozenset(
@@ -36,53 +35,23 @@ _FROM_FILES: Final = ("mesh", "sdf", "hfield")
 
 @dataclass(frozen=True)
 class Stripped:
-    """A file without references to others.
-
-    Attributes
-    ----------
-    path : pathlib.Path
-    format : str
-        ``"urdf"`` or ``"mjcf"``.
-    root : Element
-        As it was read, with the files that an MJCF includes.
-    text : str
-        What the parsers are given. An element stands in the line in which the file has it; one of an
-        included file in the line of the <include>.
-    gone : tuple of (str, int)
-        Elements that were taken out, and how many.
-    renamed : str
-        What the base link is called, where it may not be ``world``; else empty.
-    shapeless : tuple of str
-        Bodies whose inertia might have come from a mesh that was taken out.
-    meshes : dict
-        The meshes that the text names, because a body takes its inertia from them: name -> content.
-    unread : tuple of str
-        Why others could not be read, a sentence each.
-    """
+    """A file without references to others."""
 
     path: Path
-    format: str
-    root: Element
-    text: str
-    gone: tuple[tuple[str, int], ...]
-    renamed: str
-    shapeless: tuple[str, ...]
-    meshes: dict[str, bytes]
-    unread: tuple[str, ...]
+    format: str  # "urdf" or "mjcf"
+    root: Element  # as read, with the files that an MJCF includes
+    text: str  # elements keep their lines; those of an included file have the line of the <include>
+    gone: tuple[tuple[str, int], ...]  # removed elements, and how many
+    renamed: str  # the base link's new name, where it may not be "world"; else empty
+    shapeless: tuple[str, ...]  # bodies whose inertia might have come from a removed mesh
+    meshes: dict[str, bytes]  # name in the text -> content
+    unread: tuple[str, ...]  # why other meshes could not be read, a sentence each
 
 
 def strip(path: Path, *, floating_base: bool = False) -> Stripped:
-    """Read a file and take out what would open another.
+    """Read a file and remove what would open another; for a floating base add an MJCF's joint.
 
-    An MJCF whose base is to float is given the joint for it, which all parsers read. A URDF cannot say that:
-    its base link is only given a name that no parser takes for the ground's.
-
-    Raises
-    ------
-    ModelError
-        No single body of an MJCF could float.
-    LoadError
-        It cannot be read, is neither URDF nor MJCF, or names a file that is not read.
+    URDF has no such joint; its base link only gets a name that no parser takes for the ground's.
     """
     root = xml_reader.read(path)
     format_ = _FORMATS.get(root.tag)
@@ -127,91 +96,80 @@ class _Meshes:
         read = Reader()
         self._compiler, self._defaults = Compiler.of(mujoco, read), Defaults(mujoco, read)
         self._folder = path.parent
-        settings = {k: v for e in mujoco.all("compiler") for k, v in e.attributes.items()}
-        self._meshdir = settings.get("meshdir") or settings.get("assetdir", "")
-        self._bare = settings.get("strippath") == "true"
-        assets = [e for section in mujoco.all("asset") for e in section.all("mesh")]
-        self._assets = {e.attributes.get("name") or _stem(e.attributes.get("file", "")): e for e in assets}
+        self._assets = mesh_assets(mujoco)
         self.files: dict[str, bytes] = {}
         self.unread: list[str] = []
         #: Asset's name -> file's name in `files`, empty where its vertices stand in the MJCF; None: not readable.
-        self._given: dict[str, str | None] = {}
-        #: Geoms that need a file and are left out, by identity; and whether their body has lost mass by that.
+        self._passed: dict[str, str | None] = {}
+        #: Geoms that need a file and are removed, by identity; and whether their body loses mass by that.
         self._lost: dict[int, bool] = {}
         for world in mujoco.all("worldbody"):
             self._body(world, None)
 
     def lost(self, geom: Element) -> bool:
-        """Return whether a geom is taken out."""
+        """Return whether a geom is removed."""
         return id(geom) in self._lost
 
     def heavy(self, geom: Element) -> bool:
-        """Return whether a geom that is taken out would have given its body mass."""
+        """Return whether a removed geom would have given its body mass."""
         return self._lost.get(id(geom), False)
 
     def written(self, asset: Element) -> dict[str, str] | None:
-        """Return the attributes of a mesh that is handed over, else None."""
-        own = asset.attributes
-        name = own.get("name") or _stem(own.get("file", ""))
-        given = self._given.get(name)
-        if given is None or self._assets.get(name) is not asset:
+        """Return the attributes of a mesh that is passed on, else None."""
+        name = mesh_name(asset)
+        file = self._passed.get(name)
+        if file is None or self._assets.get(name) is not asset:
             return None
-        return {**own, "name": name, "file": given} if given else own
+        return {**asset.attributes, "name": name, "file": file} if file else asset.attributes
 
     def has(self, name: str) -> bool:
-        """Return whether a mesh of this name is handed over."""
-        return self._given.get(name) is not None
+        """Return whether a mesh of this name is passed on."""
+        return self._passed.get(name) is not None
 
     def _body(self, owner: Element, childclass: str | None) -> None:
         childclass = owner.attributes.get("childclass", childclass)
-        geoms = list(_parts(owner, childclass, "geom"))
-        written = any(True for _ in _parts(owner, childclass, "inertial"))
-        compiler = self._compiler
-        inferred = compiler.inertiafromgeom is not False and (bool(compiler.inertiafromgeom) or not written)
-        for geom, within in geoms:
-            full = self._defaults.filled(geom, within).attributes
-            if "mesh" in full or full.get("type") in _FROM_FILES:
-                needed = owner.tag == "body" and inferred and self._heavy(full) and full.get("type") != "hfield"
-                if not (needed and self._read(full.get("mesh", ""))):
+        parts = list(_parts(owner, childclass))
+        infer = self._compiler.inertiafromgeom
+        inferred = infer or (infer is None and not any(e.tag == "inertial" for e, _ in parts))
+        for geom, within in parts:
+            full = self._defaults.filled(geom, within)
+            type_ = full.attributes.get("type")
+            if geom.tag == "geom" and ("mesh" in full.attributes or type_ in _FROM_FILES):
+                # Faults are the parsers' to report.
+                needed = bool(owner.tag == "body" and inferred and counts(full, self._compiler, Reader(), ""))
+                if not (needed and self._read(full.attributes.get("mesh", ""))):
                     self._lost[id(geom)] = needed
-        for body, within in list(_parts(owner, childclass, "body")):
-            self._body(body, within)
-
-    def _heavy(self, full: dict[str, str]) -> bool:
-        try:
-            first, last = self._compiler.groups
-            mass, density = float(full.get("mass", "nan")), float(full.get("density", "1000"))
-            return first <= float(full.get("group", "0")) <= last and mass != 0 and (density != 0 or mass == mass)
-        except ValueError:
-            # The parsers report the fault.
-            return True
+        for body, within in parts:
+            if body.tag == "body":
+                self._body(body, within)
 
     def _read(self, name: str) -> bool:
         """Read a mesh for the parsers; return whether they can have it."""
         asset = self._assets.get(name)
-        if name not in self._given:
-            # A mesh that is not declared is left to the parsers to name.
-            self._given[name] = self._content(asset) if asset and "file" in asset.attributes else ""
-        return self._given[name] is not None
+        if name not in self._passed:
+            # The parsers report a mesh that is not declared.
+            self._passed[name] = self._content(asset) if asset and "file" in asset.attributes else ""
+        return self._passed[name] is not None
 
     def _content(self, asset: Element) -> str | None:
-        named = asset.attributes["file"].replace("\\", "/")
-        own = PurePosixPath(named).name if self._bare else named
-        relative = PurePosixPath(self._meshdir.replace("\\", "/")) / own
-        if relative.is_absolute() or PureWindowsPath(str(relative)).drive:
-            self.unread.append(f"mesh {named[:200]!r} ({asset.place}): an absolute path is not followed")
-            return None
+        """Read a mesh into `files` and return its name there, or None and a sentence in `unread`."""
+        relative = self._compiler.mesh_path(asset.attributes["file"])
+        path = self._folder / relative
+        content, why = b"", ""
         try:
-            path = self._folder / relative
-            if not path.is_file():
-                self.unread.append(f"mesh {named[:200]!r} ({asset.place}): no such file in {path.parent}")
-                return None
-            content = path.read_bytes() if path.stat().st_size <= MOST_BYTES else None
+            if relative.is_absolute() or PureWindowsPath(str(relative)).drive:
+                why = "an absolute path is not followed"
+            elif not path.is_file():
+                why = f"no such file in {path.parent}"
+            elif sum(map(len, self.files.values())) + path.stat().st_size > MOST_BYTES:
+                why = f"up to {MOST_BYTES} bytes of meshes are read"
+            else:
+                content = path.read_bytes()
         except (OSError, ValueError) as error:
-            self.unread.append(f"mesh {named[:200]!r} ({asset.place}): cannot be read ({error})")
-            return None
-        if content is None or sum(map(len, self.files.values())) + len(content) > MOST_BYTES:
-            self.unread.append(f"mesh {named[:200]!r} ({asset.place}): up to {MOST_BYTES} bytes of meshes are read")
+            why = f"cannot be read ({error})"
+        if why:
+            file = asset.attributes["file"].replace("\\", "/")
+            self.unread.append(f"mesh {file[:200]!r} ({asset.place}): {why}")
             return None
         name = relative.name
         while name in self.files:
@@ -220,17 +178,15 @@ class _Meshes:
         return name
 
 
-def _parts(owner: Element, childclass: str | None, tag: str) -> Iterator[tuple[Element, str | None]]:
-    """Yield the children of a tag with their class, and those in <frame> and <replicate> elements."""
+def _parts(owner: Element, childclass: str | None) -> Iterator[tuple[Element, str | None]]:
+    """Yield the children with their class, and those in <frame> and <replicate> elements."""
     for child in owner.children:
         if child.tag in ("frame", "replicate"):
-            yield from _parts(child, child.attributes.get("childclass", childclass), tag)
-        elif child.tag == tag:
+            # MuJoCo takes a frame's class for its childclass.
+            own = child.attributes
+            yield from _parts(child, own.get("childclass", own.get("class", childclass)))
+        else:
             yield child, childclass
-
-
-def _stem(file: str) -> str:
-    return PurePosixPath(file.replace("\\", "/")).stem
 
 
 class _Writer:
@@ -297,7 +253,7 @@ class _Writer:
                 return element.tag != "mesh" or self._meshes.written(element) is None
             return element.tag == "geom" and self._meshes.lost(element)
         if element.tag == "transmission":
-            # Without a type it says nothing, and Drake 1.51 ends the process over it.
+            # Drake 1.51 ends the process over one without a type.
             type_ = element.first("type")
             return type_ is None or not type_.text.strip()
         if element.tag in ("visual", "collision"):

@@ -11,8 +11,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.spatial import skew
 
-# How many sizes each shape takes; half lengths and radii. With two end points the
-# length is theirs.
+# Number of sizes of each shape: half lengths and radii.
 SIZES: Final = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 
 
@@ -25,11 +24,11 @@ class Lump:
     inertia: Array
 
     def moved(self, R: Array, p: Array) -> Lump:
-        """Return the same matter seen from a frame in which this one stands at R, p."""
+        """Return the same lump in another frame, in which this one has the pose R, p."""
         return Lump(self.mass, p + R @ self.com, R @ self.inertia @ R.T)
 
     def scaled(self, factor: float) -> Lump:
-        """Return the same shape of another density."""
+        """Return the same shape with `factor` times the density."""
         return Lump(factor * self.mass, self.com, factor * self.inertia)
 
 
@@ -37,10 +36,7 @@ NOTHING: Final = Lump(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
 def solid(shape: str, size: tuple[float, ...]) -> Lump:
-    """Return a shape of density 1 kg/m³ about its centre, in its own axes.
-
-    Half lengths and radii as MuJoCo takes them; the long axis is z.
-    """
+    """Return a shape of density 1 kg/m³ about its centre; half lengths and radii as in MuJoCo, the long axis is z."""
     if shape == "box":
         a, b, c = size
         mass = 8 * a * b * c
@@ -71,12 +67,10 @@ def _capsule(r: float, h: float) -> Lump:
 
 
 def together(lumps: list[Lump]) -> Lump:
-    """Return several lumps, given in the same axes, as one."""
-    mass = sum(x.mass for x in lumps)
+    """Return several lumps of positive mass, in the same axes, as one."""
     if len(lumps) == 1:
         return lumps[0]
-    if not mass:
-        return NOTHING
+    mass = sum(x.mass for x in lumps)
     com = sum((x.mass * x.com for x in lumps), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for x in lumps:

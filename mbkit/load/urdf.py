@@ -1,8 +1,7 @@
 """URDF to `Model`, by Pinocchio's parser.
 
-Pinocchio merges links that are fixed to each other, so a model has one body for every
-moving joint, named after the joint's child link; the links merged into it become
-frames. Joints stand in Pinocchio's order: depth first, siblings by name.
+Pinocchio merges links that are fixed to each other: a body has the name of its moving joint's child link, and the
+merged links become frames. Joints are in Pinocchio's order: depth first, siblings by name.
 """
 
 from __future__ import annotations
@@ -14,36 +13,20 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
-from mbkit.errors import LoadError, ModelError
+from mbkit.errors import LoadError, ModelError, UnsupportedError
 from mbkit.load.urdf_check import UrdfFile, UrdfJoint, unbounded
-from mbkit.model import Body, Mimic, Model, ModelBuilder
+from mbkit.model import Body, Model, ModelBuilder, kind_of
 from mbkit.model.validation import body_fault
 
-# Zeros and ones that rounding has blurred, set right once, when a file is loaded.
-#
-# A rotation by exactly half a turn, written 3.141592653589793, becomes a matrix with
-# 6e-17 where there should be 0. Such an entry stops a term from vanishing while the
-# expressions are derived. Only entries within a few units in the last place of 0, 1 or
-# -1 are touched: 1.5708 for a quarter turn gives -3.67e-6, and that stays as written.
-
-# A rotation matrix made by way of a quaternion is off by up to about 5 eps.
+# A rotation matrix from a quaternion is off by up to about 5 eps.
 _REACH: Final = 8 * float(np.finfo(float).eps)
 
 
 class Snapper:
-    """Snaps entries of rotations and axes, and counts what it did.
+    """Rounds entries of rotations and axes that are within `reach` of 0, 1 or -1, and counts them.
 
-    Parameters
-    ----------
-    reach : float
-        How near to 0, 1 or -1 an entry is set to it; by default what rounding does.
-
-    Attributes
-    ----------
-    count : int
-        Entries changed so far.
-    largest : float
-        The largest change.
+    Half a turn, written 3.141592653589793, gives 6e-17 in place of 0, and terms would not vanish when expressions are
+    derived. Entries farther off, such as -3.67e-6 of the angle 1.5708, stay as written.
     """
 
     def __init__(self, reach: float = _REACH) -> None:
@@ -52,10 +35,10 @@ class Snapper:
         self.largest = 0.0
 
     def __call__(self, entries: Array) -> Array:
-        """Return the entries of a rotation matrix or a unit vector, snapped."""
+        """Return the entries of a rotation matrix or a unit vector, rounded."""
         out = np.where(np.abs(entries) <= self._reach, 0.0, entries)
-        # A one is set right only where it stands alone: beside an angle of 4e-8,
-        # whose cosine is 1 - 8e-16, it would spoil the unit length.
+        # A one is set only where it is alone: beside an angle of 4e-8, whose cosine is
+        # 1 - 8e-16, it would spoil the unit length.
         alone = np.ones(out.shape, dtype=bool)
         for axis in range(out.ndim):
             alone &= np.count_nonzero(out, axis=axis, keepdims=True) == 1
@@ -68,7 +51,7 @@ class Snapper:
 
     @property
     def note(self) -> str | None:
-        """What was done, in one sentence, or None."""
+        """A sentence on the changes, or None."""
         if not self.count:
             return None
         return (
@@ -78,13 +61,33 @@ class Snapper:
 
 
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
-_ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous"}
+_ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous", "H": "helical"}
 _UNALIGNED: Final = {
     "RevoluteUnaligned": "revolute",
     "RevoluteUnboundedUnaligned": "continuous",
     "PrismaticUnaligned": "prismatic",
+    "HelicalUnaligned": "helical",
+    "FreeFlyer": "free",
+    "Spherical": "ball",
+    "SphericalZYX": "spherical_zyx",
+    "Planar": "planar",
 }
-_WHOLE: Final = {"FreeFlyer": "free", "Planar": "planar"}
+
+
+def joint_kind(joint: Any) -> tuple[str, Array | None]:
+    """Return the kind and axis of one of Pinocchio's joints."""
+    name = joint.shortname().removeprefix("JointModel")
+    if name[:-1] in _ALIGNED:
+        return _ALIGNED[name[:-1]], _AXES[name[-1]]
+    if name not in _UNALIGNED:
+        raise UnsupportedError(f"pinocchio: made a {name} joint, which has no counterpart here")
+    kind = _UNALIGNED[name]
+    if not kind_of(kind).n_axes:
+        return kind, None
+    # Not every unaligned joint has its axis as an attribute, but all have the motion that they allow.
+    data = joint.createData()
+    motion = np.ravel(data.S)
+    return kind, motion[:3] if kind == "prismatic" else motion[3:]
 
 
 def model_of(
@@ -96,7 +99,7 @@ def model_of(
     nonphysical: Literal["error", "warn"],
     gravity: ArrayLike,
 ) -> Model:
-    """Parse a checked URDF and describe what came out."""
+    """Parse a checked URDF and return its model."""
     try:
         if floating_base:
             raw = pin.buildModelFromXML(urdf.text, pin.JointModelFreeFlyer(), "root_joint")
@@ -119,14 +122,17 @@ class _Conversion:
         self.odd: dict[str, list[tuple[str, str]]] = {}
 
     def run(self, source: str, nonphysical: Literal["error", "warn"], gravity: ArrayLike) -> Model:
-        """Describe the parsed model, joint by joint."""
+        """Return the model of the parsed one, joint by joint."""
         b = ModelBuilder(self.urdf.name, gravity=gravity)
         X_base = self._add_base(b)
         for index in range(1, self.raw.njoints):
             self._add_joint(b, index, X_base)
         self._add_frames(b, X_base)
-        self.odd = self._odd_links()
-        for note in (*self.urdf.notes, *self._mimic_notes(), *self._odd_notes(), *self._rename_notes(), self.snap.note):
+        for link, why in self.urdf.odd_links.items():
+            frame = self.raw.frames[self.raw.getFrameId(link, pin.BODY)]
+            self.odd.setdefault(self.bodies[frame.parentJoint], []).append((link, why))
+        renamed = (f"link 'world' is called {n!r} here, because 'world' is the ground" for n in self.renamed)
+        for note in (*self.urdf.notes, self._mimic_note(), self._odd_note(), *renamed, self.snap.note):
             if note:
                 b.note(note)
         try:
@@ -134,10 +140,10 @@ class _Conversion:
         except ModelError as error:
             raise ModelError(source, error.faults) from None
 
-    # The base: what Pinocchio has merged into its universe.
+    # The base: the links that Pinocchio has merged into its universe
 
     def _add_base(self, b: ModelBuilder) -> Any:
-        """Add the body that stands still, and return where it stands in the world, or None."""
+        """Add the body that does not move, and return its pose in the world, or None."""
         if self.floating_base:
             self.bodies.append("world")
             return None
@@ -162,7 +168,7 @@ class _Conversion:
         b.add_body(name, mass=body.mass, com=body.com, inertia=body.inertia)
 
     def _base_link(self) -> tuple[UrdfJoint | None, Any]:
-        """Return the fixed joint whose child is the base, if the root link is but the ground."""
+        """Return the fixed joint whose child is the base, where the root link is the ground, and the base's pose."""
         here = pin.SE3.Identity()
         if self.urdf.root != "world":
             return None, here
@@ -186,12 +192,10 @@ class _Conversion:
             name += "_"
         return name
 
-    # Joints.
-
     def _add_joint(self, b: ModelBuilder, index: int, X_base: Any) -> None:
         raw, name = self.raw, str(self.raw.names[index])
         joint = raw.joints[index]
-        kind, axis = _kind(joint)
+        kind, axis = joint_kind(joint)
         link = self.joints[name].child if name in self.joints else self.urdf.root
         body = self._body_name(link)
         X = raw.jointPlacements[index]
@@ -219,66 +223,36 @@ class _Conversion:
             armature=raw.armature[v],
             damping=raw.damping[v],
             friction=raw.upperDryFrictionLimit[v],
-            mimic=self._mimic_of(name),
+            mimic=self.joints[name].mimic if self.mimic == "reduce" and name in self.joints else None,
             **limits,
         )
 
-    def _mimic_of(self, name: str) -> Mimic | None:
-        return self.joints[name].mimic if self.mimic == "reduce" and name in self.joints else None
-
-    # Frames: the links and fixed joints that were merged away.
-
     def _add_frames(self, b: ModelBuilder, X_base: Any) -> None:
-        taken = {*self.bodies, "world"}
+        """Add the links and fixed joints that were merged."""
+        names = {*self.bodies, "world"}
         for type_ in (pin.BODY, pin.FIXED_JOINT):
             for frame in list(self.raw.frames)[1:]:
                 body = self.bodies[frame.parentJoint]
-                if frame.type != type_ or frame.name in taken or body == "world":
+                if frame.type != type_ or frame.name in names or body == "world":
                     continue
-                taken.add(frame.name)
+                names.add(frame.name)
                 X = frame.placement
                 if frame.parentJoint == 0 and X_base is not None and not X_base.isIdentity(0.0):
                     X = X_base.actInv(X)
                 b.add_frame(frame.name, body=body, translation=X.translation, rotation=self.snap(X.rotation))
 
-    # What a reader should know.
-
-    def _mimic_notes(self) -> list[str]:
+    def _mimic_note(self) -> str:
         mimics = [(j.name, j.mimic) for j in self.urdf.joints if j.mimic]
-        if not mimics:
-            return []
         listing = ", ".join(f"{name} = {m.ratio:g} {m.joint} {m.offset:+g}" for name, m in mimics)
+        what = "reduced, so that they have no coordinate of their own"
         if self.mimic == "free":
-            return [f"mimic joints kept independent, as mimic='free' asks: {listing}"]
-        return [f"mimic joints reduced, so that they have no coordinate of their own: {listing}"]
+            what = "kept independent, as mimic='free' asks"
+        return f"mimic joints {what}: {listing}" if mimics else ""
 
-    def _odd_links(self) -> dict[str, list[tuple[str, str]]]:
-        bodies: dict[str, list[tuple[str, str]]] = {}
-        for link, why in self.urdf.odd_links.items():
-            frame = self.raw.frames[self.raw.getFrameId(link, pin.BODY)]
-            bodies.setdefault(self.bodies[frame.parentJoint], []).append((link, why))
-        return bodies
-
-    def _odd_notes(self) -> list[str]:
+    def _odd_note(self) -> str:
         odd = [(body, link, why) for body, links in self.odd.items() for link, why in links]
         healed = [f"{link} ({why})" for body, link, why in odd if body not in self.suspects]
-        if not healed:
-            return []
         listing = "; ".join(healed[:5]) + (f"; and {len(healed) - 5} more" if len(healed) > 5 else "")
-        return [f"links that no matter is like, seen alone, but sound with what is fixed to them: {listing}"]
-
-    def _rename_notes(self) -> list[str]:
-        return [f"link 'world' is called {n!r} here, because 'world' is the ground" for n in self.renamed]
-
-
-def _kind(joint: Any) -> tuple[str, Any]:
-    """Return the kind and axis of one of Pinocchio's joints."""
-    name = joint.shortname().removeprefix("JointModel")
-    if name[:-1] in _ALIGNED:
-        return _ALIGNED[name[:-1]], _AXES[name[-1]]
-    if name in _UNALIGNED:
-        # Not every unaligned joint shows its axis, but all show the motion they allow.
-        data = joint.createData()
-        motion = np.ravel(data.S)
-        return _UNALIGNED[name], motion[:3] if name.startswith("P") else motion[3:]
-    return _WHOLE[name], None
+        return (
+            f"links of inconsistent inertia, sound together with the links fixed to them: {listing}" if healed else ""
+        )

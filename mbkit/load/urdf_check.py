@@ -1,8 +1,7 @@
-"""What stands in a URDF, checked before any parser in C++ sees it.
+"""Checks of a URDF before any parser in C++ reads it.
 
-`examine` finds all faults of a file at once and writes its bodies and joints, names and
-numbers to the letter, as plain XML. Meshes, textures, plugins
-and everything else that could point outside the file are gone from that text.
+`examine` finds all faults of a file at once and writes its bodies and joints as plain XML, with the same names and
+numbers, and without meshes, textures, plugins and all else that could point outside the file.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from mbkit.load.xml_reader import Element, Reader, misspelt
 from mbkit.model import Body, Mimic
 from mbkit.model.validation import body_fault
 
-# The tree of a URDF: names, parents, loops, and joints that follow others.
+# The tree of a URDF
 
 # The parser in C++ recurses over the tree, and its tables grow as the square.
-_MOST_JOINTS: Final = 2000
+_MAX_JOINTS: Final = 2000
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint's place in the tree; its numbers stay in the text."""
+    """A joint without its numbers, which stay in the text."""
 
     name: str
     kind: str
@@ -39,7 +38,7 @@ class UrdfJoint:
 
 
 def check_names(links: Sequence[str], joints: Sequence[UrdfJoint], read: Reader) -> None:
-    """Find names that are used twice, and links that do not exist."""
+    """Find repeated names, and links that do not exist."""
     for what, names in (("link", links), ("joint", [j.name for j in joints])):
         for name, count in Counter(names).items():
             if count > 1 and name:
@@ -84,7 +83,7 @@ def check_tree(links: Sequence[str], joints: Sequence[UrdfJoint], read: Reader) 
 def _cycles(links: Iterable[str], carriers: Mapping[str, Sequence[UrdfJoint]]) -> list[list[str]]:
     """Return the joints of every closed loop, from parent to child; each link's first parent counts."""
     done: set[str] = set()
-    found = []
+    out = []
     for start in links:
         path: dict[str, str] = {}
         at = start
@@ -93,15 +92,15 @@ def _cycles(links: Iterable[str], carriers: Mapping[str, Sequence[UrdfJoint]]) -
             at = carriers[at][0].parent
         if at in path:
             inside = list(path)[list(path).index(at) :]
-            found.append([path[n] for n in reversed(inside)])
+            out.append([path[n] for n in reversed(inside)])
         done |= path.keys()
-    return found
+    return out
 
 
 def check_size(links: Sequence[str], joints: Sequence[UrdfJoint], floating_base: bool, read: Reader) -> None:
     """Find trees that are too large, or in which nothing moves."""
-    if len(joints) > _MOST_JOINTS:
-        read.fault(f"{len(joints)} joints; up to {_MOST_JOINTS} are read")
+    if len(joints) > _MAX_JOINTS:
+        read.fault(f"{len(joints)} joints; up to {_MAX_JOINTS} are read")
     if links and not floating_base and all(j.kind == "fixed" for j in joints):
         what = "all joints are fixed" if joints else "no joints"
         read.fault(f"{what}, so nothing moves (nq = 0); add a joint that moves, or load with floating_base=True")
@@ -110,7 +109,7 @@ def check_size(links: Sequence[str], joints: Sequence[UrdfJoint], floating_base:
 def check_mimics(
     joints: list[UrdfJoint], matters: bool, lenient: bool, read: Reader
 ) -> tuple[list[UrdfJoint], list[str]]:
-    """Return the joints without the tags that cannot be followed, and what was said about those."""
+    """Return the joints without the tags that cannot be followed, and notes on these."""
     by_name = {j.name: j for j in joints}
     out, fixed, lost = [], [], []
     suggestions = Suggestions()
@@ -148,62 +147,30 @@ _KINDS: Final = {
     "floating": "free",
     "planar": "planar",
 }
-# What Pinocchio's parser takes for no limit.
-_OPEN: Final = "{}1.7976931348623157e308"
-# How many names stand in a note.
-_MOST_TOLD: Final = 40
+# Pinocchio's parser takes this for no limit.
+_OPEN: Final = "1.7976931348623157e308"
+# Names in a note.
+_MAX_LISTED: Final = 40
 _MOMENTS: Final = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
 class UrdfFile:
-    """A URDF that was found sound.
-
-    Attributes
-    ----------
-    name : str
-        The robot's.
-    text : str
-        The file again, less everything but bodies and joints.
-    root : str
-        The link that no joint carries.
-    joints : tuple of UrdfJoint
-        In the file's order.
-    links : frozenset of str
-    odd_links : mapping of str to str
-        Links whose own inertia is inconsistent, each with the reason. Links
-        fixed to them may make it consistent, so this is not yet a fault.
-    notes : tuple of str
-    """
+    """A URDF without faults."""
 
     name: str
-    text: str
-    root: str
-    joints: tuple[UrdfJoint, ...]
+    text: str  # the bodies and joints alone
+    root: str  # the link that no joint carries
+    joints: tuple[UrdfJoint, ...]  # in the file's order
     links: frozenset[str]
-    odd_links: Mapping[str, str]
+    odd_links: Mapping[str, str]  # links of inconsistent inertia, which links fixed to them may correct, and why
     notes: tuple[str, ...]
 
 
 def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: bool, lenient: bool) -> UrdfFile:
-    """Check a <robot> element.
+    """Check a <robot> element, or raise `ModelError` with every fault.
 
-    Parameters
-    ----------
-    robot : Element
-    source : str
-        The file's name, for messages.
-    floating_base : bool
-        Whether a robot without moving joints is still of use.
-    mimic_matters : bool
-        Whether a mimic tag that cannot be followed is a fault.
-    lenient : bool
-        Whether such a tag is noted instead.
-
-    Raises
-    ------
-    ModelError
-        With every fault of the file.
+    A mimic tag that cannot be followed is a fault where `mimic_matters`, and a note where `lenient`.
     """
     read = Reader()
     name = robot.attributes.get("name", "")
@@ -217,8 +184,8 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
     odd: dict[str, str] = {}
     link_texts = [_link(e, read, odd) for e in robot.all("link")]
     links = [e.attributes.get("name", "") for e in robot.all("link")]
-    made = [_joint(e, read) for e in robot.all("joint")]
-    joints = [j for j, _ in made]
+    joints_and_texts = [_joint(e, read) for e in robot.all("joint")]
+    joints = [j for j, _ in joints_and_texts]
     check_names(links, joints, read)
     root = check_tree(links, joints, read)
     check_size(links, joints, floating_base, read)
@@ -227,18 +194,17 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
         read.fault("joint 'root_joint': floating_base=True adds a joint of that name; rename yours")
     if read.faults:
         raise ModelError(source, read.faults)
-    notes += [*read.notes, *unread]
-    text = _written("robot", {"name": name}, [*link_texts, *(t for _, t in made)])
-    return UrdfFile(name, text, root, tuple(joints), frozenset(links), odd, tuple(notes))
+    text = _written("robot", {"name": name}, [*link_texts, *(t for _, t in joints_and_texts)])
+    return UrdfFile(name, text, root, tuple(joints), frozenset(links), odd, notes=(*notes, *read.notes, *unread))
 
 
 def unbounded(limit: float) -> float:
-    """Return a limit, infinite where a parser's largest double stands for none."""
+    """Return a limit, infinite where it is a parser's largest double."""
     return limit if abs(limit) < 1e300 else math.copysign(math.inf, limit)
 
 
-# Single elements. Each returns its text: numbers as they were written, one space
-# apart (urdfdom takes ' 1.5 ' for no number, and drops the link's inertia).
+# Texts of single elements: numbers as they were written, one space apart (urdfdom does
+# not read ' 1.5 ', and drops the link's inertia).
 
 
 def _written(tag: str, attributes: Mapping[str, str], inside: Iterable[str] = ()) -> str:
@@ -248,8 +214,7 @@ def _written(tag: str, attributes: Mapping[str, str], inside: Iterable[str] = ()
 
 
 def _copied(element: Element, *names: str) -> str:
-    given = {n: " ".join(element.attributes[n].split()) for n in names if n in element.attributes}
-    return _written(element.tag, given)
+    return _written(element.tag, {n: " ".join(element.attributes[n].split()) for n in names if n in element.attributes})
 
 
 def _origin(owner: Element, item: str, read: Reader) -> list[str]:
@@ -312,12 +277,10 @@ def _joint(joint: Element, read: Reader) -> tuple[UrdfJoint, str]:
     mimic = None
     follows = read.only(joint, "mimic", item)
     if follows is not None:
-        leader = read.name(follows, "joint", item)
-        ratio, offset = read.number(follows, "multiplier", item, 1.0), read.number(follows, "offset", item, 0.0)
-        mimic = Mimic(leader, ratio, offset)
-    return UrdfJoint(name, kind, ends["parent"], ends["child"], mimic), _written(
-        "joint", {"name": name, "type": type_}, texts
-    )
+        ratio, offset = (read.number(follows, n, item, x) for n, x in (("multiplier", 1.0), ("offset", 0.0)))
+        mimic = Mimic(read.name(follows, "joint", item), ratio, offset)
+    text = _written("joint", {"name": name, "type": type_}, texts)
+    return UrdfJoint(name, kind, ends["parent"], ends["child"], mimic), text
 
 
 def _end(joint: Element, tag: str, item: str, read: Reader) -> str:
@@ -365,16 +328,13 @@ def _limit(joint: Element, kind: str, item: str, read: Reader) -> list[str]:
         # PyBullet and others write no limit in this way.
         crossed = f"lower limit {lower:g} above upper limit {upper:g}"
         read.notes.append(f"{item}: {crossed}, read as no limit ({limit.place})")
-        unlimited = {"lower": _OPEN.format("-"), "upper": _OPEN.format("")}
-        return [
-            _copied(replace(limit, attributes=limit.attributes | unlimited), "lower", "upper", "effort", "velocity")
-        ]
+        limit = replace(limit, attributes=limit.attributes | {"lower": f"-{_OPEN}", "upper": _OPEN})
     if not bounded and not (kind == "continuous" and {"effort", "velocity"} <= limit.attributes.keys()):
         return []
     return [_copied(limit, "lower", "upper", "effort", "velocity")]
 
 
-# What URDF says of dynamics: the elements in each element, and its attributes.
+# The elements of URDF's dynamics, with the elements in each and its attributes.
 _SCHEMA: Final[Mapping[str, tuple[frozenset[str], frozenset[str]]]] = {
     tag: (frozenset(children.split()), frozenset(attributes.split()))
     for tag, children, attributes in (
@@ -393,15 +353,15 @@ _SCHEMA: Final[Mapping[str, tuple[frozenset[str], frozenset[str]]]] = {
         ("mimic", "", "joint multiplier offset"),
     )
 }
-# Elements and attributes with a meaning of their own, in the specification or in common extensions.
+# Elements of the specification or of common extensions that say nothing about the dynamics.
 _EXTENSIONS: Final = frozenset({"visual", "collision", "material", "transmission", "contact", "calibration"})
-# In these each unknown name would be a part of the dynamics that is lost, but for what simulators keep there.
+# In these an unknown name would be a lost part of the dynamics, except for these attributes of simulators.
 _WHOLE: Final = frozenset({"inertial", "origin", "mass", "inertia", "parent", "child", "dynamics", "mimic"})
 _HARMLESS: Final = frozenset({"D", "K", "mu_coulomb", "mu_viscous"})
 
 
 def _unread(robot: Element, read: Reader) -> list[str]:
-    """Find misspelt and misplaced names where dynamics is written, and say what else was not looked at."""
+    """Find misspelt and misplaced names in the dynamics, and return notes on everything else that is not read."""
     elements: Counter[str] = Counter()
     attributes: Counter[str] = Counter()
     stack = [robot]
@@ -420,8 +380,8 @@ def _unread(robot: Element, read: Reader) -> list[str]:
         ("left out of the file, with every path in it", elements),
         ("attributes that URDF does not define, left out", attributes),
     ):
-        listing = ", ".join(f"{n} {tag[:40]}" for tag, n in sorted(counts.items())[:_MOST_TOLD])
-        listing += f" and {len(counts) - _MOST_TOLD} more" if len(counts) > _MOST_TOLD else ""
+        listing = ", ".join(f"{n} {tag[:40]}" for tag, n in sorted(counts.items())[:_MAX_LISTED])
+        listing += f" and {len(counts) - _MAX_LISTED} more" if len(counts) > _MAX_LISTED else ""
         notes += [f"{what}: {listing}"] if listing else []
     return notes
 

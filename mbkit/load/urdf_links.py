@@ -1,8 +1,7 @@
-"""A URDF link by link, as it is written: no engine's parser, nothing fused, nothing left out.
+"""A URDF link by link, without an engine's parser: the measure of importers; and floating bases for parsers.
 
-What importers make of a file is measured by this reading. It knows the URDF specification alone:
-a joint's frame is its child link's, an inertia is about the centre of mass in the axes of its
-origin, rpy are turns about fixed x, y and z, and a missing axis is x.
+By the URDF specification a joint's frame is its child link's, an inertia is about the centre of mass in the axes of
+its origin, rpy are turns about fixed x, y and z, and a missing axis is x.
 """
 
 from __future__ import annotations
@@ -22,20 +21,15 @@ from mbkit.load.urdf_check import examine, unbounded
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Mimic, Model, ModelBuilder
 
-# A description whose base stands still, written so that parsers can let it go.
-
 #: The joint on which a floating base moves.
 BASE_JOINT: Final = "root_joint"
-#: What a base link called "world" is called then: the ground has that name.
+#: Replaces the name "world" of a base link: the ground has that name.
 _BASE_LINK: Final = "world_link"
 _JOINTS: Final = ("joint", "freejoint")
 
 
 def floated(mujoco: Element, read: Reader) -> Element:
-    """Return a <mujoco> element with a free joint for the one body that stands in the world.
-
-    Where that cannot be, a fault is kept and the element is returned as it is.
-    """
+    """Return a <mujoco> element with a free joint for the world's only body, or keep a fault."""
     tops = [b for world in mujoco.all("worldbody") for b in _parts(world, ("body",))]
     if not tops:
         return mujoco
@@ -52,10 +46,7 @@ def floated(mujoco: Element, read: Reader) -> Element:
 
 
 def with_base(robot: Element) -> tuple[Element, str]:
-    """Return a <robot> element whose base link is not called ``world``, and what that is called instead.
-
-    Parsers take a link of that name for the ground. The name is empty where nothing had to be done.
-    """
+    """Return a <robot> whose base link is not called ``world``, the ground's name for parsers, and any new name."""
     joints = robot.all("joint")
     links = {e.attributes.get("name") for e in robot.all("link")}
     if "world" not in links or any(e.attributes.get("link") == "world" for j in joints for e in j.all("child")):
@@ -64,19 +55,15 @@ def with_base(robot: Element) -> tuple[Element, str]:
     while name in links:
         name += "_"
 
-    def called(element: Element, attribute: str) -> Element:
-        if element.attributes.get(attribute) != "world":
-            return element
-        return replace(element, attributes={**element.attributes, attribute: name})
-
-    def child(element: Element) -> Element:
-        if element.tag == "link":
-            return called(element, "name")
+    def renamed(element: Element) -> Element:
+        attribute = {"link": "name", "parent": "link"}.get(element.tag, "")
+        if element.attributes.get(attribute) == "world":
+            return replace(element, attributes={**element.attributes, attribute: name})
         if element.tag != "joint":
             return element
-        return replace(element, children=[called(e, "link") if e.tag == "parent" else e for e in element.children])
+        return replace(element, children=[renamed(e) for e in element.children])
 
-    return replace(robot, children=[child(e) for e in robot.children]), name
+    return replace(robot, children=[renamed(e) for e in robot.children]), name
 
 
 def _parts(owner: Element, tags: tuple[str, ...]) -> Iterator[Element]:
@@ -101,22 +88,13 @@ def _replaced(owner: Element, old: Element, new: Element) -> Element:
     return replace(owner, children=[_replaced(c, old, new) for c in owner.children])
 
 
-_KINDS: Final = {"floating": "free"}
-_SINGLE: Final = ("revolute", "continuous", "prismatic")
-
-
 def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Model:
-    """Return the description that a <robot> element is, one body for each link.
+    """Return the model of a <robot> element with one body for each link, or raise `ModelError`.
 
-    The root link stands in the world, or floats there; or it is called ``world``, and is the world then.
-
-    Raises
-    ------
-    ModelError
-        The file has faults; all of them are listed.
+    The root link is fixed to the world or floats; a root link called ``world`` is the world.
     """
     urdf = examine(root, source, floating_base=floating_base, mimic_matters=False, lenient=True)
-    # What was examined is clean XML of known elements.
+    # The checked text has known elements alone.
     robot = xml_reader.parse(urdf.text.encode(), source)
     snap = Snapper()
     b = ModelBuilder(urdf.name)
@@ -166,22 +144,22 @@ def _add_link(b: ModelBuilder, link: Element, snap: Snapper) -> None:
 
 
 def _add_joint(b: ModelBuilder, joint: Element, mimics: Mapping[str, Mimic | None], snap: Snapper) -> None:
-    name, kind = joint.attributes["name"], _KINDS.get(joint.attributes["type"], joint.attributes["type"])
+    name, kind = joint.attributes["name"], joint.attributes["type"].replace("floating", "free")
     R, p = _pose(joint, snap)
     parent, child = (e.attributes["link"] for tag in ("parent", "child") for e in joint.all(tag))
-    given: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     limit, dynamics = joint.first("limit"), joint.first("dynamics")
-    if kind in _SINGLE:
-        given["axis"] = _numbers(joint.first("axis"), "xyz", "1 0 0")
-        given["damping"] = float(_numbers(dynamics, "damping", "0")[0])
-        given["friction"] = float(_numbers(dynamics, "friction", "0")[0])
-        given["mimic"] = mimics[name]
+    if kind in ("revolute", "continuous", "prismatic"):
+        values["axis"] = _numbers(joint.first("axis"), "xyz", "1 0 0")
+        values["damping"] = _numbers(dynamics, "damping", "0")
+        values["friction"] = _numbers(dynamics, "friction", "0")
+        values["mimic"] = mimics[name]
         for ours, theirs in (("velocity_limit", "velocity"), ("effort_limit", "effort")):
             if limit is not None and theirs in limit.attributes:
-                given[ours] = unbounded(float(_numbers(limit, theirs, "0")[0]))
+                values[ours] = unbounded(float(limit.attributes[theirs]))
         if limit is not None and kind != "continuous":
-            given["lower"], given["upper"] = (unbounded(float(_numbers(limit, x, "0")[0])) for x in ("lower", "upper"))
-    b.add_joint(name, kind, parent=parent, child=child, translation=p, rotation=R, **given)
+            values |= {x: unbounded(float(limit.attributes.get(x, 0))) for x in ("lower", "upper")}
+    b.add_joint(name, kind, parent=parent, child=child, translation=p, rotation=R, **values)
 
 
 def read_links(path: Path) -> Model:

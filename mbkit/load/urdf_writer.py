@@ -21,25 +21,13 @@ _TYPES: Final = {
     "planar": "planar",
     "free": "floating",
 }
-# What readers take for none: the largest that any of them still reads.
+# Stands for no limit: the largest number that every reader reads.
 _OPEN: Final = 1e308
 
 
 def urdf_text(model: Model, comment: str) -> str:
-    """Return a description as URDF.
-
-    Parameters
-    ----------
-    model : Model
-    comment : str
-        What stands at its head.
-
-    Raises
-    ------
-    UnsupportedError
-        With everything that URDF cannot say of it.
-    """
-    faults = list(_unsayable(model))
+    """Return a description as URDF, or raise `UnsupportedError` with every part that URDF does not have."""
+    faults = list(_unsupported(model))
     if faults:
         raise UnsupportedError(f"URDF cannot say of {model.name}: {'; '.join(faults)}")
     lines = [
@@ -51,11 +39,11 @@ def urdf_text(model: Model, comment: str) -> str:
         lines += _link(body)
     for joint in model.joints:
         lines += _joint(joint)
-    taken = {b.name for b in model.bodies} | {"world"}
+    links = {b.name for b in model.bodies} | {"world"}
     joints = {j.name for j in model.joints}
     for frame in model.frames:
-        # A body's own frame cannot be another one here.
-        if frame.name in taken:
+        # Here a body's own frame cannot be another one.
+        if frame.name in links:
             continue
         name = f"{frame.name}_fixed"
         while name in joints:
@@ -72,7 +60,7 @@ def urdf_text(model: Model, comment: str) -> str:
     return "\n".join([*lines, "</robot>"]) + "\n"
 
 
-def _unsayable(model: Model) -> Iterator[str]:
+def _unsupported(model: Model) -> Iterator[str]:
     for joint in model.joints:
         item = f"joint {joint.name!r}"
         if joint.kind not in _TYPES:

@@ -1,7 +1,6 @@
 """Parser for untrusted XML, with line numbers, and a strict reader of attributes.
 
-A document type declaration, which can hold entity bombs, external entities and file URLs, is refused. The rest of
-XML cannot refer to anything outside the text.
+It refuses document type declarations, because they can hold entity bombs, external entities and file URLs.
 """
 
 from __future__ import annotations
@@ -24,40 +23,35 @@ MOST_ELEMENTS: Final = 500_000
 MOST_LEVELS: Final = 250
 
 _ENDINGS: Final = (".urdf", ".xml", ".mjcf")
-_MOST_TOLD: Final = 10
-# How far into a file an XML declaration is looked for, and how long it may be.
+_MAX_LISTED: Final = 10
+# An XML declaration starts in the first so many bytes, and is no longer.
 _HEAD: Final = 4096
 _COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
 _ENCODING: Final = re.compile(rb"encoding\s*=\s*[\"']([A-Za-z0-9._-]+)[\"']")
 _BLANK: Final = b" \t\r\n\xef\xbb\xbf"
 
-#: What expat says of any character that it cannot take: "syntax error", "not well-formed (invalid token)".
+#: expat's "syntax error" and "not well-formed (invalid token)" do not name the character.
 _VAGUE: Final = (2, 4)
-#: Characters of the line that a message repeats.
-_SHOWN: Final = 30
+#: Length of the part of a line in a message.
+_MAX_SHOWN: Final = 30
 
 
 @dataclass(eq=False, slots=True)
 class Element:
-    """An element as it was written: tag, attributes, line, children, and what text is in it, joined.
-
-    `file` is the included file that it stands in, and empty in the file that was asked for; `included_at`
-    is then the line of the <include> there, else 0.
-    `notes`, of the root element, say what of the text was passed over.
-    """
+    """An element as it was written."""
 
     tag: str
     attributes: dict[str, str]
     line: int
     children: list[Element] = field(default_factory=list)
     text: str = ""
-    file: str = ""
-    notes: tuple[str, ...] = ()
-    included_at: int = 0
+    file: str = ""  # the included file that holds it; empty in the main file
+    notes: tuple[str, ...] = ()  # of the root element: ignored parts of the text
+    included_at: int = 0  # the line of the <include> in the main file, else 0
 
     @property
     def place(self) -> str:
-        """Where it stands, for messages."""
+        """File and line, for messages."""
         return f"{self.file}, line {self.line}" if self.file else f"line {self.line}"
 
     def all(self, tag: str) -> list[Element]:
@@ -78,14 +72,7 @@ class Element:
 
 
 def read(path: Path) -> Element:
-    """Return the root element of a file.
-
-    Raises
-    ------
-    LoadError
-        The file is missing, unreadable, empty, not well formed, or holds a
-        document type declaration.
-    """
+    """Return the root element of a file, or raise `LoadError`."""
     try:
         if not path.exists():
             raise LoadError(f"{path}: no such file")
@@ -94,24 +81,23 @@ def read(path: Path) -> Element:
             raise LoadError(f"{path}: expected a URDF or MJCF file, this is {what}")
         size = path.stat().st_size
         if size > MOST_BYTES:
-            raise LoadError(f"{path}: {size} bytes; a description of up to {MOST_BYTES} bytes was expected")
+            raise LoadError(f"{path}: expected a description of up to {MOST_BYTES} bytes, got {size} bytes")
         content = path.read_bytes()
+    except LoadError:
+        raise
     except (OSError, ValueError) as error:
-        if isinstance(error, LoadError):
-            raise
         # ValueError: a null character in the name.
         raise LoadError(f"{path!s}: cannot be read ({error})") from None
     return parse(content, str(path))
 
 
 def _descriptions(folder: Path) -> str:
-    """Return which descriptions a folder and those below it hold, for a message."""
-    found = sorted(
-        str(p.relative_to(folder)) for p in itertools.islice(folder.rglob("*"), 10_000) if p.suffix in _ENDINGS
-    )
-    if not found:
+    """List the descriptions in a folder and below, for a message."""
+    files = itertools.islice(folder.rglob("*"), 10_000)
+    names = sorted(str(p.relative_to(folder)) for p in files if p.suffix in _ENDINGS)
+    if not names:
         return ", and no .urdf or .xml file is in it"
-    return f"; it holds {', '.join(found[:_MOST_TOLD])}{' and more' * (len(found) > _MOST_TOLD)}"
+    return f"; it holds {', '.join(names[:_MAX_LISTED])}{' and more' * (len(names) > _MAX_LISTED)}"
 
 
 def parse(content: bytes, name: str) -> Element:
@@ -162,27 +148,27 @@ def parse(content: bytes, name: str) -> Element:
         if error.code not in _VAGUE or not why:
             why = expat.errors.messages.get(error.code, str(error))
         raise LoadError(f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}") from None
+    except LoadError:
+        raise
     except (LookupError, ValueError) as error:
-        if isinstance(error, LoadError):
-            raise
         raise LoadError(f"{name}: not readable as XML: {error}; save it as UTF-8") from None
     roots[0].notes = notes
     return roots[0]
 
 
 def _readable(content: bytes) -> tuple[bytes, str | None, tuple[str, ...]]:
-    """Return a text without what robot parsers pass over and expat does not, its encoding, and notes.
+    """Return a text without parts that robot parsers ignore and expat refuses, its encoding, and notes.
 
-    That is text before the XML declaration, and null characters after the last element. Lines keep their numbers.
+    These are text before the XML declaration, and null characters after the last element. Lines keep their numbers.
     """
     if content[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in content[:4]:
         # In UTF-16 a null is half of a character.
         return content, None, ()
     notes = []
-    whole = content.rstrip(b"\0" + _BLANK[:4])
-    if b"\0" in content[len(whole) :]:
-        content = whole
-        notes.append("null characters after the last element were passed over")
+    stripped = content.rstrip(b"\0" + _BLANK[:4])
+    if b"\0" in content[len(stripped) :]:
+        content = stripped
+        notes.append("null characters after the last element were ignored")
     start = content.find(b"<?xml", 0, _HEAD)
     stop = content.find(b"?>", start, start + _HEAD) + 2
     before = content[: max(start, 0)]
@@ -190,7 +176,7 @@ def _readable(content: bytes) -> tuple[bytes, str | None, tuple[str, ...]]:
         return content, None, tuple(notes)
     encoding = _ENCODING.search(content, start, stop)
     content = b"\n" * content.count(b"\n", 0, stop) + content[stop:]
-    notes.append("text before the XML declaration was passed over")
+    notes.append("text before the XML declaration was ignored")
     return content, encoding.group(1).decode() if encoding else None, tuple(notes)
 
 
@@ -200,25 +186,25 @@ def _unexpected(content: bytes, at: int) -> str:
         return ""
     byte = content[at]
     try:
-        found = content[at : at + 4].decode("utf-8", "ignore")[:1] if byte < 0x80 else content[at:].decode()[:1]
+        character = content[at : at + 4].decode("utf-8", "ignore")[:1] if byte < 0x80 else content[at:].decode()[:1]
     except UnicodeDecodeError:
         return f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8"
     before = content[:at].splitlines()[-1:] if content[:at][-1:] not in (b"\n", b"\r") else []
-    line = b"".join(before).decode("utf-8", "replace").replace("\0", "").lstrip()[-_SHOWN:]
+    line = b"".join(before).decode("utf-8", "replace").replace("\0", "").lstrip()[-_MAX_SHOWN:]
     after = f" after {line!r}" if line else ""
-    if not found.isprintable() and not found.isspace():
+    if not character.isprintable() and not character.isspace():
         return f"control character 0x{byte:02x}{after}; remove it"
     hint = ""
     if line.endswith("&"):
         hint = "; write &amp; for &"
-    elif found == "<":
+    elif character == "<":
         hint = "; write &lt; for < in a value"
     elif not line:
         hint = "; expected <"
-    return f"unexpected {found!r}{after}{hint}"
+    return f"unexpected {character!r}{after}{hint}"
 
 
-# Numbers and names in attributes, read strictly; every fault is kept, none is raised.
+# Numbers and names in attributes
 
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 #: Larger than anything that moves, and the products of several still fit a double.
@@ -227,38 +213,28 @@ _LONGEST_NAME: Final = 1000
 
 
 class Reader:
-    """Reads attributes of one file and collects its faults.
-
-    Attributes
-    ----------
-    faults : list of str
-        One sentence per fault: the element, what was expected, what came.
-    notes : list of str
-        What was passed over without loss.
-    """
+    """Reads attributes strictly, and collects faults and notes instead of raising."""
 
     def __init__(self) -> None:
         self.faults: list[str] = []
         self.notes: list[str] = []
 
     def fault(self, text: str, element: Element | None = None) -> None:
-        """Keep one fault; the element tells the line, and the file where that is an included one."""
-        where = f" ({element.place})" if element else ""
-        self.faults.append(text + where)
+        """Keep one fault, with the element's place."""
+        self.faults.append(f"{text} ({element.place})" if element else text)
 
     def name(self, element: Element, attribute: str, item: str) -> str:
-        """Return a name that must be there, not be empty, and be short enough for a message."""
+        """Return a required name that is short enough for a message."""
         value = element.attributes.get(attribute, "")
         if not value.strip():
             self.fault(f"{item}: <{element.tag}> has no {attribute}; give it one", element)
         if len(value) > _LONGEST_NAME:
             self.fault(
-                f"{item}: {element.tag} {attribute}: a name of {len(value)} characters; "
-                f"expected up to {_LONGEST_NAME}, got {_short(value)}",
+                f"{item}: {element.tag} {attribute}: expected a name of up to {_LONGEST_NAME} characters, "
+                f"got {len(value)}: {_short(value)}",
                 element,
             )
-            return value[:_LONGEST_NAME]
-        return value
+        return value[:_LONGEST_NAME]
 
     def numbers(
         self,
@@ -271,18 +247,9 @@ class Reader:
         default: tuple[float, ...] | None = None,
         bounded: bool = True,
     ) -> tuple[float, ...]:
-        """Return the numbers of an attribute.
+        """Return `count` numbers of an attribute, or from `least` to `count`.
 
-        Parameters
-        ----------
-        element, attribute, item
-            Where to read, and the element that messages name.
-        count, least : int
-            How many numbers are expected: exactly `count`, or from `least` to `count`.
-        default : tuple of float, optional
-            What stands for an absent attribute, which is a fault without it.
-        bounded : bool
-            Whether sizes that would overflow are a fault; limits may be that large.
+        An absent attribute is a fault without a `default`, and sizes that would overflow are one where `bounded`.
         """
         where = f"{item}: {element.tag} {attribute}"
         neutral = default if default is not None else (0.0,) * count
@@ -323,12 +290,12 @@ class Reader:
 
     def only(self, element: Element, tag: str, item: str) -> Element | None:
         """Return the child of this tag, of which there may be one, or several that are equal."""
-        found = element.all(tag)
-        if len(found) > 1 and all(_content(e) == _content(found[0]) for e in found):
-            self.notes.append(f"{item}: {len(found)} equal <{tag}> elements were read as one ({found[1].place})")
-        elif len(found) > 1:
-            self.fault(f"{item}: {len(found)} <{tag}> elements; keep one", found[1])
-        return found[0] if found else None
+        children = element.all(tag)
+        if len(children) > 1 and all(_content(e) == _content(children[0]) for e in children):
+            self.notes.append(f"{item}: {len(children)} equal <{tag}> elements were read as one ({children[1].place})")
+        elif len(children) > 1:
+            self.fault(f"{item}: {len(children)} <{tag}> elements; keep one", children[1])
+        return children[0] if children else None
 
 
 def _amount(count: int, least: int | None) -> str:
@@ -350,62 +317,46 @@ def _hint(word: str) -> str:
 
 
 def _content(element: Element) -> tuple[object, ...]:
-    """Return what an element says, to compare it with another."""
+    """Return an element's content without lines and spaces, to compare it with another."""
     return element.tag, element.attributes, element.text.split(), [_content(c) for c in element.children]
 
 
 def misspelt(name: str, known: Iterable[str]) -> str:
-    """Return the known name that was probably meant, or an empty text.
+    """Return the known name that was probably meant, or an empty text; case and separators do not matter.
 
-    Names are compared without case and separators. They must have most letters in common and nearly the same length,
-    so that an extension whose name holds a known word (``gear_velocity``) is not taken for it.
+    Lengths must be nearly the same, so that an extension such as ``gear_velocity`` does not match a word in it.
     """
     plain = {_plain(k): k for k in known if abs(len(k) - len(name)) <= 2}
-    found = difflib.get_close_matches(_plain(name), plain, n=1, cutoff=0.75) if plain else ()
-    return plain[found[0]] if found else ""
+    near = difflib.get_close_matches(_plain(name), plain, n=1, cutoff=0.75)
+    return plain[near[0]] if near else ""
 
 
 def _plain(name: str) -> str:
     return re.sub(r"[-_.\s]", "", name.lower())
 
 
-# MJCF in several files: the content of a file replaces its <include>, as in MuJoCo.
+# MJCF in several files
 #
-# A name is looked for in the folder of the file that was asked for, then in that of the file which
-# names it; what stands inside the root element there takes the <include>'s place; no file is taken
-# twice. Unlike MuJoCo, only names relative to those folders are followed, so that a description
-# means the same wherever its folder is.
+# As in MuJoCo, the content of a file's root element replaces an <include>, a name is relative to the folder of the
+# main file or else of the file with the <include>, and no file is included twice. Unlike in MuJoCo, absolute
+# names are not followed, so that a description means the same wherever its folder is.
 
 _TAG: Final = "include"
 
 
 def expanded(mujoco: Element, path: Path) -> Element:
-    """Return a <mujoco> element with the files that it includes.
-
-    Parameters
-    ----------
-    mujoco : Element
-        Of the file that was asked for; left as it is.
-    path : pathlib.Path
-        That file.
-
-    Raises
-    ------
-    LoadError
-        A file is missing, is no XML, is named by an absolute path, or is included twice.
-    """
+    """Return the <mujoco> element of a file with the files that it includes, or raise `LoadError`."""
     if all(e.tag != _TAG for e in mujoco.walk()):
         return mujoco
-    main = _Main(path)
-    return replace(mujoco, children=main.inside(mujoco, path.parent, 1))
+    return replace(mujoco, children=_Includes(path).inside(mujoco, path.parent, 1))
 
 
-class _Main:
-    """The file that was asked for, and what was taken into it so far."""
+class _Includes:
+    """The files that a main file includes."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.taken = {_identity(path)}
+        self.seen = {path.resolve()}
         self.bytes = 0
 
     def inside(self, element: Element, folder: Path, level: int) -> list[Element]:
@@ -426,20 +377,19 @@ class _Main:
             self._refuse(include, 'no file; write <include file="..."/>')
         if include.children:
             self._refuse(include, "has elements of its own; move them into the file, or beside the <include>")
-        found = self._found(include, name, folder)
-        identity = _identity(found)
-        if identity in self.taken:
-            self._refuse(include, "was included before, or includes itself; a file is taken once at most")
-        self.taken.add(identity)
-        root = self._read(include, found)
+        path = self._resolve(include, name, folder)
+        if path.resolve() in self.seen:
+            self._refuse(include, "was included before, or includes itself; include a file once at most")
+        self.seen.add(path.resolve())
+        root = self._read(include, path)
         if not root.children:
             self._refuse(include, f"<{root.tag[:60]}> in it is empty; expected elements inside")
         # A file counts as a level, so that a chain of them ends too.
-        return self.inside(root, found.parent, level + 1)
+        return self.inside(root, path.parent, level + 1)
 
-    def _found(self, include: Element, name: str, folder: Path) -> Path:
-        """Return the file that a name means."""
-        # Written on Windows, and read so by MuJoCo everywhere.
+    def _resolve(self, include: Element, name: str, folder: Path) -> Path:
+        """Return the path of an included file."""
+        # MuJoCo reads Windows' separators everywhere.
         relative = PurePosixPath(name.replace("\\", "/"))
         if relative.is_absolute() or PureWindowsPath(name).drive:
             self._refuse(
@@ -461,8 +411,9 @@ class _Main:
         except (LoadError, OSError) as error:
             self._refuse(include, str(error))
         if self.bytes > MOST_BYTES:
-            self._refuse(include, f"up to {MOST_BYTES} bytes of included files were expected")
-        file = _relative(path, self.path.parent)
+            self._refuse(include, f"expected up to {MOST_BYTES} bytes of included files")
+        folder = self.path.parent
+        file = str(path.relative_to(folder) if path.is_relative_to(folder) else path)
         for element in root.walk():
             element.file = file
             element.included_at = include.included_at or include.line
@@ -471,15 +422,3 @@ class _Main:
     def _refuse(self, element: Element, why: str) -> NoReturn:
         named = f' file="{element.attributes["file"][:200]}"' if element.attributes.get("file") else ""
         raise LoadError(f"{self.path}: {element.place}: <{element.tag}{named}>: {why}")
-
-
-def _identity(path: Path) -> Path:
-    # However it is spelt, and through whatever links.
-    return path.resolve()
-
-
-def _relative(path: Path, folder: Path) -> str:
-    try:
-        return str(path.relative_to(folder))
-    except ValueError:
-        return str(path)

@@ -7,7 +7,7 @@ is (cos, sin), a planar joint's velocity is in the body's axes.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -15,22 +15,10 @@ import pinocchio as pin
 from mbkit._check import Array
 from mbkit.engines.imported import Imported, checked, unused, written
 from mbkit.errors import UnsupportedError
+from mbkit.load.urdf import joint_kind
 from mbkit.load.urdf_links import BASE_JOINT
 from mbkit.model import Body, Joint, Model
 from mbkit.model.joint_types import kind_of
-
-_ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous", "H": "helical"}
-_UNALIGNED: Final = {
-    "RevoluteUnaligned": "revolute",
-    "RevoluteUnboundedUnaligned": "continuous",
-    "PrismaticUnaligned": "prismatic",
-    "HelicalUnaligned": "helical",
-    "FreeFlyer": "free",
-    "Spherical": "ball",
-    "SphericalZYX": "spherical_zyx",
-    "Planar": "planar",
-}
-_AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
 
 
 def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
@@ -101,8 +89,8 @@ class _Description:
         """Return a joint as steps: Pinocchio's joint, kind, axis, and where it stands in the one before."""
         if joint.shortname() == "JointModelComposite":
             inner = joint.extract()
-            return [(j, *_kind(j), X) for j, X in zip(inner.joints, inner.jointPlacements, strict=True)]
-        return [(joint, *_kind(joint), pin.SE3.Identity())]
+            return [(j, *joint_kind(j), X) for j, X in zip(inner.joints, inner.jointPlacements, strict=True)]
+        return [(joint, *joint_kind(joint), pin.SE3.Identity())]
 
     # The engine's own values, in the description's coordinates.
 
@@ -138,19 +126,6 @@ class _Description:
         g = np.array(pin.computeGeneralizedGravity(raw, self.data, theirs))
         passive = -np.array(raw.damping) * u
         return {"M": T.T @ M @ T, "g": T.T @ g, "nle": T.T @ (nle + M @ slip), "passive": T.T @ passive}
-
-
-def _kind(joint: Any) -> tuple[str, Array | None]:
-    name = joint.shortname().removeprefix("JointModel")
-    if name[:-1] in _ALIGNED:
-        return _ALIGNED[name[:-1]], _AXES[name[-1]]
-    if name not in _UNALIGNED:
-        raise UnsupportedError(f"pinocchio: made a {name} joint, which has no counterpart here")
-    kind = _UNALIGNED[name]
-    if kind_of(kind).n_axes:
-        motion = np.ravel(joint.createData().S)
-        return kind, motion[:3] if kind == "prismatic" else motion[3:]
-    return kind, None
 
 
 def _body(name: str, inertia: Any) -> Body:
