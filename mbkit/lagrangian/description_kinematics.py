@@ -25,6 +25,8 @@ from mbkit.model.joint_types import cross3
 from mbkit.model.parts import Loop, Prescribed
 
 Vector = list[Any]
+#: The joints from a body down to one that carries it.
+_Way = list[Joint]
 #: (linear, angular) velocity per unit of one velocity.
 Column = tuple[Vector, Vector]
 #: What enters the formulas of joints and energies; springs and dampers are kept as they are written.
@@ -158,14 +160,15 @@ class SymbolicKinematics:
         at = self.model.layout.v[joint.mimic.joint if joint.mimic else joint.name].start + k
         return at, self.space.of(self._v[joint.name][k] / self.velocities[at])
 
-    def _to_world(self, body: str, x: Vector) -> Vector:
-        for joint in self.way(body):
-            x = self.to_parent(joint, x, 1)
+    def carried(self, way: _Way, x: Vector, weight: int) -> Vector:
+        """Return a point (weight 1) or a direction (0) of a way's first body in the axes of its last."""
+        for joint in way:
+            x = self.to_parent(joint, x, weight)
         return x
 
-    def way(self, body: str) -> list[Joint]:
+    def way(self, body: str) -> _Way:
         """Return the joints from a body down to the ground."""
-        out: list[Joint] = []
+        out: _Way = []
         while body != "world":
             out.append(self._carrier[body])
             body = out[-1].parent
@@ -279,8 +282,9 @@ class SymbolicKinematics:
         """Yield each spring between points with the square of its length."""
         for spring in self.model.springs:
             values = self.values["springs", spring.name]
-            ends = self._to_world(spring.body_a, values.point_a), self._to_world(spring.body_b, values.point_b)
-            gap = [y - x for x, y in zip(*ends, strict=True)]
+            a = self.carried(self.way(spring.body_a), values.point_a, 1)
+            b = self.carried(self.way(spring.body_b), values.point_b, 1)
+            gap = [y - x for x, y in zip(a, b, strict=True)]
             yield spring, self.shown(_dot(gap, gap))
 
     def coordinates_of(self, joint: Joint) -> list[sp.Expr]:
@@ -356,7 +360,7 @@ def _times(R: Any, x: Vector) -> Vector:
 
 
 def _transposed_times(R: Any, x: Vector) -> Vector:
-    return [_dot([R[0][i], R[1][i], R[2][i]], x) for i in range(3)]
+    return _times(list(zip(*R, strict=True)), x)
 
 
 # Coordinates that are moved in time, as expressions of it.
@@ -364,11 +368,11 @@ def _transposed_times(R: Any, x: Vector) -> Vector:
 _EPS: Final = 2.0**-52
 
 
-def motion(kin: SymbolicKinematics, given: Prescribed, t: sp.Symbol) -> sp.Expr:
+def motion(kin: SymbolicKinematics, prescribed: Prescribed, t: sp.Symbol) -> sp.Expr:
     """Return offset + rate t + amplitude sin(frequency t + phase)."""
     fields = ("offset", "rate", "amplitude", "frequency", "phase")
-    offset, rate, amplitude, frequency, phase = (kin.written("prescribed", given, f) for f in fields)
-    if kin.model.joint(given.joint).type.angular:
+    offset, rate, amplitude, frequency, phase = (kin.written("prescribed", prescribed, f) for f in fields)
+    if kin.model.joint(prescribed.joint).type.angular:
         offset = _read(offset)
     return offset + rate * t + amplitude * sp.sin(frequency * t + _read(phase))
 
@@ -404,7 +408,11 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
     (its negative after an odd number of turns). Others: ½ Σ b_k x a_k of the frames' axes, the sine of their angle; it
     is zero at half a turn too, where its rows depend on each other.
     """
-    ends = _ways(kin, loop)
+    a, b = ends = kin.way(loop.body_a), kin.way(loop.body_b)
+    # Both ways end at the last body that they share.
+    while a and b and a[-1] is b[-1]:
+        a.pop()
+        b.pop()
     rows = _meeting(kin, loop, ends)
     if loop.kind == "frame":
         rows += _aligned(kin, loop, ends)
@@ -416,33 +424,11 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
     return rows
 
 
-#: From a body of the loop up to the one that carries both ends.
-_Way = list[Joint]
-
-
-def _ways(kin: SymbolicKinematics, loop: Loop) -> tuple[_Way, _Way]:
-    """Return the joints from either end to the body that carries both."""
-    a, b = kin.way(loop.body_a), kin.way(loop.body_b)
-    while a and b and a[-1] is b[-1]:
-        a.pop()
-        b.pop()
-    return a, b
-
-
 def _meeting(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
     values = kin.values["loops", loop.name]
-    points = [
-        _carried(kin, way, x, 1) for way, x in zip(ends, (values.translation_a, values.translation_b), strict=True)
-    ]
-    gap = [x - y for x, y in zip(*points, strict=True)]
+    a, b = kin.carried(ends[0], values.translation_a, 1), kin.carried(ends[1], values.translation_b, 1)
+    gap = [x - y for x, y in zip(a, b, strict=True)]
     return _independent(kin, gap, f"loop {loop.name!r}: its points never meet")
-
-
-def _carried(kin: SymbolicKinematics, way: _Way, x: list[Any], weight: int) -> list[Any]:
-    """Return a point (weight 1) or a direction (0) of the first body in the axes of the last."""
-    for joint in way:
-        x = kin.to_parent(joint, x, weight)
-    return x
 
 
 def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
@@ -452,7 +438,7 @@ def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> li
         return _in_plane(kin, loop, ends, axes[0] if axes else None, message)
     values = kin.values["loops", loop.name]
     frames = [
-        [_carried(kin, way, [row[k] for row in R], 0) for k in range(3)]
+        [kin.carried(way, [row[k] for row in R], 0) for k in range(3)]
         for way, R in zip(ends, (values.rotation_a, values.rotation_b), strict=True)
     ]
     half = kin.space.number(Fraction(1, 2))

@@ -32,10 +32,9 @@ def from_model(
 ) -> Lagrangian:
     """Return a model as a `Lagrangian` to read and to run: T, V and Rayleigh's dissipation in its coordinates.
 
-    The joints' own formulas are evaluated on exact sums of cosines and sines, which are
-    short without a search: a planar chain has cos(theta2 + theta3) where one would write it.
-    Numbers are the decimals of the description. Springs are in V, dampers in the
-    dissipation, armature in T; dry friction and limits are left out, as in every engine.
+    The joints' own formulas are evaluated on exact sums of cosines and sines, which are short without a search: a
+    planar chain has cos(theta2 + theta3) where one would write it. Numbers are the decimals of the description. Springs
+    are in V, dampers in the dissipation, armature in T; dry friction and limits are left out, as in every engine.
 
     Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
     both ends. A point closure has three rows, two where the loop lies in a plane, and its multipliers are
@@ -48,9 +47,8 @@ def from_model(
     model : Model
         Of joints whose velocities are the rates of their coordinates: not ball and free ones.
     symbols : bool, optional
-        Whether a system of the catalog is written in the textbooks' symbols, with the model's
-        numbers as values of the parameters: cart_pole in m_c, m_p, l and g. Not given, it is if
-        the model has no named parameters of its own.
+        Whether a system of the catalog is written in the textbooks' symbols, with the model's numbers as values of the
+        parameters: cart_pole in m_c, m_p, l and g. Not given, it is if the model has no named parameters of its own.
     coordinates : sequence of str, optional
         Names instead of the model's, such as ``["q1", "q2"]``, prescribed ones included.
     drives : bool

@@ -1,9 +1,8 @@
 """Constraints embedded: the motion on independent coordinates alone.
 
-A chart divides q into independent and dependent coordinates. The dependent ones follow
-from f(q, t) = 0 by Newton's iteration, velocities from J v + ∂f/∂t = 0 as
-v = N(q) u + v_t, and the equation is pulled back by N (Wehage and Haug 1982,
-Generalized coordinate partitioning; Shabana 2013, Dynamics of Multibody Systems, ch. 5)::
+A chart divides q into independent and dependent coordinates. The dependent ones follow from f(q, t) = 0 by Newton's
+iteration, velocities from J v + ∂f/∂t = 0 as v = N(q) u + v_t, and the equation is pulled back by N (Wehage and Haug
+1982, Generalized coordinate partitioning; Shabana 2013, Dynamics of Multibody Systems, ch. 5)::
 
     Nᵀ M N u̇ = Nᵀ (τ + applied - M a_t)
 

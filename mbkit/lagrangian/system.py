@@ -48,9 +48,8 @@ class Lagrangian(EnergyForm):
     time : sympy.Symbol, optional
         Where T, V, a force or a constraint depends on it. Dynamicsymbols bring their own.
     forces : mapping of coordinate to sympy.Expr, optional
-        Generalized forces beside V's, of coordinates, velocities, time and parameters.
-        A symbol that stands alone and nowhere else is an input: it is that coordinate's
-        entry of ``tau`` when the equation is run.
+        Generalized forces beside V's, of coordinates, velocities, time and parameters. A symbol that stands alone and
+        nowhere else is an input: it is that coordinate's entry of ``tau`` when the equation is run.
     dissipation : sympy.Expr, optional
         Rayleigh's function R of the velocities; the force is -∂R/∂v.
     parameters : mapping of sympy.Symbol to float or None, or sequence of symbols, optional

@@ -204,9 +204,8 @@ def furuta_pendulum(
     """Return a rotary pendulum: an arm turned about the vertical by a torque ``tau`` carries a pendulum.
 
     Two coordinates: ``alpha``, the arm's turn about the vertical, which is cyclic, and ``theta``, the pendulum's angle
-    from the downward vertical, a turn about the arm. At zero the pendulum hangs. L is the arm's length,
-    J its moment about the vertical; the pendulum is a thin rod with its centre of mass l from the hinge and the moment
-    I across it.
+    from the downward vertical, a turn about the arm. At zero the pendulum hangs. L is the arm's length, J its moment
+    about the vertical; the pendulum is a thin rod with its centre of mass l from the hinge and the moment I across it.
 
     References
     ----------
@@ -370,9 +369,8 @@ def rigid_slider_crank(
 
     One coordinate, ``theta``, the crank's angle from the dead centre at which the piston is farthest; it is positive
     from there towards +y, counterclockwise with the piston along +x. The parameter ``tau`` is a constant torque on the
-    crank. It adds to the ``torque=`` of `mbkit.simulate`; with ``torque=0`` here, that is the whole input. J = J1 +
-    m1 L1²/4 + m2 (x2′² + y2′²) + J2 ψ′² + m3 x3′², never zero: dead centres are
-    passed.
+    crank. It adds to the ``torque=`` of `mbkit.simulate`; with ``torque=0`` here, that is the whole input. J = J1 + m1
+    L1²/4 + m2 (x2′² + y2′²) + J2 ψ′² + m3 x3′², never zero: dead centres are passed.
 
     References
     ----------
@@ -476,12 +474,11 @@ def gyroscope(
 ) -> Lagrangian:
     """Return a symmetric rotor in two gimbals, with its centre of mass on its axis.
 
-    Three coordinates: ``alpha``, the outer gimbal's turn about the vertical, ``beta``, the inner gimbal's turn
-    about the outer one, which is the elevation of the rotor's axis above the horizontal, and ``gamma``, the
-    rotor's turn in the inner gimbal; α and γ are cyclic. A and C are the rotor's moments across and along its
-    axis, about its centre of mass, which lies l from the gimbals' centre; A_i, B_i and C_i the inner gimbal's
-    about its hinge, along the rotor's axis and across both, J_o the outer one's about the vertical. At β = ±π/2
-    the mass matrix is singular but for J_o.
+    Three coordinates: ``alpha``, the outer gimbal's turn about the vertical, ``beta``, the inner gimbal's turn about
+    the outer one, which is the elevation of the rotor's axis above the horizontal, and ``gamma``, the rotor's turn in
+    the inner gimbal; α and γ are cyclic. A and C are the rotor's moments across and along its axis, about its centre of
+    mass, which lies l from the gimbals' centre; A_i, B_i and C_i the inner gimbal's about its hinge, along the rotor's
+    axis and across both, J_o the outer one's about the vertical. At β = ±π/2 the mass matrix is singular but for J_o.
 
     References
     ----------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -278,10 +279,7 @@ def _inputs(
     given: Mapping[sp.Symbol, sp.Expr], known: set[sp.Symbol], others: Iterable[sp.Expr]
 ) -> Mapping[sp.Symbol, sp.Symbol]:
     """Return the symbols that stand alone as a force, and nowhere else."""
-    counts: dict[Any, int] = {}
-    for x in (*given.values(), *others):
-        for s in x.free_symbols:
-            counts[s] = counts.get(s, 0) + 1
+    counts = Counter(s for x in (*given.values(), *others) for s in x.free_symbols)
     alone = {q: x for q, x in given.items() if isinstance(x, sp.Symbol) and x not in known and counts[x] == 1}
     return MappingProxyType(alone)
 

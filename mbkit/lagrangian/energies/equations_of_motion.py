@@ -70,18 +70,18 @@ class EquationsOfMotion(Printable):
     @property
     def applied(self) -> sp.ImmutableMatrix:
         """Q - C v - d - ∂V/∂q (+ Jᵀ λ): what M v̇ is, (n, 1)."""
-        out = self.forces - self.coriolis_force - self.drift - self.potential_gradient
-        if self.multipliers:
-            out += self.constraint_jacobian.T * sp.Matrix(self.multipliers)
-        return sp.ImmutableMatrix(out)
+        return sp.ImmutableMatrix(self._right_side - self.coriolis_force - self.drift - self.potential_gradient)
+
+    @property
+    def _right_side(self) -> sp.ImmutableMatrix:
+        """Q (+ Jᵀ λ), (n, 1)."""
+        J, multipliers = self.constraint_jacobian, self.multipliers
+        return self.forces + J.T * sp.Matrix(multipliers) if multipliers else self.forces
 
     def _rows(self) -> list[tuple[list[sp.Expr], sp.Expr]]:
         """Return the terms of each left side in the order of textbooks, and its right side."""
-        right = self.forces
-        if self.multipliers:
-            right += self.constraint_jacobian.T * sp.Matrix(self.multipliers)
         out = []
-        for i, force in enumerate(right):
+        for i, force in enumerate(self._right_side):
             terms = [m * a for m, a in zip(self.mass_matrix[i, :], self.accelerations, strict=True)]
             terms += [self.coriolis_force[i], self.drift[i], self.potential_gradient[i]]
             out.append(([x for x in terms if x != 0], force))
@@ -151,13 +151,10 @@ def printed_equations(
     progress: Callable[[float, str], object] = lambda fraction, what: None,  # noqa: ARG005
 ) -> list[tuple[str, str]]:
     """Return the two sides of each equation and of each constraint; `progress` gets the fraction done."""
-    right = e.forces
-    if e.multipliers:
-        right = right + e.constraint_jacobian.T * sp.Matrix(e.multipliers)
     join = board.latex_of if latex else board.text_of
-    out = []
-    for i, force in enumerate(right):
-        progress(i / len(right), f"equation {i + 1} of {len(right)}")
+    out, n = [], len(e.coordinates)
+    for i, force in enumerate(e._right_side):
+        progress(i / n, f"equation {i + 1} of {n}")
         parts = [m * a for m, a in zip(e.mass_matrix[i, :], e.accelerations, strict=True)]
         parts += [_by_speeds(e.coriolis_force[i], e.velocities), e.drift[i], spread(e.potential_gradient[i])]
         out.append((join(short(part) for part in parts), join([short(force)])))

@@ -1,13 +1,13 @@
 """Symbols of coordinates, velocities and accelerations, by name.
 
-Inside, a coordinate is a plain symbol and so is its velocity, so that ∂T/∂v is a plain
-derivative. `sympy.physics.mechanics.dynamicsymbols` and their derivatives are replaced
-by such symbols when they come in.
+Inside, a coordinate is a plain symbol and so is its velocity, so that ∂T/∂v is a plain derivative.
+`sympy.physics.mechanics.dynamicsymbols` and their derivatives are replaced by such symbols when they come in.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -184,11 +184,9 @@ def listed(what: str, given: Any) -> list[Any]:
 
 
 def _differ(symbols: Sequence[sp.Symbol]) -> None:
-    seen: dict[str, sp.Symbol] = {}
-    for s in symbols:
-        if s.name in seen:
-            raise InputError(f"coordinates: {s.name!r} stands twice among coordinates, velocities and time")
-        seen[s.name] = s
+    for name, times in Counter(s.name for s in symbols).items():
+        if times > 1:
+            raise InputError(f"coordinates: {name!r} stands twice among coordinates, velocities and time")
 
 
 def fits(what: str, s: sp.Symbol) -> None:

@@ -59,10 +59,9 @@ class SystemSummary:
         symbols = (*s.parameters, *s.coordinates, *s.velocities, *s.inputs.values())
         return Abbreviations(shown, symbols)
 
-    def _equations(self, *, latex: bool = False) -> list[tuple[str, str]]:
-        return [] if self.long else self._lines(self._short, latex=latex)
-
-    def _lines(self, short: Abbreviations, *, latex: bool) -> list[tuple[str, str]]:
+    def _equations(self, short: Abbreviations, *, latex: bool = False) -> list[tuple[str, str]]:
+        if self.long:
+            return []
         # The matrices are there before; they take about a third of the time.
         return printed_equations(
             *(self.equations, self._board, short),
@@ -117,7 +116,7 @@ class SystemSummary:
             out.append("The equations are too long for a page; --python and --c write them.")
         else:
             out.append(f"Equation{'s' * (len(s.coordinates) > 1)} of motion:")
-            for left, right in self._equations():
+            for left, right in self._equations(self._short):
                 out += ["  " + line for line in folded(f"{left} = {right}", width - 2)]
         out += ["", *self._conserved(width)]
         return "\n".join(out)
@@ -158,7 +157,7 @@ class SystemSummary:
             rows.append(rf"{name} &= \begin{{bmatrix}} {entries} \end{{bmatrix}}")
         out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
         if not self.long:
-            out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(latex=True)]))
+            out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(self._short, latex=True)]))
         if self._kept:
             out.append(_aligned([f"{board.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
         return "\n".join(out)
@@ -192,8 +191,7 @@ class SystemSummary:
         out["forces"] = [text(x) for x in e.forces]
         out["constraints"] = [text(x) for x in s.constraints]
         # Each equation alone: no letter is explained elsewhere.
-        plain = Abbreviations((), ())
-        rows = [] if self.long else self._lines(plain, latex=True)
+        rows = self._equations(Abbreviations((), ()), latex=True)
         out["equations"] = [] if self.long else [f"{text(x.lhs)} = {text(x.rhs)}" for x in e.equations()]
         out["latex"] = [f"{left} = {right}" for left, right in rows]
         out["cyclic"] = [name(q) for q in s.cyclic_coordinates()]

@@ -1,16 +1,14 @@
 """Quasi-velocities: a system's equations in velocities w that are no coordinates' rates, q̇ = D(q) w.
 
-Boltzmann and Hamel's equations (Greenwood 2003, Advanced Dynamics, ch. 4.3), with T(q, w, t)
-and p_k = ∂T/∂w_k::
+Boltzmann and Hamel's equations (Greenwood 2003, Advanced Dynamics, ch. 4.3), with T(q, w, t) and p_k = ∂T/∂w_k::
 
     d/dt ∂T/∂w_i  -  Σ_r D_ri ∂T/∂q_r  +  Σ_jk γ^k_ij w_j p_k  =  Σ_r D_ri (Q_r - ∂V/∂q_r)
 
     γ^k_ij = Σ_rs (∂W_kr/∂q_s - ∂W_ks/∂q_r) D_ri D_sj          W = D⁻¹
 
-The upper index k belongs to the momentum, i to the equation, j to the velocity; γ is
-skew in i and j. The columns of D are vector fields whose Lie brackets it holds:
-[D_i, D_j] = Σ_k γ^k_ij D_k. For a rotation and body-axes rates γ^k_ij = ε_ijk, and the term
-is ω × p, Euler's.
+The upper index k belongs to the momentum, i to the equation, j to the velocity; γ is skew in i and j. The columns of D
+are vector fields whose Lie brackets it holds: [D_i, D_j] = Σ_k γ^k_ij D_k. For a rotation and body-axes rates γ^k_ij =
+ε_ijk, and the term is ω × p, Euler's.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Routh's reduction: cyclic coordinates leave the equations, their momenta stay as constants.
 
-With the cyclic coordinates' velocities u, those of the others v, and M, b of T split
-alike, p = Mᵤᵤ u + Mᵤᵥ v + bᵤ is constant where nothing acts, and R = L - pᵀ u with u
-eliminated is the Lagrangian of the others (Goldstein, Poole, Safko 2002, ch. 8.3, where
-it has the other sign; Lanczos 1970, ch. V.4)::
+With the cyclic coordinates' velocities u, those of the others v, and M, b of T split alike, p = Mᵤᵤ u + Mᵤᵥ v + bᵤ is
+constant where nothing acts, and R = L - pᵀ u with u eliminated is the Lagrangian of the others (Goldstein, Poole, Safko
+2002, ch. 8.3, where it has the other sign; Lanczos 1970, ch. V.4)::
 
     R = ½ vᵀ (Mᵥᵥ - Mᵥᵤ Mᵤᵤ⁻¹ Mᵤᵥ) v  +  vᵀ (bᵥ + Mᵥᵤ Mᵤᵤ⁻¹ (p - bᵤ))  +  T0  -  Vₑ
     Vₑ = V + ½ (p - bᵤ)ᵀ Mᵤᵤ⁻¹ (p - bᵤ)
@@ -13,7 +12,7 @@ The term linear in v makes gyroscopic forces, and Vₑ is the effective potentia
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, Generic, NamedTuple, TypeVar
@@ -47,6 +46,14 @@ class ReducedState(NamedTuple):
     q: Array
     v: Array
     values: dict[str, Any]
+
+
+class Motion(NamedTuple):
+    """States in time: t (K,) in s, q and v (K, n)."""
+
+    t: Array
+    q: Array
+    v: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -151,7 +158,15 @@ class Routhian(Printable, Generic[FormT]):
         UnsupportedError
             A torque acted on the run, of which only the saved states know.
         """
-        return reconstructed(self, run, q0, values)
+        t, q, v, parameters = _read(self, run, values)
+        kept, ignored = self._places
+        start, rates, n = _start(self, q0, q), _rates(self), len(self.system.coordinates)
+        steps = _increments(self, t, q, v, parameters, rates)
+        whole, speeds = np.empty((len(t), n)), np.empty((len(t), n))
+        whole[:, kept], speeds[:, kept] = q, v
+        whole[:, ignored] = start + np.concatenate([np.zeros((1, len(ignored))), np.cumsum(steps, axis=0)])
+        speeds[:, ignored] = rates(q, v, parameters)[..., 0]
+        return Motion(t, whole, speeds)
 
     def latex(self) -> str:
         """Return R, the momenta and the ignored rates as an aligned LaTeX block."""
@@ -207,16 +222,12 @@ def _quadratic(M: Any, v: list[sp.Symbol]) -> sp.Expr:
 def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
     free = system.cyclic_coordinates()
     ignorable = system.forced_cyclic_coordinates() | dict.fromkeys(free, sp.Integer(0))
-    if cyclic is None:
-        wanted: Iterable[Any] = free
-    else:
-        wanted = listed("cyclic", cyclic)
     by_name = {q.name: q for q in system.coordinates}
     out: list[sp.Symbol] = []
-    for given in wanted:
-        q = by_name.get(name_of(given))
+    for wanted in free if cyclic is None else listed("cyclic", cyclic):
+        q = by_name.get(name_of(wanted))
         if q is None:
-            raise InputError(f"cyclic: {given} is no coordinate; the coordinates are {', '.join(by_name)}")
+            raise InputError(f"cyclic: {wanted} is no coordinate; the coordinates are {', '.join(by_name)}")
         if q not in ignorable:
             raise InputError(f"cyclic: L holds {q}; cyclic are {plain(free) or 'none'}")
         if q not in free:
@@ -275,29 +286,6 @@ _TOLERANCE: Final = 1e-13
 _SAME: Final = 1e-9
 
 
-class Motion(NamedTuple):
-    """States in time: t (K,) in s, q and v (K, n)."""
-
-    t: Array
-    q: Array
-    v: Array
-
-
-def reconstructed(routhian: Routhian[Any], run: Any, q0: ArrayLike, values: Mapping[str, float]) -> Motion:
-    """Return the motion of the whole system; see `Routhian.reconstruct`."""
-    t, q, v, parameters = _read(routhian, run, values)
-    kept, ignored = routhian._places
-    start = _start(routhian, q0, q)
-    rates = _rates(routhian)
-    steps = _increments(routhian, t, q, v, parameters, rates)
-    n = len(kept) + len(ignored)
-    whole, speeds = np.empty((len(t), n)), np.empty((len(t), n))
-    whole[:, kept], speeds[:, kept] = q, v
-    whole[:, ignored] = start + np.concatenate([np.zeros((1, len(ignored))), np.cumsum(steps, axis=0)])
-    speeds[:, ignored] = rates(q, v, parameters)[..., 0]
-    return Motion(t, whole, speeds)
-
-
 def _read(routhian: Routhian[Any], run: Any, values: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
     """Return t, q, v and a row of the reduced model's parameters for each state, the time among them."""
     model, held = routhian._model, {}
@@ -336,21 +324,20 @@ def _read(routhian: Routhian[Any], run: Any, values: Mapping[str, float]) -> tup
 def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
     kept, ignored = routhian._places
     whole = len(kept) + len(ignored)
-    given = np.asarray(q0, dtype=np.float64)
-    if given.shape == (len(ignored),):
-        require_finite("q0", given)
-        return given
-    if given.shape != (whole,):
+    start = np.asarray(q0, dtype=np.float64)
+    if start.shape not in ((len(ignored),), (whole,)):
         raise InputError(
             f"q0: expected the whole configuration ({whole},) or its ignored coordinates ({len(ignored)},), "
-            f"got shape {given.shape}"
+            f"got shape {start.shape}"
         )
-    require_finite("q0", given)
-    off = float(np.abs(given[kept] - q[0]).max())
+    require_finite("q0", start)
+    if len(start) < whole:
+        return start
+    off = float(np.abs(start[kept] - q[0]).max())
     if off > _SAME * (1 + float(np.abs(q[0]).max())):
         names = ", ".join(x.name for x in routhian.lagrangian.coordinates)
         raise InputError(f"q0: its {names} differ from the run's first state by {off:.3g}")
-    return given[ignored]
+    return start[ignored]
 
 
 def _rates(routhian: Routhian[Any]) -> Numeric:

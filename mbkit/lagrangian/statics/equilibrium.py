@@ -177,8 +177,7 @@ def equilibrium(
     Parameters
     ----------
     dynamics : Dynamics or Lagrangian
-        Of any engine. The own derivation differentiates the forces exactly; of others
-        differences are taken.
+        Of any engine. The own derivation differentiates the forces exactly; of others differences are taken.
     q0 : (nq,) array_like, optional
         Start of the search; the neutral configuration and then random ones when not given.
     tau : (nv,) array_like, optional
@@ -187,9 +186,8 @@ def equilibrium(
         A configuration: what is returned is the tau that holds it. With constraints,
         which take a part of the load, it is the least such tau.
     forces : mapping of str to (3,) or (6,) array_like, optional
-        What acts on frames or bodies of a robot: force at the frame's origin, N, and
-        moment, N m, in world axes. A payload of mass m in the hand is
-        ``{"hand": [0, 0, -9.81 * m]}``; it stays as it is when the robot moves.
+        What acts on frames or bodies of a robot: force at the frame's origin, N, and moment, N m, in world axes. A
+        payload of mass m in the hand is ``{"hand": [0, 0, -9.81 * m]}``; it stays as it is when the robot moves.
     seed : int
         Of the random starts.
 
@@ -211,9 +209,8 @@ def equilibrium(
     from the end. It finds one equilibrium, not all; of an upright and a hanging pendulum
     the one that is nearer in its own way.
 
-    Stability is that of M δq̈ + D δq̇ + K δq = 0 on what constraints leave free. Where K is
-    symmetric, and D has no part that feeds energy in, K's sign decides (Lagrange and
-    Dirichlet, Kelvin and Tait); else the eigenvalues do.
+    Stability is that of M δq̈ + D δq̇ + K δq = 0 on what constraints leave free. Where K is symmetric, and D has no
+    part that feeds energy in, K's sign decides (Lagrange and Dirichlet, Kelvin and Tait); else the eigenvalues do.
 
     Examples
     --------

@@ -28,8 +28,7 @@ def generalized_force(
     Parameters
     ----------
     forces : sequence of vectors
-        f_i: of 1, 2 or 3 components along fixed axes, N; a single vector where there is
-        one point.
+        f_i: of 1, 2 or 3 components along fixed axes, N; a single vector where there is one point.
     points : sequence of vectors
         R_i(q, t), where the forces act, along the same axes, m.
     coordinates : sequence of sympy symbols

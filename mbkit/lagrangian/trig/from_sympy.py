@@ -49,17 +49,12 @@ def forms(x: sp.Expr) -> list[sp.Expr]:
         reading = _Reading(x)
         out.append(reading.as_it_stands())
         if x.has(*_QUOTIENTS):
-            reading = _Reading(_plain(x))
+            for f, put in _QUOTIENTS.items():
+                x = x.replace(f, put)
+            reading = _Reading(x)
             out.append(reading.as_it_stands())
         out += reading.over_one_denominator()
     return out
-
-
-def _plain(x: sp.Expr) -> sp.Expr:
-    """Return an expression in cosines and sines alone."""
-    for f, put in _QUOTIENTS.items():
-        x = x.replace(f, put)
-    return x
 
 
 @dataclass

@@ -81,10 +81,8 @@ class TrigRing:
         return self._turned(1, angle)
 
     def _turned(self, kind: int, angle: Any) -> TrigPolynomial:
-        wanted = angle.expression
-        if wanted in self._angle:
-            return self.turned(kind, {wanted: 1})
-        value, rest = wanted.as_coeff_Mul()
+        x = angle.expression
+        value, rest = (1, x) if x in self._angle else x.as_coeff_Mul()
         return self.turned(kind, {rest: int(value)})
 
     def turned(self, kind: int, multiples: Mapping[sp.Expr, int]) -> TrigPolynomial:
@@ -218,15 +216,19 @@ def quotient(above: TrigPolynomial, below: TrigPolynomial) -> TrigPolynomial | N
         return None
     a, b = _exponential(above), _exponential(below)
     # Of a product the least and the largest exponents add, of each variable by itself.
-    low, high = ([p - q for p, q in zip(f(a), f(b), strict=True)] for f in (_least, _largest))
+    spans = list(zip(zip(*a, strict=True), zip(*b, strict=True), strict=True))
+    low, high = [min(x) - min(y) for x, y in spans], [max(x) - max(y) for x, y in spans]
     lead = max(b)
+    real, imaginary = b[lead]
+    size = real**2 + imaginary**2
+    inverse = real / size, -imaginary / size
     out: _Exponential = {}
     while a:
         first = max(a)
         step = tuple(p - q for p, q in zip(first, lead, strict=True))
         if any(not i <= e <= j for i, e, j in zip(low, step, high, strict=True)) or len(out) == _MOST:
             return None
-        out[step] = factor = _ratio(a[first], b[lead])
+        out[step] = factor = _times(a[first], inverse)
         for exponents, value in b.items():
             _subtract(a, tuple(p + q for p, q in zip(exponents, step, strict=True)), _times(factor, value))
     return _sum(above, out)
@@ -257,22 +259,8 @@ def _sum(like: TrigPolynomial, x: _Exponential) -> TrigPolynomial:
     return TrigPolynomial(like.space, terms)
 
 
-def _least(x: _Exponential) -> list[int]:
-    return [min(e) for e in zip(*x, strict=True)]
-
-
-def _largest(x: _Exponential) -> list[int]:
-    return [max(e) for e in zip(*x, strict=True)]
-
-
 def _times(x: _Complex, y: _Complex) -> _Complex:
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
-
-
-def _ratio(x: _Complex, y: _Complex) -> _Complex:
-    size = y[0] ** 2 + y[1] ** 2
-    real, imaginary = _times(x, (y[0], -y[1]))
-    return real / size, imaginary / size
 
 
 def _subtract(out: _Exponential, exponents: _Exponents, value: _Complex) -> None:

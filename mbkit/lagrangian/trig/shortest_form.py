@@ -63,8 +63,9 @@ def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = Tru
     writer = _Writer(x, whole, decimals)
     if len(x.terms) > _SMALL:
         return writer.expression(writer.as_it_is())
+    wider = [_Writer(y, whole, decimals) for y in combine_angles(x)]
     forms = [(writer, form) for form in writer.forms()]
-    forms += [(other, form) for other in map(writer.like, combine_angles(x)) for form in other.squares()]
+    forms += [(other, form) for other in wider for form in other.squares()]
     forms.sort(key=lambda pair: len(pair[1]))
     near = [(w, form) for w, form in forms[:_TRIED] if len(form) <= len(forms[0][1]) + 2]
     candidates = [w.expression(form) for w, form in near]
@@ -75,10 +76,6 @@ class _Writer:
     def __init__(self, x: TrigPolynomial, whole: bool, decimals: bool) -> None:
         self._x, self._whole, self._decimals = x, whole, decimals
         self._sums: dict[frozenset[Any], sp.Expr] = {}
-
-    def like(self, x: TrigPolynomial) -> _Writer:
-        """Return a writer of another sum."""
-        return _Writer(x, self._whole, self._decimals)
 
     def squares(self) -> list[Form]:
         """Return the sum with its last angle split off."""
