@@ -342,7 +342,7 @@ def _advances(joint: Joint, i: int) -> bool:
 
 
 def _turn(angle: sp.Expr) -> sp.Expr:
-    """Return what a cosine is taken of: a coordinate where an angle is a whole multiple of it."""
+    """Return an angle to take cosines of: a coordinate where the angle is a whole multiple of it."""
     value, rest = sp.expand(angle).as_coeff_Mul()
     return rest if value.is_Integer and rest.is_Symbol else sp.expand(angle)
 

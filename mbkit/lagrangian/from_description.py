@@ -32,23 +32,22 @@ def from_model(
 ) -> Lagrangian:
     """Return a model as a `Lagrangian` to read and to run: T, V and Rayleigh's dissipation in its coordinates.
 
-    The joints' own formulas are evaluated on exact sums of cosines and sines, which are short without a search: a
-    planar chain has cos(theta2 + theta3) where one would write it. Numbers are the decimals of the description. Springs
-    are in V, dampers in the dissipation, armature in T; dry friction and limits are left out, as in every engine.
+    The joints' formulas are evaluated on exact sums of cosines and sines. Numbers are the decimals of the description.
+    Springs are in V, dampers in the dissipation, armature in T; dry friction and limits are left out, as in every
+    engine.
 
     Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
-    both ends. A point closure has three rows, two where the loop lies in a plane, and its multipliers are
-    the force on body a; a frame closure has three more of the orientation, one where all axes in the
-    loop are parallel (`mbkit.lagrangian.description_kinematics`). Coordinates that are prescribed become
-    functions of the time, and T has terms of first and zeroth degree then.
+    both ends. A point closure has three rows, two in a plane, and its multipliers are the force on body a; a frame
+    closure has three more, one where all axes in the loop are parallel (`mbkit.lagrangian.description_kinematics`).
+    Prescribed coordinates become functions of the time, and T has terms of first and zeroth degree then.
 
     Parameters
     ----------
     model : Model
         Of joints whose velocities are the rates of their coordinates: not ball and free ones.
     symbols : bool, optional
-        Whether a system of the catalog is written in the textbooks' symbols, with the model's numbers as values of the
-        parameters: cart_pole in m_c, m_p, l and g. Not given, it is if the model has no named parameters of its own.
+        Whether a catalog system is written in the textbooks' symbols, with the model's numbers as their values:
+        cart_pole in m_c, m_p, l and g. By default, if the model has no named parameters of its own.
     coordinates : sequence of str, optional
         Names instead of the model's, such as ``["q1", "q2"]``, prescribed ones included.
     drives : bool
@@ -62,13 +61,13 @@ def from_model(
     UnsupportedError
         Ball or free joints, too many terms to read, or no coordinate that is left to move.
     InputError
-        `symbols` asked for of a model that is no system of the catalog, names that do not fit, or
-        a loop whose ends never meet or do not move against each other.
+        `symbols` of a model that is not in the catalog, names that do not fit, or a loop whose ends never meet or do
+        not move against each other.
 
     Notes
     -----
-    Where a spatial loop has more rows than it takes freedoms (Bricard's, Bennett's), the set is redundant: which
-    rows are enough changes from pose to pose, and running it is refused with the rows by name.
+    A spatial loop with more rows than freedoms that it takes (Bricard's, Bennett's) is redundant: running it is
+    refused with the rows by name.
 
     Examples
     --------
@@ -164,9 +163,9 @@ def _check(model: Model) -> None:
         )
 
 
-def _time(taken: set[str]) -> sp.Symbol:
+def _time(used: set[str]) -> sp.Symbol:
     names = chain(("t", "time"), (f"t_{k}" for k in count()))
-    return sp.Symbol(next(name for name in names if name not in taken))
+    return sp.Symbol(next(name for name in names if name not in used))
 
 
 def _check_kept(model: Model, kept: set[sp.Symbol], rows: Iterable[tuple[str, sp.Expr]]) -> None:

@@ -335,7 +335,7 @@ _OFTEN: Final = 3
 class Abbreviations:
     """Letters for the long roots among some expressions: `roots` holds ρ, or ρ1, ρ2, ..., and what each stands for."""
 
-    def __init__(self, expressions: Iterable[sp.Expr], taken: Iterable[sp.Symbol]) -> None:
+    def __init__(self, expressions: Iterable[sp.Expr], used: Iterable[sp.Symbol]) -> None:
         counts: Counter[sp.Expr] = Counter()
         roots: set[sp.Expr] = set()
         for x in expressions:
@@ -346,7 +346,7 @@ class Abbreviations:
                         roots.add(part.base)
         # In the order in which they were met.
         bases = [base for base, n in counts.items() if base in roots and n >= _OFTEN]
-        names = {s.name for s in taken}
+        names = {s.name for s in used}
         letter = next(name for name in ("rho", "varrho", "rho_") if name not in names)
         letters = [letter] if len(bases) == 1 else [f"{letter}{k + 1}" for k in range(len(bases))]
         self.roots = {sp.Symbol(name): sp.sqrt(base) for name, base in zip(letters, bases, strict=True)}

@@ -57,16 +57,13 @@ class Lagrangian(EnergyForm):
     constraints : sequence of sympy.Expr or sympy.Eq, optional
         Holonomic: f(q, t) = 0 each.
     name : str
-
-    Notes
-    -----
-    A name stands for one thing: ``Symbol("m", positive=True)`` and ``Symbol("m")`` are the same parameter.
+        A name stands for one thing: ``Symbol("m", positive=True)`` and ``Symbol("m")`` are the same parameter.
 
     Attributes
     ----------
     T, V, dissipation : sympy.Expr
     coordinates, velocities, accelerations : tuple of sympy.Symbol
-        Plain symbols, whatever was given.
+        Plain symbols.
     time : sympy.Symbol or None
         Where something depends on it.
     forces : (n, 1) sympy.Matrix
@@ -158,7 +155,7 @@ class Lagrangian(EnergyForm):
         D : (n, n) sympy.Matrix
             Of coordinates (and parameters), one row per coordinate.
         names : str or sequence of str or sympy.Symbol, optional
-            Of w; ``w1``, ``w2``, ... when not given.
+            Of w; ``w1``, ``w2``, ... by default.
 
         Raises
         ------
@@ -196,16 +193,7 @@ class Lagrangian(EnergyForm):
     # Constraints
 
     def constraint(self, q: ArrayLike, t: float = 0.0, **values: float) -> Array:
-        """Return f(q, t), (m,) or (N, m); zero where the constraints hold.
-
-        Parameters
-        ----------
-        q : (n,) or (N, n) array_like
-        t : float
-            s.
-        **values
-            Of parameters, by name.
-        """
+        """Return f(q, t), (m,) or (N, m), at q (n,) or (N, n), t in s and values of parameters by name."""
         manifold = self._manifold(t, values)
         return manifold.value(self.model.check_q(q))
 
@@ -217,18 +205,14 @@ class Lagrangian(EnergyForm):
     def multipliers(
         self, q: ArrayLike, v: ArrayLike, tau: ArrayLike | None = None, t: float = 0.0, **values: float
     ) -> Array:
-        """Return λ, (m,) or (N, m): the forces Jᵀ λ that hold the constraints.
+        """Return λ, (m,) or (N, m), of the forces Jᵀ λ that hold the constraints; other arguments as of `constraint`.
 
         Parameters
         ----------
         q, v : (n,) or (N, n) array_like
-            A consistent state; `project` makes one.
+            A consistent state, such as `project` returns.
         tau : (n,) or (N, n) array_like, optional
-            Zero when not given.
-        t : float
-            s.
-        **values
-            Of parameters, by name.
+            Zero by default.
         """
         q, v = self.model.check_q(q), self.model.check_v(v)
         tau = self.model.check_v(np.zeros_like(v) if tau is None else tau, "tau")
@@ -244,25 +228,14 @@ class Lagrangian(EnergyForm):
         return out
 
     def project(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, **values: float) -> tuple[Array, Array]:
-        """Return the nearest state that the constraints allow, by the mass matrix's measure.
+        """Return the nearest state that the constraints allow, in the metric of the mass matrix.
 
-        Parameters
-        ----------
-        q, v : (n,) or (N, n) array_like
-        t : float
-            s.
-        **values
-            Of parameters, by name.
-
-        Returns
-        -------
-        q, v : (n,) or (N, n) arrays
-            With f(q, t) = 0 and J v + ∂f/∂t = 0 to rounding.
+        f(q, t) = 0 and J v + ∂f/∂t = 0 hold to rounding; arguments are those of `constraint`, shapes stay.
 
         Raises
         ------
         InputError
-            Constraints that contradict or follow from each other, or too far a way.
+            Constraints that contradict or follow from each other, or a state too far from them.
         """
         manifold = self._manifold(t, values)
         q, v = np.broadcast_arrays(self.model.check_q(q), self.model.check_v(v))
@@ -286,8 +259,8 @@ class Lagrangian(EnergyForm):
         Parameters
         ----------
         independent : sequence of coordinates or their names, optional
-            As many as there are coordinates less constraints. When not given, those on
-            which the others depend best, chosen anew where that changes.
+            As many as there are coordinates less constraints. By default the best conditioned choice, which may
+            change during a run.
         **values
             Of parameters, by name.
         """
@@ -321,9 +294,8 @@ class Lagrangian(EnergyForm):
 class QuasiLagrangian(Lagrangian):
     """A system in quasi-velocities, the result of `Lagrangian.quasi_velocities`.
 
-    It reads and runs as a `Lagrangian` does, with the velocities w: states are (q, w), and
-    ``tau`` is the force on each w, Dᵀ times that on each coordinate (`to_force`). Momenta of
-    cyclic coordinates, Routh's and Hamilton's functions need coordinates' rates and are those of `system`.
+    States are (q, w), and ``tau`` is the force on each w, Dᵀ times that on each coordinate (`to_force`). Routh's and
+    Hamilton's functions need the coordinates' rates and are those of `system`.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """Systems on paper: functions that return a `Lagrangian` in the symbols of textbooks.
 
-Every function takes keyword parameters in SI units, or None for a value that is given later, when the
+Every function takes keyword parameters in SI units, or None for a value that follows when the
 system is run; its docstring gives the coordinates, the zero pose and the source.
 """
 
@@ -39,7 +39,7 @@ __all__ = [
     "spherical_pendulum",
 ]
 
-#: A parameter's value in SI units; None for one that is given later.
+#: A parameter's value in SI units; None for one that follows when the system is run.
 Value = float | None
 
 
@@ -48,8 +48,8 @@ def _values(
 ) -> dict[sp.Symbol, Value]:
     """Return values by symbol, of argument -> (symbol, value): those above zero, then those that may be any number."""
     out: dict[sp.Symbol, Value] = {}
-    for given, above in ((positive, True), (free or {}, False)):
-        for name, (symbol, value) in given.items():
+    for group, above in ((positive, True), (free or {}, False)):
+        for name, (symbol, value) in group.items():
             out[symbol] = None if value is None else real(name, value, positive=above)
     return out
 
@@ -68,8 +68,8 @@ def pendulum(*, mass: Value = 1.0, length: Value = 1.0, gravity: Value = 9.81) -
     """
     m, l, g, th = sp.symbols("m l g theta")
     w = velocity_of(th)
-    given = _values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})
-    return Lagrangian(m * l**2 * w**2 / 2, -m * g * l * sp.cos(th), [th], parameters=given, name="pendulum")
+    values = _values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})
+    return Lagrangian(m * l**2 * w**2 / 2, -m * g * l * sp.cos(th), [th], parameters=values, name="pendulum")
 
 
 def double_pendulum(
@@ -89,8 +89,8 @@ def double_pendulum(
     T = (m1 + m2) * l1**2 * w1**2 / 2 + m2 * l2**2 * w2**2 / 2 + m2 * l1 * l2 * w1 * w2 * sp.cos(th1 - th2)
     V = -(m1 + m2) * g * l1 * sp.cos(th1) - m2 * g * l2 * sp.cos(th2)
     positive = {"mass1": (m1, mass1), "length1": (l1, length1), "mass2": (m2, mass2), "length2": (l2, length2)}
-    given = _values(positive, {"gravity": (g, gravity)})
-    return Lagrangian(T, V, [th1, th2], parameters=given, name="double_pendulum")
+    values = _values(positive, {"gravity": (g, gravity)})
+    return Lagrangian(T, V, [th1, th2], parameters=values, name="double_pendulum")
 
 
 def elastic_pendulum(
@@ -112,8 +112,8 @@ def elastic_pendulum(
     T = m * (u**2 + (l + s) ** 2 * w**2) / 2
     V = k * s**2 / 2 - m * g * (l + s) * sp.cos(th)
     positive = {"mass": (m, mass), "length": (l, length), "stiffness": (k, stiffness)}
-    given = _values(positive, {"gravity": (g, gravity)})
-    return Lagrangian(T, V, [th, s], parameters=given, name="elastic_pendulum")
+    values = _values(positive, {"gravity": (g, gravity)})
+    return Lagrangian(T, V, [th, s], parameters=values, name="elastic_pendulum")
 
 
 def spherical_pendulum(*, mass: Value = 1.0, length: Value = 1.0, gravity: Value = 9.81) -> Lagrangian:
@@ -130,8 +130,8 @@ def spherical_pendulum(*, mass: Value = 1.0, length: Value = 1.0, gravity: Value
     m, l, g, th, ph = sp.symbols("m l g theta phi")
     w, u = velocity_of(th), velocity_of(ph)
     T = m * l**2 * (w**2 + u**2 * sp.sin(th) ** 2) / 2
-    given = _values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})
-    return Lagrangian(T, -m * g * l * sp.cos(th), [th, ph], parameters=given, name="spherical_pendulum")
+    values = _values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})
+    return Lagrangian(T, -m * g * l * sp.cos(th), [th, ph], parameters=values, name="spherical_pendulum")
 
 
 # Systems with fewer motors than coordinates
@@ -153,8 +153,8 @@ def cart_pole(
     u, w = velocity_of(x), velocity_of(th)
     T = (M + m) * u**2 / 2 + m * l * u * w * sp.cos(th) + m * l**2 * w**2 / 2
     positive = {"cart_mass": (M, cart_mass), "pole_mass": (m, pole_mass), "length": (l, length)}
-    given = _values(positive, {"gravity": (g, gravity)})
-    return Lagrangian(T, -m * g * l * sp.cos(th), [x, th], forces={x: F}, parameters=given, name="cart_pole")
+    values = _values(positive, {"gravity": (g, gravity)})
+    return Lagrangian(T, -m * g * l * sp.cos(th), [x, th], forces={x: F}, parameters=values, name="cart_pole")
 
 
 def acrobot(
@@ -188,8 +188,8 @@ def acrobot(
     V = -(m1 * c1 + m2 * l1) * g * sp.cos(th1) - m2 * g * c2 * sp.cos(th1 + th2)
     positive = {"length1": (l1, length1), "mass1": (m1, mass1), "mass2": (m2, mass2), "com1": (c1, com1)}
     positive |= {"com2": (c2, com2), "inertia1": (I1, inertia1), "inertia2": (I2, inertia2)}
-    given = _values(positive, {"gravity": (g, gravity)})
-    return Lagrangian(T, V, [th1, th2], forces={th2: tau}, parameters=given, name="acrobot")
+    values = _values(positive, {"gravity": (g, gravity)})
+    return Lagrangian(T, V, [th1, th2], forces={th2: tau}, parameters=values, name="acrobot")
 
 
 def furuta_pendulum(
@@ -217,8 +217,8 @@ def furuta_pendulum(
     T += m * L * l * u * w * sp.cos(th)
     positive = {"arm_length": (L, arm_length), "arm_inertia": (J, arm_inertia), "pendulum_mass": (m, pendulum_mass)}
     positive |= {"pendulum_com": (l, pendulum_com), "pendulum_inertia": (I, pendulum_inertia)}
-    given = _values(positive, {"gravity": (g, gravity)})
-    return Lagrangian(T, -m * g * l * sp.cos(th), [al, th], forces={al: tau}, parameters=given, name="furuta_pendulum")
+    values = _values(positive, {"gravity": (g, gravity)})
+    return Lagrangian(T, -m * g * l * sp.cos(th), [al, th], forces={al: tau}, parameters=values, name="furuta_pendulum")
 
 
 # Motion about a centre
@@ -236,8 +236,8 @@ def kepler(*, mass: Value = 1.0, strength: Value = 1.0) -> Lagrangian:
     """
     m, k, r, ph = sp.symbols("m k r phi")
     u, w = velocity_of(r), velocity_of(ph)
-    given = _values({"mass": (m, mass)}, {"strength": (k, strength)})
-    return Lagrangian(m * (u**2 + r**2 * w**2) / 2, -k / r, [r, ph], parameters=given, name="kepler")
+    values = _values({"mass": (m, mass)}, {"strength": (k, strength)})
+    return Lagrangian(m * (u**2 + r**2 * w**2) / 2, -k / r, [r, ph], parameters=values, name="kepler")
 
 
 # Systems that are carried along in time: T has terms below the second degree
@@ -256,8 +256,8 @@ def bead_on_hoop(*, mass: Value = 1.0, radius: Value = 1.0, speed: Value = 4.0, 
     m, R, Om, g, th = sp.symbols("m R Omega g theta")
     w = velocity_of(th)
     T = m * R**2 * (w**2 + Om**2 * sp.sin(th) ** 2) / 2
-    given = _values({"mass": (m, mass), "radius": (R, radius)}, {"speed": (Om, speed), "gravity": (g, gravity)})
-    return Lagrangian(T, -m * g * R * sp.cos(th), [th], parameters=given, name="bead_on_hoop")
+    values = _values({"mass": (m, mass), "radius": (R, radius)}, {"speed": (Om, speed), "gravity": (g, gravity)})
+    return Lagrangian(T, -m * g * R * sp.cos(th), [th], parameters=values, name="bead_on_hoop")
 
 
 def driven_pendulum(
@@ -351,9 +351,9 @@ def slider_crank(
     # sin(θ + φ)/cos φ, without the angle φ: l cos φ is the root.
     lever = sp.sin(th) * (1 + r * sp.cos(th) / sp.sqrt(l**2 - r**2 * sp.sin(th) ** 2))
     positive = {"mass": (m, mass), "crank": (r, crank), "rod": (l, rod)}
-    given = _values(positive, {"torque": (tau, torque), "force": (F, force)})
+    values = _values(positive, {"torque": (tau, torque), "force": (F, force)})
     J, Q = m * r**2 * lever**2, tau + F * r * lever
-    return one_degree(J, 0, Q, coordinate=th, parameters=given, name="slider_crank")
+    return one_degree(J, 0, Q, coordinate=th, parameters=values, name="slider_crank")
 
 
 def rigid_slider_crank(
@@ -387,8 +387,8 @@ def rigid_slider_crank(
     J = m1 * L1**2 / 3 + m2 * (middle**2 + (L1 * c / 2) ** 2) + m2 * L2**2 / 12 * turn**2 + m3 * slide**2
     positive = {"crank": (L1, crank), "rod": (L2, rod), "crank_mass": (m1, crank_mass)}
     positive |= {"rod_mass": (m2, rod_mass), "piston_mass": (m3, piston_mass)}
-    given = _values(positive, {"torque": (tau, torque)})
-    return one_degree(J, 0, tau, coordinate=th, parameters=given, name="rigid_slider_crank")
+    values = _values(positive, {"torque": (tau, torque)})
+    return one_degree(J, 0, tau, coordinate=th, parameters=values, name="rigid_slider_crank")
 
 
 def sliding_block(
@@ -407,13 +407,13 @@ def sliding_block(
     m, al, mu, v0, g, x = sp.symbols("m alpha mu v_0 g x")
     u = velocity_of(x)
     positive = {"mass": (m, mass), "creep": (v0, creep)}
-    given = _values(positive, {"slope": (al, slope), "friction": (mu, friction), "gravity": (g, gravity)})
+    values = _values(positive, {"slope": (al, slope), "friction": (mu, friction), "gravity": (g, gravity)})
     return one_degree(
         m,
         -m * g * x * sp.sin(al),
         -mu * m * g * sp.cos(al) * sp.tanh(u / v0),
         coordinate=x,
-        parameters=given,
+        parameters=values,
         name="sliding_block",
     )
 
@@ -429,8 +429,8 @@ def falling_body(*, mass: Value = 1.0, drag: Value = 0.25, gravity: Value = 9.81
     """
     m, c, g, z = sp.symbols("m c g z")
     u = velocity_of(z)
-    given = _values({"mass": (m, mass)}, {"drag": (c, drag), "gravity": (g, gravity)})
-    return one_degree(m, m * g * z, -c * u * sp.Abs(u), coordinate=z, parameters=given, name="falling_body")
+    values = _values({"mass": (m, mass)}, {"drag": (c, drag), "gravity": (g, gravity)})
+    return one_degree(m, m * g * z, -c * u * sp.Abs(u), coordinate=z, parameters=values, name="falling_body")
 
 
 # Rotating bodies in Euler's angles
@@ -456,8 +456,8 @@ def heavy_top(
     u, w, s = velocity_of(ph), velocity_of(th), velocity_of(ps)
     T = A * (w**2 + u**2 * sp.sin(th) ** 2) / 2 + C * (s + u * sp.cos(th)) ** 2 / 2
     positive = {"mass": (m, mass), "length": (l, length), "across": (A, across), "axial": (C, axial)}
-    given = _values(positive, {"gravity": (g, gravity)})
-    return Lagrangian(T, m * g * l * sp.cos(th), [ph, th, ps], parameters=given, name="heavy_top")
+    values = _values(positive, {"gravity": (g, gravity)})
+    return Lagrangian(T, m * g * l * sp.cos(th), [ph, th, ps], parameters=values, name="heavy_top")
 
 
 def gyroscope(
@@ -512,8 +512,8 @@ def rigid_body(*, A: Value = 1.0, B: Value = 2.0, C: Value = 2.5) -> Lagrangian:
     second = -w * sp.sin(ps) + u * sp.sin(th) * sp.cos(ps)
     third = s + u * sp.cos(th)
     T = (a * first**2 + b * second**2 + c * third**2) / 2
-    given = _values({"A": (a, A), "B": (b, B), "C": (c, C)})
-    return Lagrangian(T, 0, [ph, th, ps], parameters=given, name="rigid_body")
+    values = _values({"A": (a, A), "B": (b, B), "C": (c, C)})
+    return Lagrangian(T, 0, [ph, th, ps], parameters=values, name="rigid_body")
 
 
 _SYSTEMS: Final[dict[str, Callable[..., Lagrangian]]] = {

@@ -2,7 +2,7 @@
 
 Independence belongs to a pose: one set has full rank on the branch where a mechanism moves, and none on others (a row
 of equal four-bars). So J is judged where a motion starts or a force is evaluated, and random configurations only help
-to say what is wrong.
+to explain the error.
 """
 
 from __future__ import annotations

@@ -67,9 +67,9 @@ class EnergyForm:
             acceleration_of(q) if w.name == velocity_of(q).name else velocity_of(w)
             for q, w in zip(self.coordinates, self.velocities, strict=True)
         )
-        taken = {s.name for s in (*moving, *self.parameters, *self.inputs.values(), *self.accelerations)}
+        used = {s.name for s in (*moving, *self.parameters, *self.inputs.values(), *self.accelerations)}
         self.multiplier_symbols = tuple(
-            sp.Symbol(free_name(f"lambda{k + 1}", taken)) for k in range(len(self.constraints))
+            sp.Symbol(free_name(f"lambda{k + 1}", used)) for k in range(len(self.constraints))
         )
         _check_names(self)
         _check_declared(self)
@@ -141,10 +141,10 @@ class EnergyForm:
         """Return the same system with numbers for some parameters."""
         own = {s.name: s for s in self.parameters}
         put = {}
-        for given, x in values.items():
-            symbol = own.get(str(given))
+        for key, x in values.items():
+            symbol = own.get(str(key))
             if symbol is None:
-                raise InputError(f"values: {given} is no parameter; they are {plain(self.parameters) or 'none'}")
+                raise InputError(f"values: {key} is no parameter; they are {plain(self.parameters) or 'none'}")
             put[symbol] = sp.sympify(x)
         out = self._arguments()
         out |= {name: out[name].subs(put) for name in ("T", "V", "dissipation")}
@@ -201,7 +201,7 @@ def symbols_of(form: EnergyForm) -> list[sp.Symbol]:
 
 
 def read_expression(
-    form: EnergyForm, what: str, given: Any, also: Iterable[sp.Symbol] = (), *, others: bool = False
+    form: EnergyForm, what: str, source: Any, also: Iterable[sp.Symbol] = (), *, others: bool = False
 ) -> sp.Expr:
     """Return an expression in a system's own symbols, from symbols of the same names or dynamicsymbols.
 
@@ -210,7 +210,7 @@ def read_expression(
     own = [*symbols_of(form), *also]
     known = {s.name: s for s in own}
     rates = {q.name: v for q, v in zip(form.coordinates, form.velocities, strict=True)}
-    out = expression(what, given, known)
+    out = expression(what, source, known)
     for d in out.atoms(sp.Derivative):
         name = name_of(d.expr)
         if name in rates and d.derivative_count == 1:
@@ -226,12 +226,12 @@ def read_expression(
 # Arguments
 
 
-def _parameters(given: Any) -> Mapping[sp.Symbol, float | None]:
-    if isinstance(given, Mapping):
-        pairs: Iterable[tuple[Any, Any]] = given.items()
+def _parameters(source: Any) -> Mapping[sp.Symbol, float | None]:
+    if isinstance(source, Mapping):
+        pairs: Iterable[tuple[Any, Any]] = source.items()
     else:
-        none = given is None or (not isinstance(given, sp.Basic) and not given)
-        pairs = [] if none else ((s, None) for s in listed("parameters", given))
+        none = source is None or (not isinstance(source, sp.Basic) and not source)
+        pairs = [] if none else ((s, None) for s in listed("parameters", source))
     out: dict[sp.Symbol, float | None] = {}
     for symbol, value in pairs:
         if not isinstance(symbol, sp.Symbol):
@@ -242,12 +242,12 @@ def _parameters(given: Any) -> Mapping[sp.Symbol, float | None]:
     return MappingProxyType(out)
 
 
-def _forces(into: PlainSymbols, given: Any) -> dict[sp.Symbol, sp.Expr]:
-    if not isinstance(given, Mapping):
-        raise InputError(f"forces: expected {{coordinate: force}}, got {given!r}")
+def _forces(into: PlainSymbols, source: Any) -> dict[sp.Symbol, sp.Expr]:
+    if not isinstance(source, Mapping):
+        raise InputError(f"forces: expected {{coordinate: force}}, got {source!r}")
     out: dict[sp.Symbol, sp.Expr] = dict.fromkeys(into.coordinates, sp.Integer(0))
     seen = set()
-    for key, value in given.items():
+    for key, value in source.items():
         coordinate = into("forces", key)
         if coordinate not in out:
             names = ", ".join(map(str, into.coordinates))
@@ -259,28 +259,28 @@ def _forces(into: PlainSymbols, given: Any) -> dict[sp.Symbol, sp.Expr]:
     return out
 
 
-def _rows(given: Any) -> Sequence[Any]:
-    if isinstance(given, (sp.Basic, str)) and not isinstance(given, sp.Tuple):
-        given = [given]
+def _rows(source: Any) -> Sequence[Any]:
+    if isinstance(source, (sp.Basic, str)) and not isinstance(source, sp.Tuple):
+        source = [source]
     try:
-        return list(given)
+        return list(source)
     except TypeError:
-        raise InputError(f"constraints: expected a list of expressions, got {given!r}") from None
+        raise InputError(f"constraints: expected a list of expressions, got {source!r}") from None
 
 
-def _row(into: PlainSymbols, what: str, given: Any) -> sp.Expr:
+def _row(into: PlainSymbols, what: str, source: Any) -> sp.Expr:
     """Return f of f = 0; of an equation its left side less its right side."""
-    if isinstance(given, sp.Equality):
-        return into(what, given.lhs) - into(what, given.rhs)
-    return into(what, given)
+    if isinstance(source, sp.Equality):
+        return into(what, source.lhs) - into(what, source.rhs)
+    return into(what, source)
 
 
 def _inputs(
-    given: Mapping[sp.Symbol, sp.Expr], known: set[sp.Symbol], others: Iterable[sp.Expr]
+    acting: Mapping[sp.Symbol, sp.Expr], known: set[sp.Symbol], others: Iterable[sp.Expr]
 ) -> Mapping[sp.Symbol, sp.Symbol]:
     """Return the symbols that stand alone as a force, and nowhere else."""
-    counts = Counter(s for x in (*given.values(), *others) for s in x.free_symbols)
-    alone = {q: x for q, x in given.items() if isinstance(x, sp.Symbol) and x not in known and counts[x] == 1}
+    counts = Counter(s for x in (*acting.values(), *others) for s in x.free_symbols)
+    alone = {q: x for q, x in acting.items() if isinstance(x, sp.Symbol) and x not in known and counts[x] == 1}
     return MappingProxyType(alone)
 
 

@@ -61,19 +61,20 @@ class VelocityMap:
             "linear": ([q, x], ca.horzcat(ca.jacobian(moving, q), D, W)),
         }
         self._functions = {
-            name: ca.Function(name, given, [ca.densify(out)], {"cse": True}) for name, (given, out) in outputs.items()
+            name: ca.Function(name, arguments, [ca.densify(out)], {"cse": True})
+            for name, (arguments, out) in outputs.items()
         }
         self._machines = {name: Machine(f) for name, f in self._functions.items()}
 
-    def _call(self, name: str, *given: Any) -> Any:
-        if isinstance(given[0], ca.SX):
-            return self._functions[name](*given)
-        lead = np.broadcast_shapes(*(x.shape[:-1] for x in given))
-        full = (np.ascontiguousarray(np.broadcast_to(x, (*lead, x.shape[-1]))) for x in given)
+    def _call(self, name: str, *arguments: Any) -> Any:
+        if isinstance(arguments[0], ca.SX):
+            return self._functions[name](*arguments)
+        lead = np.broadcast_shapes(*(x.shape[:-1] for x in arguments))
+        full = (np.ascontiguousarray(np.broadcast_to(x, (*lead, x.shape[-1]))) for x in arguments)
         return self._machines[name](*full)[0]
 
-    def _column(self, name: str, *given: Any) -> Any:
-        out = self._call(name, *given)
+    def _column(self, name: str, *arguments: Any) -> Any:
+        out = self._call(name, *arguments)
         return out if isinstance(out, ca.SX) else out[..., 0]
 
     def check_start(self, q: Array, v: Array) -> None:

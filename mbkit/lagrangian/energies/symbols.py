@@ -35,9 +35,9 @@ def _dotted(symbol: sp.Symbol, dots: str) -> sp.Symbol:
     return sp.Symbol(f"{stem}{dots}{rest}", **({"real": True} if symbol.is_real else {}))
 
 
-def free_name(name: str, taken: Collection[str]) -> str:
+def free_name(name: str, used: Collection[str]) -> str:
     """Return a name, with a capital or a mark behind it where it is taken: p_x, P_x, P_x_."""
-    while name in taken:
+    while name in used:
         name = name[0].upper() + name[1:] if name[0].islower() else f"{name}_"
     return name
 
@@ -57,8 +57,8 @@ class PlainSymbols:
         among: Iterable[sp.Symbol] = (),
         named: Iterable[sp.Symbol] = (),
     ) -> None:
-        given = listed("coordinates", coordinates)
-        functions = [c for c in given if isinstance(c, AppliedUndef)]
+        originals = listed("coordinates", coordinates)
+        functions = [c for c in originals if isinstance(c, AppliedUndef)]
         times = {c.args for c in functions}
         if len(times) > 1 or any(len(c.args) != 1 for c in functions):
             raise InputError(f"coordinates: expected functions of one time, got {functions}")
@@ -70,7 +70,7 @@ class PlainSymbols:
         self.time = time if own is None else own
         self._map: dict[Any, sp.Symbol] = {}
         own_coordinates = []
-        for c in given:
+        for c in originals:
             if isinstance(c, AppliedUndef):
                 self._map[c] = sp.Symbol(c.func.__name__)
                 own_coordinates.append(self._map[c])
@@ -79,7 +79,7 @@ class PlainSymbols:
             else:
                 raise InputError(f"coordinates: expected SymPy symbols or dynamicsymbols, got {c!r}")
         self.coordinates = tuple(own_coordinates)
-        self.velocities = self._velocities(given, velocities, among)
+        self.velocities = self._velocities(originals, velocities, among)
         own_time = [self.time] if self.time else []
         _differ((*self.coordinates, *self.velocities, *own_time))
         for what, symbols in (("coordinates", self.coordinates), ("velocities", self.velocities), ("time", own_time)):
@@ -87,18 +87,20 @@ class PlainSymbols:
                 fits(what, s)
         self._named = {s.name: s for s in (*named, *own_time, *self.velocities, *self.coordinates)}
 
-    def _velocities(self, given: Sequence[Any], velocities: Any, among: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
+    def _velocities(
+        self, originals: Sequence[Any], velocities: Any, among: Iterable[sp.Symbol]
+    ) -> tuple[sp.Symbol, ...]:
         if velocities is None:
             # A symbol of that name in T may have assumptions of its own.
             named = {s.name: s for s in among}
             own = [named.get(velocity_of(c).name, velocity_of(c)) for c in self.coordinates]
         else:
             rates = listed("velocities", velocities)
-            if len(rates) != len(given):
-                what = f"{len(rates)} velocities for {len(given)} coordinates"
+            if len(rates) != len(originals):
+                what = f"{len(rates)} velocities for {len(originals)} coordinates"
                 raise InputError(f"velocities: {what}; give each coordinate one, in the same order")
             own = []
-            for c, w in zip(given, rates, strict=True):
+            for c, w in zip(originals, rates, strict=True):
                 if isinstance(w, sp.Symbol):
                     own.append(w)
                 elif isinstance(w, AppliedUndef):
@@ -108,14 +110,14 @@ class PlainSymbols:
                     own.append(velocity_of(self._map[c]))
                 else:
                     raise InputError(f"velocities: expected a symbol, or the derivative of {c}, got {w!r}")
-        for c, symbol in zip(given, own, strict=True):
+        for c, symbol in zip(originals, own, strict=True):
             if isinstance(c, AppliedUndef):
                 self._map[sp.Derivative(c, self.time)] = symbol
         return tuple(own)
 
-    def __call__(self, what: str, given: Any) -> sp.Expr:
+    def __call__(self, what: str, value: Any) -> sp.Expr:
         """Return an expression in plain symbols."""
-        out = expression(what, given, self._named)
+        out = expression(what, value, self._named)
         # A derivative before the function in it.
         order = sorted(self._map, key=lambda x: not isinstance(x, sp.Derivative))
         out = by_name(out.subs([(x, self._map[x]) for x in order]), self._named)
@@ -133,10 +135,10 @@ def plain(names: Iterable[sp.Symbol]) -> str:
     return ", ".join(sorted(s.name for s in names))
 
 
-def name_of(given: Any) -> str:
+def name_of(value: Any) -> str:
     """Return the name of a coordinate given as a symbol, a dynamicsymbol or a name."""
     return (
-        given if isinstance(given, str) else str(getattr(given, "func", given) if getattr(given, "args", ()) else given)
+        value if isinstance(value, str) else str(getattr(value, "func", value) if getattr(value, "args", ()) else value)
     )
 
 
@@ -150,14 +152,14 @@ def by_name(x: Any, named: Mapping[str, sp.Symbol]) -> Any:
     return x.xreplace(put) if put else x
 
 
-def expression(what: str, given: Any, named: Mapping[str, sp.Symbol] = MappingProxyType({})) -> sp.Expr:
+def expression(what: str, value: Any, named: Mapping[str, sp.Symbol] = MappingProxyType({})) -> sp.Expr:
     """Return a scalar SymPy expression; text is read with the symbols of these names."""
     try:
-        out = sp.sympify(given, locals=dict(named))
+        out = sp.sympify(value, locals=dict(named))
     except (sp.SympifyError, TypeError, AttributeError) as error:
-        raise InputError(f"{what}: expected a SymPy expression, got {given!r}") from error
+        raise InputError(f"{what}: expected a SymPy expression, got {value!r}") from error
     if not isinstance(out, sp.Expr) or out.is_Matrix:
-        raise InputError(f"{what}: expected a scalar SymPy expression, got {type(given).__name__}")
+        raise InputError(f"{what}: expected a scalar SymPy expression, got {type(value).__name__}")
     if out.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
         raise InputError(f"{what}: {out} is not finite")
     if out.has(sp.I):
@@ -168,17 +170,17 @@ def expression(what: str, given: Any, named: Mapping[str, sp.Symbol] = MappingPr
     return out
 
 
-def listed(what: str, given: Any) -> list[Any]:
+def listed(what: str, value: Any) -> list[Any]:
     """Return one or several symbols as a list."""
-    if isinstance(given, (sp.Basic, str)) and not isinstance(given, sp.Tuple):
-        given = [given]
+    if isinstance(value, (sp.Basic, str)) and not isinstance(value, sp.Tuple):
+        value = [value]
     try:
-        out = list(given)
+        out = list(value)
     except TypeError:
-        raise InputError(f"{what}: expected a list of symbols, got {given!r}") from None
+        raise InputError(f"{what}: expected a list of symbols, got {value!r}") from None
     if not out:
         raise InputError(f"{what}: expected at least one symbol, got none")
-    if isinstance(given, (set, frozenset)) and len(out) > 1:
+    if isinstance(value, (set, frozenset)) and len(out) > 1:
         raise InputError(f"{what}: expected a list of symbols, got a set, which has no order")
     return out
 

@@ -141,11 +141,11 @@ class Numeric:
     """A matrix of SymPy expressions as a function of arrays, one argument per sequence of symbols."""
 
     def __init__(self, expressions: Any, *arguments: Sequence[sp.Symbol]) -> None:
-        given = [ca.SX.sym(f"x{k}", len(symbols)) for k, symbols in enumerate(arguments)]
+        inputs = [ca.SX.sym(f"x{k}", len(symbols)) for k, symbols in enumerate(arguments)]
         self._shape = expressions.shape
-        names = {s: x[i] for symbols, x in zip(arguments, given, strict=True) for i, s in enumerate(symbols)}
+        names = {s: x[i] for symbols, x in zip(arguments, inputs, strict=True) for i, s in enumerate(symbols)}
         column = Conversion(names, float).matrix(list(expressions))
-        self._machine = Machine(ca.Function("expressions", given, [ca.densify(column)], {"cse": True}))
+        self._machine = Machine(ca.Function("expressions", inputs, [ca.densify(column)], {"cse": True}))
 
     def __call__(self, *arguments: Array) -> Array:
         """Return the matrix at one state, (m, n), or at each of a batch, (N, m, n)."""

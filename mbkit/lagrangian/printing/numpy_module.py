@@ -27,8 +27,8 @@ def python_code(system: Lagrangian) -> str:
         raise UnsupportedError(f"{system.name}: a system with constraints cannot be written as a Python module yet")
     e = system.equations()
     n = len(e.coordinates)
-    given = dict.fromkeys(system.inputs.values(), sp.Integer(0))
-    h = e.coriolis_force + e.drift + e.potential_gradient - e.forces.subs(given)
+    no_inputs = dict.fromkeys(system.inputs.values(), sp.Integer(0))
+    h = e.coriolis_force + e.drift + e.potential_gradient - e.forces.subs(no_inputs)
     names = _names(system)
     written = {s: sp.Symbol(name) for s, name in names.items()}
     upper = [e.mass_matrix[i, j] for i in range(n) for j in range(i, n)]

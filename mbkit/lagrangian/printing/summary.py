@@ -96,8 +96,8 @@ class SystemSummary:
         q = ", ".join(self._named(x) for x in s.coordinates)
         out = [f"{one_line(s.name)}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
         if s.parameters:
-            given = (written(p.name) + ("" if x is None else f" = {x:g}") for p, x in s.parameters.items())
-            out.append(f"parameters {', '.join(given)}")
+            texts = (written(p.name) + ("" if x is None else f" = {x:g}") for p, x in s.parameters.items())
+            out.append(f"parameters {', '.join(texts)}")
         if s.time:
             out.append(f"time {written(s.time.name)}")
         kinetic = [f"T is too long for a page ({self._size} operations): ½ vᵀ M v with"] if self.long else None
@@ -151,8 +151,8 @@ class SystemSummary:
         if s.dissipation != 0:
             rows.append(f"R &= {board.latex(self._short(s.dissipation))}")
         rows += [f"{board.latex(letter)} &= {board.latex(root)}" for letter, root in self._short.roots.items()]
-        for name, (given, _) in self._matrices.items():
-            A = given.applyfunc(self._short)
+        for name, (original, _) in self._matrices.items():
+            A = original.applyfunc(self._short)
             entries = r" \\ ".join(" & ".join(board.latex(x) for x in A[i, :]) for i in range(A.rows))
             rows.append(rf"{name} &= \begin{{bmatrix}} {entries} \end{{bmatrix}}")
         out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
@@ -203,12 +203,12 @@ class SystemSummary:
         s, e = self.system, self.equations
         every = (*s.coordinates, *s.velocities, *e.accelerations, *s.parameters, *s.inputs.values(), *e.multipliers)
         every = (*every, *([s.time] if s.time else []))
-        taken = {x.name for x in every}
+        used = {x.name for x in every}
         out: dict[sp.Symbol, sp.Symbol] = {}
         for x in every:
             if not x.name.isidentifier() or keyword.iskeyword(x.name):
-                out[x] = sp.Symbol(identifier(x.name, taken))
-                taken.add(out[x].name)
+                out[x] = sp.Symbol(identifier(x.name, used))
+                used.add(out[x].name)
         return out
 
 

@@ -47,11 +47,11 @@ _SHORT: Final = 100
 
 def momentum_symbols(system: EnergyForm, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
     """Return a symbol for each coordinate's momentum: theta -> p_theta, or P_theta where that is taken already."""
-    taken = {s.name for s in symbols_of(system)}
+    used = {s.name for s in symbols_of(system)}
     out = []
     for q in coordinates:
-        out.append(sp.Symbol(free_name(f"p_{q.name}", taken)))
-        taken.add(out[-1].name)
+        out.append(sp.Symbol(free_name(f"p_{q.name}", used)))
+        used.add(out[-1].name)
     return tuple(out)
 
 
@@ -167,13 +167,7 @@ class Hamiltonian(Printable):
     # Brackets
 
     def canonical(self, f: Any) -> sp.Expr:
-        """Return an expression with the velocities in it written in momenta.
-
-        Raises
-        ------
-        InputError
-            Symbols that the system does not know.
-        """
+        """Return an expression with its velocities written in momenta; refuse symbols that the system does not know."""
         out = read_expression(self.system, "f", f, self.momenta)
         return sp.sympify(out.subs(dict(zip(self.system.velocities, self.velocities, strict=True)), simultaneous=True))
 
@@ -230,16 +224,7 @@ class Hamiltonian(Printable):
         return both[..., :n], both[..., n], other
 
     def to_momentum(self, q: ArrayLike, v: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
-        """Return p = M v + b in numbers.
-
-        Parameters
-        ----------
-        q, v : (n,) or (N, n) array_like
-        t : float
-            s; where time enters.
-        **values
-            Of parameters, by name; the others keep theirs.
-        """
+        """Return p = M v + b in numbers, of q and v (n,) or (N, n), t in s, and values of parameters by name."""
         M, b, velocity = self._mass(q, v, "v", t, values)
         return np.asarray((M @ velocity[..., None])[..., 0] + b)
 
@@ -268,7 +253,7 @@ class Hamiltonian(Printable):
         Parameters
         ----------
         tau : (n,) array_like, optional
-            What the inputs are, one entry a coordinate; zero when not given.
+            The inputs, one entry a coordinate; zero by default.
         **values
             Of parameters, by name; the others keep theirs.
         """

@@ -138,12 +138,12 @@ def in_quasi_velocities(system: EnergyForm, D: Any, names: Any) -> tuple[dict[st
     return arguments, KineticSplit(T2=tidy(T2), T1=T1, T0=k.T0, M=M, b=b), quasi
 
 
-def _checked(system: EnergyForm, given: Any) -> sp.ImmutableMatrix:
+def _checked(system: EnergyForm, matrix: Any) -> sp.ImmutableMatrix:
     n = len(system.coordinates)
     try:
-        D = sp.ImmutableMatrix(given)
+        D = sp.ImmutableMatrix(matrix)
     except (TypeError, ValueError):
-        raise InputError(f"D: expected a SymPy matrix ({n}, {n}), got {type(given).__name__}") from None
+        raise InputError(f"D: expected a SymPy matrix ({n}, {n}), got {type(matrix).__name__}") from None
     if D.shape != (n, n):
         raise InputError(
             f"D: expected shape ({n}, {n}), one row for each of {', '.join(map(str, system.coordinates))}, "
@@ -170,18 +170,18 @@ def _named(system: EnergyForm, names: Any) -> list[sp.Symbol]:
         names = [f"w{i + 1}" for i in range(n)]
     if isinstance(names, str):
         names = names.replace(",", " ").split()
-    given: Sequence[Any] = list(names)
-    if len(given) != n:
-        raise InputError(f"names: expected {n}, one for each column of D, got {len(given)}")
+    symbols: Sequence[Any] = list(names)
+    if len(symbols) != n:
+        raise InputError(f"names: expected {n}, one for each column of D, got {len(symbols)}")
     out = []
-    for x in given:
+    for x in symbols:
         if not isinstance(x, (str, sp.Symbol)) or not str(x):
             raise InputError(f"names: expected names or symbols, got {x!r}")
         out.append(sp.Symbol(x) if isinstance(x, str) else x)
         fits("velocities", out[-1])
-    taken = {s.name for s in symbols_of(system)}
+    used = {s.name for s in symbols_of(system)}
     for s in out:
-        if s.name in taken:
+        if s.name in used:
             raise InputError(f"names: {s.name!r} stands for something else already")
-        taken.add(s.name)
+        used.add(s.name)
     return out

@@ -109,16 +109,9 @@ class Routhian(Printable, Generic[FormT]):
         return EnergyModel(self.lagrangian)
 
     def reduce(self, q: ArrayLike, v: ArrayLike, *, t: float = 0.0, **values: float) -> ReducedState:
-        """Return the reduced system's state and the values of the constant momenta.
+        """Return the reduced system's state and constant momenta.
 
-        Parameters
-        ----------
-        q, v : (n,) or (N, n) array_like
-            Of the whole system.
-        t : float
-            s; where time enters.
-        **values
-            Of the whole system's parameters, by name; the others keep theirs.
+        Of the whole system's q and v, (n,) or (N, n), time t in s, and values of its parameters by name.
         """
         s, n = self.system, len(self.system.coordinates)
         q, v = rows("q", q, n, s.name, "nq"), rows("v", v, n, s.name, "nv")
@@ -132,9 +125,8 @@ class Routhian(Printable, Generic[FormT]):
     def reconstruct(self, run: Any, q0: ArrayLike, **values: float) -> Motion:
         """Return the motion of the whole system, with the ignored coordinates by quadrature.
 
-        Each interval between saved states is integrated once more, from the state at its
-        start and to 1e-13, with the rates of the ignored coordinates beside it: the
-        answer is as accurate as the run itself, however far apart its states are.
+        Each interval between saved states is integrated again from its start, to 1e-13, with the ignored rates: the
+        result is as accurate as the run, however far apart its states are.
 
         Parameters
         ----------
@@ -143,8 +135,7 @@ class Routhian(Printable, Generic[FormT]):
         q0 : (n,) or (m,) array_like
             The whole configuration at the first time, or its ignored coordinates alone.
         **values
-            Of the reduced system's parameters, the momenta among them, by name; those that
-            a trajectory ran with need not be given.
+            Of the reduced system's parameters and momenta, by name; a Trajectory brings its own.
 
         Returns
         -------

@@ -109,12 +109,11 @@ class Equilibrium:
     residual : float
         The largest force that is left over, in the units of tau.
     multipliers : (m,) array
-        λ of the constraints; empty without.
+        λ of the constraints.
     stable : bool or None
-        Of small motions: True where they stay small, False where some grow, None where
-        the linear equation does not decide or changes with the time.
+        Whether small motions stay small; None where the linear equation does not decide or changes with the time.
     frequencies : (k,) array
-        Angular frequencies of those that oscillate, rad/s, increasing.
+        Angular frequencies of small motions that oscillate, rad/s, increasing.
     eigenvalues : (2 f,) complex array
         Of the linearized equation with f degrees of freedom, 1/s.
     name : str
@@ -177,23 +176,18 @@ def equilibrium(
     Parameters
     ----------
     dynamics : Dynamics or Lagrangian
-        Of any engine. The own derivation differentiates the forces exactly; of others differences are taken.
+        Of any engine. The own derivation differentiates the forces exactly, others by differences.
     q0 : (nq,) array_like, optional
-        Start of the search; the neutral configuration and then random ones when not given.
+        Start of the search; by default the neutral configuration, then random ones.
     tau : (nv,) array_like, optional
-        Generalized force that acts; zero when not given.
+        Generalized force that acts; zero by default.
     holding : (nq,) array_like, optional
-        A configuration: what is returned is the tau that holds it. With constraints,
-        which take a part of the load, it is the least such tau.
+        A configuration to hold: the result is the tau that holds it, the least one with constraints.
     forces : mapping of str to (3,) or (6,) array_like, optional
-        What acts on frames or bodies of a robot: force at the frame's origin, N, and moment, N m, in world axes. A
-        payload of mass m in the hand is ``{"hand": [0, 0, -9.81 * m]}``; it stays as it is when the robot moves.
+        On frames or bodies of a robot: force at the frame's origin, N, and moment, N m, constant in world axes. A
+        payload of mass m in the hand is ``{"hand": [0, 0, -9.81 * m]}``.
     seed : int
         Of the random starts.
-
-    Returns
-    -------
-    Equilibrium
 
     Raises
     ------
@@ -205,12 +199,10 @@ def equilibrium(
 
     Notes
     -----
-    Newton's iteration with the exact stiffness, and Levenberg and Marquardt's damping far
-    from the end. It finds one equilibrium, not all; of an upright and a hanging pendulum
-    the one that is nearer in its own way.
-
-    Stability is that of M δq̈ + D δq̇ + K δq = 0 on what constraints leave free. Where K is symmetric, and D has no
-    part that feeds energy in, K's sign decides (Lagrange and Dirichlet, Kelvin and Tait); else the eigenvalues do.
+    Newton's iteration with the exact stiffness, and Levenberg and Marquardt's damping far from the end, finds one
+    equilibrium, not all. Stability is that of M δq̈ + D δq̇ + K δq = 0 on what constraints leave free. Where K is
+    symmetric and D feeds no energy in, K's sign decides (Lagrange and Dirichlet, Kelvin and Tait); else the
+    eigenvalues do.
 
     Examples
     --------
@@ -268,12 +260,12 @@ def _equilibrium_at(balance: Balance, q: Array, tau: Array, multipliers: Array) 
     )
 
 
-def _wrench(name: str, given: ArrayLike) -> Array:
+def _wrench(name: str, value: ArrayLike) -> Array:
     try:
-        shape = np.shape(given)
+        shape = np.shape(value)
     except ValueError:
         shape = ()
     if shape not in ((3,), (6,)):
         raise InputError(f"forces[{name!r}]: expected shape (3,) or (6,), got {shape}")
-    wrench = finite_array(f"forces[{name!r}]", given, shape)
+    wrench = finite_array(f"forces[{name!r}]", value, shape)
     return wrench if len(wrench) == 6 else np.concatenate([wrench, np.zeros(3)])

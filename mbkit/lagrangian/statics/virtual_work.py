@@ -28,15 +28,15 @@ def generalized_force(
     Parameters
     ----------
     forces : sequence of vectors
-        f_i: of 1, 2 or 3 components along fixed axes, N; a single vector where there is one point.
+        f_i: of 1, 2 or 3 components along fixed axes, N; one vector for one point.
     points : sequence of vectors
         R_i(q, t), where the forces act, along the same axes, m.
     coordinates : sequence of sympy symbols
-        PlainSymbols symbols or dynamicsymbols.
+        Plain symbols or dynamicsymbols.
     torques : sequence of vectors, optional
         n_k on bodies, N m.
     angular_velocities : sequence of vectors, optional
-        ω_k(q, v, t) of those bodies, along the torques' axes; in a plane of one component.
+        ω_k(q, v, t) of those bodies, along the torques' axes; one component in a plane.
     velocities : sequence of sympy symbols, optional
         As of `Lagrangian`, for forces and angular velocities that contain them.
     time : sympy.Symbol, optional
@@ -44,8 +44,7 @@ def generalized_force(
     Returns
     -------
     dict
-        Coordinate as it was given -> Q_j, fit to be the `forces` of a `Lagrangian`. At
-        the given time: what the time moves does no virtual work.
+        Each coordinate of the input -> Q_j, as the `forces` of a `Lagrangian`; what the time moves does no work.
 
     Raises
     ------
@@ -90,12 +89,12 @@ def check_places(what: str, places: list[tuple[sp.Expr, ...]], into: PlainSymbol
             raise InputError(f"{what}[{k}]: expected coordinates and time only, got the velocity {plain(moving)}")
 
 
-def vectors(what: str, given: Any, into: PlainSymbols) -> list[tuple[sp.Expr, ...]]:
+def vectors(what: str, source: Any, into: PlainSymbols) -> list[tuple[sp.Expr, ...]]:
     """Return vectors of expressions in plain symbols; a single vector is a list of one."""
     try:
-        rows = [list(x) if _several(x) else x for x in given]
+        rows = [list(x) if _several(x) else x for x in source]
     except TypeError:
-        raise InputError(f"{what}: expected a list of vectors, got {given!r}") from None
+        raise InputError(f"{what}: expected a list of vectors, got {source!r}") from None
     if rows and not any(isinstance(x, list) for x in rows):
         rows = [rows]
     out = []
@@ -153,8 +152,7 @@ def from_particles(
     potential : sympy.Expr, optional
         Other potential energy, such as of springs, J.
     forces : sequence of vectors, optional
-        f_i on each particle beside gravity, N, of coordinates, velocities, time and
-        parameters; None for a particle that has none.
+        f_i on each particle beside gravity, N; None for a particle without.
     generalized : mapping of coordinate to sympy.Expr, optional
         Generalized forces besides.
     dissipation, time, parameters, constraints, name
@@ -221,6 +219,6 @@ def _work(forces: Sequence[Any], R: list[tuple[sp.Expr, ...]], into: PlainSymbol
         return {}
     if len(forces) != len(R):
         raise InputError(f"forces: {len(forces)} of them for {len(R)} positions; give one for each, or None")
-    given = [[0] * len(x) if f is None else f for f, x in zip(forces, R, strict=True)]
-    plain = [[into(f"forces[{k}]", x) for x in f] for k, f in enumerate(given)]
+    filled = [[0] * len(x) if f is None else f for f, x in zip(forces, R, strict=True)]
+    plain = [[into(f"forces[{k}]", x) for x in f] for k, f in enumerate(filled)]
     return generalized_force(plain, R, into.coordinates, velocities=into.velocities, time=into.time)

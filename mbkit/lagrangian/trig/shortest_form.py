@@ -202,7 +202,7 @@ class _Writer:
 
 # Powers of the cosines and sines of single angles
 
-#: Sums of angles that are taken as one.
+#: Most sums of angles that count as one angle.
 _COMBINED: Final = 2
 
 #: Powers (angle, of cos, of sin) of single angles.
