@@ -179,7 +179,9 @@ def test_symbols_are_the_engines(curved):
 
 
 def test_mass_matrix_rate_less_twice_coriolis_is_skew(curved):
-    still = curved.system._like(T=curved.system.kinetic_split()[0], time=None, forces={})
+    moving = curved.system
+    arguments = {"dissipation": moving.dissipation, "parameters": moving.parameters}
+    still = Lagrangian(moving.kinetic_split()[0], moving.V, moving.coordinates, moving.velocities, **arguments)
     quasi = still.quasi_velocities(curved.D, ["a", "b"])
     eq = equations_of(quasi.model)
     rate = ca.jtimes(ca.densify(eq.mass_matrix)[:], eq.q, eq.kin.qdot)

@@ -1,8 +1,4 @@
-"""Energies of a model as SymPy expressions, from the joints' own formulas and nothing else.
-
-The same kinematics as the derivation's (`mbkit.derivation`), on exact sums of cosines and sines: every
-number is the decimal that was written, so what cancels is gone and the result is short.
-"""
+"""Energies of a model as SymPy expressions: the derivation's kinematics on exact sums of cosines and sines."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Expressions in the order of a blackboard: ½ (m₁ + m₂) l₁² θ̇₁² + m₂ l₁ l₂ θ̇₁ θ̇₂ cos(θ₁ - θ₂).
+"""Expressions in the order of textbooks: ½ (m₁ + m₂) l₁² θ̇₁² + m₂ l₁ l₂ θ̇₁ θ̇₂ cos(θ₁ - θ₂).
 
-SymPy's printers take factors in the order of the alphabet. Here a number comes first, then masses and inertias, g and
-lengths, coordinates, velocities, accelerations, and cosines last; in sums what turns comes after what does not.
+A number comes first, then masses and inertias, g and lengths, coordinates, velocities, accelerations, and cosines last.
 """
 
 from __future__ import annotations

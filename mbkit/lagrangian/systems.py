@@ -16,29 +16,6 @@ from mbkit.errors import UnknownNameError
 from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.system import Lagrangian
 
-__all__ = [
-    "acrobot",
-    "bead_on_hoop",
-    "cart_pole",
-    "double_pendulum",
-    "driven_pendulum",
-    "elastic_pendulum",
-    "falling_body",
-    "furuta_pendulum",
-    "get",
-    "gyroscope",
-    "heavy_top",
-    "kepler",
-    "names",
-    "one_degree",
-    "pendulum",
-    "rigid_body",
-    "rigid_slider_crank",
-    "slider_crank",
-    "sliding_block",
-    "spherical_pendulum",
-]
-
 #: A parameter's value in SI units; None for one that follows when the system is run.
 Value = float | None
 
@@ -408,14 +385,8 @@ def sliding_block(
     u = velocity_of(x)
     positive = {"mass": (m, mass), "creep": (v0, creep)}
     values = _values(positive, {"slope": (al, slope), "friction": (mu, friction), "gravity": (g, gravity)})
-    return one_degree(
-        m,
-        -m * g * x * sp.sin(al),
-        -mu * m * g * sp.cos(al) * sp.tanh(u / v0),
-        coordinate=x,
-        parameters=values,
-        name="sliding_block",
-    )
+    V, Q = -m * g * x * sp.sin(al), -mu * m * g * sp.cos(al) * sp.tanh(u / v0)
+    return one_degree(m, V, Q, coordinate=x, parameters=values, name="sliding_block")
 
 
 def falling_body(*, mass: Value = 1.0, drag: Value = 0.25, gravity: Value = 9.81) -> Lagrangian:
@@ -524,6 +495,7 @@ _SYSTEMS: Final[dict[str, Callable[..., Lagrangian]]] = {
         *(sliding_block, falling_body),
     )
 }
+__all__ = ["get", "names", "one_degree", *_SYSTEMS]
 
 
 def names() -> tuple[str, ...]:

@@ -1,8 +1,6 @@
 """Whether constraints are independent at a configuration, and why they are not.
 
-Independence belongs to a pose: one set has full rank on the branch where a mechanism moves, and none on others (a row
-of equal four-bars). So J is judged where a motion starts or a force is evaluated, and random configurations only help
-to explain the error.
+Independence belongs to a pose: a set may have full rank on one branch of a mechanism only (a row of equal four-bars).
 """
 
 from __future__ import annotations

@@ -124,18 +124,9 @@ class EnergyForm:
         return partial(type(self), **self._arguments()), ()
 
     def _arguments(self) -> dict[str, Any]:
-        return {
-            "T": self.T,
-            "V": self.V,
-            "coordinates": self.coordinates,
-            "velocities": self.velocities,
-            "time": self.time,
-            "forces": {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)},
-            "dissipation": self.dissipation,
-            "parameters": dict(self.parameters),
-            "constraints": self.constraints,
-            "name": self.name,
-        }
+        names = ("T", "V", "coordinates", "velocities", "time", "dissipation", "constraints", "name")
+        forces = {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)}
+        return {n: getattr(self, n) for n in names} | {"forces": forces, "parameters": dict(self.parameters)}
 
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> Self:
         """Return the same system with numbers for some parameters."""

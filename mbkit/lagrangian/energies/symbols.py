@@ -1,8 +1,4 @@
-"""Symbols of coordinates, velocities and accelerations, by name.
-
-Inside, a coordinate is a plain symbol and so is its velocity, so that ∂T/∂v is a plain derivative.
-`sympy.physics.mechanics.dynamicsymbols` and their derivatives are replaced by such symbols when they come in.
-"""
+"""Plain symbols of coordinates, velocities and accelerations; they replace dynamicsymbols and their derivatives."""
 
 from __future__ import annotations
 

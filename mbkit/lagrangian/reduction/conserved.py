@@ -1,9 +1,6 @@
-"""Conserved quantities: the momenta of cyclic coordinates, and Jacobi's integral.
+"""Conserved quantities: momenta of cyclic coordinates along which nothing acts, and Jacobi's integral.
 
-A coordinate is cyclic where L does not hold it. Its momentum p = ∂L/∂v is then constant, provided that no force, input,
-dissipation or constraint acts along it (Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 2.6). The energy
-function h = vᵀ ∂L/∂v - L is T2 - T0 + V, and is constant where L does not hold the time and nothing does work; it is
-the energy T + V where T has neither T1 nor T0 (ch. 2.7).
+Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 2.6 and 2.7.
 """
 
 from __future__ import annotations

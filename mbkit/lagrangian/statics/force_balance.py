@@ -55,7 +55,7 @@ class Balance:
     def scale(self, q: Array, tau: Array) -> float:
         """Return the size of the forces that balance, which scales the residual's rounding."""
         sizes = [np.abs(tau).max(initial=0.0), np.abs(self.load(q)).max(initial=0.0)]
-        # Where all is balanced, how the forces change over a unit of the coordinates.
+        # The stiffness gives a scale where all forces are zero.
         sizes.append(np.abs(self.stiffness(q)).max(initial=0.0))
         return float(max(*sizes, np.finfo(float).tiny))
 

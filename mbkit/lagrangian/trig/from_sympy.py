@@ -1,7 +1,6 @@
 """SymPy's expressions as exact sums of cosines and sines, and back in short forms.
 
-Roots and denominators are generators of the sum, each with the sum that it is a power of. So terms come over one
-denominator, even powers of a root become its radicand, and common factors cancel, modulo sin² + cos² = 1.
+Roots and denominators are generators of the sum, so that common factors cancel modulo sin² + cos² = 1.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Exact sums of cosines and sines of angles, with polynomials for coefficients.
 
-Every term of the kinetic energy of a tree of joints is such a sum. Products become sums at once
-(cos a cos b = ½ cos(a - b) + ½ cos(a + b)), so equal things always look equal, what cancels is gone, and a planar
-chain of n links never has more than n² terms: all that `sympy.trigsimp` searches for, in a time that is bounded.
+Products become sums at once (cos a cos b = ½ cos(a - b) + ½ cos(a + b)), so this is a normal form: equal sums have
+equal terms, and a planar chain of n links has at most n² terms.
 """
 
 from __future__ import annotations

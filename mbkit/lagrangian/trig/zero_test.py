@@ -1,8 +1,4 @@
-"""Zero tests of expressions by their values at random places, in a time that is bounded.
-
-`sympy.simplify` may search for an identity for ever. Values decide instead: with more digits the value of a zero gets
-smaller, and any other stays.
-"""
+"""Zero tests of expressions by values at random places: with more digits only the value of a zero gets smaller."""
 
 from __future__ import annotations
 
