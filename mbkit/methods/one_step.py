@@ -58,7 +58,7 @@ class ArrayStages:
 
     def __init__(self, count: int, shape: tuple[int, ...]) -> None:
         self.shape, self._nv, self._count = shape, shape[-1], 0
-        self._moved = (*shape[:-1], 2 * self._nv)
+        self._moved, self._single = (*shape[:-1], 2 * self._nv), len(shape) == 1
         self._rates = np.empty((count, *self._moved))
         # Views, which are not free: a step of a small model takes some ten microseconds.
         self._u, self._w = self._rates[..., : self._nv], self._rates[..., self._nv :]
@@ -80,11 +80,11 @@ class ArrayStages:
 
     def moved(self, h: float, weights: Array) -> tuple[Array, Array]:
         """Return h times the weighted sums of u̇ and ẇ."""
-        out = (h * weights) @ self._known[self._count]
-        if len(self._moved) == 1:
-            return out[: self._nv], out[self._nv :]
+        out, nv = (h * weights) @ self._known[self._count], self._nv
+        if self._single:
+            return out[:nv], out[nv:]
         out = out.reshape(self._moved)
-        return out[..., : self._nv], out[..., self._nv :]
+        return out[..., :nv], out[..., nv:]
 
     def squares(self, weights: Array, scales: tuple[Array, Array]) -> Any:
         """Return the sum of the squares, for one state."""

@@ -149,7 +149,7 @@ class Tableau:
 
     @cached_property
     def _rows(self) -> list[tuple[float, Array]]:
-        """Time and weights of each stage; of arrays, Python would make them anew in every step."""
+        """Time and weights of each stage, sliced once."""
         return [(float(c), self.A[i, :i]) for i, c in enumerate(self.c)]
 
     @property
@@ -178,11 +178,10 @@ class Tableau:
         q, w, u
             The new state, which is the old q moved by u.
         """
-        for i in range(len(stages), self.stages):
-            if not i:
-                stages.append(*rates(t, q, None, w))
-                continue
-            c, weights = self._rows[i]
+        known = len(stages)
+        if not known:
+            stages.append(*rates(t, q, None, w))
+        for c, weights in self._rows[max(known, 1) :]:
             u, dw = stages.moved(h, weights)
             stages.append(*rates(t + c * h, space.move(q, u), u, w + dw))
         u, dw = stages.moved(h, self.b)

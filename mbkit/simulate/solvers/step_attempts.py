@@ -154,11 +154,8 @@ def first_length(
     return np.asarray(np.minimum(100 * h0, h1))
 
 
-class _OneOf(Field):
+class _MemberField(Field):
     """The field of one member of a batch, on single states."""
-
-    def one(self, member: int) -> None:
-        self._use(self._dyn.of_samples([member]))
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ beside a single state."""
@@ -187,7 +184,7 @@ class RungeKuttaAttempts:
         batch: int | None,
     ) -> None:
         self._space, self._tolerances, self._torque, self._batch = space, tolerances, torque, batch
-        self._field = _OneOf(dyn, self._space)
+        self._field = Field(dyn, space) if batch is None else _MemberField(dyn, space)
         self._tableau = dormand_prince_853()
         self._least = duration * float(np.finfo(float).eps)
         self._stages = ArrayStages(self._tableau.stages, (space.nv,))
@@ -211,7 +208,7 @@ class RungeKuttaAttempts:
         """Begin at a state."""
         (member,) = which
         if self._batch is not None:
-            self._field.one(member)
+            self._field.only(np.array([member]))
         self._of_interval = self._torque.of_member(None if self._batch is None else member)
         self._q, self._w, self._t, self._h = q[0], w[0], t, h
         self._most, self._last, self._error = MAX_GROWTH, FIRST_ROOT, 0.0

@@ -57,7 +57,7 @@ class Field:
     """
 
     def __init__(self, dyn: Dynamics, space: Space) -> None:
-        self._dyn, self._space = dyn, space
+        self._dyn, self._space, self._flat = dyn, space, space.flat
         self._use(dyn)
         self.evaluations = 0
 
@@ -67,16 +67,16 @@ class Field:
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.time_parameter is not None
-        self._approach = Approach()
+        self._approach, self._constrained = Approach(), own.model.constrained
 
     @property
     def near_singular(self) -> bool:
         """Whether constraints may soon depend on each other."""
-        return self._own.model.constrained and self._approach.near
+        return self._constrained and self._approach.near
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
-        if not self._own.model.constrained:
+        if not self._constrained:
             return q, w
         q, w = settled(self._own, t, q, w)
         self._approach.saw(self._own, t, q)
@@ -84,13 +84,13 @@ class Field:
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
-        if self.near_singular:
+        if self._constrained and self._approach.near:
             q, w = beside(self._own, t, q, w)
         return self(t, q, w, force)
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""
-        v = self._space.leave(q, w)
+        v = w if self._flat else self._space.leave(q, w)
         if not isinstance(force, np.ndarray):
             # Never call the user's function on a state that is not finite.
             if not (is_bounded(q).all() and is_bounded(v).all()):
@@ -107,7 +107,7 @@ class Field:
             if _finite(q, v):
                 raise
             raise DivergenceError(DIVERGED) from None
-        return np.asarray(self._space.acceleration(q, v, a))
+        return a if self._flat else np.asarray(self._space.acceleration(q, v, a))
 
 
 def _blamed(told: str, q: Array, v: Array) -> str:
