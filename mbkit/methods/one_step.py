@@ -145,19 +145,8 @@ def embedded_error(
 ) -> Any:
     """Return the error of a step of Dormand and Prince's pair 8(5, 3) in units of the tolerance, as DOP853 combines it.
 
-    Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.10.
-
-    Parameters
-    ----------
-    m : Arithmetic
-    errors : pair of (s,) arrays
-        b minus the weights of order 5 and of order 3.
-    stages : Stages
-    scales : pair
-        Tolerated errors of u and w.
-    h : scalar
-    n : int
-        Numbers of a state.
+    Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.10. `errors` are b minus the weights of
+    order 5 and 3, `scales` the tolerated errors of u and w, and n counts the numbers of a state.
     """
     fifth, third = (stages.squares(weights, scales) for weights in errors)
     total = fifth + 0.01 * third
@@ -208,16 +197,8 @@ def next_step(
 ) -> tuple[Any, Any, Any]:
     """Return the length of the next attempt, its largest growth, and the error's root to remember.
 
-    Parameters
-    ----------
-    m : Arithmetic
-    factors : StepFactors
-        Of the attempt's error.
-    accepted : condition
-    step, h : scalars
-        Length of the attempt, and the one that was chosen for it before the end of the run shortened it, s.
-    growth, last : scalars
-        Largest growth of this step, and the root of the last accepted error.
+    `h` is the length that was chosen for this attempt before the end of the run shortened it to `step`; `last` is the
+    root of the last accepted error.
     """
     factor, reduction, root = factors
     grown = step * m.choose(factor < growth, factor, growth)

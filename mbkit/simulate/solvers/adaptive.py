@@ -1,9 +1,7 @@
 """The adaptive run of a one-step method with an embedded error on the manifold: rk853, rodas5.
 
-Own steps do not depend on what is saved or looked for. A state within a step is made
-by a shorter step from the same start, of the same order as all others, so that there is
-no interpolant whose error would have to be told apart; compiled, several of these
-stand side by side in a vector.
+Steps do not depend on what is saved or looked for. A state within a step is computed by a shorter step from the same
+start, of the same order as the others; no interpolant adds an error of its own.
 """
 
 from __future__ import annotations
@@ -106,18 +104,7 @@ def stop_times(asked: IntegrationProblem) -> list[float]:
 def march(
     trials: StepAttempts, group: Sequence[TrajectoryRecorder], stops: Sequence[float], first: int = 0
 ) -> Iterator[list[tuple[int, AcceptedSteps]]]:
-    """Take trajectories to the end; yields what was made, after each look at it.
-
-    Parameters
-    ----------
-    trials : StepAttempts
-        Begun.
-    group : sequence of TrajectoryRecorder
-    stops : sequence of float
-        As of `stop_times`.
-    first : int
-        Index of the stop to go to first.
-    """
+    """Take trajectories to the end, from stop `first` on; yields accepted steps after they are recorded."""
     for k in range(first, len(stops)):
         trials.hold(k, stops[k])
         while made := trials.advance():
@@ -129,19 +116,7 @@ def march(
 
 
 class TrajectoryRecorder:
-    """One trajectory: its steps so far, what is kept of them, and how it ends.
-
-    Parameters
-    ----------
-    problem : IntegrationProblem
-    space : Space
-    index : int
-        Which trajectory.
-
-    Attributes
-    ----------
-    member : TrajectoryRecord
-    """
+    """Puts the steps of one trajectory into its record, `member`."""
 
     def __init__(self, problem: IntegrationProblem, space: Space, index: int) -> None:
         self.member = record_of(problem, index)
@@ -216,10 +191,7 @@ class TrajectoryRecorder:
         return state
 
     def _keep(self, trials: StepAttempts, place: int, made: AcceptedSteps, steps: int, until: float) -> bool:
-        """Keep what is wanted after the start, up to a time in or at the end of the last step.
-
-        Returns whether all that was wanted is a state; if not, nothing is kept.
-        """
+        """Keep the wanted states up to a time in the last step; return False, and keep none, if one is unbounded."""
         if self._save is None:
             ends = slice(1, steps + 1 - int(until != made.t[steps]))
             return self._add(made.t[ends], made.q[ends], made.w[ends])

@@ -34,31 +34,15 @@ _HUGE: Final = 1e300
 
 @dataclass(frozen=True)
 class _Scheme:
-    """A method's tries.
-
-    Attributes
-    ----------
-    name : str
-    coefficients : sequence of list
-        Which are not among the sources that a cached code is told by.
-    parts : callable
-        From the equations to the parts of one try.
-    stages : int
-    rate : str
-        Where ẇ at the start is found after a try of no length.
-    grows : int
-        The power of a step's length with which its estimated error grows.
-    jacobians : int
-        Of each try.
-    """
+    """The attempted step of a method."""
 
     name: str
-    coefficients: Sequence[list[float]]
+    coefficients: Sequence[list[float]]  # for the key of cached code
     parts: Callable[[Equations], tuple[Part, ...]]
     stages: int
-    rate: str
-    grows: int
-    jacobians: int
+    rate: str  # name of ẇ at the start, after an attempt of no length
+    grows: int  # power of a step's length with which its error grows
+    jacobians: int  # of each attempt
 
 
 @cache

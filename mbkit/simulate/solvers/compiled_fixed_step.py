@@ -49,22 +49,11 @@ _STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares"}
 class BlockLoop:
     """Room for the states of a block of steps side by side, one trajectory in each column.
 
-    Columns beyond the states repeat the last one.
-
-    Parameters
-    ----------
-    sizes : dict of str to (int, int)
-        Of each name the number of places, one for each step that has its own, and of rows.
-    count : int
-        States that there is room for.
-
-    Attributes
-    ----------
-    block : int
-        Steps of the next block, at most.
+    Columns beyond the `count` states repeat the last one. `sizes` has for each name the number of places, one for each
+    step that has its own, and of rows.
     """
 
-    block: int
+    block: int  # steps of the next block, at most
 
     def __init__(self, sizes: Mapping[str, tuple[int, int]], count: int) -> None:
         self._width = padded(count)
@@ -85,15 +74,7 @@ class BlockLoop:
             self._fill("parameters", place, np.atleast_2d(values).T)
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
-        """Take some steps, at most `block`, from where the last ones ended.
-
-        Parameters
-        ----------
-        steps : int
-        start, dt : float
-            Time at which the first begins, and length of each; s.
-        torques : (steps or 1, nv, n or 1) array
-        """
+        """Take at most `block` steps of length dt from where the last ones ended; torques (steps or 1, nv, n or 1)."""
         raise NotImplementedError
 
     def again(self) -> None:
@@ -143,16 +124,9 @@ def run_parts(
     steps: int,
     bar: Progress,
 ) -> None:
-    """Run parts of a batch on all cores.
+    """Run parts of a batch in threads, at most `workers`.
 
-    Parameters
-    ----------
-    parts : sequence of slice
-    new_worker : callable
-        Called in each thread; returns run(part), which yields the number of steps done.
-    workers, steps : int
-        Threads at most, and steps of each part.
-    bar : Progress
+    new_worker(), called in each thread, returns run(part), which yields the number of `steps` done.
     """
     done, left, stop = [0] * len(parts), iter(list(enumerate(parts))), threading.Event()
     total = max(len(parts) * steps, 1)
@@ -185,22 +159,7 @@ def run_parts(
 
 
 class Plan:
-    """A method's step for one model, in machine code.
-
-    Parameters
-    ----------
-    dyn : LagrangianDynamics
-    method : {"rk4", "semi_implicit_euler"}
-
-    Attributes
-    ----------
-    parts : tuple of Part
-        What is run for a step, in this order.
-    codes : tuple of Compiled
-        The parts' machine code.
-    sizes : dict of str to int
-        Rows of each array that the parts read or write.
-    """
+    """A method's step for one model in machine code: its parts in order, and the rows of each array they use."""
 
     def __init__(self, dyn: LagrangianDynamics, method: str) -> None:
         def code(part: Part) -> Compiled:
@@ -224,17 +183,9 @@ class Plan:
 
 
 class Chunk(BlockLoop):
-    """States on their way by an explicit step.
+    """At most `most` states that take explicit steps.
 
-    Parameters
-    ----------
-    plan : Plan
-    most : int
-        States that it has room for.
-    torques : bool
-        Whether each step of a block has a torque of its own.
-    all_kept : bool
-        Whether all states of a block can be read after it, or the last one alone.
+    `torques`: each step of a block has its own; `all_kept`: each state of a block can be read, not only the last.
     """
 
     block = BLOCK
@@ -259,15 +210,7 @@ class Chunk(BlockLoop):
         ]
 
     def begin(self, q: Array, w: Array, parameters: Array) -> None:
-        """Put states in.
-
-        Parameters
-        ----------
-        q, w : (n, nq) and (n, nv) arrays
-            In the integrators' own velocity.
-        parameters : (p,) or (n, p) array
-            Values of the model's named parameters.
-        """
+        """Put in states, (n, nq) and (n, nv) of `Space`, and the values of parameters, (p,) or (n, p)."""
         self._count = len(q)
         self._fill("q", 0, q.T)
         self._fill("w", 0, w.T)
@@ -311,13 +254,7 @@ def run_rollout(
     bar: Progress,
     workers: int | None = None,
 ) -> SolverResult:
-    """Step one state or a batch over the grid.
-
-    Parameters
-    ----------
-    workers : int, optional
-        Threads; as many as there are cores when not given. No number depends on it.
-    """
+    """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core."""
     single = q0.ndim == 1
     q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
     check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])

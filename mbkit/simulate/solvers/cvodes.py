@@ -1,9 +1,7 @@
 """SUNDIALS' CVODES through CasADi: BDF of orders 1 to 5, with CasADi's exact Jacobian.
 
-Hindmarsh and others 2005, SUNDIALS: Suite of nonlinear and differential/algebraic
-equation solvers. The right-hand side is the one of `mbkit.simulate.solvers.vector_field`, as a graph that
-CasADi's machine interprets: nothing is compiled, and each evaluation for a UR5 costs
-about 15 µs with all that CVODES does around it, 50 µs for a Panda.
+Hindmarsh and others 2005, SUNDIALS: Suite of nonlinear and differential/algebraic equation solvers. CasADi interprets
+the right-hand side.
 """
 
 from __future__ import annotations
@@ -29,8 +27,7 @@ __all__ = ["run_cvodes"]
 
 _GRAPH: Final = "_cvodes_graph"
 _EPS: Final = float(np.finfo(float).eps)
-# Steps after which CasADi is left, to tell how far the run is. CVODES starts each call
-# with order 1, which costs some tens of steps.
+# Steps of a call. Progress is reported after it, and each starts with order 1, which costs some tens of steps.
 _PIECE: Final = 2000
 # Between two saved times: far more than any tolerance asks for, so that a run ends.
 _MOST_STEPS: Final = 2_000_000
@@ -49,11 +46,7 @@ class _Failure(NamedTuple):
 
 
 def run_cvodes(asked: IntegrationProblem) -> SolverResult:
-    """Integrate one state, or each of a batch by itself, to the times of `save`.
-
-    The times are passed by and interpolated, as accurately as CVODES steps. Torques
-    held as an array start it anew at each interval.
-    """
+    """Integrate one state, or each of a batch by itself; CVODES interpolates, and starts again where a torque jumps."""
     dyn, torque = asked.dyn, asked.torque
     if not isinstance(dyn, LagrangianDynamics):
         raise UnsupportedError(

@@ -74,16 +74,7 @@ def run_fixed(
 
 
 class _Run:
-    """States on their way.
-
-    Attributes
-    ----------
-    q_kept, v_kept : (n, K, nq) and (n, K, nv) arrays
-    steps : (n,) array of int
-        Good steps of each trajectory.
-    why : str
-        Reason of the first divergence.
-    """
+    """The current states, those kept so far (n, K, ...), good steps of each (n,), and why the first one diverged."""
 
     def __init__(
         self, step: Step, field: Field, torque: Torque, space: Space, q0: Array, v0: Array, grid: Grid, kept: Indices

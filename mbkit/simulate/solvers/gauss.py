@@ -1,10 +1,8 @@
 """Gauss-Legendre collocation on the space of `mbkit.model.integration_space`, with its stages solved to rounding.
 
-Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.7, with
-Munthe-Kaas's pulled-back velocities on rotations. Of all methods with s stages they
-have the highest order, 2s. Without quaternions they are symmetric: the step -h undoes
-the step h, and errors in energy do not grow. They are symplectic in canonical (q, p);
-here they act on (q, v), where they are not: `implicit_midpoint` is.
+Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.7, with Munthe-Kaas's velocities on
+rotations. Without quaternions they are symmetric: the step -h undoes the step h. They are symplectic on (q, p), but not
+on (q, v) as here.
 """
 
 from __future__ import annotations
@@ -195,11 +193,7 @@ class CollocationStep:
         return _inverse_of(np.einsum("ij,i...kl->...ikjl", h * self._A, J))
 
     def _slopes(self, t: float, q: Array, u: Array, w: Array, force: Force) -> Array:
-        """Return J = ∂(u̇, ẇ)/∂(u, w).
-
-        It is of differences, of any engine and torque: half of the digits are plenty for
-        an iteration that multiplies errors by h times the change of J over the step.
-        """
+        """Return J = ∂(u̇, ẇ)/∂(u, w) by differences: half of the digits are enough for the iteration."""
         nv = self._nv
         size = sqrt(_EPS) * max(1.0, float(np.abs(w).max(initial=0.0)))
         J = np.empty((*w.shape[:-1], 2 * nv, 2 * nv))

@@ -1,10 +1,8 @@
 """Runs of the implicit midpoint rule in (q, p), on `mbkit.derivation.steps.midpoint`'s parts.
 
-The state from step to step is (q, π), and velocities are made of it only where they are
-kept. With no torque or an array, blocks of steps run as machine code, chunks of a batch
-on all cores; the chunks are the same whatever the number of cores. A function as torque
-is evaluated at the midpoint and taken along in the iteration, which then converges
-linearly, at the rate of the step times the torque's derivative.
+The state from step to step is (q, π); velocities follow from it where they are kept. Without a torque function, steps
+run as machine code, on all cores. A torque function is evaluated at the midpoint in each iteration, which then
+converges linearly, at the rate of the step times the torque's derivative.
 """
 
 from __future__ import annotations
@@ -36,8 +34,6 @@ from mbkit.simulate.torque import Torque
 __all__ = ["MidpointSolver", "called", "run_midpoint"]
 
 
-# One step of the implicit midpoint rule at a time, for torque functions and what is not compiled.
-
 # With a torque function the iteration converges linearly.
 _WITH_FUNCTION: Final = 60
 _EPS: Final = float(np.finfo(float).eps)
@@ -67,20 +63,7 @@ def called(
 
 
 class MidpointSolver:
-    """Newton's iteration for trajectories side by side.
-
-    Parameters
-    ----------
-    dyn : LagrangianDynamics
-    torque : Torque
-    single : bool
-        Whether there is one trajectory, no batch.
-
-    Attributes
-    ----------
-    iterations : int
-        Summed over the trajectories.
-    """
+    """Newton's iteration for trajectories side by side, one step at a time; `iterations` are of all together."""
 
     def __init__(self, dyn: LagrangianDynamics, torque: Torque, *, single: bool) -> None:
         self._dyn, self._torque, self._single = dyn, torque, single

@@ -31,29 +31,10 @@ _FIRST: Final = len(GUESS)
 
 
 class MidpointChunk(BlockLoop):
-    """Room for the states of a block of steps, one trajectory in each column.
+    """At most `WIDEST` trajectories that take blocks of steps with equally many Newton iterations each.
 
-    All steps of a block are made with the same number of Newton's iterations, without a
-    look in between. Where one of them turns out not to be solved, the block is made
-    again with more.
-
-    Parameters
-    ----------
-    dyn : LagrangianDynamics
-        Its functions are machine code.
-    count : int
-        Trajectories, at most `WIDEST`.
-    steps : int
-        That are to be made, so that little is prepared for few.
-    torques : bool
-        Whether each step has a torque of its own.
-
-    Attributes
-    ----------
-    good : (n,) array of int
-        How many steps of the last block are solved, per trajectory.
-    iterations : int
-        Newton's iterations so far, summed over the trajectories.
+    Where a step is not solved, the block is repeated with more. `good` are the solved steps of the last block, (n,);
+    `torques`: each step has its own torque.
     """
 
     def __init__(self, dyn: LagrangianDynamics, count: int, steps: int, *, torques: bool) -> None:

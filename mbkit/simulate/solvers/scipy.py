@@ -1,9 +1,6 @@
-"""SciPy's adaptive methods on q and v: an independent road to a reference, and the stiff ones.
+"""SciPy's adaptive methods on q and v, with the exact Jacobian for the implicit ones.
 
-DOP853 (Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, ch.
-II.5), Radau IIA of order 5 (Hairer, Wanner 1996, volume II, ch. IV.8), BDF (Shampine,
-Reichelt 1997) and ODEPACK's LSODA (Petzold 1983). The implicit ones get the exact
-Jacobian. Interpolants of DOP853 and Radau are less accurate than their steps (order 7 beside 8, 3 beside 5), so these
+Interpolants of DOP853 and Radau are less accurate than their steps (order 7 beside 8, 3 beside 5), so these
 end where a state is wanted; multistep methods interpolate, since stopping often would slow them.
 """
 
@@ -60,12 +57,7 @@ class _Task:
 
 
 def run_scipy(asked: IntegrationProblem) -> SolverResult:
-    """Integrate one state, or each of a batch by itself.
-
-    Saved states are as accurate as the steps: steps of DOP853 and Radau end on the
-    saved times, BDF and LSODA interpolate. Without `save`, the solver's own steps are
-    kept. Torques held as an array start every method anew at each interval.
-    """
+    """Integrate one state, or each of a batch by itself; a jump of a held torque starts every method again."""
     dyn, save, torque = asked.dyn, asked.save, asked.torque
     method = method_of(asked.method)
     dense = method.multistep

@@ -43,21 +43,12 @@ ROUNDS: Final = 256
 
 @dataclass(frozen=True, eq=False)
 class AcceptedSteps:
-    """Accepted steps of one trajectory in a row, the state before the first in front.
+    """Accepted steps of one trajectory in a row, the state before the first in front."""
 
-    Attributes
-    ----------
-    t : (n + 1,) array
-    q, w : (n + 1, nq) and (n + 1, nv) arrays
-        In the integrators' own velocity.
-    tried : int
-        Steps that were tried on the way.
-    """
-
-    t: Array
-    q: Array
-    w: Array
-    tried: int
+    t: Array  # (n + 1,)
+    q: Array  # (n + 1, nq)
+    w: Array  # (n + 1, nv), of `Space`
+    tried: int  # attempted steps
 
 
 class StepAttempts(Protocol):
@@ -95,11 +86,7 @@ class StepAttempts(Protocol):
         """Leave a trajectory where it is."""
 
     def stuck(self, place: int) -> bool | None:
-        """Return whether no step at all could be made for a trajectory.
-
-        True if the tries were no numbers, False if they were inaccurate however short;
-        None where all is well.
-        """
+        """Return None while steps are possible; True if attempts are not finite, False if inaccurate at any length."""
 
     def why(self, place: int) -> str:
         """Return why a try was no number."""
@@ -123,20 +110,9 @@ def first_length(
     probe: Callable[[Array, Array], Array],
     grows: int = 8,
 ) -> Array:
-    """Return how long a first step may be, one for each state: (n,).
+    """Return the length of the first step from each state, (n,); k is ẇ there, and probe(q, w) is ẇ elsewhere.
 
-    Hairer, Nørsett, Wanner 1993, II.4, as SciPy does it.
-
-    Parameters
-    ----------
-    space : Space
-    q, w, k : (n, nq), (n, nv), (n, nv) arrays
-        States and ẇ there.
-    tolerances : Tolerances
-    probe : callable
-        probe(q, w) -> ẇ at other states.
-    grows : int
-        The power of a step's length with which its estimated error grows.
+    Hairer, Nørsett, Wanner 1993, II.4, as in SciPy. The error of a step grows with its length to the power `grows`.
     """
     sizes = np.concatenate([space.sizes(q, w), np.abs(w)], axis=-1)
     scale = tolerances.atol + tolerances.rtol * sizes
@@ -229,8 +205,7 @@ class RungeKuttaAttempts:
             h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self.grows)[0])
         except DivergenceError:
             h = math.nan
-        # Where there is no rate, the step finds that out. At the least length no step
-        # would be tried at all, and nobody be told.
+        # Where there is no rate, the step finds that out; at the least length no step would be tried.
         return max(h if h > 0 else 1e-6 * (self._stop - self._t), 2 * self._least)
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
@@ -333,12 +308,8 @@ class RungeKuttaAttempts:
         return q, w
 
 
-# The Rosenbrock step stage by stage, on any engine's forward dynamics and under any torque.
-#
-# It acts on y = (q, v) with quaternions as four numbers, whose exact flow keeps their length, and takes the exact
-# Jacobian of `mbkit.simulate.diagnostics.linearization`. A state within a step is that of the method's own polynomial
-# of order 4,
-# whose error is a part of the one that the step is judged by; a shorter step would cost as much as the step.
+# The Rosenbrock step acts on y = (q, v), with quaternions as four numbers, whose length the exact flow keeps. A state
+# within a step is that of the method's polynomial of order 4: a shorter step would cost as much as the step.
 
 #: Of a step: how far apart the rates are that tell the time's own part, by a parabola.
 _APART: Final = 1e-3

@@ -1,8 +1,6 @@
 """heyoka's adaptive Taylor method: in double on the own derivation, with 34 digits on the oracle.
 
-A step's series is also its interpolant, as accurate as the step: saved states and
-events are read off it, and the steps are as long as the series allows. Only torques
-held as an array end them, since they jump.
+A step's series is also its interpolant, as accurate as the step. Only jumps of a held torque end steps early.
 """
 
 from __future__ import annotations
@@ -84,13 +82,7 @@ def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:
 
 
 class StoppedError(Exception):
-    """A state that has no next one; never leaves mbkit.
-
-    Attributes
-    ----------
-    ended : str
-        As in `Stats`.
-    """
+    """A state that has no next one; never leaves mbkit. `ended` is as in `Stats`."""
 
     def __init__(self, ended: Ended, message: str) -> None:
         super().__init__(message)
@@ -98,25 +90,9 @@ class StoppedError(Exception):
 
 
 class TaylorSteps:
-    """Steps of one trajectory after the other, with a borrowed integrator.
+    """Steps of one trajectory at a time, with a borrowed integrator; t0, y0 and t, y are the ends of the last one.
 
-    Parameters
-    ----------
-    system : TaylorSystem
-    integrator : heyoka.taylor_adaptive
-        Of this system, for one's own use.
-    kind : Precision
-    behind : (k,) array
-        The values of the equations' trailing argument.
-    settled : callable, optional
-        settled(t, y) is the state to go on from after a step that led to y.
-
-    Attributes
-    ----------
-    t0, t : float
-        Start and end of the last step, s.
-    y0, y : (nq + nv,) arrays
-        The states there, of the format's own type.
+    `behind` are the values of the equations' trailing argument; settled(t, y) is the state to go on from after a step.
     """
 
     def __init__(
@@ -136,21 +112,9 @@ class TaylorSteps:
         self.y0 = self.y = np.empty(0)
 
     def __call__(self, t0: float, y0: Any, stops: Sequence[float], force: Callable[[int], Any]) -> Iterator[float]:
-        """Take steps from a time that end at the stops, and yield the time after each.
+        """Take steps from t0 to the last stop that end at each stop, under force(k) before the k-th; yield their ends.
 
-        Parameters
-        ----------
-        t0 : float
-        y0 : (nq + nv,) array
-        stops : sequence of float
-            Increasing, above t0; the last is the end.
-        force : callable
-            force(k) is what acts before the k-th stop, (nv,).
-
-        Raises
-        ------
-        StoppedError
-            No such step exists; t and y are the last good ones.
+        Raises `StoppedError` where there is no step; t and y are the last good ones.
         """
         integrator, kind = self._integrator, self._kind
         state = integrator.state
@@ -203,11 +167,9 @@ class TaylorSteps:
         return StoppedError("diverged", DIVERGED)
 
     def _holds(self) -> float:
-        """Return how long a step the series just made allows, by its last six orders.
+        """Return how long a step the last series allows, by its last six orders.
 
-        heyoka judges by the last two. Where a symmetry makes both of them vanish, as for a
-        pendulum let go at the horizontal, whose series has every fourth term only, its
-        step is far too long.
+        heyoka takes the last two, which may vanish by symmetry: a pendulum from the horizontal has every fourth term.
         """
         series = np.abs(_rounded(self._integrator.tc))
         order = series.shape[1] - 1

@@ -29,30 +29,9 @@ _COVERED: Final = 1e-6
 
 
 class TrajectoryRecord:
-    """One trajectory of an adaptive solver.
+    """One trajectory of an adaptive solver: `save` are times to keep, None for the end of every step.
 
-    Parameters
-    ----------
-    model : Model
-    save : sequence of float or None
-        Times to keep; None for the end of every step.
-    start, duration : float
-        s.
-    poses : SingularPoses, optional
-        Where constraints act.
-
-    Attributes
-    ----------
-    steps, rejected : int
-    reached : float
-        Time of the last good state, s.
-    ended : str
-        As in `Stats`.
-    message : str
-    events : list of Hit
-    error : FunctionError or None
-    last : (nq,) array or None
-        Configuration of the last good state.
+    `reached` is the time and `last` the configuration of the last good state; `ended` is as in `Stats`.
     """
 
     def __init__(
@@ -229,22 +208,8 @@ def grid_result(
 ) -> SolverResult:
     """Return the result of a run with a fixed step.
 
-    Parameters
-    ----------
-    grid : Grid
-    kept : (K,) array of int
-        Indices of the states to keep.
-    q, v : (n, K, nq) and (n, K, nv) arrays
-        Those states; what lies behind a trajectory's last good step is overwritten by NaN.
-    steps : (n,) array of int
-        Good steps of each trajectory.
-    single : bool
-        Whether the result has no batch dimension.
-    why : callable
-        why(i) says why trajectory i diverged; empty if that is not known.
-    evaluations, jacobians : int
-    error : FunctionError, optional
-        That of a torque function.
+    `kept` are the indices of the states q and v, (n, K, ...), which are overwritten by NaN behind the good `steps` of
+    each trajectory, (n,). why(i) is the reason why trajectory i diverged, or empty.
     """
     lost = np.flatnonzero(steps < grid.steps)
     for i in lost:
@@ -260,7 +225,7 @@ def grid_result(
             message += f"; {len(lost)} of {len(steps)} trajectories diverged, see reached"
     rows = int(np.count_nonzero(kept <= steps.max())) if len(steps) else len(kept)
     q, v = (x if rows == len(kept) else x[:, :rows].copy() for x in (q, v))
-    # Handed on as they are, however large, and not copied for fear of a later change.
+    # Read-only, so that nobody needs a copy.
     q.setflags(write=False)
     v.setflags(write=False)
     reached = np.array([grid.time(int(k)) for k in steps])

@@ -48,13 +48,7 @@ def _finite(q: Array, v: Array) -> bool:
 
 
 class Field:
-    """ẇ of the integrators' state, from an engine's forward dynamics.
-
-    Attributes
-    ----------
-    evaluations : int
-        Of the forward dynamics so far, summed over a batch.
-    """
+    """ẇ of the integrators' state, from an engine's forward dynamics; `evaluations` are summed over a batch."""
 
     def __init__(self, dyn: Dynamics, space: Space) -> None:
         self._dyn, self._space, self._flat = dyn, space, space.flat
@@ -117,17 +111,9 @@ def _blamed(told: str, q: Array, v: Array) -> str:
 
 
 class Rates:
-    """The right-hand side on y = (q, v) of one state, with quaternions of any length.
+    """The right-hand side on y = (q, v) of one state, with quaternions of any length as four numbers.
 
-    Nothing is shared with the fixed-step methods: quaternions are four numbers
-    with the rate D(q) v of their joint, and velocities are mbkit's own.
-
-    Attributes
-    ----------
-    evaluations : int
-        Of the forward dynamics so far.
-    why : str
-        What the engine said when it last failed.
+    `why` is the engine's reason when it last failed.
     """
 
     def __init__(self, dyn: Dynamics, *, explicit: bool = False) -> None:
