@@ -261,6 +261,18 @@ def test_a_planted_error_in_one_joint_is_found_and_named(monkeypatch, method, te
     assert not result.worst.passed
 
 
+@pytest.mark.parametrize(
+    ("method", "term", "passed"), [("_gravity", "g", False), ("_nle", "nle", False), ("_mass_matrix", "M", True)]
+)
+def test_the_rounding_of_the_mass_matrix_excuses_no_other_term(monkeypatch, method, term, passed):
+    planted(monkeypatch, MujocoDynamics, method, lambda x: x * (1 + 1e-9))
+    monkeypatch.setattr(MujocoDynamics, "mass_matrix_rounding", lambda self, q: 1e10)  # noqa: ARG005
+    rows = {(r.term, r.engine): r for r in terms(mb.load("ur5"), engines=("pinocchio", "mujoco")).rows}
+    row = rows[term, "mujoco"]
+    assert row.passed == passed
+    assert (row.allowed > 1e-12) == passed
+
+
 def test_a_planted_error_in_the_accelerations_breaks_the_power_balance(monkeypatch):
     planted(monkeypatch, PinocchioDynamics, "forward_dynamics", lambda a: a * (1 + 1e-8))
     failed = {(r.term, r.engine) for r in terms(mb.load("ur5")).rows if not r.passed}
@@ -416,7 +428,7 @@ def test_progress_is_told_and_grows():
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
-        ({"engines": ("pinocchio",)}, InputError, "at least two"),
+        ({"engines": ("pinocchio",)}, InputError, "at least 2"),
         ({"engines": "pinocchio"}, InputError, "several names"),
         ({"engines": ("pinocchio", "oracle")}, InputError, "leave it out"),
         ({"engines": ("pinocchio", "mujocco")}, UnknownNameError, "'mujoco'"),

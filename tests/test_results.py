@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -13,6 +14,7 @@ from mbkit.errors import InputError, OutputError
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.result import BaselineResult
 from mbkit.studies.baseline.tolerance import Moved, VersionChange
+from mbkit.studies.compare.result import Comparison
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap
@@ -87,6 +89,22 @@ def test_json_holds_all_of_a_result(name, tmp_path):
     assert again.to_json() == text
     assert repr(again) == repr(result)
     assert again.to_markdown() == result.to_markdown()
+
+
+def test_infinite_numbers_come_back_from_json_and_old_files_stay_readable():
+    shown = replace(AGREEING.rollouts[0], tolerance=math.inf, condition=math.nan)
+    study = replace(AGREEING, rollouts=(*AGREEING.rollouts, shown))
+    text = study.to_json()
+    again = Comparison.from_json(text).rollouts[-1]
+    assert again.tolerance == math.inf
+    assert math.isnan(again.condition)
+    apart = replace(EXPLAINED, causes=(replace(EXPLAINED.causes[0], effects={"M": math.inf, "g": 0.5}),))
+    assert Explanation.from_json(apart.to_json()) == apart
+    old = json.loads(text)
+    del old["infinite"]
+    assert old["rollouts"][-1]["tolerance"] is None
+    assert math.isnan(Comparison.from_json(json.dumps(old)).rollouts[-1].tolerance)
+    assert "infinite" not in json.loads(EXPLAINED.to_json())
 
 
 @pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"model": 1}', "[" * 100_000])

@@ -14,14 +14,23 @@ from pathlib import Path
 from typing import Any, Final
 
 from mbkit import catalog
-from mbkit.engines import ENGINES
+from mbkit.engines.registry import ENGINES, REFERENCE, compared
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
 from mbkit.load.robot_data import find
 from mbkit.model import Model
 
-__all__ = ["checked_target", "is_code", "kept", "model_of", "not_installed", "resolved", "with_values"]
-
+__all__ = [
+    "checked_target",
+    "engine_names",
+    "is_code",
+    "kept",
+    "model_of",
+    "names_of",
+    "not_installed",
+    "resolved",
+    "with_values",
+]
 
 _FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
 
@@ -169,6 +178,32 @@ def with_values(model: Model) -> Model:
     """Return the model with numbers for its named parameters, which not every engine takes."""
     values = {name: x for name, x in model.parameters.items() if x is not None}
     return model.with_parameters(**values) if values else model
+
+
+def names_of(what: str, names: object) -> tuple[str, ...]:
+    """Return names as a tuple, each once; `what` begins the message of an error."""
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise InputError(f"{what}: expected several names, got {names!r}; write ({names!r},)")
+    unique = tuple(dict.fromkeys(names))
+    if not unique:
+        raise InputError(f"{what}: expected at least one name, got none")
+    for name in unique:
+        if not isinstance(name, str):
+            raise InputError(f"{what}: expected names, got {name!r}")
+    return unique
+
+
+def engine_names(engines: object, least: int = 1) -> tuple[str, ...]:
+    """Return the names of engines that can be compared and measured, each once."""
+    names, known = names_of("engines", engines), compared()
+    for name in names:
+        if name == REFERENCE:
+            raise InputError("engines: the oracle is the reference by which the others are measured; leave it out")
+        if name not in known:
+            raise UnknownNameError("engine", name, known)
+    if len(names) < least:
+        raise InputError(f"engines: expected at least {least} of {list(known)}, got {list(names)}")
+    return names
 
 
 def not_installed(engines: Iterable[str]) -> dict[str, str]:

@@ -14,9 +14,9 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from functools import cache
+from functools import cache, reduce
 from importlib import metadata
-from operator import attrgetter
+from operator import attrgetter, getitem
 from pathlib import Path
 from typing import Any, ClassVar, Final, Self
 
@@ -77,6 +77,17 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         return to_plain(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _infinities(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[dict[str, Any]]:
+    """Yield where data is infinite, which JSON's numbers cannot say: the keys that lead there, and the value."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, (dict, list, tuple)):
+        for key, x in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _infinities(x, (*path, key))
+    elif isinstance(value, float) and math.isinf(value):
+        yield {"at": list(path), "value": "Infinity" if value > 0 else "-Infinity"}
 
 
 def from_plain(kind: Any, value: Any) -> Any:
@@ -201,15 +212,20 @@ class ResultTable:
         return asdict(typing.cast(Any, self))
 
     def to_json(self, path: str | Path | None = None) -> str:
-        """Return the result as JSON, and write it to `path` if given. Infinity and NaN become null."""
-        text = json.dumps(to_plain(self.to_dict()), indent=1, allow_nan=False)
+        """Return the result as JSON, and write it to `path` if given.
+
+        Infinity and NaN become null; an entry ``infinite`` then lists which are infinite.
+        """
+        data = self.to_dict()
+        infinite = list(_infinities(data))
+        text = json.dumps(to_plain(data | ({"infinite": infinite} if infinite else {})), indent=1, allow_nan=False)
         if path is not None:
             write(path, text + "\n")
         return text
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Return the result that `to_json` wrote; null is NaN.
+        """Return the result that `to_json` wrote; null is NaN where ``infinite`` does not list it.
 
         Raises
         ------
@@ -217,7 +233,11 @@ class ResultTable:
             The text is no such result.
         """
         try:
-            result: Self = from_plain(cls, json.loads(text))
+            data = json.loads(text)
+            for entry in data.get("infinite", ()):
+                *path, last = entry["at"]
+                reduce(getitem, path, data)[last] = float(entry["value"])
+            result: Self = from_plain(cls, data)
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
             raise InputError(
                 f"text: expected the JSON of a {cls.__name__}, such as Path(...).read_text() of a file "

@@ -14,13 +14,13 @@ from mbkit._check import Array, count
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import compared, find_engine
-from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
-from mbkit.studies._targets import checked_target, with_values
+from mbkit.studies._targets import checked_target, engine_names, with_values
 from mbkit.studies.baseline.description import described, links_of
 from mbkit.studies.baseline.file import ROLLOUT, Baseline, Rollout, check_replaceable, path_of, store, text_of
 from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Comparator, relevant
@@ -144,7 +144,7 @@ def record(
         The file cannot be written, or is not this model's to replace; it stays as it was.
     """
     model, where = checked_model(model), path_of(path)
-    names = _engine_names(engines)
+    names = compared() if engines is None else engine_names(engines)
     count("samples", samples, least=1)
     count("seed", seed)
     checked_target(target, options)
@@ -226,20 +226,6 @@ def checked_model(model: object) -> Model:
         raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to record; add a joint")
     model.require_values("a baseline")
     return model
-
-
-def _engine_names(engines: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of engines, all that there are where none were given."""
-    if engines is None:
-        return compared()
-    if isinstance(engines, str):
-        raise InputError(f"engines: expected several names, got the string {engines!r}; write [{engines!r}]")
-    for name in engines:
-        if name not in compared():
-            raise UnknownNameError("engine", str(name), compared())
-    if not engines:
-        raise InputError(f"engines: expected at least one of {', '.join(compared())}")
-    return tuple(dict.fromkeys(engines))
 
 
 def build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[Refusal], list[Refusal]]:

@@ -13,13 +13,13 @@ import numpy as np
 from mbkit._check import Array, count, real
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.engines.registry import REFERENCE, STANDARD, compared, find_engine
-from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnknownNameError
+from mbkit.engines.registry import STANDARD, find_engine
+from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
-from mbkit.studies._targets import with_values
+from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.omissions import omissions
 from mbkit.studies.compare.result import Comparison, Row
@@ -327,22 +327,11 @@ def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tole
     expect_model(model)
     if not model.nv:
         raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to compare; add a joint")
-    if isinstance(engines, str):
-        raise InputError(f"engines: expected several names, got the string {engines!r}; write ({engines!r}, ...)")
-    for name in engines:
-        if name == REFERENCE:
-            raise InputError("engines: the oracle is what every engine is measured by; leave it out")
-        if not isinstance(name, str) or name not in compared():
-            raise UnknownNameError("engine", str(name), compared())
-    unique = tuple(dict.fromkeys(engines))
-    if len(unique) < 2:
-        raise InputError(
-            f"engines: expected at least two to compare, got {list(engines)}; there are {list(compared())}"
-        )
+    names = engine_names(engines, least=2)
     count("samples", samples, least=1)
     count("seed", seed)
     real("tolerance", tolerance, positive=True)
-    return unique
+    return names
 
 
 def _build(

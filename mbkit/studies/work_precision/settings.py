@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from mbkit.engines.registry import REFERENCE, compared, find_engine
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.engines.registry import find_engine
+from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS, Method, method_of
+from mbkit.studies._targets import engine_names, names_of
 
-__all__ = ["INTERVALS", "Settings", "names_of", "pairs", "plans", "save_grid"]
+__all__ = ["INTERVALS", "Settings", "pairs", "plans", "save_grid"]
 
 #: Errors are measured at the ends of this many equal parts of the horizon.
 INTERVALS: Final = 10
@@ -123,12 +124,7 @@ def pairs(
     InputError, UnknownNameError
         An unknown engine or method, or a method that the engine does not have.
     """
-    names = names_of("engines", engines)
-    for name in names:
-        if name == REFERENCE:
-            raise InputError("engines: the oracle is the reference for the others and is not measured; leave it out")
-        if name not in compared():
-            raise UnknownNameError("engine", name, compared())
+    names = engine_names(engines)
     if isinstance(methods, Mapping):
         for engine in methods:
             if engine not in names:
@@ -152,16 +148,3 @@ def pairs(
                 f"methods: {name} is not on {' or '.join(wanted)}; it is on {', '.join(METHODS[name].engines)}"
             )
     return out
-
-
-def names_of(what: str, given: object) -> tuple[str, ...]:
-    """Return names as a tuple, each once; `what` begins the message of an error."""
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise InputError(f"{what}: expected several names, got {given!r}; write ({given!r},)")
-    names = tuple(dict.fromkeys(given))
-    if not names:
-        raise InputError(f"{what}: expected at least one name, got none")
-    for name in names:
-        if not isinstance(name, str):
-            raise InputError(f"{what}: expected names, got {name!r}")
-    return names
