@@ -19,10 +19,7 @@ def file_stem(name: str) -> str:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise `OutputError` if `folder` cannot be written to; nothing is created.
-
-    Asked before long work, so that its result need not look for a place.
-    """
+    """Raise `OutputError`, before long work, if `folder` cannot be written to; nothing is created."""
     place = folder.absolute()
     while not place.exists() and place != place.parent:
         place = place.parent
@@ -33,10 +30,7 @@ def check_writable(folder: Path) -> None:
 
 
 def check_replaceable(folder: Path, *names: str, force: bool = False) -> None:
-    """Raise `OutputError` where a file is that mbkit did not write, unless `force` is given.
-
-    Asked before long work, as `check_writable` is.
-    """
+    """Raise `OutputError`, before long work, for a file that mbkit did not write, unless `force` is set."""
     for path in (folder / name for name in names):
         if not force and os.path.lexists(path) and not _is_own(path):
             raise OutputError(
@@ -74,13 +68,7 @@ def _is_own(path: Path) -> bool:
 
 
 def write(folder: Path, name: str, content: str | bytes, *, force: bool = False) -> Path:
-    """Write a file as a whole or not at all, and return its path; text is UTF-8.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written; or, unless `force` is given, a file is there that mbkit did not write.
-    """
+    """Write a file as a whole or not at all, text as UTF-8, and return its path; see `check_replaceable`."""
     with _interrupt.uninterrupted:
         check_replaceable(folder, name, force=force)
         return _write(folder, name, content)

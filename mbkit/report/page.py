@@ -17,16 +17,7 @@ if TYPE_CHECKING:
 
 
 def render(shown: Document, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
-    """Return a document as a page.
-
-    Parameters
-    ----------
-    shown : Document
-    data, table : str
-        Names of the JSON and CSV files beside the page.
-    when : datetime, optional
-        Stamped on the page; by default now.
-    """
+    """Return a document as a page; `data` and `table` are the JSON and CSV files beside it, `when` its date."""
     return _render("document.html", when, data, shown.result, shown=shown, table_file=table)
 
 

@@ -15,13 +15,7 @@ _PATIENCE = 2.0  # s before the bar appears
 
 
 class Bar:
-    """A context manager; called with a fraction and a text, it shows both.
-
-    Parameters
-    ----------
-    label : str
-        What the bar is named.
-    """
+    """A context manager; called with a fraction and a text, it shows both."""
 
     def __init__(self, label: str) -> None:
         self._label, self._text, self._fraction = one_line(label, 60), "", 0.0

@@ -43,19 +43,15 @@ class StepCase:
 
 @dataclass(frozen=True)
 class Bound:
-    """What steps times the fastest frequency or rate ω showed over all cases that tell one.
+    """Steps times the fastest frequency or rate ω, over all cases that have one."""
 
-    Up to `held` it held in every case (0: nowhere), from `failed` on it did not (NaN: all held); `theory` is linear
-    theory's least limit, infinite where it has none and NaN where none is known.
-    """
-
-    held: float
-    failed: float
-    theory: float
+    held: float  # up to here it held in every case; 0: nowhere
+    failed: float  # NaN: all held
+    theory: float  # the least limit; infinite: no limit, NaN: unknown
 
     @property
     def words(self) -> str:
-        """The rule for whoever chooses a step."""
+        """The rule for a step."""
         if math.isnan(self.failed):
             return f"no limit found up to {_two(self.held)} / ω"
         return f"dt ≤ {_two(self.held)} / ω" if self.held else f"none tried held, the least {_two(self.failed)} / ω"
@@ -70,7 +66,7 @@ class Rule:
 
     @property
     def words(self) -> str:
-        """The rule for whoever chooses a step, by_words once where it is the same."""
+        """The rule for a step, once where it is the same for every ω."""
         by_words: dict[str, list[str]] = {}
         for kind, bound in self.bounds.items():
             by_words.setdefault(bound.words, []).append(kind)
@@ -138,10 +134,7 @@ def _least(group: list[Bound]) -> Bound:
 
 
 def against_theory(line: Line, case: CaseResult) -> str:
-    """Return how the measured breaking point stands to linear theory's; empty where one of them is not known.
-
-    A sweep tells where a method breaks to one of its steps: between the last that held and the first that did not.
-    """
+    """Return how the measured breaking point compares with linear theory; empty where one is unknown."""
     limit = math.nan if line.row.theory is None else line.row.theory
     at = place(case.values, limit)
     if math.isnan(at):
@@ -168,10 +161,7 @@ _WIDTH: Final = 10.4
 
 
 def stable_steps(cases: Sequence[StepCase]) -> str:
-    """Draw each case's steps, a panel a case and a line an engine and method.
-
-    A method's steps are from the largest that held to the least that did not; an arrow where none failed.
-    """
+    """Draw each case's steps, a panel a case: from the largest that held to the least that failed, or an arrow."""
     names = _names(cases)
     columns = min(_COLUMNS, len(cases))
     count = math.ceil(len(cases) / columns)

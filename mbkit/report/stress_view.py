@@ -57,18 +57,14 @@ _NAMED: Final = 3
 
 @dataclass(frozen=True)
 class Overview:
-    """A case in one line.
-
-    `lines` are its rows, the furthest first; `best` speaks for each engine, `choice` for mbkit's own choice of method;
-    `furthest` is how many values the best held, and `anchor` the case's place on the page.
-    """
+    """A case in one line."""
 
     case: CaseResult
-    anchor: str
-    lines: tuple[Line, ...]
-    best: dict[str, Line]
-    choice: Line | None
-    furthest: int
+    anchor: str  # the case's place on the page
+    lines: tuple[Line, ...]  # the furthest first
+    best: dict[str, Line]  # by engine
+    choice: Line | None  # of method auto
+    furthest: int  # how many values the best held
 
     @property
     def behind(self) -> bool:
@@ -210,21 +206,16 @@ def bars(result: StressResult) -> list[tuple[float, str, list[str]]]:
 
 @dataclass(frozen=True)
 class MethodLine:
-    """One engine and method over the families of cases.
-
-    `families` has the cases where none held further and those where it was asked, `ahead` and `cases` the same of
-    all; `held` is the mean part of a sweep that held, `silent` the cases where it was wrong in silence, and `factor`
-    the median of its run time over the least of those that held as far, NaN where it was never ahead.
-    """
+    """One engine and method over the families of cases."""
 
     name: str
     series: int
-    families: dict[str, tuple[int, int]]
-    ahead: int
+    families: dict[str, tuple[int, int]]  # cases where it held furthest, and where it ran
+    ahead: int  # the same of all families
     cases: int
-    held: float
-    silent: int
-    factor: float
+    held: float  # the mean part of a sweep
+    silent: int  # cases where it was wrong in silence
+    factor: float  # median run time over the least of those that held as far; NaN: never ahead
 
 
 @dataclass(frozen=True)
@@ -238,10 +229,7 @@ class _Score:
 
 
 def methods(result: StressResult) -> list[MethodLine]:
-    """Return every engine and method that ran, the one that was most often unbeaten first.
-
-    Terms have no methods, and a sweep of the step asks for stability alone: neither counts.
-    """
+    """Return every engine and method that ran, the one that was most often unbeaten first."""
     found: dict[tuple[str, str], list[_Score]] = {}
     for case in result.cases:
         if not ranks(case):

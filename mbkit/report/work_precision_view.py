@@ -91,15 +91,11 @@ class Lead:
 
 @dataclass(frozen=True)
 class CurveLine:
-    """One engine and method in one line.
-
-    `best` has the least error, the fastest of several that are as good as the reference can tell; `off` says that the
-    observed order is not the method's own.
-    """
+    """One engine and method in one line."""
 
     curve: Curve
-    best: PrecisionPoint | None
-    off: bool
+    best: PrecisionPoint | None  # the fastest of those with the least error that the reference can resolve
+    off: bool  # the observed order is not the method's own
     on_front: bool
 
 

@@ -34,19 +34,7 @@ def silent(_fraction: float, _text: str) -> None:
 
 
 class Checkpointer:
-    """Reports progress, and saves results.
-
-    Parameters
-    ----------
-    progress : callable, optional
-    checkpoint : path or callable, optional
-        A JSON file that is whole at any time, or a function of the result.
-
-    Raises
-    ------
-    InputError
-        An argument is of another kind, or the path is in a folder that does not exist.
-    """
+    """Reports progress, and saves results to a JSON file or by a function."""
 
     def __init__(self, progress: Progress | None, checkpoint: Checkpoint | None) -> None:
         if progress is not None and not callable(progress):

@@ -1,4 +1,4 @@
-"""What a person asks about: a robot, a catalog system, a file, or a function of their own."""
+"""Models and engines by the names that users write."""
 
 from __future__ import annotations
 
@@ -36,21 +36,10 @@ _FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
 
 
 def model_of(target: str, options: Mapping[str, Any] | None = None) -> Model:
-    """Return the model that a text names.
+    """Return the model of a robot's name, a catalog system, a path or ``package.module:function``.
 
-    Parameters
-    ----------
-    target : str
-        A robot's name, a catalog system's, a path, or ``package.module:function``
-        for a function without arguments that returns a `Model`; the current folder
-        is looked in first.
-    options : mapping, optional
-        Keyword arguments of `mbkit.load`, for robots and files only.
-
-    Raises
-    ------
-    UnknownNameError, LoadError, ModelError
-        With the culprit; what a user's function raises becomes a `LoadError`.
+    The function has no arguments and returns a `Model`; the current folder is searched first. `options` are keyword
+    arguments of `mbkit.load`, for robots and files only. What a user's function raises becomes a `LoadError`.
     """
     options = options or {}
     if _FUNCTION.fullmatch(target) and not os.path.exists(target):
@@ -152,10 +141,7 @@ def checked_target(target: object, options: object = None) -> None:
 
 
 def kept(target: str, baseline: Path) -> str:
-    """Return a target as it is kept: a file relative to the baseline, so that both can move together.
-
-    It then begins with a dot, as no name does.
-    """
+    """Return a target as a baseline keeps it: a file relative to the baseline, with a dot first, as in no name."""
     if not os.path.isfile(target):
         return target
     try:

@@ -35,19 +35,7 @@ _STATES: Final = 5
 
 @dataclass(frozen=True)
 class Converted:
-    """A description in another format.
-
-    Attributes
-    ----------
-    model : str
-    format : str
-        ``"mjcf"`` or ``"urdf"``.
-    text : str
-    gaps : tuple of Gap
-        How far each term of what was read back is from the description's.
-    notes : tuple of str
-        What the text does not hold, and what it holds otherwise.
-    """
+    """A description in another format, and how far each term is off after reading it back."""
 
     model: str
     format: str

@@ -1,4 +1,4 @@
-"""What every study's result shares: plain data, JSON, CSV, Markdown and HTML, from one description of its tables."""
+"""What all results of studies share: plain data, JSON, CSV, Markdown and HTML."""
 
 from __future__ import annotations
 
@@ -91,10 +91,7 @@ def _infinities(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[dict[s
 
 
 def from_plain(kind: Any, value: Any) -> Any:
-    """Return plain data as a type has it: dataclasses, tuples, and NaN for null where it is a number.
-
-    Entries that a dataclass does not have are left out.
-    """
+    """Return plain data as a type: dataclasses, tuples, NaN for null in a number. Unknown entries are left out."""
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
         names = [f.name for f in fields(kind) if f.name in value]
@@ -193,10 +190,7 @@ Block = Title | Table | Items
 
 
 class ResultTable:
-    """Base of the frozen dataclasses that studies return.
-
-    A result says what it holds once, as `_blocks` for people and as `_csv_columns` of `_csv_rows` for programs.
-    """
+    """Base of the results of studies: `_blocks` for people, `_csv_columns` of `_csv_rows` for programs."""
 
     _csv_columns: ClassVar[Sequence[Column]] = ()
 
@@ -274,10 +268,7 @@ def _csv_cell(value: Any) -> Any:
 
 
 def write_whole(path: Path, content: bytes, claim: Callable[[str], None] | None = None) -> None:
-    """Write a file as a whole or not at all: under a temporary name, and then renamed.
-
-    `claim` is called with the temporary name before; what it raises leaves the file as it was.
-    """
+    """Write a file as a whole or not at all: under a temporary name, which `claim` may refuse, then renamed."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".mbkit-")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -297,13 +288,7 @@ def write_whole(path: Path, content: bytes, claim: Callable[[str], None] | None 
 
 
 def write(path: str | Path, text: str) -> None:
-    """Write a text to a file.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written there.
-    """
+    """Write a text to a file, or raise `OutputError`."""
     try:
         Path(path).write_text(text, encoding="utf-8")
     except OSError as error:

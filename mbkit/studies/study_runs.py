@@ -38,10 +38,7 @@ def free_of_mimic(model: Model) -> Model:
 
 
 def start_state(model: Model, seed: int) -> tuple[Array, Array]:
-    """Return where rollouts start: near the middle of the joints' ranges, moving gently.
-
-    Wilder starts measure how fast the scene loses digits, not the integrators.
-    """
+    """Return a gentle start near the middle of the joints' ranges: a wild one measures chaos, not integrators."""
     q, v = state_within_limits(model, np.random.default_rng([seed, 1]), 0.1)
     return q, 0.1 * v
 

@@ -63,16 +63,7 @@ _PROGRAM: Final = (
 
 
 class WorkerDiedError(RuntimeError):
-    """The process that made a call ended without an answer: a crash, or no memory left.
-
-    Attributes
-    ----------
-    how : str
-    signal : str
-        Such as ``"SIGSEGV"``; empty where there was none.
-    last : str
-        The last line of its output.
-    """
+    """The process ended without an answer: how, by which signal (such as SIGSEGV), and its last line of output."""
 
     def __init__(self, how: str, signal: str = "", last: str = "") -> None:
         super().__init__(how)
@@ -110,23 +101,11 @@ def describe(error: BaseException) -> str:
 
 
 class Worker:
-    """A process that makes one call at a time in a folder of its own; started by the first call.
+    """A process that makes one call at a time in a folder below `home`; started by the first call.
 
-    Parameters
-    ----------
-    home : Path, optional
-        A folder of the caller's own in which the worker has its folder. The worker removes it if the caller is killed.
-    memory : int
-        Bytes that it may take (Linux); 0 for no limit.
-    environment : mapping of str to str, optional
-        By default this process's.
-    outlives_thread : bool
-        Whether it stays when the thread that started it ends (Linux); it ends with the process in any case.
-
-    Attributes
-    ----------
-    stage : str
-        What the current or last call last reported by `report_stage`.
+    The worker removes `home` if the caller is killed.
+    It may take `memory` bytes (Linux; 0: no limit), and ends with the thread that started it unless `outlives_thread`
+    (Linux). `stage` is what the call last reported by `report_stage`.
     """
 
     def __init__(
@@ -159,27 +138,10 @@ class Worker:
     ) -> T:
         """Return the function's result, or raise its exception.
 
-        Parameters
-        ----------
-        function : callable
-            Of a module, or of a script whose work is below ``if __name__ == "__main__":``.
-        *args
-            Picklable.
-        cpu_seconds : float
-            Processor time; at most four times as much passes on the wall's clock.
-        stage_seconds : mapping of str to float, optional
-            The same for stages that the function reports by `report_stage`.
-        deadline : float
-            On `time.perf_counter`.
-
-        Raises
-        ------
-        WorkerDiedError, WorkerTimeoutError, WorkerClosedError
-            The process is gone; the next call starts another.
-        CallError
-            The function or the arguments cannot be imported in the process.
-        WorkerStartError
-            Processes cannot be started here.
+        Function and arguments are picklable. `cpu_seconds` limits the processor time, and four times as much the wall's
+        clock; `stage_seconds` does so for stages that the function reports; `deadline` is on `time.perf_counter`.
+        Raises `WorkerDiedError`, `WorkerTimeoutError` or `WorkerClosedError` when the process is gone (the next call
+        starts another), `CallError` when it cannot import the function, `WorkerStartError` when none starts.
         """
         self.begin(function, *args)
         result: T = self.finish(cpu_seconds, stage_seconds, deadline)
@@ -188,12 +150,7 @@ class Worker:
     def begin(self, function: Callable[..., Any], *args: Any, alarm: float = 0.0) -> None:
         """Send a call, whose result `finish` waits for.
 
-        Parameters
-        ----------
-        function, *args
-            As of `call`.
-        alarm : float
-            Seconds after which the process ends itself if nobody is there any more to end it; 0 for never.
+        After `alarm` seconds the process ends itself, in case its parent is gone; 0 for never.
         """
         if self._closed.is_set():
             raise WorkerClosedError
@@ -521,14 +478,7 @@ def run(
 ) -> Iterator[tuple[str, T | Exception]]:
     """Yield the name and the result, or the exception, of each call as it finishes.
 
-    Parameters
-    ----------
-    calls : mapping of str to callable
-        Picklable where processes make them.
-    executor : concurrent.futures.Executor, optional
-        By default worker processes, of which a crash ends its own call only.
-    jobs : int, optional
-        Number of workers; by default as many as there are processors.
+    By default `jobs` worker processes make the calls, where a crash ends its own call only.
     """
     if not calls:
         return

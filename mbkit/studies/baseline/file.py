@@ -421,10 +421,7 @@ def _checksum(body: str) -> str:
 
 
 def check_replaceable(path: Path, model: str) -> None:
-    """Raise `OutputError` where a file is that recording this model's baseline must not replace.
-
-    A baseline of the same model may be, whole or damaged; anything else may be dear.
-    """
+    """Raise `OutputError` unless a file is absent or a baseline of the same model, whole or damaged."""
     if not os.path.lexists(path):
         return
     if not is_baseline(path):
@@ -443,14 +440,7 @@ def check_replaceable(path: Path, model: str) -> None:
 
 
 def store(path: Path, text: str, model: str, *, force: bool) -> None:
-    """Write a baseline as a whole or not at all; what was there stays until then.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written; or, unless `force` is given, another process has put another
-        robot's baseline there in the meantime.
-    """
+    """Write a baseline as a whole or not at all; unless `force` is set, never over another robot's baseline."""
     # Where a link leads, so that it stays one.
     path = Path(os.path.realpath(path))
     try:

@@ -85,16 +85,7 @@ def allowed(baseline: Baseline, engine: str, term: str) -> float:
 
 
 class Comparator:
-    """Measures values of any term against others.
-
-    Parameters
-    ----------
-    terms : mapping
-        The values that set the scales: M, and the forces at play.
-    at : States
-    description : Description
-    coordinates, velocities : iterable of str
-    """
+    """Measures values of any term against others; `terms` are the values that set the scales."""
 
     def __init__(
         self,

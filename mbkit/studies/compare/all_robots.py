@@ -27,46 +27,20 @@ STATUSES: Final[tuple[Status, ...]] = ("agree", "differ", "refused", "failed")
 
 @dataclass(frozen=True)
 class RobotOutcome:
-    """How one robot ended.
-
-    Attributes
-    ----------
-    robot : str
-        Its name, folder and file.
-    status : str
-        ``"agree"``; ``"differ"``; ``"refused"`` where the file, or all engines but
-        one, do not hold it; ``"failed"`` where something broke that should not.
-    reason : str
-        Why it is not agreement of all engines; empty where it is.
-    comparison : Comparison or None
-    """
+    """How one robot ended."""
 
     robot: str
-    status: Status
-    reason: str = ""
+    status: Status  # "refused": by the file, or by all engines but one; "failed": an error of mbkit
+    reason: str = ""  # why not all engines agree
     comparison: Comparison | None = None
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What became of many robots.
-
-    Attributes
-    ----------
-    outcomes : tuple of RobotOutcome
-        By name.
-    expected : int
-        How many were asked for; more than there are outcomes after an interruption.
-    engines : tuple of str
-    samples, seed : int
-    seconds : float
-        Time of the whole sweep.
-    versions : dict
-    processor : str
-    """
+    """The outcomes of many robots."""
 
     outcomes: tuple[RobotOutcome, ...]
-    expected: int
+    expected: int  # more than there are outcomes after an interruption
     engines: tuple[str, ...]
     samples: int
     seed: int
@@ -141,31 +115,11 @@ def all_robots(
     executor: Executor | None = None,
     jobs: int | None = None,
 ) -> Iterator[RobotOutcome]:
-    """Compare the terms of many robots, each in its own call to an executor.
+    """Compare the terms of many robots, each in its own call to an executor, and yield each as it finishes.
 
-    Parameters
-    ----------
-    names : sequence of str, optional
-        Robots; by default all of `mbkit.robots`.
-    engines, samples, seed
-        As in `mbkit.compare`.
-    floating_base, mimic
-        As in `mbkit.load`.
-    executor : concurrent.futures.Executor, optional
-        Where to compute: any, such as Dask's or MPI's. By default a pool of
-        processes of our own; a script then needs ``if __name__ == "__main__":``.
-    jobs : int, optional
-        Size of our own pool; by default as many as there are processors.
-
-    Yields
-    ------
-    RobotOutcome
-        As each is finished; nothing that happens to one robot ends the others.
-
-    Raises
-    ------
-    UnknownNameError
-        A name is no robot's.
+    Parameters as in `mbkit.compare` and `mbkit.load`; `names` are all of `mbkit.robots` by default. The executor is
+    any of `concurrent.futures`; by default `jobs` worker processes, for which a script needs
+    ``if __name__ == "__main__":``. Nothing that happens to one robot ends the others.
     """
     known = {r.name: r.path for r in robots()}
     shorter = {alias: r.name for r in robots() for alias in r.aliases}
@@ -200,7 +154,7 @@ def outcome_of(
     floating_base: bool,
     mimic: Literal["reduce", "free"],
 ) -> RobotOutcome:
-    """Compare one robot, and say how it ended."""
+    """Compare one robot, and return how it ended."""
     with warnings.catch_warnings():
         # Nonphysical bodies are in the comparison's facts.
         warnings.simplefilter("ignore", MbkitWarning)

@@ -29,39 +29,19 @@ from mbkit._check import Array
 
 @dataclass(frozen=True)
 class Scales:
-    """What errors are measured against, per sample.
+    """What errors are measured against, per sample."""
 
-    Attributes
-    ----------
-    M : (N, nv, nv) array
-    diagonal : (N, nv) array
-        Of M.
-    inertial : (N,) array
-        ‖M‖ ‖v‖².
-    weight : (N,) array
-        The norm over j of |g| √(m M_jj).
-    acting : (N, nv) array
-        |τ| + |nle| + |τ_passive|, what cancels in M a.
-    size : (N,) array
-        Norm of M scaled to a unit diagonal.
-    condition : (N,) array
-        cond(M), scaled likewise (no unit can change it).
-    """
-
-    M: Array
-    diagonal: Array
-    inertial: Array
-    weight: Array
-    acting: Array
-    size: Array
-    condition: Array
+    M: Array  # (N, nv, nv)
+    diagonal: Array  # (N, nv), of M
+    inertial: Array  # (N,), ‖M‖ ‖v‖²
+    weight: Array  # (N,), norm over j of |g| √(m M_jj)
+    acting: Array  # (N, nv), |τ| + |nle| + |τ_passive|, which cancel in M a
+    size: Array  # (N,), norm of M scaled to a unit diagonal
+    condition: Array  # (N,), cond(M) scaled likewise: no unit changes it
 
     @classmethod
     def of(cls, M: Array, v: Array, acting: Array, weight: float = 0.0) -> Scales:
-        """Take the scales from the reference's values at the samples.
-
-        `weight` is |g| √m.
-        """
+        """Return the scales of the reference's values at the samples; `weight` is |g| √m."""
         diagonal = np.einsum("nii->ni", M).copy()
         norm = np.linalg.norm(M, 2, axis=(1, 2))
         root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -142,8 +122,8 @@ def interleaved(
 ) -> dict[str, tuple[float, float]]:
     """Return (median, half interquartile range) of each call's time in ns.
 
-    Every round times each call once, over as many repetitions as fill `budget`
-    seconds, so that a drift of the machine's speed meets all of them alike.
+    Each of the `rounds` times each call over as many repetitions as fill `budget` seconds, so that a drift of the
+    machine's speed is the same for all.
     """
     repetitions: dict[str, int] = {}
     for name, call in calls.items():

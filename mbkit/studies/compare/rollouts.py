@@ -40,10 +40,7 @@ _NATIVE: Final = {m.own: m.name for m in METHODS.values() if m.own}
 
 
 def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str) -> tuple[RolloutRow, ...]:
-    """Compare trajectories of 1 s at 1 ms, for Runge–Kutta 4 and semi-implicit Euler.
-
-    Nothing is compared unless MuJoCo and another engine hold the model.
-    """
+    """Compare trajectories of 1 s at 1 ms of MuJoCo and other engines, for rk4 and semi-implicit Euler."""
     ours_on = [name for name in (PINOCCHIO, DERIVED) if name in engines]
     if MUJOCO not in engines or not ours_on:
         return ()

@@ -39,11 +39,7 @@ _AS_IT_IS: Final = "; returned as it is"
 
 
 class Judge:
-    """Evaluates every term in every engine, and judges it against the oracle.
-
-    A term for which the oracle has no value, as where M is singular, is judged
-    against the first engine that gives one.
-    """
+    """Evaluates every term in every engine against the oracle, or the first engine where it has no value."""
 
     def __init__(
         self,

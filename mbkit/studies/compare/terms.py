@@ -24,8 +24,6 @@ from mbkit.studies.compare.errors import (
     matrix_errors,
 )
 
-# States at which engines are compared: random ones, and the hard ones.
-
 # An angle this far from gimbal lock loses four digits in anything that divides
 # by its cosine; none of the terms should.
 _NEAR: float = 1e-4
@@ -33,13 +31,7 @@ _NEAR: float = 1e-4
 
 @dataclass(frozen=True)
 class States:
-    """States with accelerations and torques, and the kind of each.
-
-    Attributes
-    ----------
-    q, v, a, tau : (N, n) arrays
-    kinds : tuple of str
-    """
+    """States with accelerations and torques, (N, n) arrays, and the kind of each."""
 
     q: Array
     v: Array
@@ -49,12 +41,9 @@ class States:
 
 
 def states(model: Model, samples: int, seed: int) -> States:
-    """Return `samples` random states, and beside them neutral, at-limit and near-singular ones.
+    """Return `samples` random states; without constraints also neutral, at-limit and near-singular ones.
 
-    Near-singular states are at the closed and straight poses where axes align:
-    every angle at a multiple of a right angle, pushed off by 1e-4, which puts
-    spherical-ZYX joints next to gimbal lock and arms next to stretched. Of a model with
-    constraints they are no states, and left out.
+    Near singular: every angle 1e-4 from a multiple of a right angle, which is near gimbal lock and stretched arms.
     """
     rng = np.random.default_rng(seed)
     q, v = model.random_state(rng, samples)
@@ -101,19 +90,7 @@ def _near_singular(model: Model, rng: np.random.Generator, n: int) -> Array:
 
 @dataclass(frozen=True)
 class Term:
-    """One compared quantity.
-
-    Attributes
-    ----------
-    name : str
-        As it stands in tables.
-    quantity : str
-        Method of `Dynamics`.
-    arguments : tuple of str
-        Fields of `States`.
-    errors : callable
-        (errors, reference values, scales) -> Errors.
-    """
+    """One compared quantity: a method of `Dynamics`, and the fields of `States` that it takes."""
 
     name: str
     quantity: str
@@ -121,7 +98,7 @@ class Term:
     errors: Callable[[Array, Array, Scales], Errors]
 
     def call(self, dyn: Dynamics, states: States) -> Array:
-        """Evaluate at all states."""
+        """Return the values at all states."""
         return np.asarray(getattr(dyn, self.quantity)(*(getattr(states, a) for a in self.arguments)))
 
     def reference(self, oracle: OracleDynamics, states: States) -> tuple[Array, Array]:

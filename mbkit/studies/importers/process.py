@@ -43,18 +43,7 @@ if hasattr(os, "register_at_fork"):
 
 
 class Reading:
-    """A text that an engine's importer reads.
-
-    Parameters
-    ----------
-    engine : str
-    text, format_ : str
-    floating_base : bool
-    files : dict
-        The meshes that the text names: name -> content.
-    seconds : float
-        Processor time of the reading, and of each evaluation of its terms.
-    """
+    """A text that an engine's importer reads, in at most `seconds` of processor time; so is each call of its terms."""
 
     def __init__(
         self, engine: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes], seconds: float
@@ -65,21 +54,11 @@ class Reading:
         self._text = (importer.module, text, format_, floating_base, files)
 
     def begin(self) -> None:
-        """Have the importer begin to read.
-
-        Raises
-        ------
-        ImporterError
-        """
+        """Begin to read; raises `ImporterError`."""
         self._begin(_read, *self._text)
 
     def result(self) -> Imported:
-        """Wait for the reading that was begun, and return it.
-
-        Raises
-        ------
-        ImporterError
-        """
+        """Return the reading that was begun; raises `ImporterError`."""
         model, notes, beside = self._finish()
         return Imported(model, self._terms, notes, beside)
 

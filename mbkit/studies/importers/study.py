@@ -33,11 +33,6 @@ from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_t
 from mbkit.studies.importers.process import ImporterError, Reading, one_at_a_time
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 
-# The stages at which a reading of a file is compared with another, and what an engine's own terms hold beside it.
-#
-# An engine may hold more than bodies and joints: tendons, actuators, a fluid, gravity compensation. What
-# each of them does to the terms is measured by taking it out.
-
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
@@ -56,17 +51,7 @@ def unmimicked(model: Model) -> Model:
 def stages(
     reference: Model | Imported, imported: Imported, samples: int, seed: int, tolerance: float
 ) -> tuple[Stage, ...]:
-    """Compare what an importer made with the reference, from the tree to the terms.
-
-    Parameters
-    ----------
-    reference : Model or Imported
-        A description; or what another importer made, whose engine then computes the terms.
-    imported : Imported
-    samples, seed : int
-        Random states for the terms, which the importer's own engine computes on its own model.
-    tolerance : float
-    """
+    """Compare an importer's model with the reference, from the tree to the terms, which its own engine computes."""
     described = reference.model if isinstance(reference, Imported) else reference
     free = unmimicked(described)
     near = Tolerances.of(free, tolerance)
@@ -217,10 +202,7 @@ def _terms(reference: Model, ours: Values, theirs: Values, at: States, tolerance
 
 
 def _asked(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
-    """Return the engine's own terms of its own model, in the reference's coordinates.
-
-    `names` has the engine's joint of each of the reference's.
-    """
+    """Return the engine's own terms in the reference's coordinates; `names` has its joint for each of these."""
     theirs = imported.model.layout
     q_order, v_order = (
         np.concatenate([np.arange(r[names[j.name]].start, r[names[j.name]].stop) for j in reference.independent_joints])
@@ -239,21 +221,11 @@ def _ordered(x: Array, order: np.ndarray) -> Array:
 
 @dataclass(frozen=True)
 class OwnTerms:
-    """What an engine's own terms hold.
+    """The content of an engine's own terms."""
 
-    Attributes
-    ----------
-    causes : tuple of Cause
-        What acts in them beside the bodies and joints that were read out, each with its measured effects.
-    idle : tuple of str
-        What was taken out and changed no term.
-    held : bool
-        Whether the terms are those of the bodies and joints, once all of that is taken out.
-    """
-
-    causes: tuple[Cause, ...]
-    idle: tuple[str, ...]
-    held: bool
+    causes: tuple[Cause, ...]  # what acts beside bodies and joints
+    idle: tuple[str, ...]  # what changes no term
+    held: bool  # without these, the terms are those of bodies and joints
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -262,17 +234,7 @@ class OwnTerms:
 
 
 def own_terms(engine: str, imported: Imported, samples: int, seed: int, tolerance: float) -> OwnTerms:
-    """Measure what acts in an importer's model beside its bodies and joints.
-
-    Parameters
-    ----------
-    engine : str
-    imported : Imported
-    samples, seed : int
-        Random states.
-    tolerance : float
-        Relative difference of a term that counts.
-    """
+    """Measure what acts in an importer's model beside its bodies and joints."""
     at = states_of(imported.model, samples, seed)
     owners = [j.name for j in imported.model.independent_joints for _ in range(j.type.nv)]
     whole, described = imported.terms(at.q, at.v, ()), model_terms(imported.model, at)
@@ -502,10 +464,7 @@ def _written(stripped: Stripped, floating_base: bool) -> Model:
 def _reference(
     stripped: Stripped, read: dict[str, Imported], floating_base: bool
 ) -> tuple[Model | Imported | None, str, str]:
-    """Return what the importers are compared with, what it is called, and why it is not the file itself.
-
-    MJCF means what MuJoCo makes of it. For a URDF no importer has that standing.
-    """
+    """Return what importers are compared with, its name, and why it is not the file; MuJoCo's reading of an MJCF."""
     try:
         return _written(stripped, floating_base), "file", ""
     except MbkitError as error:
