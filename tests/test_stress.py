@@ -430,7 +430,10 @@ def test_the_command_prints_and_writes(study, here, monkeypatch):
     folder = here / "mbkit-report"
     assert {p.name for p in folder.iterdir()} == {"stress.html", "stress.json", "stress.csv"}
     assert StressResult.from_json((folder / "stress.json").read_text()).breaking() == study.breaking()
-    assert 'href="stress.csv"' in (folder / "stress.html").read_text(encoding="utf-8")
+    page = (folder / "stress.html").read_text(encoding="utf-8")
+    assert 'href="stress.csv"' in page
+    assert "<h1>Stiff and extreme" in page
+    assert "How to read the maps" in page
     one = replace(study, cases=study.cases[:1], complete=False)
 
     def stopped(*_: object, **__: object) -> None:

@@ -12,8 +12,8 @@ from rich.console import Console
 
 from mbkit.errors import UnknownNameError
 from mbkit.report import stress_view, terminal
-from mbkit.report.page import stress_page
-from mbkit.report.stress_page import section
+from mbkit.report.page import render
+from mbkit.report.stress_page import case_map, view
 from mbkit.report.stress_steps import kinds, rules, stable_steps, steps
 from mbkit.report.stress_view import avoid, methods
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
@@ -171,8 +171,12 @@ def printed(what: object, width: int = 100) -> str:
     return capture.get()
 
 
+def stress_page(result: StressResult, **files: str) -> str:
+    return render(view(result), **files)
+
+
 def summary(result: StressResult) -> object:
-    return terminal.render(stress_view.view(result))
+    return terminal.render(view(result))
 
 
 @pytest.fixture(scope="module")
@@ -353,7 +357,7 @@ def test_a_damper_has_a_rule_of_its_own():
 
 def test_the_map_marks_where_it_breaks_and_where_theory_lets_it():
     told = {
-        (r.line.row.engine, r.line.row.method): r for o in stress_view.overview(RESULT)[:1] for r in section(o).rows
+        (r.line.row.engine, r.line.row.method): r for o in stress_view.overview(RESULT)[:1] for r in case_map(o).rows
     }
     assert [c.style for c in told["pinocchio", "rk4"].cells] == ["h1", "w3 brk", "gross lim", "end"]
     assert [c.style for c in told["mujoco", "rk4"].cells] == ["h1", "w3 brk", "gross sil lim", "gross sil"]
@@ -365,7 +369,7 @@ def test_the_map_marks_where_it_breaks_and_where_theory_lets_it():
 
 def test_an_interrupted_row_is_filled_with_empty_cells():
     cut = replace(SPRING, rows=(replace(SPRING.rows[1], cells=SPRING.rows[1].cells[:2]),))
-    told = section(stress_view.overview(replace(RESULT, cases=(cut,)))[0])
+    told = case_map(stress_view.overview(replace(RESULT, cases=(cut,)))[0])
     assert [c.style for c in told.rows[0].cells] == ["h0", "h0", "none", "none"]
     page = " ".join(Tags(stress_page(replace(RESULT, cases=(cut,), complete=False))).text.split())
     assert "auto, then not run" in page

@@ -73,8 +73,8 @@ def stress(
         _list(as_json=as_json)
         leave(DONE)
     from mbkit.methods.registry import method_of
-    from mbkit.report import stress_view
     from mbkit.report.progress import Bar
+    from mbkit.report.stress_page import view
     from mbkit.studies.stress.study import stress as study
     from mbkit.studies.work_precision.result import InterruptedSweepError
 
@@ -90,9 +90,7 @@ def stress(
             result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **given)
     except InterruptedSweepError as stopped:
         result = stopped.result
-    written = show(
-        result, lambda: stress_view.view(result), stem, out, as_json=as_json, force=force, table=result.to_csv
-    )
+    written = show(result, lambda: view(result), stem, out, as_json=as_json, force=force, table=result.to_csv)
     finished = sum(cell.end == "finished" for _, row in result.rows() for cell in row.cells)
     if not result.complete:
         say("interrupted", f"{finished} runs were finished")

@@ -168,7 +168,8 @@ class Document:
 
     A terminal has `name` before the verdict and `summary` below it, or the verdict at the end (`last`); a page has a
     heading and, in the browser's bar, a title. `marked` is a verdict that is a judgement, with ✓ or ✗. At the foot of
-    the page stand `basis` and the result's `versions`, `processor` and `seconds`.
+    the page stand `basis` and the result's `versions`, `processor` and `seconds`. A page with tables of its own names
+    its template, and what this is filled with.
     """
 
     name: str
@@ -183,6 +184,8 @@ class Document:
     opening: Sequence[Block] = ()
     basis: Mapping[str, Text] = field(default_factory=dict)
     last: bool = False
+    template: str = "document.html"
+    content: Callable[[], Mapping[str, Any]] = dict
 
     def shown(self, where: On) -> Iterator[tuple[Section, list[Block]]]:
         """Yield the sections that have something to show there."""

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from mbkit._escape import terminal
 from mbkit.report.document import Document, spans
-from mbkit.report.formatting import choice, count_text, error_text, time_text
-from mbkit.report.stress_page import FILTERS, content
-from mbkit.studies.stress.result import StressResult
+from mbkit.report.formatting import count_text, error_text, time_text
+from mbkit.report.stress_page import FILTERS
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -18,17 +17,10 @@ if TYPE_CHECKING:
 
 def render(shown: Document, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
     """Return a document as a page; `data` and `table` are the JSON and CSV files beside it, `when` its date."""
-    return _render("document.html", when, data, shown.result, shown=shown, table_file=table)
-
-
-def stress_page(result: StressResult, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
-    """Return the page of where engines and methods break; the parameters are those of `render`."""
-    return _render("stress.html", when, data, result, table=table, **content(result))
-
-
-def _render(template: str, when: datetime | None, data: str, result: Any, **more: Any) -> str:
     stamp = (when or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M:%S %Z").strip()
-    return _environment().get_template(template).render(result=result, when=stamp, data=data, **more)
+    template = _environment().get_template(shown.template)
+    names = {"data": data, "table_file": table}
+    return template.render(shown=shown, result=shown.result, when=stamp, **names, **shown.content())
 
 
 @lru_cache(maxsize=1)
@@ -49,7 +41,6 @@ def _environment() -> Environment:
         error=error_text,
         time=time_text,
         count=count_text,
-        choice=choice,
         spans=spans,
         kind=lambda block: type(block).__name__,
         markup=Markup,

@@ -1,7 +1,6 @@
-"""The content of the stress page; a case has a map, a table of coloured cells, and what stands under it.
+"""The document of where engines and methods break.
 
-The map is a table and no picture: as sharp as the page on any screen, to be searched and copied, with the rest
-of a cell shown to whoever points at it.
+A case has a map on the page: a table of coloured cells, as sharp as the page, that can be searched and copied.
 """
 
 from __future__ import annotations
@@ -13,7 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from mbkit.report import stress_view
-from mbkit.report.formatting import error_text, time_text
+from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Table
+from mbkit.report.formatting import choice, error_text, time_text
 from mbkit.report.stress_steps import against_theory, kinds, rules, stable_steps, steps
 from mbkit.report.stress_view import HOW, Overview, held_text, remarks, value_text
 from mbkit.studies._figure_style import engine_index
@@ -50,7 +50,7 @@ class MapRow:
 
 
 @dataclass(frozen=True)
-class Section:
+class CaseMap:
     """A case with all that the page tells of it: rows that ran, the furthest first, and what was left out and why."""
 
     case: CaseResult
@@ -78,7 +78,7 @@ class Section:
         return any(not math.isnan(cell.energy) for row in self.rows for cell in row.line.row.cells)
 
 
-def section(overview: Overview) -> Section:
+def case_map(overview: Overview) -> CaseMap:
     """Return what the page tells of a case."""
     case = overview.case
     rows = [
@@ -88,7 +88,7 @@ def section(overview: Overview) -> Section:
     ]
     heads = [value_text(v, case, unit=False) for v in case.values]
     measured = _MEASURES.get(case.measure, case.measure)
-    return Section(case, overview.anchor, heads, rows, overview.left_out, _facts(case), _truths(case), measured)
+    return CaseMap(case, overview.anchor, heads, rows, overview.left_out, _facts(case), _truths(case), measured)
 
 
 def _cells(line: Line, case: CaseResult) -> list[MapCell]:
@@ -154,7 +154,6 @@ def content(result: StressResult) -> dict[str, Any]:
     step_rules = rules(step_cases)
     engines = engines_of(result.cases)
     return {
-        "headline": stress_view.headline(result),
         "avoid": stress_view.avoid(result),
         "silences": stress_view.silences(result),
         "asked": [o for o in overview if o.choice is not None],
@@ -162,7 +161,7 @@ def content(result: StressResult) -> dict[str, Any]:
         "methods": stress_view.methods(result),
         "run_families": stress_view.families([o for o in overview if stress_view.ranks(o.case)]),
         "families": stress_view.families(overview),
-        "sections": {o.anchor: section(o) for o in overview},
+        "sections": {o.anchor: case_map(o) for o in overview},
         "engines": engines,
         "series": {e: engine_index(e) + 1 for e in engines},
         "steps": step_cases,
@@ -196,3 +195,83 @@ FILTERS: Final = {
     "remarks": remarks,
     "rowname": name_of,
 }
+
+
+# The document: a line a case on a terminal; on a page all of `content`.
+
+#: Of methods that were wrong in silence, and of the cases of each.
+_METHODS: Final = 6
+_PLACES: Final = 2
+
+
+def view(result: StressResult) -> Document:
+    """Return for each case who held furthest and how far, mbkit's own choice, and what breaks first."""
+    cases = stress_view.overview(result)
+    runs = sum(cell.end != "not run" for _, row in result.rows() for cell in row.cells)
+    auto = [Column("auto", lambda o: _choice(o), fill=True)] if any(o.choice for o in cases) else []
+    columns = (
+        Column("case", lambda o: o.case.name, most=22, fill=True),
+        Column("furthest", lambda o: o.leader_name if o.leader else "none ran", most=24, fill=True),
+        Column("held to", lambda o: _held(o.leader, o) if o.leader else "", fill=True),
+        *auto,
+        Column("✗", lambda o: Span(_silent_count(o), "bad"), right=True),
+        Column("first to break", lambda o: Span(_first(o), "muted"), fill=True),
+    )
+    behind = [
+        Bullet(
+            o.case.name,
+            f"auto {held_text(o.choice, o.case)}, {name_of(o.lines[0].row)} {held_text(o.lines[0], o.case)}",
+            "!",
+            "allowed",
+        )
+        for o in cases
+        if o.behind and o.choice is not None
+    ]
+    silent = [Bullet(a.method, _places(a), "✗", "bad") for a in stress_view.avoid(result)]
+    return Document(
+        name="stress",
+        heading="Stiff and extreme: where each engine and method breaks",
+        title="Stiff and extreme",
+        verdict=stress_view.headline(result),
+        good=bool(result.complete and result.cases and not silent),
+        marked=False,
+        summary=f"{len(cases)} cases · {runs} runs · {time_text(result.seconds)}",
+        sections=[
+            Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
+            Section("Where another held further than auto", [Items(behind)]),
+            Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
+        ],
+        result=result,
+        basis={name: choice(value) for name, value in result.settings.items()},
+        template="stress.html",
+        content=lambda: content(result),
+    )
+
+
+def _choice(o: Overview) -> Span:
+    text = "" if o.choice is None else "behind" if o.behind else "✓"
+    return Span(text, "allowed" if o.behind else "good")
+
+
+def _held(line: Line, o: Overview) -> str:
+    if line.whole:
+        return "all"
+    return "nothing" if line.broken.held is None else value_text(line.broken.held, o.case)
+
+
+def _silent_count(o: Overview) -> str:
+    return str(sum(line.outcomes.count("silent") for line in o.lines) or "")
+
+
+def _first(o: Overview) -> str:
+    """Return which row is the first that is of no use, and how."""
+    ended = [(line.usable, line, *line.ended) for line in o.lines if line.ended and not line.left_out]
+    if not ended:
+        return ""
+    _, line, cell, how = min(ended, key=lambda item: item[0])
+    return f"{value_text(cell.value, o.case, unit=False)} {how}: {name_of(line.row)}"
+
+
+def _places(a: stress_view.Avoid) -> str:
+    places = [f"{p.case.name} at {p.case.parameter} = {p.text}" for p in a.places[:_PLACES]]
+    return ", ".join(places + ([f"{len(a.places) - _PLACES} more"] if len(a.places) > _PLACES else []))

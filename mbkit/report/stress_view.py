@@ -1,4 +1,4 @@
-"""What a page and a terminal tell of where engines and methods break: the words, and the lines of tables."""
+"""Where engines and methods break: the words, and the rows of tables, of a page and a terminal."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Table
-from mbkit.report.formatting import time_text
 from mbkit.studies._figure_style import engine_index
 from mbkit.studies.stress.figure import number_text
 from mbkit.studies.stress.measurements import (
@@ -327,80 +325,3 @@ def _avoid_at(group: list[SilentLine]) -> AvoidAt:
     engines = tuple(s.row.engine for s in group)
     # A method of one engine, or wrong on all of them, needs no engine named.
     return AvoidAt(case, group[0].anchor, value_text(first, case), () if len(engines) == len(asked) else engines)
-
-
-# On a terminal: a line a case, and what was wrong in silence. The page has a template of its own.
-
-#: Of methods that were wrong in silence, and of the cases of each.
-_METHODS: Final = 6
-_PLACES: Final = 2
-
-
-def view(result: StressResult) -> Document:
-    """Return for each case who held furthest and how far, mbkit's own choice, and what breaks first."""
-    cases = overview(result)
-    runs = sum(cell.end != "not run" for _, row in result.rows() for cell in row.cells)
-    choice = [Column("auto", lambda o: _choice(o), fill=True)] if any(o.choice for o in cases) else []
-    columns = (
-        Column("case", lambda o: o.case.name, most=22, fill=True),
-        Column("furthest", lambda o: o.leader_name if o.leader else "none ran", most=24, fill=True),
-        Column("held to", lambda o: _held(o.leader, o) if o.leader else "", fill=True),
-        *choice,
-        Column("✗", lambda o: Span(_silent_count(o), "bad"), right=True),
-        Column("first to break", lambda o: Span(_first(o), "muted"), fill=True),
-    )
-    behind = [
-        Bullet(
-            o.case.name,
-            f"auto {held_text(o.choice, o.case)}, {name_of(o.lines[0].row)} {held_text(o.lines[0], o.case)}",
-            "!",
-            "allowed",
-        )
-        for o in cases
-        if o.behind and o.choice is not None
-    ]
-    silent = [Bullet(a.method, _places(a), "✗", "bad") for a in avoid(result)]
-    return Document(
-        name="stress",
-        heading="",
-        title="",
-        verdict=headline(result),
-        good=True,
-        marked=False,
-        summary=f"{len(cases)} cases · {runs} runs · {time_text(result.seconds)}",
-        sections=[
-            Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
-            Section("Where another held further than auto", [Items(behind)]),
-            Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
-        ],
-        result=result,
-    )
-
-
-def _choice(o: Overview) -> Span:
-    text = "" if o.choice is None else "behind" if o.behind else "✓"
-    return Span(text, "allowed" if o.behind else "good")
-
-
-def _held(line: Line, o: Overview) -> str:
-    if line.whole:
-        return "all"
-    return "nothing" if line.broken.held is None else value_text(line.broken.held, o.case)
-
-
-def _silent_count(o: Overview) -> str:
-    return str(sum(line.outcomes.count("silent") for line in o.lines) or "")
-
-
-def _first(o: Overview) -> str:
-    """Return which row is the first that is of no use, and how."""
-    ended = [(line.usable, line, *line.ended) for line in o.lines if line.ended and not line.left_out]
-    if not ended:
-        return ""
-    _, line, cell, how = min(ended, key=lambda item: item[0])
-    return f"{value_text(cell.value, o.case, unit=False)} {how}: {name_of(line.row)}"
-
-
-def _places(a: Avoid) -> str:
-    places = [f"{p.case.name} at {p.case.parameter} = {p.text}" for p in a.places[:_PLACES]]
-    return ", ".join(places + ([f"{len(a.places) - _PLACES} more"] if len(a.places) > _PLACES else []))
