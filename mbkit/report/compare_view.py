@@ -53,9 +53,9 @@ class Failure:
     row: Row | None = None
 
 
-def view(result: Comparison, asked: str = "") -> Document:
-    """Return the document of a comparison; `asked` is what a person called the model."""
-    asked = asked if asked != result.model else ""
+def view(result: Comparison, target: str = "") -> Document:
+    """Return the document of a comparison; `target` is the name by which a person called the model."""
+    target = target if target != result.model else ""
     facts = result.facts
     mass = facts.get("mass")
     samples = result.rows[0].samples if result.rows else result.samples
@@ -64,7 +64,7 @@ def view(result: Comparison, asked: str = "") -> Document:
     precision = result.precision
     steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in _judged(result)))
     return Document(
-        name=f"{result.model} ({asked})" if asked else result.model,
+        name=f"{result.model} ({target})" if target else result.model,
         heading=result.model,
         title=f"{result.model}: {outcome}",
         verdict=headline(result),
@@ -73,7 +73,7 @@ def view(result: Comparison, asked: str = "") -> Document:
         f" · {result.seconds:.1f} s",
         opening=[Items([_failure(f) for f in failures(result)], most=_MAX_FAILURES)],
         sections=[
-            Section("The model", [Facts(list(model_facts(facts, asked, result.setup)))], on="page"),
+            Section("The model", [Facts(list(model_facts(facts, target, result.setup)))], on="page"),
             Section("Terms: worst relative error, time per call", _terms(result) if result.rows else []),
             Section(_ROLLOUTS.format(steps), _rollouts(result)),
             *(work_precision_view.sections(precision, whole=False) if precision is not None else []),
@@ -88,11 +88,13 @@ def view(result: Comparison, asked: str = "") -> Document:
             ),
         ],
         result=result,
-        basis={
-            "states": f"{result.samples} random ones, seed {result.seed}; beside them neutral, at-limit and "
-            "near-singular ones"
-        },
+        basis=_basis(result),
     )
+
+
+def _basis(result: Comparison | Sweep) -> dict[str, Text]:
+    states = f"{result.samples} random ones, seed {result.seed}; beside them neutral, at-limit and near-singular ones"
+    return {"states": states}
 
 
 def headline(result: Comparison) -> str:
@@ -106,7 +108,7 @@ def headline(result: Comparison) -> str:
         (sum(not o.unchanged for o in result.omissions), len(result.omissions), "omissions"),
     ):
         parts += [f"{some} of {all_} {what}"] if some else []
-    # Rows are measured by the oracle: what differs is who fails. Rollouts are measured by MuJoCo's own.
+    # Rows are measured by the oracle: the engine that differs fails. Rollouts are measured by MuJoCo's own.
     rows = [r for r in result.rows if not r.passed]
     engines = dict.fromkeys([*(r.engine for r in rows), *(r.engine for r in result.rollouts if not r.passed)])
     known = [r.engine for r in rows if r.defect]
@@ -142,7 +144,7 @@ def _terms(result: Comparison) -> list[Block]:
     by_term = figures.by_term(result)
     short = [Column("term", lambda rows: next(iter(rows.values())).term)]
     short += [_of_engine(engine, result.reference) for engine in result.engines]
-    asked = [(term, engine, rows.get(engine)) for term, rows in by_term.items() for engine in result.engines]
+    entries = [(term, engine, rows.get(engine)) for term, rows in by_term.items() for engine in result.engines]
     allowed = [r for r in result.rows if r.passed and r.reason]
     but = ", but where an engine's own formula cannot do better (marked !)" if allowed else ""
     return [
@@ -163,7 +165,7 @@ def _terms(result: Comparison) -> list[Block]:
             "double precision can tell stand at the bottom.",
             wide=True,
         ),
-        Table(_COLUMNS, asked, on="page"),
+        Table(_COLUMNS, entries, on="page"),
         Items([Bullet(f"{r.term}, {r.engine}", r.reason, "!", "allowed") for r in allowed]),
         Paragraph(
             "Times are medians of single calls through mbkit, interleaved between engines; ± is half the interquartile "
@@ -198,20 +200,20 @@ def _short(row: Row | None) -> Text:
 def _of_row(text: Callable[[Row], Text], own: Text = "", refused: Text = "") -> Callable[[Any], Text]:
     """Return a cell of the long table; `own` of the engine that stands in for the oracle, `refused` without a row."""
 
-    def cell(asked: tuple[str, str, Row | None]) -> Text:
-        row = asked[2]
+    def cell(entry: tuple[str, str, Row | None]) -> Text:
+        row = entry[2]
         return refused if row is None else own if row.engine == row.reference else text(row)
 
     return cell
 
 
 def _time(ns: Callable[[Row], float]) -> Callable[[Any], Text]:
-    return lambda asked: "" if asked[2] is None else time_text(ns(asked[2]) * 1e-9)
+    return lambda row: "" if row[2] is None else time_text(ns(row[2]) * 1e-9)
 
 
 _COLUMNS: Final = (
-    Column("term", lambda asked: asked[0], group=True),
-    Column("engine", lambda asked: asked[1]),
+    Column("term", lambda row: row[0], group=True),
+    Column("engine", lambda row: row[1]),
     Column(
         "worst",
         _of_row(_error, Span("stands in for the oracle", "muted"), Span("refused, see the notes", "muted")),
@@ -364,10 +366,7 @@ def robots_view(result: Sweep) -> Document:
             Section("Reasons", [Items(reasons)]),
         ],
         result=result,
-        basis={
-            "states": f"{result.samples} random ones, seed {result.seed}; beside them neutral, at-limit and "
-            "near-singular ones"
-        },
+        basis=_basis(result),
         last=True,
     )
 

@@ -79,10 +79,10 @@ def refusals(found: Iterable[Refusal]) -> list[Bullet]:
     return out
 
 
-def model_facts(facts: Mapping[str, Any], asked: str, setup: Mapping[str, float]) -> Iterator[tuple[str, Text]]:
+def model_facts(facts: Mapping[str, Any], target: str, setup: Mapping[str, float]) -> Iterator[tuple[str, Text]]:
     """Yield what a page says of a model."""
-    if asked:
-        yield "asked for as", asked
+    if target:
+        yield "asked for as", target
     mass = f", {facts['mass']:.5g} kg" if "mass" in facts else ""
     yield "size", f"nq = {facts.get('nq', '?')} coordinates, nv = {facts.get('nv', '?')} velocities{mass}"
     if "needs" in facts:

@@ -50,5 +50,5 @@ def _environment() -> Environment:
 
 
 def _harmless(value: Any) -> Any:
-    # Control characters too; markup made here is of another type.
+    # Control characters too; our own markup is of another type.
     return terminal(value) if type(value) is str else value

@@ -32,7 +32,7 @@ _KNOWN: Final = "; known to "
 
 @dataclass(frozen=True)
 class MapCell:
-    """A cell: its classes in the style sheet, its text, and what is said of it to whoever points at it."""
+    """A cell: its classes in the style sheet, its text, and its tooltip."""
 
     style: str
     text: str
@@ -113,7 +113,7 @@ def _first_beyond(line: Line, case: CaseResult) -> int:
 
 
 def _title(case: CaseResult, row: Row, cell: Measurement, outcome: Outcome) -> str:
-    """Return all of a cell, for whoever points at it."""
+    """Return the tooltip of a cell: all its numbers."""
     parts = [f"{name_of(row)}, {case.parameter} = {value_text(cell.value, case)}: {HOW[outcome]}"]
     for name, x in (("error", cell.error), ("energy", cell.energy)):
         parts += [] if math.isnan(x) else [f"{name} {error_text(x)}"]
@@ -205,7 +205,7 @@ _PLACES: Final = 2
 
 
 def view(result: StressResult) -> Document:
-    """Return for each case who held furthest and how far, mbkit's own choice, and what breaks first."""
+    """Return the document of a stress study."""
     cases = stress_view.overview(result)
     runs = sum(cell.end != "not run" for _, row in result.rows() for cell in row.cells)
     auto = [Column("auto", lambda o: _choice(o), fill=True)] if any(o.choice for o in cases) else []

@@ -111,7 +111,7 @@ def held_text(line: Line, case: CaseResult) -> str:
 
 
 def headline(result: StressResult) -> str:
-    """Return who held furthest and how much was wrong in silence, in one sentence."""
+    """Return what held furthest and how much was wrong in silence, in one sentence."""
     stopped = "interrupted; what was finished: "
     if result.complete:
         stopped = f"{result.left_out}; " if result.left_out else ""
@@ -122,13 +122,13 @@ def headline(result: StressResult) -> str:
 
 def _leaders(result: StressResult) -> str:
     ran = [c for c in result.cases if c.rows]
-    asked = [c for c in ran if ranks(c)] or ran
-    counts = Counter(name for case in asked for name in _ahead(case))
+    ranked = [c for c in ran if ranks(c)] or ran
+    counts = Counter(name for case in ranked for name in _ahead(case))
     if not counts:
-        return f"nothing held in {_of(len(asked))}"
+        return f"nothing held in {_of(len(ranked))}"
     most = max(counts.values())
     names = _listed([name for name, count in counts.items() if count == most])
-    return f"{names} held furthest, or as far as any, in {most} of {_of(len(asked))}"
+    return f"{names} held furthest, or as far as any, in {most} of {_of(len(ranked))}"
 
 
 def ranks(case: CaseResult) -> bool:
@@ -137,7 +137,7 @@ def ranks(case: CaseResult) -> bool:
 
 
 def _ahead(case: CaseResult) -> list[str]:
-    """Return who held as far as any: engine and method, or of terms the engine in all of them."""
+    """Return what held as far as any: engine and method, or of terms the engine in all of them."""
     most = furthest(case)
     if not most:
         return []
@@ -246,8 +246,8 @@ def methods(result: StressResult) -> list[MethodLine]:
 def _summed(scores: list[_Score]) -> MethodLine:
     families: dict[str, tuple[int, int]] = {}
     for s in scores:
-        ahead, asked = families.get(s.family, (0, 0))
-        families[s.family] = ahead + s.ahead, asked + 1
+        ahead, cases = families.get(s.family, (0, 0))
+        families[s.family] = ahead + s.ahead, cases + 1
     factors = [s.factor for s in scores if math.isfinite(s.factor)]
     row = scores[0].line.row
     return MethodLine(
@@ -321,7 +321,7 @@ def avoid(result: StressResult) -> list[Avoid]:
 def _avoid_at(group: list[SilentLine]) -> AvoidAt:
     case = group[0].case
     first = min((s.cells[0].value for s in group), key=lambda v: case.values.index(v) if v in case.values else 0)
-    asked = [row.engine for row in case.rows if row.method == group[0].row.method]
+    of_method = [row.engine for row in case.rows if row.method == group[0].row.method]
     engines = tuple(s.row.engine for s in group)
     # A method of one engine, or wrong on all of them, needs no engine named.
-    return AvoidAt(case, group[0].anchor, value_text(first, case), () if len(engines) == len(asked) else engines)
+    return AvoidAt(case, group[0].anchor, value_text(first, case), () if len(engines) == len(of_method) else engines)

@@ -145,7 +145,7 @@ def front_names(result: WorkPrecision) -> list[str]:
 
 
 def headline(result: WorkPrecision) -> str:
-    """Return who is fastest at which error, in one sentence."""
+    """Return the fastest curve for each error, in one sentence."""
     stopped = "" if result.complete else "interrupted; what was finished: "
     missing = "".join(f"; {x}" for x in result.shortened if x != "interrupted")
     found = levels(result)
@@ -178,14 +178,14 @@ def picture(result: WorkPrecision) -> bytes:
 # The document.
 
 
-def view(result: WorkPrecision, asked: str = "") -> Document:
-    """Return the document of a study; `asked` is what a person called the model."""
-    asked = asked if asked != result.model else ""
+def view(result: WorkPrecision, target: str = "") -> Document:
+    """Return the document of a study; `target` is the name by which a person called the model."""
+    target = target if target != result.model else ""
     facts = result.facts
     count = sum(len(c.points) for c in result.curves)
     notes = [Bullet("", note) for note in facts.get("notes", ())]
     return Document(
-        name=f"{result.model} ({asked})" if asked else result.model,
+        name=f"{result.model} ({target})" if target else result.model,
         heading=f"{result.model}: error against run time",
         title=f"{result.model}: error against run time",
         verdict=headline(result),
@@ -196,7 +196,7 @@ def view(result: WorkPrecision, asked: str = "") -> Document:
             *sections(result, whole=True),
             Section(
                 "The model",
-                [Facts(list(model_facts(facts, asked, {}))), Items(notes)],
+                [Facts(list(model_facts(facts, target, {}))), Items(notes)],
                 on="page",
             ),
         ],

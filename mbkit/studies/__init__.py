@@ -1,4 +1,4 @@
-"""Questions asked of several engines at once."""
+"""Studies of several engines: compare, stress, work-precision, baselines, explain."""
 
 from mbkit.studies import stress
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row

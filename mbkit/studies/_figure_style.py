@@ -19,7 +19,7 @@ _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸�
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours by what they are for; six series, as many as engines can be told apart."""
+    """Colours by what they are for; six series, one an engine."""
 
     ink: str
     muted: str

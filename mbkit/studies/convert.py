@@ -23,7 +23,7 @@ from mbkit.model.builder import expect_model
 from mbkit.studies._targets import with_values
 from mbkit.studies.explain.result import Cause
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of
+from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of, velocity_joints
 
 __all__ = ["FORMATS", "Converted", "convert"]
 
@@ -92,8 +92,8 @@ def convert(model: Model, to: str) -> Converted:
     Examples
     --------
     >>> import mbkit as mb
-    >>> made = mb.convert(mb.catalog.pendulum(), "mjcf")
-    >>> made.worst < 1e-12
+    >>> mjcf = mb.convert(mb.catalog.pendulum(), "mjcf")
+    >>> mjcf.worst < 1e-12
     True
     """
     expect_model(model)
@@ -144,7 +144,7 @@ def _to_mjcf(model: Model) -> Converted:
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
     at = states_of(model, _STATES, 0)
     values = evaluated(read_back(model, text), at)
-    found = gaps(model_terms(model, at), values, at.v, _owners(model))
+    found = gaps(model_terms(model, at), values, at.v, velocity_joints(model))
     if not found.comparable or found.worst > _TOLERANCE:
         why = f"MuJoCo wants inertias with A + B >= C of {', '.join(lifted)}" if lifted else "please report this model"
         raise MbkitError(
@@ -188,7 +188,3 @@ def _to_urdf(model: Model) -> Converted:
         notes.append("no body has mass, so that reading back compares no forces, but bodies and joints alone")
     order = [c.says for c in found.causes if c.kind == "joint order"]
     return Converted(model.name, "urdf", text, found.gaps, (*notes, *order))
-
-
-def _owners(model: Model) -> list[str]:
-    return [j.name for j in model.independent_joints for _ in range(j.type.nv)]

@@ -276,7 +276,7 @@ def write_whole(path: Path, content: bytes, claim: Callable[[str], None] | None 
             # A name must not stand for content that a crash can still take.
             file.flush()
             os.fsync(file.fileno())
-        # A temporary file is for its owner only; the file is for whoever may read the folder.
+        # A temporary file is private; the file gets the usual permissions.
         mask = os.umask(0)
         os.umask(mask)
         os.chmod(temporary, 0o666 & ~mask)

@@ -11,8 +11,9 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.errors import MbkitError, MbkitWarning
+from mbkit.errors import InputError, MbkitError, MbkitWarning
 from mbkit.model import Model
+from mbkit.model.builder import expect_model
 from mbkit.model.manifold import limits_box
 from mbkit.simulate import Trajectory, simulate
 
@@ -30,6 +31,16 @@ def state_within_limits(model: Model, rng: np.random.Generator, share: float = 0
     middle = 0.5 * (lower[bounded] + upper[bounded])
     q[bounded] = middle + share * (q[bounded] - middle)
     return q, v
+
+
+def require_motion(model: object, purpose: str) -> Model:
+    """Return a model that has a velocity."""
+    model = expect_model(model)
+    if not model.nv:
+        raise InputError(
+            f"model: nothing moves in {model.name} (nv = 0), so there is nothing to {purpose}; add a joint"
+        )
+    return model
 
 
 def free_of_mimic(model: Model) -> Model:

@@ -246,7 +246,7 @@ class Worker:
                 raise self._end_dead() from None
             if time.perf_counter() < min(end, last):
                 continue
-            # On a busy machine the process may not have had the time that it was given.
+            # On a busy machine the process may not have had its processor time.
             missing = seconds - (_processor_seconds(self._process.pid) - spent)
             if missing <= 0 or end >= last:
                 self.end()

@@ -41,7 +41,7 @@ def check(
     First the description: a parameter that changed is named, with its old and new value,
     and what it does to the terms. Where there is none, the numbers of every recorded engine, to
     its own rounding (`mbkit.studies.baseline.tolerance` says how much that is). Where these stand,
-    the versions: new ones alone ask whether to record anew.
+    the versions: new ones alone ask whether to record again.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def check(
     tell(1.0, "done")
     return replace(
         result,
-        status=_status(rows, built or refused, moved_versions),
+        status="numbers" if rows else "skipped" if not (built or refused) else "versions" if moved_versions else "same",
         engines=tuple(built),
         moved=tuple(rows),
         skipped=tuple(missing),
@@ -152,14 +152,6 @@ def _require_same_robot(recorded: Baseline, model: Model, path: str) -> None:
 def _joints(names: Iterable[str]) -> str:
     names = list(names)
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-
-
-def _status(rows: list[Moved], tried: object, moved: tuple[VersionChange, ...]) -> Status:
-    if rows:
-        return "numbers"
-    if not tried:
-        return "skipped"
-    return "versions" if moved else "same"
 
 
 def _differences(
@@ -260,9 +252,7 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
             f"{path_a} is a baseline of {a.model!r}, {path_b} of {b.model!r}; they have no joint in common"
         )
     notes = _notes(a, b)
-    rows: list[Moved] = []
-    if not notes:
-        rows = _rows(a, b)
+    rows = [] if notes else _rows(a, b)
     changed = without_consequences(changes(a.description, b.description), a.description)
     moved = tolerance.moved(a.versions, b.versions)
     status: Status = "description" if changed else "numbers" if rows or notes else "versions" if moved else "same"

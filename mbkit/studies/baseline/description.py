@@ -171,7 +171,7 @@ _ENTRIES: Final = {
 }
 # Of these, zero is no size: an origin moved by 1e-17 m has not moved.
 _ABSOLUTE: Final = ("com", "translation", "rotation", "axes", "point", "lower", "upper")
-# A turn this small cannot be told from the rounding of its sine.
+# A smaller turn is within the rounding of its sine.
 _TURNED: Final = 1e-7
 
 
@@ -255,7 +255,7 @@ def _fields(section: str, name: str, owner: str, before: Part, after: Part) -> I
         what = _what(section, field, owner)
         x, y = _numbers(old), _numbers(new)
         if x is None or y is None or x.shape != y.shape:
-            yield Change(section, name, field, old, new, f"{what}: {_told(old)} → {_told(new)}")
+            yield Change(section, name, field, old, new, f"{what}: {_plain_text(old)} → {_plain_text(new)}")
             continue
         yield Change(section, name, field, old, new, f"{what}: {_difference(field, x, y)}", _only_rounding(field, x, y))
 
@@ -271,7 +271,7 @@ def _numbers(x: Any) -> Array | None:
     return np.array(x, dtype=np.float64, ndmin=1) if isinstance(x, (int, float, list)) else None
 
 
-def _told(x: Any) -> str:
+def _plain_text(x: Any) -> str:
     return "none" if x in (None, "") else str(x)
 
 
@@ -295,7 +295,7 @@ def _pair(old: float, new: float) -> str:
 
 
 def _turn(old: Array, new: Array) -> str:
-    """Return by how much and about which of the old axes a frame has turned; empty for less than can be told."""
+    """Return by how much and about which of the old axes a frame has turned; empty for a turn within rounding."""
     R = old.reshape(3, 3).T @ new.reshape(3, 3)
     twice = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     size = float(np.linalg.norm(twice))
@@ -315,11 +315,8 @@ def _only_rounding(field: str, old: Array, new: Array) -> bool:
     return float(np.linalg.norm(new - old)) <= _ROUNDINGS * _EPS * size
 
 
-# What a URDF says of links that a parser merges, because they are fixed to each other.
-#
-# A `Model` has one body for them, whose numbers all follow from any of theirs. So that an edit is told by
-# the name of the link or joint that was edited, their own numbers are recorded too, where it is known
-# which file a model came from.
+# A `Model` has one body for links that are fixed to each other. Their own numbers are recorded beside it, so that a
+# change names the link or joint that was edited.
 
 LINK_SECTIONS: Final = ("links", "places")
 _PLACE: Final = ("translation", "rotation")
@@ -333,12 +330,12 @@ def links_of(model: Model, target: str, options: Mapping[str, Any], baseline: Pa
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MbkitWarning)
-            # By the name it was asked for by, whose bad bodies are taken as written.
+            # By its own name: a robot's inconsistent bodies stay as written.
             if load(resolved(target, baseline), **options).digest != model.digest:
                 return {}
             return _merged(read_links(path))
     except (MbkitError, TypeError):
-        # It only sharpens what is told; whoever loads the target tells what is wrong with it.
+        # Links only make a message more exact; loading the target reports its faults.
         return {}
 
 

@@ -50,7 +50,7 @@ class Baseline:
     digest : str
         Its fingerprint, `Model.digest`.
     target, options
-        What `mbkit baseline check` loads, and how; empty where a model itself was given.
+        What `mbkit baseline check` loads, and how; empty for a model without a source.
     seed : int
     processor : str
     versions : dict
@@ -108,8 +108,6 @@ class Baseline:
         return f"<Baseline of {self.model!r}: {', '.join(self.engines)}; {content}>"
 
 
-# A baseline as a table of plain data, and back: one row for each joint, so that a changed line names it.
-
 #: Of the file. Another number is another layout, which this one does not read.
 FORMAT: Final = 1
 #: Of a rollout that a file asks for; `record` writes far fewer.
@@ -160,7 +158,7 @@ def _from_table(t: Mapping[str, Any]) -> Baseline:
         seed=t["seed"],
         processor=t["processor"],
         versions=dict(t["versions"]),
-        description=_description(t),
+        description={s: {"": dict(t[s])} if s in FLAT else dict(t[s]) for s in SECTIONS if s in t},
         coordinates=coordinates,
         velocities=velocities,
         states=at,
@@ -227,10 +225,6 @@ def _errors(t: Mapping[str, Any], engine: str) -> dict[str, float]:
     """Return the errors of every term that an engine gave."""
     errors, without = t.get("errors", {}).get(engine, {}), t.get("left_out", {}).get(engine, {})
     return {term: errors.get(term, 0.0) for term in t["terms"] if term not in without}
-
-
-def _description(t: Mapping[str, Any]) -> Description:
-    return {s: {"": dict(t[s])} if s in FLAT else dict(t[s]) for s in SECTIONS if s in t}
 
 
 # Arrays as rows by name.
@@ -457,11 +451,11 @@ def store(path: Path, text: str, model: str, *, force: bool) -> None:
 
 
 def _claim(temporary: str, path: Path, model: str) -> None:
-    """Take the name if it is free, in one step that two processes cannot both take; else look who has it."""
+    """Claim a free name in one atomic step; else check that its file may be replaced."""
     try:
         os.link(temporary, path)
     except OSError:
-        # It is taken, or the file system has no links.
+        # There is such a file, or the file system has no links.
         check_replaceable(path, model)
 
 

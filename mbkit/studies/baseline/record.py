@@ -14,10 +14,9 @@ from mbkit._check import Array, count
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import compared, find_engine
-from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError, UnsupportedError
+from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.model import Model
-from mbkit.model.builder import expect_model
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import checked_target, engine_names, with_values
@@ -26,7 +25,7 @@ from mbkit.studies.baseline.file import ROLLOUT, Baseline, Rollout, check_replac
 from mbkit.studies.baseline.tolerance import FINE, ROUNDING, Comparator, relevant
 from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.results import Refusal
-from mbkit.studies.study_runs import quiet_simulate
+from mbkit.studies.study_runs import quiet_simulate, require_motion
 
 # What is recorded, evaluated: the states, every term at them, and where a short rollout ends.
 
@@ -161,7 +160,7 @@ def record(
 def _recorded(
     model: Model,
     names: Sequence[str],
-    asked: bool,
+    required: bool,
     samples: int,
     seed: int,
     tell: Progress,
@@ -169,19 +168,19 @@ def _recorded(
     tell(0.0, "building")
     plain = with_values(model)
     built, refused, missing = build_engines(plain, names)
-    if asked and missing:
+    if required and missing:
         raise UnsupportedError("; ".join(f"{m.engine}: {m.reason}" for m in missing))
     if not built:
         why = "; ".join(f"{r.engine}: {r.reason}" for r in refused)
         raise UnsupportedError(f"no engine holds {model.name}, so there is nothing to record: {why}")
     at = _states(plain, samples, seed)
     tell(0.1, "34 digits")
-    terms, untold = evaluate(OracleDynamics(plain), at, _ROLLOUT)
+    terms, absent = evaluate(OracleDynamics(plain), at, _ROLLOUT)
     description = described(model)
     comparator = Comparator(terms, at, description, model.coordinate_names, model.velocity_names)
     errors: dict[str, dict[str, float]] = {}
     own: dict[str, dict[str, Array]] = {}
-    left_out: list[Refusal] = [*refused, *untold]
+    left_out: list[Refusal] = [*refused, *absent]
     for k, (name, dyn) in enumerate(built.items()):
         tell(0.6 + 0.4 * k / len(built), name)
         values, without = evaluate(dyn, at, _ROLLOUT)
@@ -221,11 +220,9 @@ def _error(comparator: Comparator, term: str, value: Array, reference: Array) ->
 
 def checked_model(model: object) -> Model:
     """Return a model that has something to record."""
-    model = expect_model(model)
-    if not model.nv:
-        raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to record; add a joint")
-    model.require_values("a baseline")
-    return model
+    checked = require_motion(model, "record")
+    checked.require_values("a baseline")
+    return checked
 
 
 def build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[Refusal], list[Refusal]]:
@@ -237,8 +234,7 @@ def build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamic
         try:
             engines[name] = dynamics(model, name, **find_engine(name).brief)
         except UnsupportedError as error:
-            absent = isinstance(error.__cause__, ModuleNotFoundError)
-            if absent:
+            if isinstance(error.__cause__, ModuleNotFoundError):
                 missing.append(Refusal(name, "", f"not installed; pip install {find_engine(name).package}"))
             else:
                 refused.append(Refusal.of(name, error))

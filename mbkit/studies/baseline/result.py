@@ -28,9 +28,9 @@ class BaselineResult(ResultTable):
     against : str
         The second file of a `diff`.
     status : {"same", "versions", "numbers", "description", "skipped"}
-        The gravest thing found; ``"skipped"`` where no engine was there to be asked.
+        The gravest difference; ``"skipped"`` where no engine was installed.
     engines : tuple of str
-        Those that were asked.
+        Those that were checked.
     changes : tuple of Change
         Parameters of the description, causes before effects.
     moved : tuple of Moved
@@ -67,7 +67,7 @@ class BaselineResult(ResultTable):
 
     @property
     def passed(self) -> bool:
-        """Whether the robot and all engines that were asked are as recorded."""
+        """Whether the robot and all engines that were checked are as recorded."""
         return self.status in ("same", "versions") and not (self.strict and self.skipped)
 
     @property
@@ -79,7 +79,7 @@ class BaselineResult(ResultTable):
             parameters = f"{_count(self.changes, 'parameter')} of the description"
             sentences = {
                 "same": "the same robot, with the same numbers",
-                "versions": f"the same numbers, of other versions: {self._told_versions()}",
+                "versions": f"the same numbers, of other versions: {self._version_text()}",
                 "numbers": "the same description, with other numbers",
                 "description": f"{parameters} differ{'s' if _one(self.changes) else ''}",
             }
@@ -91,18 +91,18 @@ class BaselineResult(ResultTable):
         if self.status == "numbers":
             names = ", ".join(dict.fromkeys(r.engine for r in self.moved))
             return f"{_count(self.moved, 'number')} moved: {names}{missing}"
-        told_worst = f"{', '.join(self.engines)}; largest error {self.worst:.1e}"
+        agreement = f"{', '.join(self.engines)}; largest error {self.worst:.1e}"
         if self.status == "versions":
-            return f"as recorded ({told_worst}), by other versions: {self._told_versions()}; rebaseline?{missing}"
-        return f"as recorded ({told_worst}){missing}"
+            return f"as recorded ({agreement}), by other versions: {self._version_text()}; rebaseline?{missing}"
+        return f"as recorded ({agreement}){missing}"
 
-    def _told_versions(self) -> str:
+    def _version_text(self) -> str:
         return ", ".join(map(str, self.versions))
 
     def lines(self, everything: bool = False) -> Iterator[tuple[str, str]]:
         """Iterate over what was found, gravest first: (what it is about, what is to be said).
 
-        Unless `everything` is asked for, the first 20 parameters and of each engine the 5 numbers that
+        Unless `everything` is set, the first 20 parameters and of each engine the 5 numbers that
         are off most.
         """
         most = len(self.moved) if everything else _MOST
@@ -132,7 +132,7 @@ class BaselineResult(ResultTable):
             yield "note", note
 
     def text(self, remedy: str = "") -> str:
-        """Return everything for a terminal without colours; `remedy` is how the caller records anew."""
+        """Return everything for a terminal without colours; `remedy` is the command that records again."""
         head = f"{self.model}, {self.path}: {self.verdict}"
         if self.question == "diff":
             head = f"{self.path} → {self.against}: {self.verdict}"

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, Final, Literal
 
 from mbkit.engines.registry import STANDARD
@@ -69,34 +68,19 @@ class Sweep:
             digits = min(c.digits for c in agreed if len(c.engines) == n)
             parts.append(f"{count} agree in {n} engines, to {digits:.1f} digits or more")
         counts = self.counts
-        for status, words in (("differ", "differ"), ("refused", "refused"), ("failed", "failed")):
-            parts += [f"{counts[status]} {words}"] if counts[status] else []
+        parts += [f"{counts[status]} {status}" for status in STATUSES[1:] if counts[status]]
         missing = self.expected - len(self.outcomes)
         parts += [f"{missing} not reached"] if missing else []
         return f"{self.expected} robots: " + ("; ".join(parts) or "nothing compared")
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data; NaN is None."""
-        return {
-            "passed": self.passed,
-            "verdict": self.verdict,
-            "counts": self.counts,
-            "expected": self.expected,
-            "engines": list(self.engines),
-            "samples": self.samples,
-            "seed": self.seed,
-            "seconds": self.seconds,
-            "versions": self.versions,
-            "processor": self.processor,
+        names = ("passed", "verdict", "counts", "expected", "engines", "samples", "seed", "seconds", "versions")
+        return {name: results.to_plain(getattr(self, name)) for name in (*names, "processor")} | {
             "robots": [
-                {
-                    "robot": o.robot,
-                    "status": o.status,
-                    "reason": o.reason,
-                    "comparison": json.loads(o.comparison.to_json()) if o.comparison else None,
-                }
+                vars(o) | {"comparison": json.loads(o.comparison.to_json()) if o.comparison else None}
                 for o in self.outcomes
-            ],
+            ]
         }
 
     def to_json(self) -> str:
@@ -129,7 +113,7 @@ def all_robots(
             raise UnknownNameError("robot", name, [*shorter, *known])
         wanted.append(shorter.get(name, name))
     # The largest first, or the last processor would work alone at the end.
-    wanted.sort(key=lambda n: -_size(known[n]))
+    wanted.sort(key=lambda n: -known[n].stat().st_size if known[n].exists() else 0)
     calls = {
         name: partial(outcome_of, name, tuple(engines), samples, seed, floating_base=floating_base, mimic=mimic)
         for name in wanted
@@ -139,10 +123,6 @@ def all_robots(
             yield RobotOutcome(name, "failed", f"{type(result).__name__}: {result}")
         else:
             yield result
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
 
 
 def outcome_of(

@@ -109,7 +109,7 @@ def _coriolis(model: Model, q: Array, v: Array) -> Omission:
     return Omission(
         "Coriolis matrix",
         False,
-        "C(q, v) is derived only when asked; C v comes without it",
+        "C(q, v) is derived only on demand; C v comes without it",
         times["matrix"][0] - times["nle"][0],
         math.hypot(times["matrix"][1], times["nle"][1]),
         setup,

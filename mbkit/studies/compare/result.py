@@ -101,7 +101,7 @@ class RolloutRow:
     judged : bool
         False where too few steps are well conditioned to say anything.
     asked : float
-        The horizon that was to be compared, s.
+        The horizon to compare, s.
     """
 
     method: str
@@ -122,7 +122,7 @@ class RolloutRow:
 
     @property
     def cut(self) -> bool:
-        """Whether the compared horizon is shorter than the one asked for."""
+        """Whether the compared horizon is shorter than the one wanted."""
         return self.duration < self.asked * (1 - 1e-9)
 
 
@@ -242,7 +242,7 @@ class Comparison(ResultTable):
 
     @property
     def verdict(self) -> str:
-        """One sentence: agree, and to how many digits, or who differs in what, and by which known defect."""
+        """One sentence: agree, and to how many digits, or which engine differs in what, and by which known defect."""
         if self.nothing:
             return f"nothing compared: {self.nothing}"
         missing = "".join(f"; {x}" for x in self.shortened)

@@ -2,7 +2,7 @@
 
 Two right programs round differently in every step, and a system multiplies that, a
 chaotic one without bound. So each rollout's condition is measured beside it: how far
-q moves when the forces are disturbed anew in every step, relative to |M||a| + |nle|,
+q moves when the forces are disturbed in every step, relative to |M||a| + |nle|,
 the size at which any backward-stable program rounds them. Over examples from 1 to
 1e7 two engines differed by 2 to 125 eps times that number. What may differ is a
 multiple of it, and the comparison ends where that would say little.
@@ -130,7 +130,7 @@ def _row(
 
 
 def _implicit_damping(model: Model, dyn: Dynamics, q0: Array, v0: Array) -> RolloutRow:
-    """Show what MuJoCo's Euler does by default: damping taken implicitly, another formula."""
+    """Compare with MuJoCo's default Euler, whose damping is implicit: another formula."""
     steps = round(DURATION / STEP)
     begun = quiet_simulate(dyn, q0, v0, DURATION, _NATIVE[EULER_METHOD], STEP)
     q, _ = dyn.rollout("euler", q0, v0, STEP, None, steps, euler_damping=True)  # type: ignore[attr-defined]

@@ -14,9 +14,8 @@ from mbkit._check import Array, count, real
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import STANDARD, find_engine
-from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NumericalError
+from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError
 from mbkit.model import Model
-from mbkit.model.builder import expect_model
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
@@ -26,10 +25,8 @@ from mbkit.studies.compare.result import Comparison, Row
 from mbkit.studies.compare.rollouts import rollouts
 from mbkit.studies.compare.terms import TERMS, States, Term, power_rows, states
 from mbkit.studies.results import Refusal, model_info
-from mbkit.studies.study_runs import free_of_mimic
+from mbkit.studies.study_runs import free_of_mimic, require_motion
 from mbkit.studies.work_precision.study import work_precision
-
-# Every term in every engine, judged against the oracle.
 
 _EPS: Final = float(np.finfo(float).eps)
 # Each of the largest terms went through about this many roundings on the way.
@@ -63,7 +60,6 @@ class Judge:
         gravity = float(np.linalg.norm(model.gravity))
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
-        #: The joint of each velocity.
         self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
 
     def rows(self, tell: Progress) -> tuple[list[Row], list[Refusal]]:
@@ -116,7 +112,7 @@ class Judge:
         return rows
 
     def _reference(self, term: Term, values: dict[str, Array]) -> tuple[str, Array, Array]:
-        """Return who has the reference values, and their high and low part."""
+        """Return the engine of the reference values, and their high and low part."""
         try:
             return self.oracle.engine, *term.reference(self.oracle, self.at)
         except NumericalError as error:
@@ -320,9 +316,7 @@ def _beyond_terms(
 
 
 def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tolerance: float) -> tuple[str, ...]:
-    expect_model(model)
-    if not model.nv:
-        raise InputError(f"model: nothing moves in {model.name} (nv = 0), so there is nothing to compare; add a joint")
+    require_motion(model, "compare")
     names = engine_names(engines, least=2)
     count("samples", samples, least=1)
     count("seed", seed)
@@ -337,7 +331,7 @@ def _build(
     *,
     compile: bool,  # noqa: A002  # the engine's own word
 ) -> tuple[dict[str, Dynamics], list[Refusal], dict[str, float], dict[str, str]]:
-    """Return the engines, who refuses the model, the time each took, and the known defects announced."""
+    """Return the engines, refusals of the model, build times, and the known defects announced."""
     engines, refusals, setup, defects = {}, [], {}, {}
     for k, name in enumerate(names):
         tell(0.05 * k / len(names), f"building {name}")

@@ -85,12 +85,9 @@ class Reading:
         if isinstance(error, WorkerTimeoutError):
             return f"its importer was {error}, without an answer"
         if isinstance(error, WorkerDiedError):
-            last = f" ({error.last})" if error.last else ""
-            return (
-                f"its importer ended the process with {error.signal}{last}"
-                if error.signal
-                else f"its importer: {error}"
-            )
+            if not error.signal:
+                return f"its importer: {error}"
+            return f"its importer ended the process with {error.signal}" + (f" ({error.last})" if error.last else "")
         return describe(error).removeprefix(f"{self._engine}: ")
 
 

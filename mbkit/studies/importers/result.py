@@ -30,12 +30,11 @@ class Stage:
     same : bool or None
         None where it cannot be compared.
     worst : float
-        The largest difference: relative for masses, inertias and terms, m for places and
-        centres of mass, in the numbers' own units for the rest; NaN where there is no number.
+        The largest difference: relative for masses, inertias and terms, else in m or its unit; NaN without one.
     where : str
         The joint or body where it is largest.
     says : str
-        What differs, in words; empty where nothing does.
+        The difference in words.
     """
 
     name: str
@@ -123,7 +122,7 @@ class ParserComparison(ResultTable):
 
     @property
     def verdict(self) -> str:
-        """One sentence: who agrees, who differs, who refuses; and what was not compared."""
+        """One sentence: which importers agree, differ, refuse or were not compared."""
         same = [p.engine for p in self.importers if p.agrees]
         differ = [p.engine for p in self.importers if p.stages and not p.agrees]
         missing = [p.engine for p in self.importers if p.refused and p.version == MISSING]

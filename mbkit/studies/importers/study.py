@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -29,9 +29,10 @@ from mbkit.studies.explain.joint_matching import Matching, align_frames, reconci
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
+from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of, velocity_joints
 from mbkit.studies.importers.process import ImporterError, Reading, one_at_a_time
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
+from mbkit.studies.study_runs import free_of_mimic
 
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
 
@@ -43,17 +44,13 @@ class _Difference:
     says: str
 
 
-def unmimicked(model: Model) -> Model:
-    """Return the description with every mimic joint free, as importers leave them."""
-    return replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))
-
-
 def stages(
     reference: Model | Imported, imported: Imported, samples: int, seed: int, tolerance: float
 ) -> tuple[Stage, ...]:
     """Compare an importer's model with the reference, from the tree to the terms, which its own engine computes."""
     described = reference.model if isinstance(reference, Imported) else reference
-    free = unmimicked(described)
+    # Importers leave mimic joints free.
+    free = free_of_mimic(described)
     near = Tolerances.of(free, tolerance)
     one, other, matching, structural = reconcile_joint_sets(free, imported.model, near)
     there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
@@ -77,13 +74,12 @@ def stages(
     at = states_of(one.model, samples, seed)
     ours = model_terms(one.model, at)
     if isinstance(reference, Imported):
-        ours = _asked(one.model, reference, {j.name: j.name for j in one.model.joints}, at)
-    theirs = _asked(one.model, imported, matching.to_b, at)
+        ours = _own_terms_of(one.model, reference, {j.name: j.name for j in one.model.joints}, at)
+    theirs = _own_terms_of(one.model, imported, matching.to_b, at)
     return (*out, *_terms(one.model, ours, theirs, at, tolerance))
 
 
-def _stage(name: str, found: Iterable[_Difference]) -> Stage:
-    some = list(found)
+def _stage(name: str, some: list[_Difference]) -> Stage:
     if not some:
         return Stage(name, True, 0.0, "", "")
     worst = max(some, key=lambda d: d.size)
@@ -92,38 +88,20 @@ def _stage(name: str, found: Iterable[_Difference]) -> Stage:
 
 
 def _tree(pairs: list[tuple[Joint, Joint]], near: Tolerances) -> list[Stage]:
-    def kinds(a: Joint, b: Joint) -> _Difference | None:
-        same = a.type.motion == b.type.motion
-        return None if same else _Difference(a.name, 1.0, f"{b.kind} for {a.kind}")
-
-    def parents(a: Joint, b: Joint) -> _Difference | None:
-        return None if a.parent == b.parent else _Difference(a.name, 1.0, f"on {b.parent} for {a.parent}")
-
-    def places(a: Joint, b: Joint) -> _Difference | None:
-        if near.vector(a.rotation, b.rotation) and near.point(a.translation, b.translation):
-            return None
-        far = float(np.linalg.norm(a.translation - b.translation))
-        turn = angle_of(a.rotation.T @ b.rotation)
-        return _Difference(a.name, max(far, turn), f"{far:.3g} m and {turn:.3g} rad off")
-
-    def axes(a: Joint, b: Joint) -> _Difference | None:
-        if near.vector(a.axes, b.axes):
-            return None
-        return _Difference(
-            a.name, float(np.abs(a.axes - b.axes).max()), f"{number_text(b.axes)} for {number_text(a.axes)}"
-        )
-
-    checks: dict[str, Callable[[Joint, Joint], _Difference | None]] = {
-        "kinds": kinds,
-        "parents": parents,
-        "places": places,
-        "axes": axes,
-    }
-    same_kind = [(a, b) for a, b in pairs if a.axes.shape == b.axes.shape]
-    return [
-        _stage(name, (d for a, b in (same_kind if name == "axes" else pairs) if (d := check(a, b)) is not None))
-        for name, check in checks.items()
-    ]
+    found: dict[str, list[_Difference]] = {name: [] for name in ("kinds", "parents", "places", "axes")}
+    for a, b in pairs:
+        if a.type.motion != b.type.motion:
+            found["kinds"].append(_Difference(a.name, 1.0, f"{b.kind} for {a.kind}"))
+        if a.parent != b.parent:
+            found["parents"].append(_Difference(a.name, 1.0, f"on {b.parent} for {a.parent}"))
+        if not (near.vector(a.rotation, b.rotation) and near.point(a.translation, b.translation)):
+            far = float(np.linalg.norm(a.translation - b.translation))
+            turn = angle_of(a.rotation.T @ b.rotation)
+            found["places"].append(_Difference(a.name, max(far, turn), f"{far:.3g} m and {turn:.3g} rad off"))
+        if a.axes.shape == b.axes.shape and not near.vector(a.axes, b.axes):
+            size, says = float(np.abs(a.axes - b.axes).max()), f"{number_text(b.axes)} for {number_text(a.axes)}"
+            found["axes"].append(_Difference(a.name, size, says))
+    return [_stage(name, some) for name, some in found.items()]
 
 
 def _mimics(reference: Model, imported: Model, matching: Matching) -> Stage:
@@ -188,8 +166,7 @@ def _uncompared() -> list[Stage]:
 
 
 def _terms(reference: Model, ours: Values, theirs: Values, at: States, tolerance: float) -> list[Stage]:
-    owners = [j.name for j in reference.independent_joints for _ in range(j.type.nv)]
-    found = gaps(ours, theirs, at.v, owners)
+    found = gaps(ours, theirs, at.v, velocity_joints(reference))
     if not found.comparable:
         return _uncompared()
     measured = {g.term: g for g in found.terms}
@@ -201,7 +178,7 @@ def _terms(reference: Model, ours: Values, theirs: Values, at: States, tolerance
     ]
 
 
-def _asked(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
+def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
     """Return the engine's own terms in the reference's coordinates; `names` has its joint for each of these."""
     theirs = imported.model.layout
     q_order, v_order = (
@@ -236,7 +213,7 @@ class OwnTerms:
 def own_terms(engine: str, imported: Imported, samples: int, seed: int, tolerance: float) -> OwnTerms:
     """Measure what acts in an importer's model beside its bodies and joints."""
     at = states_of(imported.model, samples, seed)
-    owners = [j.name for j in imported.model.independent_joints for _ in range(j.type.nv)]
+    owners = velocity_joints(imported.model)
     whole, described = imported.terms(at.q, at.v, ()), model_terms(imported.model, at)
     bare = imported.terms(at.q, at.v, tuple(x.key for x in imported.beside)) if imported.beside else whole
     causes, idle = [], []
@@ -305,12 +282,12 @@ def compare_parsers(
 ) -> ParserComparison:
     """Read a file with each engine's own importer, and compare what comes out with the file as written.
 
-    The importers are given the file without meshes and textures, so that nothing else is opened but what
+    The importers read the file without meshes and textures, so that nothing else is opened but what
     an MJCF includes and the meshes from which its bodies take their inertia; boxes, cylinders and spheres
     stay. Each runs in a process of its own, kept until this one ends: a crash or an endless loop there is
     reported like any other refusal.
 
-    What each made is compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses,
+    The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses,
     centres of mass, inertias, armature, damping, friction, limits, and M, g, nle and passive by joint name,
     by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons,
     actuators at zero control, fluid, gravity compensation. Links that an importer fuses are fused on the
@@ -363,7 +340,8 @@ def compare_parsers(
         reference, label, faults = _reference(stripped, read, floating_base)
         for engine, imported in read.items():
             if reference is None or engine == label:
-                parsed[engine] = Parsed(engine, _version(engine), notes=_alone(imported))
+                notes = (*imported.notes, *(x.says for x in imported.beside))
+                parsed[engine] = Parsed(engine, _version(engine), notes=notes)
                 continue
             try:
                 parsed[engine] = _compared(engine, imported, reference, label, samples, seed, tolerance)
@@ -390,11 +368,10 @@ def compare_parsers(
 def _read(
     stripped: Stripped, engines: Sequence[str], floating_base: bool, seconds: float
 ) -> tuple[dict[str, Imported], dict[str, str]]:
-    """Return what each importer made of a file, and why the others did not; all read at the same time."""
+    """Return each importer's reading of a file, and why the others refuse it; all read at the same time."""
     begun: dict[str, Reading] = {}
     read: dict[str, Imported] = {}
     refused: dict[str, str] = {}
-
     for engine in engines:
         try:
             check_installed(engine)
@@ -417,7 +394,7 @@ def _read(
 def _compared(
     engine: str, imported: Imported, reference: Model | Imported, label: str, samples: int, seed: int, tolerance: float
 ) -> Parsed:
-    """Return what an importer made, against the reference."""
+    """Return an importer's reading, compared with the reference."""
     described = reference.model if isinstance(reference, Imported) else reference
     found = explain(described, imported.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine))
     compared = stages(reference, imported, samples, seed, tolerance)
@@ -427,11 +404,6 @@ def _compared(
         own = OwnTerms((*theirs.causes, *own.causes), own.idle, own.held and theirs.held)
     notes = (*found.notes, *imported.notes, *own.notes)
     return Parsed(engine, _version(engine), "", compared, measured(found, compared, own), notes)
-
-
-def _alone(imported: Imported) -> tuple[str, ...]:
-    """Return the notes on an importer that is compared with nothing."""
-    return (*imported.notes, *(x.says for x in imported.beside))
 
 
 def written(source: str | os.PathLike[str]) -> Model:
