@@ -54,13 +54,7 @@ _COMMAND: Final = re.compile(
     r"vec|acute|grave|check|breve|overline|underline|mathrm|mathbf|mathit|mathsf|mathtt|mathcal|mathbb|mathscr|mathfrak|"
     r"boldsymbol|text|textrm|operatorname|prime|circ|parallel|perp|star|ast|dagger)(?![A-Za-z])"
 )
-_TEX: Final = {
-    "\\": r"\backslash ",
-    "^": r"{\wedge}",
-    "~": r"{\sim}",
-    " ": r"\ ",
-    **{c: f"\\{c}" for c in "{}$%#&_"},
-}
+_TEX: Final = {"\\": r"\backslash ", "^": r"{\wedge}", "~": r"{\sim}", " ": r"\ ", **{c: f"\\{c}" for c in "{}$%#&_"}}
 
 
 def latex(name: str, ordinary: Callable[[str], str]) -> str:

@@ -36,12 +36,7 @@ def pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81
 
 @system
 def double_pendulum(
-    *,
-    length1: Number = 1.0,
-    mass1: Number = 1.0,
-    length2: Number = 1.0,
-    mass2: Number = 1.0,
-    gravity: Number = 9.81,
+    *, length1: Number = 1.0, mass1: Number = 1.0, length2: Number = 1.0, mass2: Number = 1.0, gravity: Number = 9.81
 ) -> Model:
     """Return two point masses on massless rods, one below the other.
 
@@ -142,13 +137,7 @@ def elastic_pendulum(
     b.add_body("bob", mass=mass, com=(0.0, 0.0, -length))
     b.add_joint("theta", "continuous", parent="world", child="rod", axis=SWING)
     b.add_joint(
-        "stretch",
-        "prismatic",
-        parent="rod",
-        child="bob",
-        axis=(0.0, 0.0, -1.0),
-        lower=lower,
-        stiffness=stiffness,
+        "stretch", "prismatic", parent="rod", child="bob", axis=(0.0, 0.0, -1.0), lower=lower, stiffness=stiffness
     )
     b.add_frame("tip", body="bob", translation=(0.0, 0.0, -length))
     return b.build()

@@ -104,13 +104,7 @@ def clamped_beam(
     """
     b = ModelBuilder("clamped_beam", gravity=(0.0, 0.0, 0.0))
     _add_beam(
-        b,
-        "bend",
-        segments=segments,
-        length=length,
-        mass=mass,
-        bending_stiffness=bending_stiffness,
-        parent="world",
+        b, "bend", segments=segments, length=length, mass=mass, bending_stiffness=bending_stiffness, parent="world"
     )
     return b.build()
 

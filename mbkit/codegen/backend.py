@@ -38,7 +38,7 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
     Without a compiler a `NoCompilerWarning` says so once, and CasADi's interpreter runs it, as it does very large
     functions.
     """
-    if not compile or not _compiler():
+    if not compile or not has_compiler():
         return Machine(make())
     # Loads LLVM, which interpreting never needs.
     from mbkit.codegen.compiled import compiled
@@ -61,13 +61,9 @@ class _TooLargeError(Exception):
         self.function = function
 
 
+@cache
 def has_compiler() -> bool:
     """Return whether functions can be compiled; where not, a `NoCompilerWarning` says so once."""
-    return _compiler()
-
-
-@cache
-def _compiler() -> bool:
     if importlib.util.find_spec("llvmlite") is not None:
         return True
     warnings.warn(

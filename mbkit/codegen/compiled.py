@@ -211,12 +211,7 @@ def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
 def _compile(make: Callable[[], ca.Function]) -> tuple[dict[str, Any], bytes]:
     derived = program(make())
     code, work = jit.program_object(derived)
-    return {
-        "inputs": derived.inputs,
-        "shapes": derived.shapes,
-        "operations": derived.arithmetic,
-        "work": work,
-    }, code
+    return {"inputs": derived.inputs, "shapes": derived.shapes, "operations": derived.arithmetic, "work": work}, code
 
 
 #: Functions in use in this process.

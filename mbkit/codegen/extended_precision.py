@@ -22,24 +22,8 @@ BITS: Final = 113
 
 #: Functions' names in C -> in NumPy.
 _FUNCTIONS: Final = {
-    "sqrt": "sqrt",
-    "sin": "sin",
-    "cos": "cos",
-    "tan": "tan",
-    "asin": "arcsin",
-    "acos": "arccos",
-    "atan": "arctan",
-    "atan2": "arctan2",
-    "exp": "exp",
-    "expm1": "expm1",
-    "log": "log",
-    "log1p": "log1p",
-    "sinh": "sinh",
-    "cosh": "cosh",
-    "tanh": "tanh",
-    "asinh": "arcsinh",
-    "acosh": "arccosh",
-    "atanh": "arctanh",
+    **{f: f for f in ("sqrt", "sin", "cos", "tan", "exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh")},
+    **{f"a{f}": f"arc{f}" for f in ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")},
     "pow": "power",
 }
 #: Beyond it binary128 has no numbers, nor anything between 0 and its inverse.

@@ -199,23 +199,9 @@ slow:
 
 #: Operation, which is its name in C too -> number of arguments.
 CALLS: Final = {
-    "tan": 1,
-    "asin": 1,
-    "acos": 1,
-    "atan": 1,
-    "exp": 1,
-    "expm1": 1,
-    "log": 1,
-    "log1p": 1,
-    "sinh": 1,
-    "cosh": 1,
-    "tanh": 1,
-    "asinh": 1,
-    "acosh": 1,
-    "atanh": 1,
-    "atan2": 2,
-    "pow": 2,
-    "hypot": 2,
+    **dict.fromkeys(("tan", "asin", "acos", "atan", "exp", "expm1", "log", "log1p"), 1),
+    **dict.fromkeys(("sinh", "cosh", "tanh", "asinh", "acosh", "atanh"), 1),
+    **dict.fromkeys(("atan2", "pow", "hypot"), 2),
 }
 
 

@@ -17,57 +17,24 @@ from numpy.typing import NDArray
 
 from mbkit.errors import UnsupportedError
 
+_NAMES_UNARY: Final = (
+    *("neg", "sq", "twice", "inv", "fabs", "sign", "not", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan"),
+    *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
+_NAMES_BINARY: Final = (
+    *("add", "sub", "mul", "div", "pow", "hypot", "atan2", "fmin", "fmax"),
+    *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
+)
 #: CasADi's codes -> our names, of the operations that every backend knows.
-_UNARY: Final = {
-    ca.OP_NEG: "neg",
-    ca.OP_SQ: "sq",
-    ca.OP_TWICE: "twice",
-    ca.OP_INV: "inv",
-    ca.OP_FABS: "fabs",
-    ca.OP_SIGN: "sign",
-    ca.OP_NOT: "not",
-    ca.OP_SQRT: "sqrt",
-    ca.OP_SIN: "sin",
-    ca.OP_COS: "cos",
-    ca.OP_TAN: "tan",
-    ca.OP_ASIN: "asin",
-    ca.OP_ACOS: "acos",
-    ca.OP_ATAN: "atan",
-    ca.OP_EXP: "exp",
-    ca.OP_EXPM1: "expm1",
-    ca.OP_LOG: "log",
-    ca.OP_LOG1P: "log1p",
-    ca.OP_SINH: "sinh",
-    ca.OP_COSH: "cosh",
-    ca.OP_TANH: "tanh",
-    ca.OP_ASINH: "asinh",
-    ca.OP_ACOSH: "acosh",
-    ca.OP_ATANH: "atanh",
-}
-_BINARY: Final = {
-    ca.OP_ADD: "add",
-    ca.OP_SUB: "sub",
-    ca.OP_MUL: "mul",
-    ca.OP_DIV: "div",
-    ca.OP_POW: "pow",
-    ca.OP_CONSTPOW: "pow",
-    ca.OP_HYPOT: "hypot",
-    ca.OP_ATAN2: "atan2",
-    ca.OP_FMIN: "fmin",
-    ca.OP_FMAX: "fmax",
-    ca.OP_LT: "lt",
-    ca.OP_LE: "le",
-    ca.OP_EQ: "eq",
-    ca.OP_NE: "ne",
-    ca.OP_AND: "and",
-    ca.OP_OR: "or",
-    ca.OP_IF_ELSE_ZERO: "if_else_zero",
+_UNARY: Final[dict[int, str]] = {getattr(ca, f"OP_{name.upper()}"): name for name in _NAMES_UNARY}
+_BINARY: Final[dict[int, str]] = {getattr(ca, f"OP_{name.upper()}"): name for name in _NAMES_BINARY} | {
+    ca.OP_CONSTPOW: "pow"
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One scalar operation: an input, a constant, or one of `_UNARY` and `_BINARY`.
+    """One scalar operation: an input, a constant, or one of `_NAMES_UNARY` and `_NAMES_BINARY`.
 
     Decisions are 1 or 0; if_else_zero is b where a is not 0, else 0. fmin and fmax propagate NaN; every comparison with
     NaN is false except ne, and in a logical operation NaN counts as true, as in C.

@@ -209,11 +209,7 @@ def _taylor_series(problem: Problem, times: Array, _wanted: float, seconds: floa
 # eps cond(M) of what acts.
 
 #: Method of `Dynamics` -> its arguments, fields of `States`.
-TERMS: Final = {
-    "mass_matrix": ("q",),
-    "inverse_dynamics": ("q", "v", "a"),
-    "forward_dynamics": ("q", "v", "tau"),
-}
+TERMS: Final = {"mass_matrix": ("q",), "inverse_dynamics": ("q", "v", "a"), "forward_dynamics": ("q", "v", "tau")}
 #: Beyond this condition number doubles do not know the smallest eigenvalue of a matrix.
 _MAX_DOUBLE_CONDITION: Final = 1e15
 #: Columns of an inverse that are computed side by side.

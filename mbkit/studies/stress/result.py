@@ -206,10 +206,6 @@ class StressResult(ResultTable):
         return f"<StressResult of {len(self.cases)} case{plural}: {outcomes or 'nothing run'}>"
 
 
-def _text(x: float | None) -> str:
-    return "" if x is None else f"{x:g}"
-
-
 def _bar(case: CaseResult, other: float | None) -> float:
     return case.bar if other is None else real("bar", other, positive=True)
 
