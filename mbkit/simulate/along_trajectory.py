@@ -25,26 +25,14 @@ __all__ = [
 ]
 
 
-# States at a time: the matrices of a long run would fill the memory.
+# States at once: the matrices of a long run would fill the memory.
 _MANY: Final = 4096
 
 
 def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array], *states: Array) -> Array:
-    """Return evaluate(dyn, q, v, ...) at each state; NaN where one is none.
+    """Return evaluate(dyn, q, v, ...), of a shape, at states (K, ·) or (N, K, ·); NaN where one is not finite.
 
-    Parameters
-    ----------
-    dyn : Dynamics
-        Of a model in which time enters, with one sample for each state (`mbkit.engines.base.at_times`).
-    shape : tuple of int
-        Of the quantity at one state.
-    evaluate : callable
-        Of the dynamics and (n, ·) arrays.
-    *states : (K, ·) or (N, K, ·) arrays
-
-    Returns
-    -------
-    (K, ...) or (N, K, ...) array
+    Where time enters the model, `dyn` has one sample for each state (`mbkit.engines.base.at_times`).
     """
     lead = states[0].shape[:-1]
     flat = [x.reshape(-1, x.shape[-1]) for x in states]
@@ -61,19 +49,16 @@ def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array],
 
 
 def moved(model: Model, q: Array, u: Array) -> Array:
-    """Return `model.integrate(q, u)` on any number of leading axes; NaN where a state is none."""
+    """Return `model.integrate(q, u)` on any number of leading axes; NaN where a state is not finite."""
     out = np.full(q.shape, np.nan)
     good = np.isfinite(q).all(-1) & np.isfinite(u).all(-1)
     out[good] = model.integrate(q[good], u[good])
     return out
 
 
-# Energies along a run, the work that was done on it, and whether they fit.
-#
-# The work is ∫ (τ + τ_damping)·v dt; springs and gravity are in the potential energy.
+# Energies and work along a run. The work is ∫ (τ + τ_damping)·v dt; springs and gravity are in the potential energy.
 
-# Of an interval: far enough from the state for a difference that loses a third of the
-# digits of a term that is h/12 of the whole, near enough to be that of a parabola.
+# Part of an interval for differences: they lose a third of the digits of a term that is h/12 of the whole.
 _NEAR: Final = 1e-4
 
 
@@ -93,11 +78,9 @@ def potential_energy(dyn: Dynamics, q: Array) -> Array:
 def work(dyn: Dynamics, t: Array, q: Array, v: Array, force: PiecewiseConstantTorque | SampledTorque | None) -> Array:
     """Return the work of τ and of dampers since the first state; (K,) or (N, K).
 
-    A force that was held does τ·Δq over each interval, exactly, where v = q̇. On
-    quasi-velocities, and for dampers, the interval's rule is the trapezoid's with its
-    end correction, h/2 (p₀ + p₁) + h²/12 (ṗ₀ - ṗ₁), of fourth order, which no jump of
-    the force at its ends disturbs. A force that is known at the states alone is
-    integrated by the cubic through four of them, of fourth order too where it is smooth.
+    A held force does τ·Δq over each interval, exactly, where v = q̇. On quasi-velocities and for dampers it is the
+    trapezoid's rule with its end correction, h/2 (p₀ + p₁) + h²/12 (ṗ₀ - ṗ₁), of fourth order. A force that is known
+    at the states alone is integrated by the cubic through four of them.
     """
     h = np.diff(t)
     if isinstance(force, SampledTorque):
@@ -132,7 +115,7 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, tau: Array) -> Array:
 
 
 def _corrected(h: Array, start: tuple[Array, Array], end: tuple[Array, Array]) -> Array:
-    """Return the integral over an interval of what has these values and rates at its ends."""
+    """Return the integral over an interval from values and rates at its ends."""
     return np.asarray(h / 2 * (start[0] + end[0]) + h**2 / 12 * (start[1] - end[1]))
 
 
@@ -152,7 +135,7 @@ def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
         return np.zeros(v.shape)
     if not dyn.model.has_bodies:
         return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v), q, v)
-    # Springs are what is left of the passive force at rest.
+    # At rest the passive force is that of springs.
     return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v) - own.passive(q, np.zeros_like(v)), q, v)
 
 
@@ -169,11 +152,7 @@ def _plain(model: Model) -> list[tuple[int, int]]:
 
 
 def _by_cubics(t: Array, p: Array) -> Array:
-    """Return ∫ p dt over each interval, by the cubic through the four states about it.
-
-    At the ends these are the first or last four; of fewer states, the parabola's
-    or the trapezoid's rule.
-    """
+    """Return ∫ p dt over each interval, by the cubic through four states near it, or fewer where there are fewer."""
     n = len(t)
     if n < 2:
         return np.zeros((*p.shape[:-1], 0))

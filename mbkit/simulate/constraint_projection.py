@@ -1,12 +1,9 @@
-"""Runs under constraints: from consistent states, along consistent states.
+"""Runs under constraints: projection of their states onto f = 0 and ḟ = 0.
 
-The equation itself holds f̈ = 0 only, so that f and ḟ drift off as any other error of a
-method does. One-step methods go on from each state's foot on the constraints, by
-Newton's iteration with the mass matrix as the weight; it moves a state by what the step's
-own error is, so that their order stays. Near a singular pose explicit ones evaluate their stages on the constraints
-too: f̈ = 0 alone divides what a stage is off by J's smallest singular value, which is zero at the pose, through which
-the motion on the constraints is smooth as a rule. Multistep methods (BDF, LSODA, CVODES) have a
-history that a move would spoil: of them the states that are kept are brought back.
+The equation of motion holds f̈ = 0 only, so that f and ḟ drift. One-step methods project each step's end, by Newton's
+iteration with the mass matrix as the weight; it moves a state by the step's own error, so that the order stays. Near a
+singular pose explicit methods project their stages too, since f̈ = 0 divides their errors by J's smallest singular
+value. A projection would spoil the history of multistep methods (BDF, LSODA, CVODES): only their kept states have it.
 """
 
 from __future__ import annotations
@@ -47,17 +44,10 @@ _TAKES_PART: Final = 0.1
 
 
 def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array, Array]:
-    """Return initial states, at a time, freed of rounding.
-
-    Raises
-    ------
-    InputError
-        One is inconsistent, with the residuals; or the constraints themselves are no
-        independent set.
-    """
+    """Return initial states without rounding; an `InputError` where one or the constraints are inconsistent."""
     if not dyn.model.constrained:
         return q, v
-    # This and what follows loads CasADi.
+    # These imports load CasADi.
     from mbkit.lagrangian.constraints.manifold import manifold_of
     from mbkit.lagrangian.constraints.redundancy import refuse_unreachable, require_independent
 
@@ -73,7 +63,7 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
 
 
 def settled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return the consistent states beside those that a step has led to."""
+    """Return the consistent states near the ends of a step."""
     from mbkit.lagrangian.constraints.manifold import manifold_of
 
     return manifold_of(dyn).at(t).pulled(q, v)
@@ -90,10 +80,7 @@ def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
 class Approach:
     """Whether a run comes near a singular pose, by the smallest singular value of J at the ends of its last two steps.
 
-    Attributes
-    ----------
-    near : bool
-        Whether it would be zero within a few steps, of any state of a batch. True until two steps have shown the pace.
+    `near` is whether it would be zero within a few steps, of any state of a batch; true until two steps are known.
     """
 
     def __init__(self) -> None:
@@ -111,14 +98,9 @@ class Approach:
 
 
 class SingularPoses:
-    """The singular poses that one trajectory passes, found from J's smallest singular value at the ends of steps.
+    """The singular poses that one trajectory passes, by J's smallest singular value at the ends of steps.
 
-    The value itself is positive on both sides. Through a singular pose it is smooth once its sign is changed there.
-
-    Parameters
-    ----------
-    dyn : Dynamics
-        Of one trajectory.
+    Through a singular pose the value is smooth once its sign is changed there.
     """
 
     def __init__(self, dyn: Dynamics) -> None:
@@ -153,7 +135,7 @@ class SingularPoses:
             self._rows = np.flatnonzero(np.abs(self._seen[nearest][2]) > _TAKES_PART).tolist()
             self.times.append(float(times[1] + within[0]))
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """Return the poses in a sentence; empty where there are none."""
         if not self.times:
             return ""
@@ -167,7 +149,7 @@ class SingularPoses:
 
 
 def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
-    """Return what was kept of a run, with consistent states."""
+    """Return a run with its kept states projected onto the constraints."""
     if not dyn.model.constrained or not outcome.q.size:
         return outcome
     from mbkit.lagrangian.constraints.manifold import manifold_of
@@ -187,7 +169,7 @@ def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
 
 
 def refuse_constraints(dyn: Dynamics, method: str, why: str) -> None:
-    """Say that a method does not run under constraints."""
+    """Raise where a method does not run under constraints."""
     if dyn.model.constrained:
         raise UnsupportedError(
             f"{method}: {dyn.model.name} has constraints, {why}; {IMPLICIT_METHODS} are the implicit methods "

@@ -91,28 +91,18 @@ class Hit:
 
 
 class Watch:
-    """Looks for events along one trajectory.
-
-    Parameters
-    ----------
-    events : sequence of Event
-    member : int, optional
-        Of a batch.
-    """
+    """Search for events along one trajectory (of a batch)."""
 
     def __init__(self, events: Sequence[Event], member: int | None = None) -> None:
         self._events, self._member = tuple(events), member
         self._t, self._values = 0.0, [0.0] * len(self._events)
 
     def start(self, t: float, q: Array, v: Array) -> None:
-        """Begin at a state; a function that is zero there crosses only when it is zero again."""
+        """Begin at a state; a function that is zero there crosses when it is zero again."""
         self._t, self._values = t, [self._value(event, t, (q, v)) for event in self._events]
 
     def look(self, t1: float, state: State) -> tuple[list[Hit], Hit | None]:
-        """Return the crossings since the last look, in time's order, and the first that ends the run.
-
-        Nothing after the latter is returned.
-        """
+        """Return the crossings since the last look, in order, up to the first that ends the run, and that one."""
         there = state(t1)
         values = [self._value(event, t1, there) for event in self._events]
         found: list[tuple[float, int]] = []
@@ -140,7 +130,7 @@ class Watch:
             return t1
         from scipy.optimize import brentq
 
-        # At the ends it is what it was found to be, whatever an interpolant rounds there to.
+        # An interpolant may round to another sign at the ends.
         known = {self._t: before, t1: after}
         eps = float(np.finfo(float).eps)
         root = brentq(
@@ -159,7 +149,7 @@ def _crosses(before: float, after: float, direction: int) -> bool:
 
 
 def as_events(events: object) -> tuple[Event, ...]:
-    """Return what a caller gave as events: one, several, or functions."""
+    """Return the argument `events` as a tuple: one, several, or functions."""
     if events is None:
         return ()
     if isinstance(events, Event) or callable(events):
@@ -219,10 +209,10 @@ def at_section(
     return _passes(i, value, direction, f"{coordinate} = {value:g}", terminal)
 
 
-def _require(what: str, given: object, kind: type) -> None:
-    if not isinstance(given, kind):
+def _require(what: str, value: object, kind: type) -> None:
+    if not isinstance(value, kind):
         makes = "mbkit.load(...)" if kind is Model else "mbkit.dynamics(model, engine)"
-        raise InputError(f"{what}: expected a {kind.__name__}, got {type(given).__name__}; {makes} makes one")
+        raise InputError(f"{what}: expected a {kind.__name__}, got {type(value).__name__}; {makes} makes one")
 
 
 def _passes(i: int, value: float, direction: int, name: str, terminal: bool = True) -> Event:

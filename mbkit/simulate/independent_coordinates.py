@@ -1,11 +1,8 @@
-"""Runs on independent coordinates: from chart to chart, with a look for singular poses.
+"""Runs on independent coordinates, from chart to chart.
 
-With a tolerance, a change of the chart and the way into a singular pose are events of
-the run. With a fixed step the run goes in blocks of steps; one in which the chart wears
-out ends where it does, and the steps behind are made anew on the next chart.
-
-No choice of coordinates serves at a singular pose, where the constraints depend on each other. The run goes through it
-on all coordinates, with multipliers, and back onto a chart behind it.
+With a tolerance, a change of the chart and the way into a singular pose are events of the run. With a fixed step the
+run goes in blocks of steps; a block ends where its chart is worn. At a singular pose the constraints depend on each
+other and no chart serves: the run goes through it on all coordinates, with multipliers.
 """
 
 from __future__ import annotations
@@ -43,15 +40,14 @@ _NEAR: Final = "near a singular pose"
 _BLOCK: Final = 100
 # How far behind a singular pose charts serve again, in terms of how near they end.
 _FAR: Final = 20
-# What a singular pose itself is taken for.
+# Least measure, whose logarithm is taken.
 _LEAST: Final = 1e-16
-# More changes than this without progress are no motion any more.
 _MOST: Final = 10_000
 
 
 @dataclass
 class _Run:
-    """What has come of a run so far, on all coordinates."""
+    """A run so far, on all coordinates."""
 
     poses: SingularPoses
     t: list[float] = field(default_factory=list)
@@ -130,7 +126,7 @@ def integrate_on_charts(
             MbkitWarning,
         )
     end = start + duration if run.ended == "finished" else run.t[-1] if run.t else start
-    doubts = (run.poses.told(),) if run.poses.times else ()
+    doubts = (run.poses.describe(),) if run.poses.times else ()
     seconds = time.perf_counter() - started
     stats = Stats(run.steps, run.evaluations, seconds, run.ended, end, run.message, run.rejected, doubts=doubts)
     states = np.array(run.t), np.array(run.q).reshape(-1, model.nq), np.array(run.v).reshape(-1, model.nq)
@@ -143,7 +139,7 @@ _Part = tuple[RunData, FunctionError | None]
 
 @dataclass
 class _Way:
-    """Configurations on the way of a part, of which later ones follow: a place far off may lie on another branch."""
+    """Configurations along a part. Later ones start from them, since a place far off may lie on another branch."""
 
     dyn: EmbeddedDynamics
     times: list[float]
@@ -152,7 +148,7 @@ class _Way:
     poses: SingularPoses
 
     def passed(self, t: float, u: Array) -> Array:
-        """Return the configuration at a step's end, or near it, and note it."""
+        """Return the configuration at or near a step's end, and keep it."""
         if self.times and self.times[-1] == t:
             return self.places[-1]
         q = _at(self.dyn, t).configuration(u)
@@ -163,14 +159,14 @@ class _Way:
         return q
 
     def state(self, t: float, u: Array, w: Array) -> tuple[Array, Array]:
-        """Return q and v at a time of the part, reached from the nearest configuration that was noted."""
+        """Return q and v at a time of the part, from the nearest kept configuration."""
         near = int(np.abs(np.array(self.times) - t).argmin())
         _at(self.dyn, self.times[near]).remember(self.places[near])
         return _at(self.dyn, t).state(u, w)
 
 
 class _Whole:
-    """The same on all coordinates, where a part needs no chart."""
+    """As `_Way`, of a part on all coordinates."""
 
     def state(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:  # noqa: ARG002  # as of `_Way`
         """Return q and v."""
@@ -197,7 +193,7 @@ def _part(
     dyn: Dynamics, q: Array, v: Array, chart: Chart | None, *given: Any, **more: Any
 ) -> tuple[RunData, FunctionError | None]:
     with warnings.catch_warnings():
-        # The run as a whole tells how it ended.
+        # The whole run warns of its end.
         warnings.simplefilter("ignore", MbkitWarning)
         start = (q, v) if chart is None else (q[chart.independent], v[chart.independent])
         return integrate(dyn, *start, *given, **{"t0": 0.0, **more})
@@ -285,7 +281,7 @@ def _begun(
     force: Force,
     events: Sequence[Event],
 ) -> tuple[Chart | None, _Way | _Whole, Dynamics, Any, list[Event]]:
-    """Return the chart, the way, the dynamics, the force and the events of a part; of one without a chart too."""
+    """Return the chart, the way, the dynamics, the force and the events of a part."""
     if chart is None:
 
         def acting(s: float, q: Array, v: Array) -> Array:
@@ -313,7 +309,7 @@ def _take(
     begin: float,
     left: list[float] | None,
 ) -> str:
-    """Take in a part; return why the run goes on from its end on another chart, or nothing."""
+    """Add a part; return why the run goes on from its end on another chart, or nothing."""
     run.count(part)
     name = part.events[-1].name if part.stats.ended == "event" else ""
     worn = name == _WORN or (name == _NEAR and _passes(system))
@@ -378,7 +374,7 @@ def _watch(system: Embedded, chart: Chart, way: _Way, begin: float, what: str) -
             value = 0.0
         return float(np.log(max(value, _LEAST) / limit))
 
-    # On a choice that stays, the motion beyond the pose is another one than that which comes out.
+    # On coordinates that stay, the motion beyond the pose would come out wrong.
     return Event(function, what, direction=-1, terminal=what == _WORN or system.model.time_parameter is None)
 
 

@@ -236,9 +236,8 @@ def _adaptive(
     times = None if save is None else save_times(save, start, start + duration)
     whole = times is not None and times[0] == start and times[-1] == start + duration
     read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
-    given = dyn, method.name, q, v, start, duration, tolerances, read, times, events, bar
-    outcome = solver_of(method)(IntegrationProblem(*given))
-    return read.applied(times), outcome
+    problem = IntegrationProblem(dyn, method.name, q, v, start, duration, tolerances, read, times, events, bar)
+    return read.applied(times), solver_of(method)(problem)
 
 
 def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float | None) -> Tolerances:

@@ -21,37 +21,19 @@ __all__ = ["IntegrationProblem"]
 
 @dataclass(frozen=True, eq=False)
 class IntegrationProblem:
-    """States to integrate, and how.
-
-    Attributes
-    ----------
-    dyn : Dynamics
-    method : str
-        Its name.
-    q0, v0 : (nq,) or (N, nq), (nv,) or (N, nv) arrays
-    start, duration : float
-        Time of the states, and how long they move, s.
-    tolerances : Tolerances
-    torque : Torque
-    save : (K,) array or None
-        Times to keep; None for the method's own.
-    events : tuple of Event
-    bar : Progress
-
-    Raises
-    ------
-    InputError
-        What is to be kept does not fit in memory.
-    """
+    """States to integrate, and how."""
 
     dyn: Dynamics
     method: str
+    # (nq,) or (N, nq), and (nv,) or (N, nv).
     q0: Array
     v0: Array
+    # s
     start: float
     duration: float
     tolerances: Tolerances
     torque: Torque
+    # Times to keep; None for the method's own.
     save: Array | None
     events: tuple[Event, ...]
     bar: Progress
@@ -66,36 +48,30 @@ class IntegrationProblem:
 
     @property
     def batch(self) -> int | None:
-        """How many states; None for one that is not in a batch."""
+        """Number of states; None for one that is not in a batch."""
         return None if self.q0.ndim == 1 else len(self.q0)
 
     @property
     def q(self) -> Array:
-        """Where each begins, (N, nq)."""
+        """Configurations at the start, (N, nq)."""
         return np.atleast_2d(self.q0)
 
     @property
     def v(self) -> Array:
-        """How fast each begins, (N, nv)."""
+        """Velocities at the start, (N, nv)."""
         return np.atleast_2d(self.v0)
 
     @property
     def y(self) -> Array:
-        """Both in a row, (N, nq + nv)."""
+        """States at the start, (N, nq + nv)."""
         return np.concatenate([self.q, self.v], axis=1)
 
     def member(self, i: int) -> int | None:
         """Return the place of the i-th state in the batch, None where there is none."""
         return None if self.batch is None else i
 
-    def told(self) -> tuple[Array, Array]:
-        """Return the times to keep, and those to go through from the start to the end.
-
-        Raises
-        ------
-        InputError
-            None are given, and the method does not tell its own.
-        """
+    def saved_times(self) -> tuple[Array, Array]:
+        """Return the times to keep, and those to go through from the start to the end."""
         if self.save is None:
             raise InputError(
                 f"save: {self.method} does not tell its own steps; give the times to keep, "
@@ -104,5 +80,5 @@ class IntegrationProblem:
         return self.save, np.array([self.start, *sorted({*self.save.tolist(), self.end} - {self.start})])
 
     def report(self, i: int) -> Callable[[float], None]:
-        """Return what is told the time that the i-th state has reached."""
+        """Return a function that reports the time that the i-th state has reached."""
         return reporter(self.bar, i, len(self.q), self.start, self.duration)

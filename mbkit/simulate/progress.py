@@ -1,4 +1,4 @@
-"""Telling how far a run is: a bar on the terminal, or a call."""
+"""Progress of a run: a bar on the terminal, or a call."""
 
 from __future__ import annotations
 
@@ -19,16 +19,7 @@ _PATIENCE = 2.0  # s before a bar appears
 
 
 class Progress:
-    """A context manager whose `update` is cheap enough for every step.
-
-    Parameters
-    ----------
-    wanted : None, bool or callable
-        Nothing; a bar once the run takes more than 2 s; or a function that gets
-        the fraction done, at most ten times a second and at the end.
-    label : str
-        What the bar is named.
-    """
+    """Nothing, a bar once the run takes more than 2 s, or calls of a function, at most ten a second and at the end."""
 
     def __init__(self, wanted: bool | ProgressFunction | None, label: str) -> None:
         if wanted is not None and not isinstance(wanted, bool) and not callable(wanted):
@@ -47,9 +38,9 @@ class Progress:
         self._done = fraction
         if self._wanted and (now := time.perf_counter()) >= self._next:
             self._next = now + _PERIOD
-            self._tell()
+            self._show()
 
-    def _tell(self) -> None:
+    def _show(self) -> None:
         if callable(self._wanted):
             self._wanted(self._done)
             return
@@ -71,9 +62,5 @@ class Progress:
 
 
 def reporter(bar: Progress, i: int, count: int, start: float, duration: float) -> Callable[[float], None]:
-    """Return what tells how far the i-th trajectory is, by its time."""
-
-    def done(t: float) -> None:
-        bar.update((i + (t - start) / duration) / count)
-
-    return done
+    """Return a function that reports the time that the i-th of `count` trajectories has reached."""
+    return lambda t: bar.update((i + (t - start) / duration) / count)

@@ -1,4 +1,4 @@
-"""What an integrator hands back to `simulate`."""
+"""Result of a solver, and the cost and end of a run."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from mbkit.simulate.events import Hit
 
 __all__ = ["Ended", "SolverResult", "Stats"]
 
-
-# What a run cost and how it ended.
 
 Ended = Literal["finished", "event", "diverged", "step_too_small", "function_failed"]
 

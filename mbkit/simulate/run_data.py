@@ -23,23 +23,14 @@ __all__ = ["RunData", "RunSettings"]
 
 @dataclass(frozen=True, eq=False)
 class RunSettings:
-    """What a run was started with, for checks afterwards.
-
-    Attributes
-    ----------
-    t0 : float
-        s.
-    q0, v0 : (nq,) or (N, nq), (nv,) or (N, nv) arrays
-    setting : float or Tolerances
-        The step, s, or the tolerances of an adaptive method.
-    doubts : tuple of str
-        Those of the solver itself.
-    """
+    """What a run was started with, for checks afterwards."""
 
     t0: float
     q0: Array
     v0: Array
+    # The step, s, or the tolerances of an adaptive method.
     setting: float | Tolerances
+    # Those of the solver itself.
     doubts: tuple[str, ...]
 
     def with_start(self, t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -69,14 +60,13 @@ class RunData:
     def __post_init__(self) -> None:
         for name in ("t", "q", "v"):
             array = getattr(self, name)
-            # One that is read-only and its own is as good as a copy.
             if array.flags.writeable or array.base is not None or not array.flags.c_contiguous:
                 array = np.array(array, order="C")
                 array.setflags(write=False)
             object.__setattr__(self, name, array)
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
-        # An engine that a name can make is not sent along: a process pool would derive it for every trajectory.
+        # A process pool would derive an engine that is sent along for every trajectory.
         known = self.engine in ENGINES and (self._dyn is None or self._dyn.samples is None)
         applied = self._applied
         if isinstance(applied, TorqueCallback):

@@ -1,4 +1,4 @@
-"""The times of a run: steps that end exactly at the end, and which of them are kept."""
+"""The times of a run: its steps, and the kept ones."""
 
 from __future__ import annotations
 
@@ -24,21 +24,14 @@ _ROOM = 2**30
 
 @dataclass(frozen=True)
 class Grid:
-    """Equal steps of `dt` from `start` to `end`, the last one shortened if it must be.
+    """Equal steps of `dt` from `start` to `end`, the last one shortened if it must be."""
 
-    Attributes
-    ----------
-    start, end : float
-        First and last time, s.
-    dt, last : float
-        Length of every step, and of the last one, s.
-    steps : int
-    """
-
+    # s
     start: float
     end: float
     dt: float
     steps: int
+    # Length of the last step, s.
     last: float
 
     @classmethod
@@ -74,14 +67,9 @@ class Grid:
         return (end - first - 1) * self.dt + self.step(end - 1)
 
     def kept(self, save: ArrayLike | int | None, numbers: int) -> Indices:
-        """Return the indices of the states to keep.
+        """Return the indices of the states to keep: all, every n-th and the last, or those at some times.
 
-        Parameters
-        ----------
-        save : None, int or (K,) array_like
-            All; every n-th and the last; or the states at these times.
-        numbers : int
-            What one state holds, to refuse what no memory does.
+        A state has so many numbers; more than fit in memory are refused.
         """
         if save is None:
             return self._every(1, numbers)

@@ -24,16 +24,11 @@ TorqueFunction = Callable[[float, Array, Array], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class PiecewiseConstantTorque:
-    """A generalized force that is constant, or jumps at known times.
+    """A generalized force that is constant, or jumps at known times."""
 
-    Attributes
-    ----------
-    rows : (nv,), (R, nv) or (N, R, nv) array
-    starts : (R,) array or None
-        When each row begins to act, s; None for a constant.
-    """
-
+    # (nv,), (R, nv) or (N, R, nv)
     rows: Array
+    # When each row begins to act, s; None for a constant.
     starts: Array | None
 
     def at(self, t: Array) -> Array:
@@ -41,13 +36,7 @@ class PiecewiseConstantTorque:
         return self.rows if self.starts is None else self.rows[..., self._row(t), :]
 
     def between(self, t: Array) -> Array:
-        """Return the force between neighbouring times: (nv,), (K - 1, nv) or (N, K - 1, nv).
-
-        Raises
-        ------
-        UnsupportedError
-            The force changes between two of the times.
-        """
+        """Return the force between neighbouring times: (nv,), (K - 1, nv) or (N, K - 1, nv); an error if it changes."""
         if self.starts is None:
             return self.rows
         differ = np.diff(self.rows, axis=-2).any(axis=(0, 2) if self.rows.ndim == 3 else 1)
@@ -76,26 +65,13 @@ class SampledTorque:
 
 @dataclass(frozen=True, eq=False)
 class TorqueCallback:
-    """A user's function of (t, q, v).
-
-    Attributes
-    ----------
-    function : callable
-    nv : int
-        How many numbers it must return.
-    """
+    """A user's function of (t, q, v), which must return nv numbers."""
 
     function: TorqueFunction
     nv: int
 
     def one(self, t: float, q: Array, v: Array, member: int | None = None) -> Array:
-        """Return the force on one state.
-
-        Raises
-        ------
-        TorqueError
-            The function raised, or returned something else than (nv,) finite numbers.
-        """
+        """Return the force on one state; a `TorqueError` where the function raises or returns something else."""
         when = f"at t = {t:.9g} s" + ("" if member is None else f" for trajectory {member}")
         try:
             # Copies: the function may write into them.
@@ -118,10 +94,7 @@ class TorqueCallback:
         return np.array(rows).reshape(-1, self.nv)
 
     def sampled(self, t: Array, q: Array, v: Array, *, strict: bool) -> SampledTorque:
-        """Return the values at the saved states of a run; NaN where a state is not finite.
-
-        With `strict` a function that fails raises; else it leaves NaN.
-        """
+        """Return the values at saved states; NaN where one is not finite or, unless strict, the function fails."""
         out = np.full(v.shape, np.nan)
         for index in np.ndindex(v.shape[:-1]):
             if np.isfinite(q[index]).all() and np.isfinite(v[index]).all():
@@ -144,21 +117,7 @@ Force = Array | Callable[[float, Array, Array], Array]
 class Torque:
     """The argument `torque` of a run, checked, and read step by step.
 
-    Parameters
-    ----------
-    torque : None, (nv,), (steps, nv) or (N, steps, nv) array_like, or callable
-        A callable gets t in s and q, v of one state as copies of its own, and
-        returns (nv,); for a batch it is called once for each state.
-    model : Model
-    batch : int or None
-        Number of trajectories, None for a single state.
-    steps : int or None
-        Rows that an array must have; None where only a constant (nv,) is possible.
-
-    Raises
-    ------
-    InputError
-        An array of wrong shape or not finite; a callable raises `TorqueError` during the run.
+    An array is (nv,), (steps, nv) or (batch, steps, nv); without `steps` only a constant (nv,) is possible.
     """
 
     def __init__(
@@ -242,13 +201,7 @@ class Torque:
         return np.broadcast_to(one, (stop - start, self._nv)).copy()
 
     def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | TorqueCallback | None:
-        """Return the force of a finished run; None where it was zero.
-
-        Parameters
-        ----------
-        bounds : (rows + 1,) array or None
-            Times between which the rows of an array were held, s.
-        """
+        """Return the force of a finished run, whose rows were held between `bounds`, s; None where it was zero."""
         if self._function is not None:
             return TorqueCallback(self._function, self._nv)
         if self._rows is not None:

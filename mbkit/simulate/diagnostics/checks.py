@@ -61,21 +61,8 @@ def diagnostics(
 ) -> list[str]:
     """Return the signs that a run is wrong, each with its measured reason and a remedy.
 
-    Parameters
-    ----------
-    dyn : Dynamics
-    method : Method
-    setting : float or Tolerances
-        The step, s, or the tolerances of an adaptive method.
-    states : (K,), (K, nq) or (N, K, nq), (K, nv) or (N, K, nv) arrays
-        t, q and v, with the start; states that are not finite are passed over.
-    driven : bool
-        Whether a generalized force acted.
-    steps : int
-        Of all trajectories.
-    work : int, optional
-        Evaluations of the run, each counted as the time of one in machine code. Where given, the checks take a few
-        percent of that time: the step is not checked, and energy and mass matrix only where two states are affordable.
+    `states` are t, (N, K, ·) or (K, ·) q and v, with the start. `work` are the run's evaluations, each counted as the
+    time of one in machine code: with it the checks take a few percent of that time, and the step is not checked.
     """
     t, model, quick = states[0], dyn.model, work is not None
     # The oracle's digits are not in doubt, and its terms take long.
@@ -161,10 +148,7 @@ def _fastest(v: Array) -> Array:
 
 
 def energy_drift(samples: list[list[_Sample]], fast: list[Array], damped: bool, most: float) -> Iterator[str]:
-    """Find a change of the energy of a system that nothing drives: it is constant, or with dampers falls.
-
-    Of each trajectory a velocity is given that tells the size of its kinetic energy.
-    """
+    """Find a change of the energy of a system without drive; `fast` has a velocity that sizes T of each trajectory."""
     worst, share = 0.0, most
     for member, velocity in zip(samples, fast, strict=True):
         kinetic, potential = zip(*(one.energy() for one in member), strict=True)
@@ -182,7 +166,7 @@ def energy_drift(samples: list[list[_Sample]], fast: list[Array], damped: bool, 
 
 
 def gimbal_lock(dyn: Dynamics, q: Array) -> Iterator[str]:
-    """Find steps over gimbal lock, after which three angles are those of another sheet."""
+    """Find steps over gimbal lock, after which the three angles may be wrong."""
     if not dyn.model.has_bodies:
         return
     for joint in dyn.model.independent_joints:
@@ -301,7 +285,7 @@ def _keeps_digits(dyn: Dynamics, method: Method) -> bool:
 
 
 def massless_joints(dyn: Dynamics, q: Array) -> str:
-    """Return the end of a message that names the joints which move next to no mass at q; empty where there are none."""
+    """Return the end of a message that names the joints which move next to no mass at q, or nothing."""
     model = dyn.model
     if not model.has_bodies or dyn.samples is not None or not model.nv:
         return ""

@@ -1,12 +1,7 @@
-"""How fast the motions near a state are: the spectrum of the linearized system.
+"""Rates of the motions near a state: the spectrum of the linearized system.
 
-Of a state's small changes (u, w) the equation of motion makes ::
-
-    d/dt (u, w) = J (u, w)      J = [[∂u̇/∂u, ∂u̇/∂w], [∂ẇ/∂u, ∂ẇ/∂w]]
-
-With plain coordinates that is [[0, 1], [∂a/∂q, ∂a/∂v]], and for a stiffness K and a damping C at rest
-[[0, 1], [-M⁻¹K, -M⁻¹C]]. Its eigenvalues λ say what an explicit method's step may be: h|λ| of at most about 5
-for rk853, 2.8 for rk4.
+Small changes (u, w) of a state follow d/dt (u, w) = J (u, w); with plain coordinates J = [[0, 1], [∂a/∂q, ∂a/∂v]]. Its
+eigenvalues λ limit an explicit method's step: h|λ| of at most about 5 for rk853, 2.8 for rk4.
 """
 
 from __future__ import annotations
@@ -90,10 +85,13 @@ class Stiffness:
     def __str__(self) -> str:
         if not len(self.eigenvalues):
             return f"no rate above {self.bound:.2g} 1/s"
-        told = [f"fastest decay {self.decay:.2g} 1/s"] if self.decay > _SHARE * self.rate else []
-        told += [f"fastest oscillation {self.oscillation:.2g} rad/s"] if self.oscillation > _SHARE * self.rate else []
-        told += [f"fastest growth {self.growth:.2g} 1/s"] if self.growth > _SHARE * self.rate else []
-        return ", ".join(told) or "no motion of its own"
+        rates = {
+            "decay": (self.decay, "1/s"),
+            "oscillation": (self.oscillation, "rad/s"),
+            "growth": (self.growth, "1/s"),
+        }
+        parts = [f"fastest {k} {x:.2g} {unit}" for k, (x, unit) in rates.items() if x > _SHARE * self.rate]
+        return ", ".join(parts) or "no motion of its own"
 
     def __repr__(self) -> str:
         which = "" if self.member is None else f" of trajectory {self.member}"
@@ -102,7 +100,7 @@ class Stiffness:
 
 #: Re λ over |λ| above which a motion grows rather than oscillates.
 _GROWS: Final = 0.1
-#: Rates below this part of the fastest are not told.
+#: Rates below this part of the fastest are not shown.
 _SHARE: Final = 1e-3
 #: Rows up to which a norm is not worth its time.
 _SMALL: Final = 20
@@ -152,17 +150,17 @@ def stiffness(
         raise no_dynamics(dyn)
     model = dyn.model
     q, v, t, enough = model.check_q(q), model.check_v(v), real("t", t), real("enough", enough, nonnegative=True)
-    given = tau if callable(tau) else finite_array("tau", np.zeros(model.nv) if tau is None else tau, (model.nv,))
+    torque = tau if callable(tau) else finite_array("tau", np.zeros(model.nv) if tau is None else tau, (model.nv,))
     states, count = batch_of(q=q, v=v), dyn.samples
     if states is not None and count is not None and states != count:
         raise InputError(f"q, v: a batch of {states}, but the parameters' values are {count}")
     count = states if count is None else count
     if count is None:
-        return _of_one(dyn, q, v, given, t, enough, None)
+        return _of_one(dyn, q, v, torque, t, enough, None)
     if not count:
         raise InputError("q: expected at least one state, got an empty batch")
     q, v = np.broadcast_to(q, (count, model.nq)), np.broadcast_to(v, (count, model.nv))
-    found = [_of_one(dyn.of_samples([i]), q[i], v[i], given, t, enough, i) for i in range(count)]
+    found = [_of_one(dyn.of_samples([i]), q[i], v[i], torque, t, enough, i) for i in range(count)]
     return max(found, key=lambda one: one.rate)
 
 
@@ -202,19 +200,15 @@ def _of_one(
 
 
 def stiffness_of(J: Array, enough: float, *, exact: bool, member: int | None = None) -> Stiffness:
-    """Return what a linearized system's matrix tells; see `stiffness`."""
+    """Return the rates of a linearized system's matrix; see `stiffness`."""
     if not np.isfinite(J).all():
         raise NumericalError("stiffness: the accelerations near the state are not finite")
     # Of a small matrix the eigenvalues take no longer than the norm.
     if len(J) > _SMALL and (bound := _bound(J)) <= enough:
         return Stiffness(np.zeros(0, dtype=complex), bound, exact, member)
-    found = _eigenvalues(J)
-    return Stiffness(found, float(np.abs(found).max(initial=0.0)), exact, member)
-
-
-def _eigenvalues(J: Array) -> Array:
     found = np.linalg.eigvals(J).astype(complex)
-    return found[np.argsort(-np.abs(found), kind="stable")]
+    found = found[np.argsort(-np.abs(found), kind="stable")]
+    return Stiffness(found, float(np.abs(found).max(initial=0.0)), exact, member)
 
 
 def _bound(J: Array) -> float:
@@ -226,16 +220,7 @@ def _bound(J: Array) -> float:
 
 
 def linearized(space: Space, q: Array, w: Array, rates: Callable[[Array, Array], Array]) -> Array:
-    """Return J by central differences, (2 nv, 2 nv).
-
-    Parameters
-    ----------
-    space : Space
-    q, w : (nq,) and (nv,) arrays
-        In the integrators' own velocity.
-    rates : callable
-        rates(q, w) -> ẇ of (n, nq) and (n, nv) arrays.
-    """
+    """Return J by central differences, (2 nv, 2 nv); w is the integrators' own velocity, rates(q, w) is ẇ of rows."""
     nv = space.nv
     length = _STEP * np.maximum(1.0, np.abs(space.sizes(q, w)))
     speed = np.full(nv, _WIDE * max(1.0, float(np.abs(w).max(initial=0.0))))

@@ -28,18 +28,7 @@ _TWIN = "_derived_twin"
 
 
 class Linearization:
-    """∂ẏ/∂y of one state, for the right-hand side that `Rates` is.
-
-    Parameters
-    ----------
-    dyn : Dynamics
-        An engine without derivatives gets a twin on the lagrangian one, made once.
-
-    Attributes
-    ----------
-    evaluations : int
-        Jacobians so far.
-    """
+    """∂ẏ/∂y of one state, for the right-hand side `Rates`; `evaluations` counts Jacobians."""
 
     def __init__(self, dyn: Dynamics) -> None:
         self._twin, self._model = _twin(dyn), dyn.model
@@ -57,9 +46,9 @@ class Linearization:
         self._own = self._twin.of_samples([member])
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
-        """Return the Jacobian, (nq + nv, nq + nv); the last one where there is none."""
+        """Return the Jacobian, (nq + nv, nq + nv); the last one where the state is not finite or singular."""
         nq, nv = self._model.nq, self._model.nv
-        # What an iteration tries may be no state; the step from it fails by its rate.
+        # The step from such a state fails by its rate.
         if not np.isfinite(y).all():
             return self._last
         q, lengths = unit_quaternions(self._model, y[:nq])

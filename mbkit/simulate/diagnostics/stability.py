@@ -1,8 +1,4 @@
-"""What one step of a method makes of a linear system: by how much its fastest mode grows.
-
-Of ẍ = A x + B ẋ a step of length h is a matrix on (x, ẋ); the method is stable where its spectral
-radius is at most that of the exact flow (Hairer, Wanner 1996, IV.2).
-"""
+"""Stability of a method's step on a linear system, ẍ = A x + B ẋ (Hairer, Wanner 1996, IV.2)."""
 
 from __future__ import annotations
 
@@ -22,35 +18,15 @@ _BRIEF: Final = 0.01
 
 
 def growth(method: str, h: float, A: Array, B: Array) -> float:
-    """Return by how much a step amplifies the mode that grows most: the spectral radius.
-
-    Parameters
-    ----------
-    method : str
-        With a fixed step.
-    h : float
-        s.
-    A, B : (nv, nv) arrays
-        ∂v̇/∂q along the manifold and ∂v̇/∂v.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> spring, none = np.array([[-1.0]]), np.zeros((1, 1))
-    >>> growth("rk4", 2.8, spring, none) < 1 < growth("rk4", 2.9, spring, none)
-    True
-    >>> growth("semi_implicit_euler", 1.99, spring, none) < 1 + 1e-12
-    True
-    """
+    """Return the spectral radius of a step of h (s); A = ∂v̇/∂q along the manifold, B = ∂v̇/∂v."""
     return float(np.abs(np.linalg.eigvals(_matrix(method, h, A, B))).max())
 
 
 def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[float, complex]:
-    """Return what the modes lose of their phase or amplitude over some time, the worst, and that mode's rate.
+    """Return the largest loss of a mode's phase or amplitude over some time, and that mode's rate.
 
-    A step makes μ of a mode where the exact flow makes exp(h λ); over n steps the mode is off by the factor
-    exp(n (ln μ - h λ)), and of one that decays only as long as there is anything of it; one that is gone soon, with
-    the steps too, is passed over.
+    A step multiplies a mode by μ, the exact flow by exp(h λ); n steps are off by the factor exp(n (ln μ - h λ)). It
+    counts as long as the mode lasts; one that is soon gone is passed over.
 
     Examples
     --------
@@ -61,16 +37,15 @@ def lost(method: str, h: float, A: Array, B: Array, duration: float) -> tuple[fl
     (True, 10.0)
     """
     rates = np.linalg.eigvals(companion(A, B))
-    made = np.linalg.eigvals(_matrix(method, h, A, B))
-    # Beyond a turn a step no phase is its own; and what a step ends has no logarithm.
-    made = np.log(np.where(np.abs(made) > 1e-300, made, 1e-300).astype(complex))
+    steps = np.linalg.eigvals(_matrix(method, h, A, B))
+    # Zero has no logarithm.
+    steps = np.log(np.where(np.abs(steps) > 1e-300, steps, 1e-300).astype(complex))
     exact = h * rates
-    gap = made[None, :] - exact[:, None]
+    gap = steps[None, :] - exact[:, None]
     gap.imag = (gap.imag + np.pi) % (2 * np.pi) - np.pi
     modes, partners = _paired(np.abs(gap))
     off = np.abs(gap[modes, partners])
-    # As long as there is anything of it, in truth or in what the steps made of it.
-    dies = np.minimum(-rates.real[modes], -made.real[partners] / h)
+    dies = np.minimum(-rates.real[modes], -steps.real[partners] / h)
     lasting = np.minimum(duration, 1 / np.maximum(dies, 1e-300))
     part = np.where(lasting < _BRIEF * duration, 0.0, off * lasting / h)
     worst = int(part.argmax())
@@ -87,9 +62,9 @@ def _paired(gap: Array) -> tuple[Array, Array]:
     """Return rows and columns of pairs, the nearest first, each once."""
     rows, columns = np.unravel_index(np.argsort(gap, axis=None, kind="stable"), gap.shape)
     partner: dict[int, int] = {}
-    taken: set[int] = set()
+    paired: set[int] = set()
     for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
-        if row not in partner and column not in taken:
+        if row not in partner and column not in paired:
             partner[row] = column
-            taken.add(column)
+            paired.add(column)
     return np.array(list(partner)), np.array(list(partner.values()))

@@ -1,4 +1,4 @@
-"""A strip of stick figures: the motion at a glance."""
+"""A strip of stick figures."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 __all__ = ["Strip", "picture"]
 
 
-# Figures in windows of one size, side by side.
-
 # Inches, at most.
 _WIDTH: Final = 11.0
 _HEIGHT: Final = 8.0
@@ -37,22 +35,7 @@ _SIDE: Final = [0, 1, 3, 2]
 
 
 class Strip:
-    """A place for each figure.
-
-    Parameters
-    ----------
-    drawn : Skeleton
-        At all times that are drawn.
-    plane : Plane
-    seen : (P, 2) array
-        Points of the plane that every window holds.
-    figures : int
-
-    Attributes
-    ----------
-    size : (float, float)
-        Of the whole, inches.
-    """
+    """Windows of one size, side by side, each of which holds the points `seen`, (P, 2); `size` is in inches."""
 
     def __init__(self, drawn: Skeleton, plane: Plane, seen: Array, figures: int) -> None:
         self._drawn, self._plane, self._figures = drawn, plane, figures
@@ -78,17 +61,7 @@ class Strip:
         return min(range(1, self._figures + 1), key=waste)
 
     def draw(self, axis: Axes, k: int, t: float, since: tuple[int, int]) -> None:
-        """Draw figure k at its time, the figure before it, and the way between them.
-
-        Parameters
-        ----------
-        axis : matplotlib.axes.Axes
-        k : int
-        t : float
-            s.
-        since : (int, int)
-            Indices of the figure before and of this one among the skeleton's times.
-        """
+        """Draw figure k at t (s), the one before it and the path between; `since` are their indices of time."""
         from matplotlib.patches import Rectangle
 
         corner = self._cell * [k % self._columns, -(k // self._columns)]
@@ -142,7 +115,7 @@ class Strip:
         pen.dots(drawn.masses[:, i], color=colour, markersize=8, zorder=z + 0.3)
 
     def frame(self, axis: Axes) -> None:
-        """Set the axis's bounds; tell the scale and the directions."""
+        """Set the axis's bounds; draw the scale and the directions."""
         x, y = self._plane.names
         bar = _round(0.3 * self._window[0])
         bottom = (1 - self._rows) * self._cell[1] - 0.95 * self._gap
@@ -195,7 +168,7 @@ _FAR: Final = 6.0
 
 
 def picture(run: RunData, model: Model, figures: int, view: str | ArrayLike | None, member: int) -> Figure:
-    """Draw what `Trajectory.picture` says, of a model with numbers for its parameters."""
+    """Draw a run of a model with numbers for its parameters; see `Trajectory.picture`."""
     from matplotlib.figure import Figure
 
     figures = count("count", figures, least=1)

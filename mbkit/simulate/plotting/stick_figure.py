@@ -1,7 +1,6 @@
 """A tree as sticks: from joint to joint, and at the ends to the farthest frame or the centre of mass.
 
-Bodies that fixed joints hold together are one link. Places follow from the
-description alone, whatever engine ran.
+Bodies that fixed joints hold together are one link. Places follow from the description alone, without an engine.
 """
 
 from __future__ import annotations
@@ -22,35 +21,19 @@ __all__ = ["Plane", "Skeleton", "plane_of", "skeleton"]
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Points in world axes at n configurations.
+    """Points in world axes at n configurations."""
 
-    Attributes
-    ----------
-    links : (S, 2, n, 3) array
-        Ends of each link's sticks.
-    slides : (S, 2, n, 3) array
-        From where a sliding joint on another link is at zero to where it is.
-    joints : (S, n, 3) array
-    carts : (S, n, 3) array
-        What slides on the ground.
-    masses : (S, n, 3) array
-        Tips of the last links that are centres of mass.
-    anchors : (S, n, 3) array
-        Where the tree stands on the ground, but for carts.
-    boxes : (S, 8, n, 3) array
-        Corners of the box that has the inertia of a body with nothing to draw, x
-        changing slowest.
-    path : (n, 3) array
-        The point whose way is drawn.
-    """
-
+    # (S, 2, n, 3): ends of each link's sticks; a sliding joint on another link from its zero to its place.
     links: Array
     slides: Array
+    # (S, n, 3): joints; bodies that slide on the ground; tips that are centres of mass; feet on the ground.
     joints: Array
     carts: Array
     masses: Array
     anchors: Array
+    # (S, 8, n, 3): corners, x changing slowest, of a box with the inertia of a body with nothing to draw.
     boxes: Array
+    # (n, 3): the point whose path is drawn.
     path: Array
 
     def points(self) -> Array:
@@ -96,7 +79,7 @@ def _placement(joint: Joint, q: Array) -> tuple[Array, Array]:
 
 
 class _Drawn:
-    """What is collected on the way through the tree."""
+    """The parts of a drawn tree."""
 
     def __init__(self, model: Model, poses: dict[str, _Pose], bases: dict[str, _Pose]) -> None:
         self._model, self._poses, self._bases = model, poses, bases
@@ -180,7 +163,7 @@ class _Drawn:
         masses = [self._poses[b].of(self._model.body(b).com) for b in members if self._model.body(b).mass]
         for points, weigh in ((found, False), (masses, True)):
             far = max(points, key=lambda p: float(np.linalg.norm(p[0] - here[0])), default=here)
-            # Below this, lengths of robots are dirt.
+            # Shorter lengths of robots are rounding.
             if np.linalg.norm(far[0] - here[0]) > 1e-6:
                 same = any(np.allclose(far[0], m[0], rtol=0, atol=1e-9) for m in masses)
                 return far, weigh or same
@@ -219,7 +202,7 @@ class Plane:
 
     @property
     def names(self) -> tuple[str, str]:
-        """What the directions are called."""
+        """Names of the directions."""
         return _name(self.right), _name(self.up)
 
 
@@ -231,15 +214,7 @@ def _name(direction: Array) -> str:
 
 
 def plane_of(view: str | ArrayLike | None, points: Array, gravity: Array) -> Plane:
-    """Return the plane that a caller asked for, or the one that shows most.
-
-    Parameters
-    ----------
-    view : str, (2, 3) array_like or None
-    points : (P, 3) array
-        Whatever is drawn at any time.
-    gravity : (3,) array
-    """
+    """Return the plane of the argument `view`, or the one that shows most of the points (P, 3)."""
     if view is None:
         return _widest(points - points.mean(axis=0), gravity)
     if isinstance(view, str):

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["ACCENT", "BAD", "FAINT", "GHOST", "INK", "MUTED", "drawing", "plot"]
 
 
-# How figures of trajectories look.
-
 INK: Final = "#22303c"
 MUTED: Final = "#7b8794"
 FAINT: Final = "#e3e7eb"
@@ -100,7 +98,7 @@ def _kinds(model: Model) -> list[_Kind]:
 
 
 def plot(run: RunData) -> Figure:
-    """Draw what `Trajectory.plot` says."""
+    """Draw a run; see `Trajectory.plot`."""
     from matplotlib.figure import Figure
 
     kinds = _kinds(run.model)
@@ -172,8 +170,8 @@ def _energies(left: Axes, right: Axes, run: RunData) -> None:
     try:
         kinetic, potential = run.kinetic_energy(), run.potential_energy()
     except MbkitError as error:
-        _told(left, error)
-        _told(right, error)
+        _show_error(left, error)
+        _show_error(right, error)
         return
     parts = {"total": kinetic + potential}
     if run.q.ndim == 2:
@@ -186,7 +184,7 @@ def _energies(left: Axes, right: Axes, run: RunData) -> None:
     try:
         balance = run.power_balance()
     except MbkitError as error:
-        _told(right, error)
+        _show_error(right, error)
         return
     members = balance[:_DRAWN] if balance.ndim == 2 else balance[None]
     for member in members:
@@ -194,27 +192,27 @@ def _energies(left: Axes, right: Axes, run: RunData) -> None:
     _within(right, run, members)
 
 
-def _told(axis: Axes, error: MbkitError) -> None:
+def _show_error(axis: Axes, error: MbkitError) -> None:
     text = textwrap.fill(str(error), 60, max_lines=5)
     axis.text(0.5, 0.5, text, transform=axis.transAxes, ha="center", va="center", color=MUTED)
 
 
 def _mark(axes: Any, run: RunData) -> None:
-    """Draw a line at each event and where the run went wrong, named above the first row."""
+    """Draw a line at each event and at an early end, with its name above the first row."""
     marks = [(hit.t, hit.name, MUTED) for hit in run.events if (hit.member or 0) < _DRAWN]
     if run.stats.ended not in ("finished", "event"):
         reached = run.stats.reached
         ends = reached[:_DRAWN] if isinstance(reached, tuple) else (reached,)
         last = max(reached) if isinstance(reached, tuple) else None
-        told = run.stats.ended.replace("_", " ")
-        marks += [(end, told, BAD) for end in sorted(set(ends)) if end != last or len(set(ends)) == 1]
+        ended = run.stats.ended.replace("_", " ")
+        marks += [(end, ended, BAD) for end in sorted(set(ends)) if end != last or len(set(ends)) == 1]
     named: set[str] = set()
     for t, name, colour in marks[:_MARKED]:
         for axis in axes.flat:
             axis.axvline(t, color=colour, linewidth=0.9, linestyle=(0, (3, 2)))
         if name not in named:
             named.add(name)
-            told = textwrap.shorten(name, 30)
+            short = textwrap.shorten(name, 30)
             axes[0, 0].annotate(
-                f"{told} ", (t, 1), xycoords=("data", "axes fraction"), color=colour, ha="right", va="bottom"
+                f"{short} ", (t, 1), xycoords=("data", "axes fraction"), color=colour, ha="right", va="bottom"
             )

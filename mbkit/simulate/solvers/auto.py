@@ -1,10 +1,9 @@
-"""Stiffness detection and method switching: rk853, and rodas5 where stability holds rk853's steps.
+"""Method auto: stiffness detection and switching between rk853 and rodas5.
 
-After some steps, and each time that there are several times as many, the number of steps to come is estimated. Where it
-is large and h|λ| is near the edge of rk853's stability region (as in LSODA), or where it is very large, rodas5 tries
-some steps from the state reached, and goes on if it gets further. While it goes on, rk853 is taken again where it would
-be as fast. Tolerances follow the number of steps, whose errors add up. Decisions rest on counts and states, never on a
-clock, so that a run repeats to the bit.
+Checks come after some steps, and each time that there are several times as many. Where many steps remain and h|λ| is
+near the edge of rk853's stability region (as in LSODA), or where very many remain, rodas5 tries some steps, and goes on
+if it gets further. rk853 returns where it would be as fast. Tolerances follow the number of steps, whose errors add up.
+Decisions rest on counts and states, never on a clock, so that a run repeats to the bit.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ __all__ = [
 
 
 EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
-#: No tolerance below: rounding would be taken for error, and steps shrink without end.
+#: No tolerance below: rounding would count as error, and steps shrink without end.
 LEAST: Final = 1e-13
 #: rk853's part of the tolerance: with the whole of it, errors of a thousand steps come to 500 times as much, and a
 #: tenth costs a third more steps.
@@ -56,22 +55,15 @@ _RECENT: Final = 8
 
 @dataclass(frozen=True)
 class Costs:
-    """When to check for stiffness.
+    """When to check for stiffness."""
 
-    Attributes
-    ----------
-    first, later : int
-        Steps tried before the first check, and by what factor more before each next one.
-    worth, guess : int
-        Steps to come that make a check worth it, and those that make a trial of rodas5 worth it in any case.
-    pilot : int
-        Steps of a trial of rodas5.
-    """
-
+    # Steps before the first check, and the factor to each next one.
     first: int
     later: int
+    # Steps to come that are worth a check, and those that are worth a trial of rodas5 in any case.
     worth: int
     guess: int
+    # Steps of a trial.
     pilot: int
 
 
@@ -84,10 +76,10 @@ _IN_PYTHON: Final = Costs(first=5, later=2, worth=100, guess=300, pilot=8)
 class AutoContext:
     """What all trajectories of a run share: the problem, the costs and the counts."""
 
-    def __init__(self, asked: IntegrationProblem, space: Space, stops: Sequence[float]) -> None:
-        self.dyn, self._torque, self.batch = asked.dyn, asked.torque, asked.batch
-        self.space, self.tolerances, self.stops = space, asked.tolerances, stops
-        self.start, self.end, self.duration = asked.start, asked.end, asked.duration
+    def __init__(self, problem: IntegrationProblem, space: Space, stops: Sequence[float]) -> None:
+        self.dyn, self._torque, self.batch = problem.dyn, problem.torque, problem.batch
+        self.space, self.tolerances, self.stops = space, problem.tolerances, stops
+        self.start, self.end, self.duration = problem.start, problem.end, problem.duration
         self._trials: list[StepAttempts] = []
         self.costs = _IN_PYTHON
 
@@ -106,12 +98,12 @@ class AutoContext:
 
     @property
     def evaluations(self) -> int:
-        """Of the forward dynamics, by all trials."""
+        """Evaluations of the forward dynamics."""
         return sum(trials.evaluations for trials in self._trials)
 
     @property
     def jacobians(self) -> int:
-        """Of the forward dynamics, by all trials."""
+        """Jacobians of the forward dynamics."""
         return sum(trials.jacobians for trials in self._trials)
 
 
@@ -129,13 +121,13 @@ class StepRateMonitor:
         """Tries until the next check."""
         return self._next - self._marks[-1][0]
 
-    def saw(self, made: AcceptedSteps) -> None:
+    def saw(self, steps: AcceptedSteps) -> None:
         """Count tries."""
         tries = self._marks[-1][0]
-        if made.tried > 1:
-            self._marks.append((tries + made.tried // 2, float(made.t[len(made.t) // 2])))
-        self._marks.append((tries + made.tried, float(made.t[-1])))
-        self._ends = [*self._ends, *made.t[1:].tolist()][-_RECENT - 1 :]
+        if steps.tried > 1:
+            self._marks.append((tries + steps.tried // 2, float(steps.t[len(steps.t) // 2])))
+        self._marks.append((tries + steps.tried, float(steps.t[-1])))
+        self._ends = [*self._ends, *steps.t[1:].tolist()][-_RECENT - 1 :]
 
     def due(self) -> bool:
         """Return whether it is time for a check."""
@@ -177,25 +169,13 @@ class Segment:
 
 
 def method_sequence(segments: Sequence[Segment]) -> str:
-    """Return the methods in their order.
-
-    Examples
-    --------
-    >>> method_sequence([Segment("rk853", 0.0)]), method_sequence([Segment("rk853", 0.0), Segment("rodas5", 0.1)])
-    ('rk853 throughout', 'rk853, then rodas5')
-    """
+    """Return the methods in their order."""
     methods = [segment.method for segment in segments]
     return f"{methods[0]} throughout" if len(methods) == 1 else ", then ".join(methods)
 
 
 def describe(segments: Sequence[Segment]) -> str:
-    """Return what was chosen and why.
-
-    Examples
-    --------
-    >>> describe([Segment("rk853", 0.0), Segment("rodas5", 0.1, "where stability held its steps")])
-    'rk853 to t = 0.1 s, where stability held its steps; rodas5 from there'
-    """
+    """Return what was chosen and why."""
     parts: list[str] = []
     skipped = len(segments) - 1 - 2 * _DESCRIBED
     for i, segment in enumerate(segments):
@@ -222,19 +202,17 @@ _FASTER: Final = 1.5
 _BEGIN: Final = 1e-3
 #: Fastest rate times duration from which on the tolerance follows the number of steps.
 _MANY: Final = 1000.0
-#: Errors of n steps, in a norm that is a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most, which shall
-#: not exceed this many of those asked for; measured is a third to a three-hundredth for rk853, a tenth to a thirtieth
-#: for rodas5.
+#: Errors of n steps, in a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most: the limit, in the user's
+#: tolerances. Measured is a third to a three-hundredth of it for rk853, a tenth to a thirtieth for rodas5.
 _SUM: Final = {EXPLICIT: 300.0, IMPLICIT: 1000.0}
-#: Steps to come that are reckoned with, for each step made.
+#: Steps to come that count at most, for each step so far.
 _BELIEVED: Final = 64
-#: Where rounding is taken for error before `LEAST`, it shows in steps that shrink with this power of the tolerance,
-#: and not with the eighth root as rk853's.
+#: Above `LEAST`, rounding shows in steps that shrink with this power of the tolerance, not rk853's eighth root.
 _COLLAPSE: Final = 1 / 3
 #: Where rounding keeps steps short: by how much the tolerance is loosened, and up to what.
 _LOOSER: Final = 10.0
 _LOOSEST: Final = 1e-5
-#: Points within this part of a step, by whose accelerations their rounding is judged: what a cubic through them leaves.
+#: Rounding of accelerations is the residual of a cubic through points within this part of a step.
 _NEAR: Final = 0.03
 _AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
 _CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
@@ -258,7 +236,7 @@ class SwitchingController:
         self._context, self._index = context, index
         self.track = TrajectoryRecorder(problem, context.space, index)
         self.doubt = ""
-        # The first as given or loosened, the second for the number of steps.
+        # The first is the user's or loosened, the second for the number of steps.
         self._base, self._tolerances = context.tolerances, context.loosest(EXPLICIT, context.tolerances)
         self._segments = [Segment(EXPLICIT, context.start)]
         self._monitor: StepRateMonitor | None = None
@@ -271,8 +249,6 @@ class SwitchingController:
         self._least = LEAST
         self._next: StepAttempts | None = None
         self._ahead: list[AcceptedSteps] = []
-
-    # On the way
 
     @property
     def missing(self) -> int:
@@ -294,34 +270,30 @@ class SwitchingController:
         member = self.track.member
         return member.ended != "finished" or member.reached >= self._context.end
 
-    def leaves(self, trials: StepAttempts, place: int, made: AcceptedSteps) -> bool:
-        """Take in accepted steps; return whether another method goes on from their end."""
+    def leaves(self, trials: StepAttempts, place: int, steps: AcceptedSteps) -> bool:
+        """Add accepted steps; return whether another method goes on from their end."""
         if self._monitor is None:
-            self._monitor = StepRateMonitor(float(made.t[0]), self._first, self._context.costs.later)
-        self._monitor.saw(made)
-        self._tries += made.tried
-        self._at = float(made.t[-1]), made.q[-1], made.w[-1]
+            self._monitor = StepRateMonitor(float(steps.t[0]), self._first, self._context.costs.later)
+        self._monitor.saw(steps)
+        self._tries += steps.tried
+        self._at = float(steps.t[-1]), steps.q[-1], steps.w[-1]
         if not self._over and self._monitor.due():
             check = self._check_stiff if self._segments[-1].method == EXPLICIT else self._check_nonstiff
             check(trials, place, self._monitor)
         return self._next is not None
 
-    def alone(self, tell: Callable[[], None]) -> None:
+    def alone(self, report: Callable[[], None]) -> None:
         """Go on to the end with the methods that follow."""
         while self._next is not None and not self._over:
             trials, self._next, self._monitor = self._next, None, None
             ahead, self._ahead = self._ahead, []
-            if all(self._goes_on(trials, made) for made in ahead):
+            if all(self.track.take(trials, 0, steps) and not self.leaves(trials, 0, steps) for steps in ahead):
                 limit_rounds(trials, [self])
-                for (_, made), *_ in march(trials, [self.track], self._context.stops, self._interval):
-                    if self.leaves(trials, 0, made):
+                for (_, steps), *_ in march(trials, [self.track], self._context.stops, self._interval):
+                    if self.leaves(trials, 0, steps):
                         trials.drop(0)
                     limit_rounds(trials, [self])
-                    tell()
-
-    def _goes_on(self, trials: StepAttempts, made: AcceptedSteps) -> bool:
-        taken = self.track.take(trials, 0, made)
-        return taken and not self.leaves(trials, 0, made)
+                    report()
 
     @property
     def _interval(self) -> int:
@@ -338,38 +310,26 @@ class SwitchingController:
         """Return the loosest tolerances of a method here."""
         return self._context.loosest(method, self._base)
 
-    def _switch_to(self, method: str, why: str) -> None:
-        """Go on with a method from here."""
-        self._next, self._tolerances = self._started(method), self._loosest(method)
-        self._looser = self._tolerances.rtol, 0.0
-        self._segments.append(Segment(method, self._at[0], why))
-
-    # Looks
-
     def _check_stiff(self, trials: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
         """Check whether rodas5 shall take over."""
         rate, step, costs = monitor.rate(), monitor.step(), self._context.costs
         to_come = rate * self._rest
         if to_come < costs.worth or not step:
-            self._adapt_to_step_count(trials, place, monitor)
+            self._adapt_tolerance(trials, place, monitor.overall() * self._rest)
             return
-        found = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._context.duration))
+        rates = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._context.duration))
         if self._rounding_limited(trials, place, step):
             return
-        held = found is not None and step * found.stable >= _EDGE
+        held = rates is not None and step * rates.stable >= _EDGE
         # Where steps are short now, and not only on the average.
         worth = held or to_come >= costs.guess
         if worth and self._implicit_is_faster(min(rate, 1 / step)):
-            seen = "" if found is None else f"; {found}"
             why = "stability held its steps" if held else "rodas5 got further with a trial"
-            size = "" if found is None else f" (h|λ| = {step * found.stable:.1f}{seen})"
+            size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
             self._segments.append(Segment(IMPLICIT, self._at[0], f"where {why}{size}"))
             return
         self._detect_tolerance_stall(rate)
-        self._adapt_to_step_count(trials, place, monitor)
-
-    def _adapt_to_step_count(self, trials: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
-        """Adapt rk853's tolerance by the mean rate of steps, which passing changes hardly touch."""
+        # By the mean rate, which passing changes hardly touch.
         self._adapt_tolerance(trials, place, monitor.overall() * self._rest)
 
     def _implicit_is_faster(self, rate: float) -> bool:
@@ -402,10 +362,13 @@ class SwitchingController:
         to_come = min(rate, 1 / monitor.step() if monitor.step() else math.inf) * self._rest
         collapsed = self._detect_tolerance_stall(rate)
         if _DEARER * to_come >= costs.worth and not collapsed:
-            found = self._spectrum(trials, place, 0.0)
-            if found is not None and found.stable / _KEPT < _DEARER * rate:
+            rates = self._spectrum(trials, place, 0.0)
+            if rates is not None and rates.stable / _KEPT < _DEARER * rate:
                 self._returns += 1
-                self._switch_to(EXPLICIT, f"where stability no longer held rk853's steps ({found})")
+                self._next, self._tolerances = self._started(EXPLICIT), self._loosest(EXPLICIT)
+                self._looser = self._tolerances.rtol, 0.0
+                why = f"where stability no longer held rk853's steps ({rates})"
+                self._segments.append(Segment(EXPLICIT, self._at[0], why))
                 return
         self._adapt_tolerance(trials, place, to_come)
 
@@ -458,11 +421,11 @@ class SwitchingController:
             self._loosen(noise)
             self._adapt_tolerance(trials, place, 0.0)
             return True
-        asked = self._context.tolerances
-        loosened = self._base.rtol > asked.rtol or self._least == math.inf
-        if loosened and share * self._tolerances.rtol / self._context.loosest(EXPLICIT, asked).rtol < _ROUNDED:
-            # What was noise is passed.
-            self._base, self._least = asked, LEAST
+        wanted = self._context.tolerances
+        loosened = self._base.rtol > wanted.rtol or self._least == math.inf
+        if loosened and share * self._tolerances.rtol / self._context.loosest(EXPLICIT, wanted).rtol < _ROUNDED:
+            # The noise is passed.
+            self._base, self._least = wanted, LEAST
             self._adapt_tolerance(trials, place, 0.0)
         return False
 
@@ -481,16 +444,16 @@ class SwitchingController:
         return share, float(scatter.max() / max(np.abs(k).max(), np.finfo(float).tiny))
 
     def _loosen(self, noise: float) -> None:
-        """Ask for less where rounding, this much of the accelerations, does not allow more."""
+        """Loosen the tolerance where rounding, this part of the accelerations, does not allow it."""
         if self._tolerances.rtol < self._base.rtol:
-            # No more than what the user asked for may be possible.
+            # The user's own may still be possible.
             self._least = math.inf
             return
-        asked, t = self._context.tolerances.rtol, self._at[0]
+        wanted, t = self._context.tolerances.rtol, self._at[0]
         self._base = Tolerances(*(min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base))
         self.doubt = (
             f"near t = {t:.6g} s accelerations are known to {noise:.0e} of themselves, which is not enough for "
-            f"rtol = {asked:g}; there it took {self._base.rtol:.0e}. Leave out what has next to no mass, or compute "
+            f"rtol = {wanted:g}; there it took {self._base.rtol:.0e}. Leave out what has next to no mass, or compute "
             f"with 34 digits: mbkit.dynamics(model, 'oracle') and method={SERIES_METHOD!r}"
         )
 
@@ -507,22 +470,22 @@ class SwitchingController:
 _KINDS: Final = 3
 
 
-def run_auto(asked: IntegrationProblem) -> SolverResult:
+def run_auto(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
-    q0, v0, batch = asked.q, asked.v, asked.batch
-    space = Space(asked.dyn.model)
-    context = AutoContext(asked, space, stop_times(asked))
-    controllers = [SwitchingController(context, i, asked) for i in range(len(q0))]
-    explicit = context.make(EXPLICIT, context.loosest(EXPLICIT, asked.tolerances))
+    q0, v0, batch = problem.q, problem.v, problem.batch
+    space = Space(problem.dyn.model)
+    context = AutoContext(problem, space, stop_times(problem))
+    controllers = [SwitchingController(context, i, problem) for i in range(len(q0))]
+    explicit = context.make(EXPLICIT, context.loosest(EXPLICIT, problem.tolerances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), explicit.width):
             part = slice(first, first + explicit.width)
-            group = _Group(controllers[part], first, asked)
+            group = _Group(controllers[part], first, problem)
             try:
                 for controller, q, v in zip(group.controllers, q0[part], v0[part], strict=True):
                     controller.track.begin(q, v)
                 begun = space.enter(q0[part], v0[part])
-                explicit.start(range(first, first + len(group.controllers)), q0[part], begun, asked.start)
+                explicit.start(range(first, first + len(group.controllers)), q0[part], begun, problem.start)
                 group.together(context, explicit)
             except FunctionError as error:
                 # Where the torque is a function, trajectories run one by one.
@@ -530,35 +493,37 @@ def run_auto(asked: IntegrationProblem) -> SolverResult:
                 group.controllers[0 if which is None else which - first].track.member.fail(error)
                 break
     records = [controller.track.member for controller in controllers]
-    outcome = assemble_result(asked, records, evaluations=context.evaluations, jacobians=context.jacobians)
-    told = outcome.ended in ("finished", "event")
-    doubts = tuple(dict.fromkeys(controller.doubt for controller in controllers if controller.doubt and told))
+    outcome = assemble_result(problem, records, evaluations=context.evaluations, jacobians=context.jacobians)
+    finished = outcome.ended in ("finished", "event")
+    doubts = tuple(dict.fromkeys(controller.doubt for controller in controllers if controller.doubt and finished))
     return replace(outcome, chosen=_chosen(controllers, batch), doubts=(*outcome.doubts, *doubts))
 
 
 class _Group:
     """Trajectories that begin side by side."""
 
-    def __init__(self, controllers: Sequence[SwitchingController], first: int, asked: IntegrationProblem) -> None:
-        self.controllers, self._first, self._asked = controllers, first, asked
+    def __init__(self, controllers: Sequence[SwitchingController], first: int, problem: IntegrationProblem) -> None:
+        self.controllers, self._first, self._problem = controllers, first, problem
 
     def together(self, context: AutoContext, explicit: StepAttempts) -> None:
         """Take all to the end: explicitly side by side, what leaves that one by one."""
         tracks = [controller.track for controller in self.controllers]
         limit_rounds(explicit, self.controllers)
-        for made in march(explicit, tracks, context.stops):
-            for place, stretch in made:
-                if self.controllers[place].leaves(explicit, place, stretch):
+        for accepted in march(explicit, tracks, context.stops):
+            for place, steps in accepted:
+                if self.controllers[place].leaves(explicit, place, steps):
                     explicit.drop(place)
-            limit_rounds(explicit, [self.controllers[place] for place, _ in made])
-            self._tell()
+            limit_rounds(explicit, [self.controllers[place] for place, _ in accepted])
+            self._report()
         for controller in self.controllers:
-            controller.alone(self._tell)
+            controller.alone(self._report)
 
-    def _tell(self) -> None:
-        asked = self._asked
-        done = sum(controller.track.member.reached - asked.start for controller in self.controllers) / asked.duration
-        asked.bar.update((self._first + done) / len(asked.q))
+    def _report(self) -> None:
+        problem = self._problem
+        done = (
+            sum(controller.track.member.reached - problem.start for controller in self.controllers) / problem.duration
+        )
+        problem.bar.update((self._first + done) / len(problem.q))
 
 
 def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> str:
@@ -568,9 +533,9 @@ def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> st
     parts = []
     for kind, count in kinds.most_common(_KINDS):
         example = next(i for i, controller in enumerate(controllers) if controller.method_sequence() == kind)
-        told = controllers[example].describe()
-        such = "" if told == kind else f", such as trajectory {example}"
-        parts.append(f"{count} of {batch}{such}: {told}")
+        text = controllers[example].describe()
+        such = "" if text == kind else f", such as trajectory {example}"
+        parts.append(f"{count} of {batch}{such}: {text}")
     if len(kinds) > _KINDS:
         parts.append(f"and {len(kinds) - _KINDS} more kinds")
     return "; ".join(parts)

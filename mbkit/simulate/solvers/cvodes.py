@@ -55,7 +55,7 @@ def run_cvodes(asked: IntegrationProblem) -> SolverResult:
         )
     if torque.callable or asked.events:
         raise UnsupportedError(f"{asked.method}: takes neither torque functions nor events; use {_OTHERS}")
-    save, times = asked.told()
+    save, times = asked.saved_times()
     solve = _Solve(dyn, asked.tolerances)
     members = []
     for i, start in enumerate(asked.y):

@@ -116,7 +116,7 @@ def run_drake(asked: IntegrationProblem) -> SolverResult:
         raise UnsupportedError(
             f"{asked.method}: takes neither torque functions nor events; use method={ADAPTIVE_METHOD!r}"
         )
-    save, times = asked.told()
+    save, times = asked.saved_times()
     scheme, accuracy = method_of(asked.method).scheme, asked.tolerances.rtol
     records, evaluations = [], 0
     for i, (q, v) in enumerate(zip(asked.q, asked.v, strict=True)):

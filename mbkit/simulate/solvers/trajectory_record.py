@@ -177,7 +177,9 @@ def assemble_result(
         events=tuple(hit for record in records for hit in record.events),
         error=next((record.error for record in records if record.error), None),
         last=next((record.last for record in records if record.ended in ("diverged", "step_too_small")), None),
-        doubts=tuple(dict.fromkeys(record.poses.told() for record in records if record.poses and record.poses.times)),
+        doubts=tuple(
+            dict.fromkeys(record.poses.describe() for record in records if record.poses and record.poses.times)
+        ),
     )
 
 
