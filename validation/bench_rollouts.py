@@ -49,7 +49,7 @@ def bare(dyn, q, v, pool, steps=STEPS):
     n = len(q)
     start = np.zeros((n, mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     # The states' values matter here, not which of MuJoCo's coordinates has which.
-    start[:, 1 : 1 + m.nq], start[:, 1 + m.nq : 1 + m.nq + m.nv] = q[:, dyn._made.q_index], v[:, dyn._made.v_index]
+    start[:, 1 : 1 + m.nq], start[:, 1 + m.nq : 1 + m.nq + m.nv] = q[:, dyn._maps.q_index], v[:, dyn._maps.v_index]
     out = np.empty((n, steps, start.shape[1]))
     sensors = np.empty((n, steps, m.nsensordata))
     data = [mujoco.MjData(m) for _ in range(cores())]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from types import MethodType
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -40,6 +41,9 @@ DOUBLE_BITS: Final = 53
 #: Loops or prescribed joints that a refusal names.
 _NAMED: Final = 3
 
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+_Dynamics = TypeVar("_Dynamics", bound="Dynamics")
+
 
 def require_tree(model: Model, user: str) -> None:
     """Raise `UnsupportedError` for a model with loops or prescribed motions, in the name of an engine or study."""
@@ -55,38 +59,22 @@ def require_tree(model: Model, user: str) -> None:
 
 
 class InverseDynamicsDerivatives(NamedTuple):
-    """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv).
+    """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv)."""
 
-    Attributes
-    ----------
-    q : array
-        ∂τ/∂q along the manifold: column k is that of q ⊕ t e_k.
-    v : array
-        ∂τ/∂v.
-    a : array
-        ∂τ/∂a, the mass matrix.
-    """
-
+    #: ∂τ/∂q along the manifold: column k is that of q ⊕ t e_k.
     q: Array
     v: Array
+    #: ∂τ/∂a, the mass matrix.
     a: Array
 
 
 class ForwardDynamicsDerivatives(NamedTuple):
-    """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv).
+    """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv)."""
 
-    Attributes
-    ----------
-    q : array
-        ∂v̇/∂q along the manifold: column k is that of q ⊕ t e_k.
-    v : array
-        ∂v̇/∂v.
-    tau : array
-        ∂v̇/∂τ, the inverse of the mass matrix.
-    """
-
+    #: ∂v̇/∂q along the manifold: column k is that of q ⊕ t e_k.
     q: Array
     v: Array
+    #: ∂v̇/∂τ, the inverse of the mass matrix.
     tau: Array
 
 
@@ -310,8 +298,7 @@ class Dynamics(ABC):
         """
         return None
 
-    # What an adapter fills in. Arguments are float64, checked, and either all
-    # single states or all batches of one size.
+    # For an adapter to define. Arguments are float64, checked, and either all single states or all batches of one size.
 
     @abstractmethod
     def _mass_matrix(self, q: Array) -> Array: ...
@@ -421,6 +408,18 @@ class Dynamics(ABC):
         return float(value) if value.ndim == 0 else value
 
 
+_X, _Y, _Z = np.eye(3)
+#: Joint type -> type and axis of each joint of a stack of one-coordinate joints with the same motion.
+STACKS: Final[dict[str, Callable[[Joint], list[tuple[str, Array]]]]] = {
+    "revolute": lambda joint: [("revolute", joint.axes[0])],
+    "continuous": lambda joint: [("revolute", joint.axes[0])],
+    "prismatic": lambda joint: [("prismatic", joint.axes[0])],
+    "universal": lambda joint: [("revolute", axis) for axis in joint.axes],
+    "spherical_zyx": lambda _: [("revolute", axis) for axis in (_Z, _Y, _X)],
+    "planar": lambda _: [("prismatic", _X), ("prismatic", _Y), ("revolute", _Z)],
+}
+
+
 def unknown_joint(engine: str, joint: Joint) -> UnsupportedError:
     """Return the error for a joint of a type that an adapter has no counterpart of."""
     return UnsupportedError(
@@ -438,62 +437,42 @@ def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:
     return np.array([np.array(method(*row)) for row in zip(*arguments, strict=True)])
 
 
+def by_sample(method: _Method) -> _Method:
+    """Return a method for one state or a batch, made of one for a single state."""
+
+    def evaluate(self: Dynamics, *arguments: Array) -> Array:
+        if arguments[0].ndim == 1:
+            return np.array(method(self, *arguments))
+        return per_sample(MethodType(method, self), *arguments)
+
+    return evaluate  # type: ignore[return-value]  # the same arguments
+
+
 def through_inverse(inverse_derivatives: Array) -> Array:
-    """Return the three derivatives of forward dynamics from those of inverse dynamics.
-
-    Parameters
-    ----------
-    inverse_derivatives : (nv, 3 nv) or (N, nv, 3 nv) array
-        ∂ID/∂q, ∂ID/∂v and M side by side, at a = FD(q, v, τ).
-
-    Returns
-    -------
-    (nv, 3 nv) or (N, nv, 3 nv) array
-        ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ side by side.
-    """
+    """Return ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ side by side, from ∂ID/∂q, ∂ID/∂v and M side by side at a = FD(q, v, τ)."""
     by_q, by_v, M = np.split(inverse_derivatives, 3, axis=-1)
     unit = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
     return np.asarray(np.linalg.solve(M, np.concatenate([-by_q, -by_v, unit], axis=-1)))
 
 
-# Errors for arguments of another type
-
-
-def no_dynamics(given: Any, name: str = "dyn") -> InputError:
-    """Return what to raise, with what makes a `Dynamics`: a `Lagrangian` on paper does it by itself.
-
-    Parameters
-    ----------
-    given : object
-    name : str
-        The argument's.
-    """
-    own = not isinstance(given, type) and callable(getattr(given, "dynamics", None))
+def no_dynamics(value: Any, name: str = "dyn") -> InputError:
+    """Return the error for an argument that is no `Dynamics`, with the call that makes one."""
+    own = not isinstance(value, type) and callable(getattr(value, "dynamics", None))
     way = "its .dynamics() makes one" if own else "mbkit.dynamics(model, engine) makes one"
-    return InputError(f"{name}: expected a Dynamics, got {type(given).__name__}; {way}")
+    return InputError(f"{name}: expected a Dynamics, got {type(value).__name__}; {way}")
 
 
 # Dynamics that depend on the time: the time is one of their model's parameters.
 
-Any_ = TypeVar("Any_", bound=Dynamics)
 
-
-def at_time(dyn: Any_, t: float) -> Any_:
+def at_time(dyn: _Dynamics, t: float) -> _Dynamics:
     """Return the dynamics at a time; the same ones where time does not enter."""
     clock = dyn.model.time_parameter
     return dyn if clock is None else dyn.at(**{clock: t})  # type: ignore[return-value]  # of its own kind
 
 
-def at_times(dyn: Any_, t: Array, trajectories: int | None = None) -> Any_:
-    """Return the dynamics with a sample for each time of a run, where time enters.
-
-    Parameters
-    ----------
-    dyn : Dynamics
-    t : (K,) array
-    trajectories : int, optional
-        Size of a batch; there is one sample for each time of each trajectory then.
-    """
+def at_times(dyn: _Dynamics, t: Array, trajectories: int | None = None) -> _Dynamics:
+    """Return the dynamics with a sample for each time of a run, of each trajectory of a batch, where time enters."""
     clock = dyn.model.time_parameter
     if clock is None:
         return dyn

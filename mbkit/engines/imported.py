@@ -1,41 +1,33 @@
-"""What an engine's own importer makes of a file, in words that can be compared."""
+"""Models that the engines' own importers read from a file, described so that they can be compared."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import UnsupportedError
-from mbkit.model import Model
+from mbkit.model import Joint, Model
+from mbkit.model.joint_types import kind_of
 
 
 class Importer(NamedTuple):
-    """Where an engine's importer is.
-
-    Attributes
-    ----------
-    module : str
-        That reads with it.
-    library : str
-        The module that it needs.
-    distribution : str
-        Whose version is told.
-    package : str
-        To install.
-    """
+    """Where an engine's importer is."""
 
     module: str
+    #: Module that it needs.
     library: str
+    #: Distribution of which results name the version.
     distribution: str
+    #: Package to install.
     package: str
 
 
@@ -44,52 +36,53 @@ IMPORTERS = {
     "mujoco": Importer("mbkit.engines.mujoco.importer", "mujoco", "mujoco", "mujoco"),
     "drake": Importer("mbkit.engines.drake.importer", "pydrake", "drake", "mbkit[drake]"),
 }
-# What mbkit's own loaders take.
-_LARGEST: Final = 1e30
+#: The largest number that mbkit's own loaders take.
+_MAX_NUMBER: Final = 1e30
 
 
 class Beside(NamedTuple):
-    """What may act in an importer's model beside its bodies and joints: described, or not.
+    """Something that may act in an importer's model beside its bodies and joints."""
 
-    Attributes
-    ----------
-    key : str
-        By which `Imported.terms` leaves it out.
-    kind : str
-        Such as ``"tendon"``, ``"actuator"`` or ``"fluid"``.
-    says : str
-        Its name and its numbers.
-    without : Model or None
-        The description less what it has of this; None where it has nothing of it.
-    """
-
+    #: By which `Imported.terms` leaves it out.
     key: str
+    #: Such as ``"tendon"``, ``"actuator"`` or ``"fluid"``.
     kind: str
+    #: Its name and its numbers.
     says: str
+    #: The description less its part in it; None where it has none.
     without: Model | None = None
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A file as one engine's importer holds it.
+    """A file as one engine's importer holds it."""
 
-    Attributes
-    ----------
-    model : Model
-        What the importer made, described: its bodies, joints and numbers, as they are.
-    terms : callable
-        (q, v, without) -> M, g, nle and passive of the imported model by the engine itself, at (N, nq) and
-        (N, nv) in the coordinates of `model`, as a dict. `without` holds keys of `beside` to leave out.
-    notes : tuple of str
-        What the importer said, and what it holds that is in none of the terms.
-    beside : tuple of Beside
-        What the terms may hold beside bodies and joints.
-    """
-
+    #: The importer's bodies, joints and numbers, described as they are.
     model: Model
+    #: (q, v, without) -> M, g, nle and passive of the imported model by the engine itself, at (N, nq) and (N, nv) in
+    #: the coordinates of `model`. `without` holds keys of `beside` to leave out.
     terms: Callable[[Array, Array, tuple[str, ...]], dict[str, Array]]
+    #: The importer's messages, and parts of its model that are in none of the terms.
     notes: tuple[str, ...]
     beside: tuple[Beside, ...] = ()
+
+
+def joint_of(
+    name: str, kind: str, parent: str, child: str, rotation: Array, translation: Array, **numbers: Any
+) -> Joint:
+    """Return a joint with these numbers; without them it has no axes, zeros, and open limits."""
+    nq, nv = kind_of(kind).nq, kind_of(kind).nv
+    values: dict[str, Any] = {"axes": np.empty((0, 3)), "pitch": 0.0}
+    values |= {"lower": np.full(nq, -np.inf), "upper": np.full(nq, np.inf)}
+    values |= {x: np.full(nv, np.inf) for x in ("velocity_limit", "effort_limit")}
+    values |= {x: np.zeros(nv) for x in ("armature", "damping", "friction", "stiffness", "rest")}
+    return Joint(name, kind, parent, child, rotation, translation, **values | numbers)
+
+
+def stacked(states: Iterable[dict[str, Array]]) -> dict[str, Array]:
+    """Return the terms of each state as arrays over a batch."""
+    values = list(states)
+    return {name: np.array([x[name] for x in values]) for name in ("M", "g", "nle", "passive")}
 
 
 def unused(name: str, taken: Container[str]) -> str:
@@ -100,13 +93,7 @@ def unused(name: str, taken: Container[str]) -> str:
 
 
 def checked(engine: str, model: Model) -> Model:
-    """Return what an importer made, if something moves in it and all its numbers are numbers.
-
-    Raises
-    ------
-    UnsupportedError
-        With the culprit.
-    """
+    """Return an importer's model; raise `UnsupportedError` where nothing moves in it or a number is not sound."""
     if not model.nv:
         raise UnsupportedError(f"{engine}: nothing moves in what it made of the file (nv = 0)")
     for what, parts, names in (
@@ -116,29 +103,24 @@ def checked(engine: str, model: Model) -> Model:
         for part in parts:
             for name in names:
                 # Not a number, or memory that nobody wrote to.
-                if not (np.abs(getattr(part, name)) <= _LARGEST).all():
+                if not (np.abs(getattr(part, name)) <= _MAX_NUMBER).all():
                     raise UnsupportedError(
                         f"{engine}: made {what} {part.name!r} with a {name} that nothing has: {getattr(part, name)}"
                     )
-    if not (np.abs(model.gravity) <= _LARGEST).all():
+    if not (np.abs(model.gravity) <= _MAX_NUMBER).all():
         raise UnsupportedError(f"{engine}: made a gravity that nothing has: {model.gravity}")
     return model
 
 
 def check_installed(engine: str) -> None:
-    """Raise `UnsupportedError` if an engine is not installed; nothing is loaded.
-
-    Raises
-    ------
-    UnsupportedError
-    """
+    """Raise `UnsupportedError` if an engine is not installed; nothing is loaded."""
     library, package = IMPORTERS[engine].library, IMPORTERS[engine].package
     try:
-        found = find_spec(library) is not None
+        installed = find_spec(library) is not None
     except (ImportError, ValueError):
-        # What stands in for a module that was taken away.
-        found = False
-    if not found:
+        # A stand-in for a module that was removed.
+        installed = False
+    if not installed:
         raise UnsupportedError(f"{engine} is not installed (no module {library!r}); pip install {package}")
 
 
@@ -153,11 +135,9 @@ def written(text: str, files: Mapping[str, bytes]) -> Iterator[Path]:
 
 
 def reader(module: str) -> Callable[[str, str, bool, dict[str, bytes]], Imported]:
-    """Return the function (text, format, floating_base, files) -> Imported of an importer's module.
+    """Return an importer's function (text, format, floating_base, meshes by name) -> Imported.
 
-    `files` holds the meshes that the text names, by name.
-
-    It raises `UnsupportedError` where the importer refuses a text.
+    The function raises `UnsupportedError` where the importer refuses a text.
     """
-    made: Callable[[str, str, bool, dict[str, bytes]], Imported] = import_module(module).read
-    return made
+    read: Callable[[str, str, bool, dict[str, bytes]], Imported] = import_module(module).read
+    return read

@@ -24,8 +24,8 @@ from pydrake.systems.framework import EventStatus
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._fork import fork_safe
-from mbkit.engines.base import Dynamics, per_sample
-from mbkit.engines.drake.model import build
+from mbkit.engines.base import Dynamics, by_sample, per_sample
+from mbkit.engines.drake.model import DrakeModel, build
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Model
 
@@ -36,8 +36,8 @@ class DrakeDynamics(Dynamics):
     Attributes
     ----------
     plant : pydrake.multibody.plant.MultibodyPlant
-        What was built; free to read.
-    made : DrakeModel
+        The plant that was built; free to read.
+    maps : DrakeModel
         The plant with the maps between its coordinates and the description's.
     """
 
@@ -49,11 +49,13 @@ class DrakeDynamics(Dynamics):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.made = build(model)
-        self.plant = self.made.plant
-        self._context = self.plant.CreateDefaultContext()
+        self._hold(build(model))
         self._applied = self.plant.get_applied_generalized_force_input_port()
         self._acceleration = self.plant.get_generalized_acceleration_output_port()
+
+    def _hold(self, maps: DrakeModel) -> None:
+        self.maps, self.plant = maps, maps.plant
+        self._context = self.plant.CreateDefaultContext()
         self._lock = fork_safe(threading.RLock())
         self._rotations: list[tuple[Array, int, int | None]] = []
 
@@ -66,20 +68,20 @@ class DrakeDynamics(Dynamics):
                 # Drake's failed demands come as either.
                 if isinstance(error, NotImplementedError):
                     raise
-                told = str(error).strip().splitlines()[0]
-                raise NumericalError(f"drake: {quantity} of {self.model.name}: {told}{self._blame()}") from None
+                reason = str(error).strip().splitlines()[0]
+                raise NumericalError(f"drake: {quantity} of {self.model.name}: {reason}{self._blame()}") from None
 
     # Between the description's numbers and Drake's.
 
     def to_drake(self, q: Array, v: Array | None = None) -> tuple[Array, Array, Array]:
         """Return Drake's positions and velocities, and b of a_drake = T a + b."""
-        made, layout = self.made, self.model.layout
+        maps, layout = self.maps, self.model.layout
         full_q = layout.expand_q(q)
         full_v = np.zeros(layout.sizes[3]) if v is None else layout.expand_v(v)
-        x, u = full_q[made.q_index], full_v[made.v_index]
+        x, u = full_q[maps.q_index], full_v[maps.v_index]
         b = np.zeros(len(u))
         self._rotations = []
-        for joint, iq, iv in made.turning:
+        for joint, iq, iv in maps.turning:
             own_q, own_v = full_q[layout.full_q[joint.name]], full_v[layout.full_v[joint.name]]
             # The shape of an empty batch's answer is asked for with zeros, which no rotation is.
             unit = own_q[-4:] if own_q[-4:].any() else np.array([0.0, 0.0, 0.0, 1.0])
@@ -106,8 +108,8 @@ class DrakeDynamics(Dynamics):
         """Return T x for full velocities, accelerations or, since T is orthogonal, forces, after `_set`."""
         layout = self.model.layout
         full = layout.expand_v(x)
-        out = full[self.made.v_index]
-        for (joint, _, _), (R, angular, linear) in zip(self.made.turning, self._rotations, strict=True):
+        out = full[self.maps.v_index]
+        for (joint, _, _), (R, angular, linear) in zip(self.maps.turning, self._rotations, strict=True):
             own = full[layout.full_v[joint.name]]
             out[angular : angular + 3] = R @ own[-3:]
             if linear is not None:
@@ -118,9 +120,9 @@ class DrakeDynamics(Dynamics):
         """Return J T, in the description's order and reduced."""
         layout = self.model.layout
         full = np.zeros((len(J), layout.sizes[3]))
-        plain = self.made.v_index >= 0
-        full[:, self.made.v_index[plain]] = J[:, plain]
-        for (joint, _, _), (R, angular, linear) in zip(self.made.turning, self._rotations, strict=True):
+        plain = self.maps.v_index >= 0
+        full[:, self.maps.v_index[plain]] = J[:, plain]
+        for (joint, _, _), (R, angular, linear) in zip(self.maps.turning, self._rotations, strict=True):
             own = layout.full_v[joint.name]
             full[:, own.stop - 3 : own.stop] = J[:, angular : angular + 3] @ R
             if linear is not None:
@@ -138,89 +140,72 @@ class DrakeDynamics(Dynamics):
 
     # The protocol.
 
+    @by_sample
     def _mass_matrix(self, q: Array) -> Array:
-        def one(q: Array) -> Array:
-            self._set(q)
-            return self._columns(self._columns(self.plant.CalcMassMatrix(self._context)).T)
+        self._set(q)
+        return self._columns(self._columns(self.plant.CalcMassMatrix(self._context)).T)
 
-        return per_sample(one, q)
-
+    @by_sample
     def _gravity(self, q: Array) -> Array:
-        def one(q: Array) -> Array:
-            self._set(q)
-            return self._force(-self.plant.CalcGravityGeneralizedForces(self._context))
+        self._set(q)
+        return self._force(-self.plant.CalcGravityGeneralizedForces(self._context))
 
-        return per_sample(one, q)
-
+    @by_sample
     def _coriolis_force(self, q: Array, v: Array) -> Array:
-        return per_sample(lambda q, v: self._force(self._bias(self._set(q, v))), q, v)
+        return self._force(self._bias(self._set(q, v)))
 
     def _bias(self, b: Array) -> Array:
         """Return C v, and M b of the change of velocities."""
         out = self.plant.CalcBiasTerm(self._context)
         return np.asarray(out + self.plant.CalcMassMatrix(self._context) @ b if b.any() else out)
 
+    @by_sample
     def _nle(self, q: Array, v: Array) -> Array:
-        def one(q: Array, v: Array) -> Array:
-            bias = self._bias(self._set(q, v))
-            return self._force(bias - self.plant.CalcGravityGeneralizedForces(self._context))
+        bias = self._bias(self._set(q, v))
+        return self._force(bias - self.plant.CalcGravityGeneralizedForces(self._context))
 
-        return per_sample(one, q, v)
-
+    @by_sample
     def _passive(self, q: Array, v: Array) -> Array:
         plant, context, forces = self._weightless
+        self._set(q, v)
+        plant.SetPositions(context, self.plant.GetPositions(self._context))
+        plant.SetVelocities(context, self.plant.GetVelocities(self._context))
+        plant.CalcForceElementsContribution(context, forces)
+        return self._force(plant.CalcGeneralizedForces(context, forces))
 
-        def one(q: Array, v: Array) -> Array:
-            self._set(q, v)
-            plant.SetPositions(context, self.plant.GetPositions(self._context))
-            plant.SetVelocities(context, self.plant.GetVelocities(self._context))
-            plant.CalcForceElementsContribution(context, forces)
-            return self._force(plant.CalcGeneralizedForces(context, forces))
-
-        return per_sample(one, q, v)
-
+    @by_sample
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        def one(q: Array, v: Array, a: Array) -> Array:
-            b = self._set(q, v)
-            forces = MultibodyForces(self.plant)
-            self.plant.CalcForceElementsContribution(self._context, forces)
-            return self._force(self.plant.CalcInverseDynamics(self._context, self._vector_to_drake(a) + b, forces))
+        b = self._set(q, v)
+        forces = MultibodyForces(self.plant)
+        self.plant.CalcForceElementsContribution(self._context, forces)
+        return self._force(self.plant.CalcInverseDynamics(self._context, self._vector_to_drake(a) + b, forces))
 
-        return per_sample(one, q, v, a)
-
+    @by_sample
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        return per_sample(self._forward_reduced if self.model.layout.reduced else self._forward_tree, q, v, tau)
-
-    def _forward_tree(self, q: Array, v: Array, tau: Array) -> Array:
+        if self.model.layout.reduced:
+            zero = np.zeros(self.model.nv)
+            return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - self._inverse_dynamics(q, v, zero)))
         b = self._set(q, v)
         self._applied.FixValue(self._context, self._vector_to_drake(tau))
         return self._force(self._acceleration.Eval(self._context) - b)
 
-    def _forward_reduced(self, q: Array, v: Array, tau: Array) -> Array:
-        zero = np.zeros(self.model.nv)
-        return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - self._inverse_dynamics(q, v, zero)))
+    @by_sample
+    def _kinetic_energy(self, q: Array, v: Array) -> Any:
+        self._set(q, v)
+        return float(self.plant.CalcKineticEnergy(self._context))
 
-    def _kinetic_energy(self, q: Array, v: Array) -> Array:
-        def one(q: Array, v: Array) -> Any:
-            self._set(q, v)
-            return float(self.plant.CalcKineticEnergy(self._context))
-
-        return per_sample(one, q, v)
-
-    def _potential_energy(self, q: Array) -> Array:
-        def one(q: Array) -> Any:
-            self._set(q)
-            total = 0.0
-            for stiffness, A, p_AP, B, p_BQ in self.made.bushings:
-                P, Q = (self.plant.EvalBodyPoseInWorld(self._context, x).multiply(p) for x, p in ((A, p_AP), (B, p_BQ)))
-                total += 0.5 * stiffness * float((Q - P) @ (Q - P))
-            return total + float(self._energy())
-
-        return per_sample(one, q)
+    @by_sample
+    def _potential_energy(self, q: Array) -> Any:
+        self._set(q)
+        total = 0.0
+        for stiffness, A, p_AP, B, p_BQ in self.maps.bushings:
+            P, Q = (self.plant.EvalBodyPoseInWorld(self._context, x).multiply(p) for x, p in ((A, p_AP), (B, p_BQ)))
+            total += 0.5 * stiffness * float((Q - P) @ (Q - P))
+        return total + float(self._energy())
 
     def _energy(self) -> float:
         """Return Drake's own potential energy; of a plant without bushings where Drake cannot tell theirs."""
-        if not self.made.bushings:
+        if not self.maps.bushings:
             return float(self.plant.CalcPotentialEnergy(self._context))
         plant, context = self._without_bushings
         plant.SetPositions(context, self.plant.GetPositions(self._context))
@@ -236,7 +221,7 @@ class DrakeDynamics(Dynamics):
 
         def one(q: Array) -> Array:
             self._set(q)
-            X_WB = self.plant.EvalBodyPoseInWorld(self._context, self.made.bodies[f.body])
+            X_WB = self.plant.EvalBodyPoseInWorld(self._context, self.maps.bodies[f.body])
             X = np.eye(4)
             X[:3, :3] = X_WB.rotation().matrix() @ f.rotation
             X[:3, 3] = X_WB.multiply(np.array(f.translation))
@@ -246,7 +231,7 @@ class DrakeDynamics(Dynamics):
 
     def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
         f = self.model.frame(frame)
-        body, world = self.made.bodies[f.body], self.plant.world_frame()
+        body, world = self.maps.bodies[f.body], self.plant.world_frame()
 
         def one(q: Array) -> Array:
             self._set(q)
@@ -264,30 +249,15 @@ class DrakeDynamics(Dynamics):
 # Drake's own integrators on the plant that was built.
 
 # Drake's default of 0.1 s would hold a slow motion's steps down for no reason.
-_LONGEST: Final = 1e9
+_MAX_STEP: Final = 1e9
 
 
 class DrakeRun:
-    """A state on its way by one of Drake's integrators.
+    """A state that one of Drake's integrators carries on; `scheme` is of `pydrake.systems.analysis`.
 
-    Parameters
-    ----------
-    dyn : DrakeDynamics
-    scheme : str
-        Of `pydrake.systems.analysis.GetIntegrationSchemes`.
-    accuracy : float
-        What Drake holds the relative error of a step below.
-    t : float
-        Time of the first state, s.
-    q, v : (nq,), (nv,) arrays
-    watch : callable
-        Gets the time after each step; what it raises ends the run.
-
-    Raises
-    ------
-    UnsupportedError
-        Mimic joints, which Drake does not reduce, or ball joints, whose angles Drake cannot carry through
-        their pole.
+    `accuracy` bounds the relative error of a step; `watch` gets the time, s, after each step and may raise.
+    Raises `UnsupportedError` for mimic joints, which Drake does not reduce, and for ball joints, whose angles
+    have a pole in Drake.
     """
 
     def __init__(
@@ -308,8 +278,8 @@ class DrakeRun:
                     f"drake: ball joint {joint.name!r} has roll, pitch and yaw there, which end at a pole; "
                     "use a method that any engine has, such as rk853"
                 )
-        self._dyn, self._made = dyn, dyn.made
-        plant = self._made.plant
+        self._dyn, self._maps = dyn, dyn.maps
+        plant = self._maps.plant
         self._plant, self._context = plant, plant.CreateDefaultContext()
         self._force = plant.get_applied_generalized_force_input_port()
         self.push(np.zeros(dyn.model.nv))
@@ -317,12 +287,12 @@ class DrakeRun:
         plant.SetPositions(self._context, x)
         plant.SetVelocities(self._context, u)
         simulator = Simulator(plant, self._context)
-        config = SimulatorConfig(integration_scheme=scheme, accuracy=accuracy, max_step_size=_LONGEST)
+        config = SimulatorConfig(integration_scheme=scheme, accuracy=accuracy, max_step_size=_MAX_STEP)
         ApplySimulatorConfig(config, simulator)
         # The configuration resets the time.
         self._context.SetTime(t)
         integrator = simulator.get_mutable_integrator()
-        # Too small a step is told, not taken on with an error that nobody knows.
+        # Too small a step is an error, not carried on with an error that nobody knows.
         integrator.set_throw_on_minimum_step_size_violation(True)
 
         def monitor(context: Any) -> Any:
@@ -333,13 +303,13 @@ class DrakeRun:
         self._simulator, self._integrator = simulator, integrator
 
     def push(self, tau: Array) -> None:
-        """Hold a generalized force from now on; not for bodies that turn freely."""
-        if tau.any() and self._made.turning:
+        """Hold a generalized force from now on; `UnsupportedError` for bodies that turn freely."""
+        if tau.any() and self._maps.turning:
             raise UnsupportedError(
                 "drake: a force on a free joint would be held in world axes; use a method that any engine has"
             )
         layout = self._dyn.model.layout
-        self._force.FixValue(self._context, layout.expand_v(tau)[self._made.v_index])
+        self._force.FixValue(self._context, layout.expand_v(tau)[self._maps.v_index])
 
     def over(self, t: float) -> tuple[Array, Array]:
         """Go on to a time, s; return q and v there."""
@@ -348,12 +318,12 @@ class DrakeRun:
 
     def state(self) -> tuple[Array, Array]:
         """Return q and v, with unit quaternions."""
-        layout, made = self._dyn.model.layout, self._made
+        layout, maps = self._dyn.model.layout, self._maps
         x, u = self._plant.GetPositions(self._context), self._plant.GetVelocities(self._context)
         q, v = np.zeros(layout.sizes[2]), np.zeros(layout.sizes[3])
-        plain_q, plain_v = made.q_index >= 0, made.v_index >= 0
-        q[made.q_index[plain_q]], v[made.v_index[plain_v]] = x[plain_q], u[plain_v]
-        for joint, iq, iv in made.turning:
+        plain_q, plain_v = maps.q_index >= 0, maps.v_index >= 0
+        q[maps.q_index[plain_q]], v[maps.v_index[plain_v]] = x[plain_q], u[plain_v]
+        for joint, iq, iv in maps.turning:
             own_q, own_v = layout.full_q[joint.name], layout.full_v[joint.name]
             quaternion = x[[iq + 1, iq + 2, iq + 3, iq]]
             quaternion = quaternion / np.linalg.norm(quaternion)

@@ -1,4 +1,4 @@
-"""Drake's own importers of URDF and MJCF, and what they made of a file.
+"""Drake's own importers of URDF and MJCF, and the plants that they read, described.
 
 The only place that knows what a parsed plant holds: a joint's frames stand off its bodies' frames,
 inertias are about a body's origin, a rotor's inertia belongs to an actuator, a pitch is metres per
@@ -8,7 +8,6 @@ turn, and a base that nothing holds floats.
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
@@ -19,11 +18,10 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 
 from mbkit._check import Array
-from mbkit._fork import fork_safe
-from mbkit.engines.base import Dynamics, per_sample
+from mbkit.engines.base import Dynamics, by_sample
 from mbkit.engines.drake.engine import DrakeDynamics
 from mbkit.engines.drake.model import DrakeModel
-from mbkit.engines.imported import Imported, checked, unused, written
+from mbkit.engines.imported import Imported, checked, joint_of, unused, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.urdf_links import BASE_JOINT
 from mbkit.model import Body, Joint, Model
@@ -40,7 +38,7 @@ _KINDS: Final = {
     "quaternion_floating": "free",
 }
 _TURN: Final = 2 * np.pi
-#: What Drake says of every file, and what was never for it.
+#: Parts of messages that Drake gives for every file, or that are not for it.
 _IDLE: Final = ("safety_controller", "calibration")
 
 
@@ -59,7 +57,7 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
             # A demand of Drake's that fails comes as SystemExit.
             raise UnsupportedError(f"drake: {' '.join(str(error).replace(f'{path.parent}/', '').split())}") from None
     described = _Description(plant, floating_base)
-    dyn = _Read(checked("drake", described.model), described.made)
+    dyn = _Read(checked("drake", described.model), described.maps)
     notes = [f"the base {welded!r} floats by itself; welded to the world here"] if welded else []
     notes += [h for h in dict.fromkeys(heard) if not any(x in h for x in _IDLE)]
     if plant.num_constraints():
@@ -72,19 +70,19 @@ def _heard() -> Iterator[list[str]]:
     """Collect what Drake logs."""
     heard: list[str] = []
 
-    class Ear(logging.Handler):
+    class Collector(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             heard.append(" ".join(record.getMessage().split("warning: ")[-1].split()))
 
-    logger, ear = logging.getLogger("drake"), Ear()
+    logger, collector = logging.getLogger("drake"), Collector()
     level, propagate = logger.level, logger.propagate
-    logger.addHandler(ear)
+    logger.addHandler(collector)
     logger.setLevel(logging.WARNING)
     logger.propagate = False
     try:
         yield heard
     finally:
-        logger.removeHandler(ear)
+        logger.removeHandler(collector)
         logger.setLevel(level)
         logger.propagate = propagate
 
@@ -101,28 +99,22 @@ def _weld(plant: Any, models: Any) -> str:
 class _Read(DrakeDynamics):
     """Drake on its own plant."""
 
-    def __init__(self, model: Model, made: DrakeModel) -> None:
+    def __init__(self, model: Model, maps: DrakeModel) -> None:
         Dynamics.__init__(self, model)
-        self.made, self.plant = made, made.plant
-        self._context = self.plant.CreateDefaultContext()
-        self._lock = fork_safe(threading.RLock())
-        self._rotations: list[tuple[Array, int, int | None]] = []
+        self._hold(maps)
 
     def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:  # noqa: ARG002
         """Return M, g, nle and passive at a batch of states."""
         return {"M": self.mass_matrix(q), "g": self.gravity(q), "nle": self.nle(q, v), "passive": self.passive(q, v)}
 
+    @by_sample
     def _passive(self, q: Array, v: Array) -> Array:
         plant, context, forces = self.plant, self._context, MultibodyForces(self.plant)
-
-        def one(q: Array, v: Array) -> Array:
-            self._set(q, v)
-            plant.CalcForceElementsContribution(context, forces)
-            # Gravity is among Drake's force elements.
-            weight = plant.CalcGravityGeneralizedForces(context)
-            return self._force(plant.CalcGeneralizedForces(context, forces) - weight)
-
-        return per_sample(one, q, v)
+        self._set(q, v)
+        plant.CalcForceElementsContribution(context, forces)
+        # Gravity is among Drake's force elements.
+        weight = plant.CalcGravityGeneralizedForces(context)
+        return self._force(plant.CalcGeneralizedForces(context, forces) - weight)
 
 
 class _Description:
@@ -158,19 +150,8 @@ class _Description:
             if floating_base and kind == "free" and not int(parent.index()):
                 # Called after its body by itself.
                 name = BASE_JOINT
-            joints.append(
-                _described(
-                    name,
-                    joint,
-                    kind,
-                    self.names[int(parent.index())],
-                    self.names[index],
-                    R_P @ R_F,
-                    p_P + R_P @ p_F,
-                    effort,
-                    armature,
-                )
-            )
+            place = self.names[int(parent.index())], self.names[index], R_P @ R_F, p_P + R_P @ p_F
+            joints.append(_described(name, joint, kind, place, effort, armature))
             bodies.append(_matter(self.names[index], child, *self.at[index]))
             self.theirs.append((name, joint))
         # Coordinates stand in the order of Drake's velocities.
@@ -178,7 +159,7 @@ class _Description:
         joints, self.theirs = [joints[k] for k in order], [self.theirs[k] for k in order]
         gravity = np.array(plant.gravity_field().gravity_vector())
         self.model = Model(name="drake", gravity=gravity, bodies=tuple(bodies), joints=tuple(joints))
-        self.made = self._mapped()
+        self.maps = self._mapped()
 
     @staticmethod
     def _first_velocity(joint: Any) -> int:
@@ -245,41 +226,21 @@ def _matter(name: str, body: Any, R: Array, p: Array) -> Body:
 
 
 def _described(
-    name: str, joint: Any, kind: str, parent: str, child: str, R: Array, p: Array, effort: float, armature: float
+    name: str, joint: Any, kind: str, place: tuple[str, str, Array, Array], effort: float, armature: float
 ) -> Joint:
-    type_ = kind_of(kind)
-    lower, upper = np.full(type_.nq, -np.inf), np.full(type_.nq, np.inf)
-    speed = np.full(type_.nv, np.inf)
-    axes, pitch = np.empty((0, 3)), 0.0
-    damping = np.array(joint.default_damping_vector()) if type_.nv else np.zeros(0)
+    nv = kind_of(kind).nv
+    damping = np.array(joint.default_damping_vector()) if nv else np.zeros(0)
     if kind == "free":
         # Drake's order is angular, linear.
         damping = np.r_[damping[3:], damping[:3]]
-    if type_.nv == 1:
+    numbers: dict[str, Any] = {"damping": damping, "effort_limit": np.full(nv, effort)}
+    if nv == 1:
         axis = {"revolute": "revolute_axis", "prismatic": "translation_axis", "helical": "screw_axis"}[kind]
-        axes = np.array([getattr(joint, axis)()])
         lower, upper = np.array(joint.position_lower_limits()), np.array(joint.position_upper_limits())
-        speed = np.array(joint.velocity_upper_limits())
+        numbers |= {"axes": np.array([getattr(joint, axis)()]), "lower": lower, "upper": upper}
+        numbers |= {"velocity_limit": np.array(joint.velocity_upper_limits()), "armature": np.full(1, armature)}
         if kind == "helical":
-            pitch = float(joint.screw_pitch()) / _TURN
+            numbers["pitch"] = float(joint.screw_pitch()) / _TURN
         if kind == "revolute" and not np.isfinite([lower, upper]).any():
             kind = "continuous"
-    return Joint(
-        name=name,
-        kind=kind,
-        parent=parent,
-        child=child,
-        rotation=R,
-        translation=p,
-        axes=axes,
-        pitch=pitch,
-        lower=lower,
-        upper=upper,
-        velocity_limit=speed,
-        effort_limit=np.full(type_.nv, effort),
-        armature=np.full(type_.nv, armature) if type_.nv == 1 else np.zeros(type_.nv),
-        damping=damping,
-        friction=np.zeros(type_.nv),
-        stiffness=np.zeros(type_.nv),
-        rest=np.zeros(type_.nv),
-    )
+    return joint_of(name, kind, *place, **numbers)

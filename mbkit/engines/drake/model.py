@@ -18,57 +18,34 @@ from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
 
 from mbkit._check import Array
-from mbkit.engines.base import unknown_joint
+from mbkit.engines.base import STACKS, unknown_joint
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.parts import PointSpring
 from mbkit.model.validation import static_bodies
 
-_X, _Y, _Z = np.eye(3)
 _TURN: Final = 2 * np.pi
 
 
 @dataclass(frozen=True)
 class DrakeModel:
-    """The plant and the maps between its coordinates and the description's.
-
-    Attributes
-    ----------
-    plant : pydrake.multibody.plant.MultibodyPlant
-        Continuous, finalized.
-    q_index, v_index : integer arrays
-        Drake's entry i of a joint of real coordinates is full coordinate ``q_index[i]``; -1 where a joint
-        turns by a quaternion.
-    turning : tuple of (Joint, int, int)
-        Ball and free joints, with where they start in Drake's positions and velocities.
-    bodies : dict
-        Body name -> Drake's body.
-    bushings : tuple of (float, body, point, body, point)
-        Stiffness and ends of the springs that are bushings, of which Drake has no energy.
-    """
+    """A continuous, finalized plant, and the maps between its coordinates and the description's."""
 
     plant: Any
+    #: Entry i of a joint of real coordinates is full coordinate q_index[i]; -1 where a joint turns by a quaternion.
     q_index: np.ndarray
     v_index: np.ndarray
+    #: Ball and free joints, with their starts in Drake's positions and velocities.
     turning: tuple[tuple[Joint, int, int], ...]
     bodies: dict[str, Any]
+    #: Stiffness, body, point, body and point of the springs that are bushings, of which Drake has no energy.
     bushings: tuple[tuple[float, Any, Array, Any, Array], ...]
 
 
 def build(description: Model, *, gravity: bool = True, bushings: bool = True) -> DrakeModel:
-    """Make the plant.
+    """Return the plant, with or without gravity and the springs that have no length at rest.
 
-    Parameters
-    ----------
-    description : Model
-    gravity, bushings : bool
-        Whether it acts, and whether springs without a length at rest do.
-
-    Raises
-    ------
-    UnsupportedError
-        A body or a spring that Drake refuses, a joint of a type or with damping that it cannot hold, or a joint
-        coupling; named.
+    Raises `UnsupportedError` for what Drake refuses or cannot hold, and names it.
     """
     if description.couplings:
         names = ", ".join(repr(c.name) for c in description.couplings)
@@ -84,14 +61,14 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
     for k, body in enumerate(description.bodies):
         # Names of files may hold what Drake's do not; ours are kept in the map.
         bodies[body.name] = plant.AddRigidBody(f"{k}:{body.name}", _inertia(body, body.name in static))
-    made = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
+    added = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
     springs = [s for s in description.springs if bushings or s.rest_length > 0]
-    added = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
+    bushings_ = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
     try:
         plant.Finalize()
     except (RuntimeError, SystemExit) as error:
         raise UnsupportedError(f"drake: refuses {description.name}: {str(error).splitlines()[0]}") from None
-    return _mapped(plant, description, made, bodies, added)
+    return _mapped(plant, description, added, bodies, bushings_)
 
 
 def _add_spring(
@@ -124,9 +101,9 @@ def _inertia(body: Body, static: bool) -> Any:
         central = tree.RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
         return tree.SpatialInertia.MakeFromCentralInertia(float(body.mass), np.array(body.com), central)
     except (RuntimeError, SystemExit) as error:
-        told = str(error).strip().splitlines()
+        lines = str(error).strip().splitlines()
         raise UnsupportedError(
-            f"drake: refuses body {body.name!r} (mass {body.mass:.4g} kg): {told[0] if told else 'not physical'}"
+            f"drake: refuses body {body.name!r} (mass {body.mass:.4g} kg): {lines[0] if lines else 'not physical'}"
         ) from None
 
 
@@ -152,18 +129,11 @@ def _add(plant: Any, joint: Joint, bodies: dict[str, Any]) -> list[Any]:
     return out
 
 
-#: Joint type -> type and axis of each one-coordinate joint of its stack; none where it is one joint of Drake's.
+#: `STACKS`, a screw, and what is one joint of Drake's.
 _STEPS: Final[dict[str, Callable[[Joint], Sequence[tuple[str, Array]]]]] = {
-    "fixed": lambda _: (),
-    "revolute": lambda joint: [("revolute", joint.axes[0])],
-    "continuous": lambda joint: [("revolute", joint.axes[0])],
-    "prismatic": lambda joint: [("prismatic", joint.axes[0])],
+    **STACKS,
+    **dict.fromkeys(("fixed", "ball", "free"), lambda _: ()),
     "helical": lambda joint: [("helical", joint.axes[0])],
-    "universal": lambda joint: [("revolute", axis) for axis in joint.axes],
-    "spherical_zyx": lambda _: [("revolute", axis) for axis in (_Z, _Y, _X)],
-    "ball": lambda _: (),
-    "planar": lambda _: [("prismatic", _X), ("prismatic", _Y), ("revolute", _Z)],
-    "free": lambda _: (),
 }
 
 
@@ -172,15 +142,15 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
     if damping < 0:
         raise UnsupportedError(f"drake: joint {joint.name!r} has a negative damping, which Drake refuses")
     if kind == "revolute":
-        made = plant.AddJoint(tree.RevoluteJoint(name, at, body, axis, damping))
+        added = plant.AddJoint(tree.RevoluteJoint(name, at, body, axis, damping))
     elif kind == "prismatic":
-        made = plant.AddJoint(tree.PrismaticJoint(name, at, body, axis, damping=damping))
+        added = plant.AddJoint(tree.PrismaticJoint(name, at, body, axis, damping=damping))
     else:
         # Metres per radian here, per turn there.
-        made = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _TURN * joint.pitch, damping))
+        added = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _TURN * joint.pitch, damping))
     if joint.type.nv == 1 and joint.armature[0]:
         # Drake knows armature as the inertia of an actuator's rotor.
-        actuator = plant.AddJointActuator(f"{name}.rotor", made)
+        actuator = plant.AddJointActuator(f"{name}.rotor", added)
         actuator.set_default_rotor_inertia(float(joint.armature[0]))
         actuator.set_default_gear_ratio(1.0)
     stiffness, rest = float(joint.stiffness[k]), float(joint.rest[k])
@@ -189,10 +159,10 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
             raise UnsupportedError(f"drake: joint {joint.name!r} has a spring, which Drake's {kind} joint cannot have")
         spring = tree.RevoluteSpring if kind == "revolute" else tree.PrismaticSpring
         try:
-            plant.AddForceElement(spring(made, rest, stiffness))
+            plant.AddForceElement(spring(added, rest, stiffness))
         except (RuntimeError, SystemExit) as error:
             raise UnsupportedError(f"drake: refuses the spring of joint {joint.name!r}: {error}") from None
-    return made
+    return added
 
 
 def _turning(joint: Joint, at: Any, body: Any) -> Any:
@@ -208,7 +178,7 @@ def _turning(joint: Joint, at: Any, body: Any) -> Any:
 
 
 def _mapped(
-    plant: Any, description: Model, made: dict[str, list[Any]], bodies: dict[str, Any], bushings: tuple[Any, ...]
+    plant: Any, description: Model, added: dict[str, list[Any]], bodies: dict[str, Any], bushings: tuple[Any, ...]
 ) -> DrakeModel:
     layout = description.layout
     q_index, v_index = np.full(plant.num_positions(), -1), np.full(plant.num_velocities(), -1)
@@ -216,7 +186,7 @@ def _mapped(
     for joint in description.joints:
         if not joint.type.nv:
             continue
-        q, v, own = layout.full_q[joint.name], layout.full_v[joint.name], made[joint.name]
+        q, v, own = layout.full_q[joint.name], layout.full_v[joint.name], added[joint.name]
         if joint.type.quaternion is not None:
             turning.append((joint, own[0].position_start(), own[0].velocity_start()))
             continue

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
 from mbkit.engines import known_defects
-from mbkit.engines.base import Dynamics, per_sample
+from mbkit.engines.base import Dynamics, by_sample, per_sample
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import Rollout
 from mbkit.errors import InputError, NumericalError, UnsupportedError
@@ -38,10 +38,9 @@ class MujocoDynamics(Dynamics):
     Attributes
     ----------
     mj_model : mujoco.MjModel
-        What was compiled; free to read.
+        The compiled model; free to read.
     disabled : tuple of str
-        What was switched off because the comparison of smooth terms does not
-        want it.
+        Features that are off, because the smooth terms do not need them.
     """
 
     engine = "mujoco"
@@ -52,11 +51,14 @@ class MujocoDynamics(Dynamics):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self._made: MujocoModel = build(model)
-        self.mj_model = self._m = self._made.model
-        self.disabled = self._made.disabled
+        self._hold(build(model))
+
+    def _hold(self, compiled: MujocoModel) -> None:
+        self._maps = compiled
+        self.mj_model = self._m = compiled.model
+        self.disabled = compiled.disabled
         self._d = mujoco.MjData(self._m)
-        self._reduced = model.layout.reduced
+        self._reduced = self.model.layout.reduced
         self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
@@ -65,7 +67,7 @@ class MujocoDynamics(Dynamics):
             known_defects.announce(known_defects.TENDON_ARMATURE, f"coupling {names}")
         # One MjData and one handler of warnings: two threads in here end the process.
         with self._lock, heard_warnings() as heard:
-            # MuJoCo tells each kind of warning once, unless its count is put back.
+            # MuJoCo gives each kind of warning once, unless its count is put back.
             self._d.warning.number.fill(0)
             out = super()._evaluate(quantity, method, **arguments)
         if heard:
@@ -92,11 +94,11 @@ class MujocoDynamics(Dynamics):
     def _set(self, q: Array, v: Array | None = None) -> tuple[Array, Array]:
         """Put a state into MuJoCo; return full velocities and b of a_mj = T a + b."""
         layout, d = self.model.layout, self._d
-        d.qpos[:] = layout.expand_q(q)[self._made.q_index]
+        d.qpos[:] = layout.expand_q(q)[self._maps.q_index]
         full = np.zeros(layout.sizes[3]) if v is None else layout.expand_v(v)
-        qvel = full[self._made.v_index]
+        qvel = full[self._maps.v_index]
         b = np.zeros(self._m.nv)
-        for iq, iv in self._made.free:
+        for iq, iv in self._maps.free:
             R = self._rotation(iq)
             linear = qvel[iv : iv + 3].copy()
             slip = np.empty(3)
@@ -113,18 +115,18 @@ class MujocoDynamics(Dynamics):
 
     def _to_mujoco(self, x: Array) -> Array:
         """Return T x for a vector of full velocities or accelerations, after `_set`."""
-        out = self.model.layout.expand_v(x)[self._made.v_index].copy()
-        for iq, iv in self._made.free:
+        out = self.model.layout.expand_v(x)[self._maps.v_index].copy()
+        for iq, iv in self._maps.free:
             out[iv : iv + 3] = self._rotation(iq) @ out[iv : iv + 3]
         return np.asarray(out)
 
     def _columns(self, J: Array) -> Array:
         """Return J T, in the description's order and reduced."""
         J = J.copy()
-        for iq, iv in self._made.free:
+        for iq, iv in self._maps.free:
             J[:, iv : iv + 3] = J[:, iv : iv + 3] @ self._rotation(iq)
         full = np.empty_like(J)
-        full[:, self._made.v_index] = J
+        full[:, self._maps.v_index] = J
         return np.asarray(full @ self.model.layout.G) if self._reduced else full
 
     def _force(self, f: Array) -> Array:
@@ -143,17 +145,11 @@ class MujocoDynamics(Dynamics):
         lengths = self._d.ten_length[self._lines]
         return np.full_like(x, np.nan) if (lengths < mujoco.mjMINVAL).any() else np.asarray(x)
 
-    def _positions(self) -> None:
-        mujoco.mj_fwdPosition(self._m, self._d)
-
     def _velocities(self) -> None:
         mujoco.mj_fwdPosition(self._m, self._d)
         mujoco.mj_fwdVelocity(self._m, self._d)
 
     # The protocol.
-
-    def _mass_matrix(self, q: Array) -> Array:
-        return per_sample(self._one_mass_matrix, q)
 
     def _one_mass_matrix(self, q: Array) -> Array:
         self._set(q)
@@ -164,6 +160,8 @@ class MujocoDynamics(Dynamics):
             mujoco.mj_tendon(self._m, self._d)
         mujoco.mj_makeM(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
+
+    _mass_matrix = by_sample(_one_mass_matrix)
 
     def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
         """Return Σ |terms| / M_jj, worst over j.
@@ -186,26 +184,22 @@ class MujocoDynamics(Dynamics):
         terms = turning.sum(axis=1) + mixed + coupling + mass * np.sum(v * v, axis=1)
         layout = self.model.layout
         full = np.empty(self._m.nv)
-        full[self._made.v_index] = terms
+        full[self._maps.v_index] = terms
         own = layout.G.T**2 @ full if self._reduced else full
         diagonal = np.diag(M)
         return np.array(np.max(own / np.where(diagonal > 0, diagonal, np.inf), initial=1.0))
 
+    @by_sample
     def _gravity(self, q: Array) -> Array:
-        def one(q: Array) -> Array:
-            self._set(q)
-            self._velocities()
-            return self._force(self._d.qfrc_bias)
+        self._set(q)
+        self._velocities()
+        return self._force(self._d.qfrc_bias)
 
-        return per_sample(one, q)
-
+    @by_sample
     def _nle(self, q: Array, v: Array) -> Array:
-        def one(q: Array, v: Array) -> Array:
-            _, b = self._set(q, v)
-            self._velocities()
-            return self._force(self._d.qfrc_bias + self._times_mass(b))
-
-        return per_sample(one, q, v)
+        _, b = self._set(q, v)
+        self._velocities()
+        return self._force(self._d.qfrc_bias + self._times_mass(b))
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
         # With gravity off, so that nothing cancels.
@@ -218,31 +212,27 @@ class MujocoDynamics(Dynamics):
 
     def _times_mass(self, x: Array) -> Array:
         out = np.zeros(self._m.nv)
-        if self._made.free:
+        if self._maps.free:
             mujoco.mj_mulM(self._m, self._d, out, x)
         return out
 
+    @by_sample
     def _passive(self, q: Array, v: Array) -> Array:
-        def one(q: Array, v: Array) -> Array:
-            self._set(q, v)
-            self._velocities()
-            return self._directed(self._force(self._d.qfrc_passive))
+        self._set(q, v)
+        self._velocities()
+        return self._directed(self._force(self._d.qfrc_passive))
 
-        return per_sample(one, q, v)
-
+    @by_sample
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        def one(q: Array, v: Array, a: Array) -> Array:
-            _, b = self._set(q, v)
-            self._d.qacc[:] = self._to_mujoco(a) + b
-            mujoco.mj_inverse(self._m, self._d)
-            return self._directed(self._force(self._d.qfrc_inverse))
+        _, b = self._set(q, v)
+        self._d.qacc[:] = self._to_mujoco(a) + b
+        mujoco.mj_inverse(self._m, self._d)
+        return self._directed(self._force(self._d.qfrc_inverse))
 
-        return per_sample(one, q, v, a)
-
+    @by_sample
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        return per_sample(self._forward_reduced if self._reduced else self._forward_tree, q, v, tau)
-
-    def _forward_tree(self, q: Array, v: Array, tau: Array) -> Array:
+        if self._reduced:
+            return self._forward_reduced(q, v, tau)
         _, b = self._set(q, v)
         # T is orthogonal, so a force maps as a velocity does.
         self._d.qfrc_applied[:] = self._to_mujoco(tau)
@@ -258,32 +248,28 @@ class MujocoDynamics(Dynamics):
         rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
         return self._directed(np.linalg.solve(M, tau + rest))
 
-    def _kinetic_energy(self, q: Array, v: Array) -> Array:
-        def one(q: Array, v: Array) -> Any:
-            self._set(q, v)
-            self._velocities()
-            mujoco.mj_energyVel(self._m, self._d)
-            return float(self._d.energy[1])
+    @by_sample
+    def _kinetic_energy(self, q: Array, v: Array) -> Any:
+        self._set(q, v)
+        self._velocities()
+        mujoco.mj_energyVel(self._m, self._d)
+        return float(self._d.energy[1])
 
-        return per_sample(one, q, v)
-
-    def _potential_energy(self, q: Array) -> Array:
-        def one(q: Array) -> Any:
-            self._set(q)
-            self._positions()
-            mujoco.mj_energyPos(self._m, self._d)
-            return float(self._d.energy[0])
-
-        return per_sample(one, q)
+    @by_sample
+    def _potential_energy(self, q: Array) -> Any:
+        self._set(q)
+        mujoco.mj_fwdPosition(self._m, self._d)
+        mujoco.mj_energyPos(self._m, self._d)
+        return float(self._d.energy[0])
 
     def _body(self, frame: str) -> tuple[int, Array, Array]:
         f = self.model.frame(frame)
-        if f.body in self._made.absorbed:
+        if f.body in self._maps.absorbed:
             raise UnsupportedError(
                 f"mujoco: frame {frame!r} rides on {f.body!r}, a body without mass between two joints, "
                 "which MuJoCo holds as two joints of one body"
             )
-        return self._made.bodies[f.body], f.rotation, f.translation
+        return self._maps.bodies[f.body], f.rotation, f.translation
 
     def _frame_pose(self, body: int, R_BF: Array, p_BF: Array) -> tuple[Array, Array]:
         mujoco.mj_kinematics(self._m, self._d)
@@ -377,4 +363,4 @@ class MujocoDynamics(Dynamics):
         model = copy.copy(self._m)
         if euler_damping:
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        return Rollout(self.model, self._made, model)(integrator, q0, v0, dt, tau, steps, progress)
+        return Rollout(self.model, self._maps, model)(integrator, q0, v0, dt, tau, steps, progress)

@@ -1,4 +1,4 @@
-"""MuJoCo's own importer of URDF and MJCF, and what it made of a file.
+"""MuJoCo's own importer of URDF and MJCF, and the models that it reads, described.
 
 The only place that knows how a compiled `mjModel` holds a tree: joints stand in a body's own axes
 and may be several, `qpos0` is where they are drawn, inertias are principal moments in axes of
@@ -18,7 +18,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.imported import Beside, Imported, checked, unused
+from mbkit.engines.imported import Beside, Imported, checked, joint_of, stacked, unused
 from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf_couplings import coupled
@@ -31,7 +31,8 @@ _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
 _OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _ASLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 #: Names that a note lists.
-_FEW: Final = 6
+_MAX_NAMES: Final = 6
+_OF_TENDON: Final = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature")
 
 
 def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
@@ -65,8 +66,8 @@ def _floating(text: str) -> Any:
     spec = mujoco.MjSpec.from_string(text)
     tops = list(spec.worldbody.bodies)
     if len(tops) != 1:
-        told = ", ".join(repr(b.name) for b in tops) or "none"
-        raise UnsupportedError(f"mujoco: no single body stands in the world that could float; there are: {told}")
+        names = ", ".join(repr(b.name) for b in tops) or "none"
+        raise UnsupportedError(f"mujoco: no single body stands in the world that could float; there are: {names}")
     tops[0].add_freejoint(name=BASE_JOINT)
     return spec.compile()
 
@@ -111,8 +112,7 @@ class _Terms:
                 extra.remove(m)
         data = mujoco.MjData(m)
         with heard_warnings():
-            made = [self._one(m, data, *x) for x in zip(q, v, strict=True)]
-        return {name: np.array([x[name] for x in made]) for name in ("M", "g", "nle", "passive")}
+            return stacked(self._one(m, data, *x) for x in zip(q, v, strict=True))
 
     def _one(self, m: Any, d: Any, q: Array, v: Array) -> dict[str, Array]:
         T, slip, qvel = np.zeros((m.nv, m.nv)), np.zeros(m.nv), np.zeros(m.nv)
@@ -153,7 +153,9 @@ def _constraints(m: Any) -> list[str]:
     out = []
     for kind, names in kinds.items():
         what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
-        some = ", ".join(names[:_FEW]) + (f" and {len(names) - _FEW} more" if len(names) > _FEW else "")
+        some = ", ".join(names[:_MAX_NAMES]) + (
+            f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+        )
         out.append(f"{what} ({some}), in none of the terms")
     return out
 
@@ -162,10 +164,12 @@ def _extras(m: Any) -> list[_Extra]:
     """Return what may act in a compiled model beside its bodies and joints, with its numbers."""
     out = []
     for i in range(m.ntendon):
-        numbers = _numbers(m, "tendon", i, ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature"))
+        numbers = _numbers(m, "tendon", i, _OF_TENDON)
         if numbers:
             says = f"tendon {_called(m.tendon(i), i)} has {numbers}"
-            out.append(_Extra(Beside(f"tendon {i}", "tendon", says), _cleared("tendon", i)))
+            out.append(
+                _Extra(Beside(f"tendon {i}", "tendon", says), _zeroed(i, *(f"tendon_{name}" for name in _OF_TENDON)))
+            )
     # An actuator may have several controls, which nu counts.
     for i in range(len(m.actuator_trntype)):
         numbers = _numbers(m, "actuator", i, ("gear", "armature", "damping", "dampingpoly", "gainprm", "biasprm"))
@@ -173,7 +177,7 @@ def _extras(m: Any) -> list[_Extra]:
         out.append(_Extra(Beside(f"actuator {i}", "actuator", says), _silent(i)))
     for b in map(int, np.flatnonzero(m.body_gravcomp)):
         says = f"body {_called(m.body(b), b)} has gravity compensation {m.body_gravcomp[b]:g}"
-        out.append(_Extra(Beside(f"body {b}", "gravity compensation", says), _zeroed("body_gravcomp", b)))
+        out.append(_Extra(Beside(f"body {b}", "gravity compensation", says), _zeroed(b, "body_gravcomp")))
     if m.opt.density or m.opt.viscosity:
         wind = " ".join(f"{x:g}" for x in m.opt.wind)
         says = f"a fluid acts (density {m.opt.density:g}, viscosity {m.opt.viscosity:g}, wind {wind})"
@@ -184,11 +188,11 @@ def _extras(m: Any) -> list[_Extra]:
         if any(np.any(getattr(m, name)[j]) for name in names):
             what = "a spring on its rotation" if turning else "a spring that is not linear"
             says = f"joint {_called(m.joint(j), j)} has {what}"
-            out.append(_Extra(Beside(f"joint {j}", "spring", says), _zeroed_all(names, j)))
+            out.append(_Extra(Beside(f"joint {j}", "spring", says), _zeroed(j, *names)))
         dofs = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + kind_of(_KINDS[int(m.jnt_type[j])]).nv)
         if np.any(m.dof_dampingpoly[dofs]):
             says = f"joint {_called(m.joint(j), j)} has a damper that is not linear"
-            out.append(_Extra(Beside(f"damper {j}", "damping", says), _zeroed("dof_dampingpoly", dofs)))
+            out.append(_Extra(Beside(f"damper {j}", "damping", says), _zeroed(dofs, "dof_dampingpoly")))
     return out
 
 
@@ -205,20 +209,16 @@ def _called(element: Any, index: int) -> str:
 
 
 def _numbers(m: Any, what: str, i: int, names: tuple[str, ...]) -> str:
-    told = []
+    texts = []
     for name in names:
         values = np.ravel(getattr(m, f"{what}_{name}")[i])
         if np.any(values):
             last = int(np.flatnonzero(values)[-1]) + 1
-            told.append(f"{name} {' '.join(f'{x:g}' for x in values[:last])}")
-    return ", ".join(told)
+            texts.append(f"{name} {' '.join(f'{x:g}' for x in values[:last])}")
+    return ", ".join(texts)
 
 
-def _zeroed(name: str, at: Any) -> Callable[[Any], None]:
-    return _zeroed_all((name,), at)
-
-
-def _zeroed_all(names: tuple[str, ...], at: Any) -> Callable[[Any], None]:
+def _zeroed(at: Any, *names: str) -> Callable[[Any], None]:
     def remove(m: Any) -> None:
         for name in names:
             getattr(m, name)[at] = 0.0
@@ -226,14 +226,9 @@ def _zeroed_all(names: tuple[str, ...], at: Any) -> Callable[[Any], None]:
     return remove
 
 
-def _cleared(what: str, i: int) -> Callable[[Any], None]:
-    names = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature")
-    return _zeroed_all(tuple(f"{what}_{name}" for name in names), i)
-
-
 def _silent(i: int) -> Callable[[Any], None]:
     def remove(m: Any) -> None:
-        _zeroed_all(("actuator_armature", "actuator_damping", "actuator_dampingpoly"), i)(m)
+        _zeroed(i, "actuator_armature", "actuator_damping", "actuator_dampingpoly")(m)
         m.actuator_forcelimited[i] = 1
         m.actuator_forcerange[i] = 0.0
 
@@ -315,47 +310,28 @@ class _Description:
     def _joint(self, name: str, kind: str, parent: str, child: str, R: Array, p: Array, j: int) -> None:
         m, type_ = self.m, kind_of(kind)
         v = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + type_.nv) if j >= 0 else slice(0, 0)
-        lower, upper = np.full(type_.nq, -np.inf), np.full(type_.nq, np.inf)
-        stiffness, rest, effort = np.zeros(type_.nv), np.zeros(type_.nv), np.full(type_.nv, np.inf)
-        axes = np.empty((0, 3))
+        numbers: dict[str, Any] = {"armature": np.array(m.dof_armature[v]), "friction": np.array(m.dof_frictionloss[v])}
+        if not self._off("DAMPER"):
+            numbers["damping"] = np.array(m.dof_damping[v])
         if type_.nv == 1:
             axis, ref = np.array(m.jnt_axis[j]), float(m.qpos0[m.jnt_qposadr[j]])
-            axes = axis[None, :]
+            numbers["axes"] = axis[None, :]
             # At q = ref the body is where it is drawn.
             if ref and kind == "revolute":
                 R = R @ spatial.matrix_from_quaternion(spatial.exp_quaternion(-ref * axis))
             elif ref:
                 p = p - R @ (ref * axis)
             if m.jnt_limited[j]:
-                lower, upper = np.split(np.array(m.jnt_range[j]), 2)
+                numbers["lower"], numbers["upper"] = np.split(np.array(m.jnt_range[j]), 2)
             elif kind == "revolute":
                 kind = "continuous"
             if m.jnt_actfrclimited[j]:
-                effort = np.array([np.abs(m.jnt_actfrcrange[j]).max()])
-            stiffness = np.zeros(1) if self._off("SPRING") else np.array([float(np.ravel(m.jnt_stiffness[j])[0])])
-            rest = np.array([m.qpos_spring[m.jnt_qposadr[j]]]) if stiffness.any() else rest
+                numbers["effort_limit"] = np.array([np.abs(m.jnt_actfrcrange[j]).max()])
+            stiffness = float(np.ravel(m.jnt_stiffness[j])[0])
+            if stiffness and not self._off("SPRING"):
+                numbers["stiffness"], numbers["rest"] = np.array([stiffness]), m.qpos_spring[[m.jnt_qposadr[j]]]
         self.numbers.append(j)
-        self.joints.append(
-            Joint(
-                name=name,
-                kind=kind,
-                parent=parent,
-                child=child,
-                rotation=R,
-                translation=p,
-                axes=axes,
-                pitch=0.0,
-                lower=lower,
-                upper=upper,
-                velocity_limit=np.full(type_.nv, np.inf),
-                effort_limit=effort,
-                armature=np.array(m.dof_armature[v]),
-                damping=np.zeros(type_.nv) if self._off("DAMPER") else np.array(m.dof_damping[v]),
-                friction=np.array(m.dof_frictionloss[v]),
-                stiffness=stiffness,
-                rest=rest,
-            )
-        )
+        self.joints.append(joint_of(name, kind, parent, child, R, p, **numbers))
 
     def _spring(self, t: int) -> tuple[float, float, float]:
         """Return a tendon's stiffness, rest length and damping; a spring with a range of rest lengths is left out."""

@@ -5,7 +5,6 @@ MuJoCo's writer keeps six digits. Here numbers are the shortest decimals that gi
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
@@ -14,7 +13,6 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
-from mbkit._fork import fork_safe
 from mbkit.engines.base import Dynamics
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import JOINT_TYPES, MujocoModel, Placed, heard_warnings, mapped, specified
@@ -32,33 +30,16 @@ _LEAST: Final = 2e-15
 
 
 class ReadBack(MujocoDynamics):
-    """MuJoCo on the model that its own parser made of a text."""
+    """MuJoCo on the model that its own parser compiled of a text."""
 
-    def __init__(self, model: Model, made: MujocoModel) -> None:
+    def __init__(self, model: Model, compiled: MujocoModel) -> None:
         Dynamics.__init__(self, model)
-        self._made = made
-        self.mj_model = self._m = made.model
-        self.disabled = ()
-        self._d = mujoco.MjData(self._m)
-        self._reduced = model.layout.reduced
-        self._lock = fork_safe(threading.RLock())
+        self._hold(compiled)
 
 
 def mjcf_text(model: Model, comment: str) -> str:
-    """Return a description as MJCF.
-
-    Parameters
-    ----------
-    model : Model
-    comment : str
-        What stands at its head.
-
-    Raises
-    ------
-    UnsupportedError
-        With everything that MJCF cannot say of it.
-    """
-    faults = list(_unsayable(model))
+    """Return a description as MJCF, or raise `UnsupportedError` with all that MJCF cannot hold of it."""
+    faults = list(_unsupported(model))
     if faults:
         raise UnsupportedError(f"MJCF cannot say of {model.name}: {'; '.join(faults)}")
     spec, placed, _ = specified(model)
@@ -66,7 +47,7 @@ def mjcf_text(model: Model, comment: str) -> str:
         f"<mujoco model={xml_attribute(model.name)}>",
         f"  <!-- {xml_comment(comment)} -->",
         '  <compiler angle="radian" autolimits="false" inertiafromgeom="false" balanceinertia="false"/>',
-        f"  <option{_told(gravity=model.gravity)}/>",
+        f"  <option{_attributes(gravity=model.gravity)}/>",
         "  <worldbody>",
     ]
     owners = {name: joint for joint in model.joints for name in placed.joints[joint.name]}
@@ -78,33 +59,27 @@ def mjcf_text(model: Model, comment: str) -> str:
 
 
 def read_back(model: Model, text: str) -> ReadBack:
-    """Return what MuJoCo's parser makes of a text of `mjcf_text`, in the description's coordinates.
-
-    Raises
-    ------
-    UnsupportedError
-        MuJoCo refuses the text.
-    """
+    """Return the model that MuJoCo's parser reads from a text of `mjcf_text`, in the description's coordinates."""
     _, placed, _ = specified(model)
     with heard_warnings():
         try:
-            made = mujoco.MjModel.from_xml_string(text)
+            compiled = mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
-            told = " ".join(str(error).split())
-            raise UnsupportedError(f"mujoco: refuses what was written of {model.name}: {told}") from None
-    return ReadBack(model, mapped(made, model, placed, ()))
+            reason = " ".join(str(error).split())
+            raise UnsupportedError(f"mujoco: refuses what was written of {model.name}: {reason}") from None
+    return ReadBack(model, mapped(compiled, model, placed, ()))
 
 
-def _unsayable(model: Model) -> Iterator[str]:
+def _unsupported(model: Model) -> Iterator[str]:
     for joint in model.joints:
-        who = f"joint {joint.name!r}"
+        name = f"joint {joint.name!r}"
         if joint.kind not in JOINT_TYPES:
-            yield f"{who} is {joint.kind}"
+            yield f"{name} is {joint.kind}"
         parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
         if any(np.ptp(x) > 0 for x in parts):
-            yield f"{who} is damped differently along its body axes"
+            yield f"{name} is damped differently along its body axes"
         elif joint.kind == "free" and joint.parent == "world" and np.ptp(joint.damping) > 0:
-            yield f"{who} is damped differently in turning and in moving"
+            yield f"{name} is damped differently in turning and in moving"
     for coupling in model.couplings:
         if coupling.armature and model.branched(coupling):
             yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
@@ -113,9 +88,9 @@ def _unsayable(model: Model) -> Iterator[str]:
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
 
-def _told(**attributes: Any) -> str:
+def _attributes(**values: Any) -> str:
     out = []
-    for name, value in attributes.items():
+    for name, value in values.items():
         if isinstance(value, str):
             out.append(f" {name}={xml_attribute(value)}")
         elif value is not None:
@@ -128,18 +103,18 @@ def _body(body: Any, owners: dict[str, Joint], placed: Placed, model: Model, ind
     if name != "world":
         moments = placed.degenerate.get(name, np.array(body.inertia))
         if body.mass > 0 or moments.any():
-            at = _told(pos=body.ipos, quat=body.iquat, mass=body.mass, diaginertia=_allowed(moments))
+            at = _attributes(pos=body.ipos, quat=body.iquat, mass=body.mass, diaginertia=_allowed(moments))
             yield f"{indent}<inertial{at}/>"
     for joint in body.joints:
         yield f"{indent}<joint{_joint(joint, owners[joint.name])}/>"
-    frames = [(f.name, f.translation, f.rotation) for f in model.frames if f.body == name]
     for site in body.sites:
-        yield f"{indent}<site{_told(name=site.name, pos=site.pos)}/>"
-    for own, p, R in frames:
-        yield f"{indent}<site{_told(name=own, pos=p, xyaxes=R.T[:2])}/>"
+        yield f"{indent}<site{_attributes(name=site.name, pos=site.pos)}/>"
+    for f in model.frames:
+        if f.body == name:
+            yield f"{indent}<site{_attributes(name=f.name, pos=f.translation, xyaxes=f.rotation.T[:2])}/>"
     for child in body.bodies:
         simple = None if child.simple else "false"
-        yield f"{indent}<body{_told(name=child.name, pos=child.pos, quat=child.quat, simple=simple)}>"
+        yield f"{indent}<body{_attributes(name=child.name, pos=child.pos, quat=child.quat, simple=simple)}>"
         yield from _body(child, owners, placed, model, indent + "  ")
         yield f"{indent}</body>"
 
@@ -158,23 +133,23 @@ def _allowed(moments: Array) -> Array:
 
 def _joint(joint: Any, owner: Joint) -> str:
     kind = _TYPES[int(joint.type)]
-    given: dict[str, Any] = {"name": joint.name, "type": kind}
+    attributes: dict[str, Any] = {"name": joint.name, "type": kind}
     if kind in ("hinge", "slide"):
-        given |= {"pos": joint.pos, "axis": joint.axis}
+        attributes |= {"pos": joint.pos, "axis": joint.axis}
         for name in ("stiffness", "damping"):
-            given[name] = np.ravel(getattr(joint, name))[0] or None
-        given["springref"] = joint.springref if given["stiffness"] else None
-        given["armature"], given["frictionloss"] = joint.armature or None, joint.frictionloss or None
+            attributes[name] = np.ravel(getattr(joint, name))[0] or None
+        attributes["springref"] = joint.springref if attributes["stiffness"] else None
+        attributes["armature"], attributes["frictionloss"] = joint.armature or None, joint.frictionloss or None
         # 2 is MuJoCo's "as the range says".
         if int(joint.limited) == 1:
-            given |= {"limited": "true", "range": joint.range}
+            attributes |= {"limited": "true", "range": joint.range}
         if owner.type.nv == 1 and np.isfinite(owner.effort_limit[0]) and owner.effort_limit[0] > 0:
             effort = owner.effort_limit[0]
-            given |= {"actuatorfrclimited": "true", "actuatorfrcrange": np.array([-effort, effort])}
+            attributes |= {"actuatorfrclimited": "true", "actuatorfrcrange": np.array([-effort, effort])}
     else:
-        given |= {"pos": joint.pos} if kind == "ball" else {}
-        given["damping"] = owner.damping[-1] or None
-    return _told(**given)
+        attributes |= {"pos": joint.pos} if kind == "ball" else {}
+        attributes["damping"] = owner.damping[-1] or None
+    return _attributes(**attributes)
 
 
 def _tendons(spec: Any, model: Model) -> Iterable[str]:
@@ -183,15 +158,15 @@ def _tendons(spec: Any, model: Model) -> Iterable[str]:
     out = ["  <tendon>"]
     points, between = spec.tendons[: len(model.springs)], spec.tendons[len(model.springs) :]
     for tendon in points:
-        given = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping")}
-        out.append(f"    <spatial{_told(name=tendon.name, springlength=tendon.springlength[0], **given)}>")
-        out += [f"      <site{_told(site=wrap.target.name)}/>" for wrap in tendon.path]
+        attributes = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping")}
+        out.append(f"    <spatial{_attributes(name=tendon.name, springlength=tendon.springlength[0], **attributes)}>")
+        out += [f"      <site{_attributes(site=wrap.target.name)}/>" for wrap in tendon.path]
         out.append("    </spatial>")
     for tendon in between:
-        given = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping", "armature")}
-        rest = tendon.springlength[0] if given["stiffness"] else None
-        out.append(f"    <fixed{_told(name=tendon.name, springlength=rest, **given)}>")
-        out += [f"      <joint{_told(joint=wrap.target.name, coef=wrap.coef)}/>" for wrap in tendon.path]
+        attributes = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping", "armature")}
+        rest = tendon.springlength[0] if attributes["stiffness"] else None
+        out.append(f"    <fixed{_attributes(name=tendon.name, springlength=rest, **attributes)}>")
+        out += [f"      <joint{_attributes(joint=wrap.target.name, coef=wrap.coef)}/>" for wrap in tendon.path]
         out.append("    </fixed>")
     return [*out, "  </tendon>"]
 
@@ -203,5 +178,5 @@ def _equalities(model: Model) -> Iterable[str]:
     out = ["  <equality>"]
     for name, m in mimics:
         shape = np.array([m.offset, m.ratio, 0.0, 0.0, 0.0])
-        out.append(f"    <joint{_told(joint1=name, joint2=m.joint, polycoef=shape)}/>")
+        out.append(f"    <joint{_attributes(joint1=name, joint2=m.joint, polycoef=shape)}/>")
     return [*out, "  </equality>"]

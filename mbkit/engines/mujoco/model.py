@@ -1,4 +1,4 @@
-"""A MuJoCo model made from a description with `MjSpec`, everything off that it does not need.
+"""A MuJoCo model built from a description with `MjSpec`, everything off that it does not need.
 
 MuJoCo puts several joints into one body, first to last. So a universal joint is two
 hinges, a spherical-ZYX joint three, a planar joint two slides and a hinge, and a free
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import unknown_joint
+from mbkit.engines.base import STACKS, unknown_joint
 from mbkit.engines.imported import unused
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
@@ -67,7 +67,7 @@ _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _X, _Y, _Z = np.eye(3)
 # A ball joint can only be the last of a stack: its quaternion is in the body's own axes.
-_STACKABLE: Final = ("revolute", "continuous", "prismatic", "universal", "spherical_zyx", "planar")
+_STACKABLE: Final = tuple(STACKS)
 # MuJoCo's compiler refuses principal moments below this (mjMINVAL).
 _SMALLEST: Final = 1e-15
 _OPEN: Final = 1e10
@@ -75,53 +75,32 @@ _OPEN: Final = 1e10
 
 @dataclass
 class MujocoModel:
-    """The compiled model and the maps between its coordinates and the description's.
-
-    Attributes
-    ----------
-    model : mujoco.MjModel
-    q_index, v_index : integer arrays
-        MuJoCo's entry i is full coordinate ``q_index[i]``, quaternions included.
-    free : tuple of (int, int)
-        (start in qpos, start in qvel) of every free joint, however it is made.
-    bodies : dict
-        Body name -> MuJoCo's body index.
-    absorbed : frozenset of str
-        Massless bodies that became part of a stack of joints.
-    disabled : tuple of str
-        What was switched off.
-    """
+    """The compiled model and the maps between its coordinates and the description's."""
 
     model: Any
+    #: MuJoCo's entry i is full coordinate q_index[i], quaternions included.
     q_index: np.ndarray
     v_index: np.ndarray
+    #: Starts in qpos and qvel of every free joint, also of one that is a stack.
     free: tuple[tuple[int, int], ...]
     bodies: dict[str, int]
+    #: Massless bodies that became part of a stack of joints.
     absorbed: frozenset[str]
+    #: Features that are off.
     disabled: tuple[str, ...]
 
 
 def build(description: Model, *, spheres: bool = False) -> MujocoModel:
-    """Compile the description.
+    """Compile the description; `spheres` gives every body a sphere of 1 µm, to measure the cost of geometry.
 
-    Parameters
-    ----------
-    description : Model
-    spheres : bool
-        Whether every body gets a sphere of 1 µm, to measure what geometry costs.
-
-    Raises
-    ------
-    UnsupportedError
-        For a joint of a type that MuJoCo does not have (helical), an unevenly damped
-        free joint, or a body that MuJoCo's compiler refuses; the message names it.
+    Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
     """
     spec, placed, disabled = specified(description)
     if spheres:
         for name, body in placed.bodies.items():
             if name != "world":
                 body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], pos=body.ipos, mass=0.0)
-    # A singular M at the zero configuration is told when somebody solves with it.
+    # A singular M at the zero configuration is an error only where it is solved with.
     with heard_warnings(), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
@@ -135,35 +114,22 @@ def build(description: Model, *, spheres: bool = False) -> MujocoModel:
 
 @dataclass
 class Placed:
-    """What of a description went where in a specification.
-
-    Attributes
-    ----------
-    bodies : dict
-        Body name -> MuJoCo's body.
-    degenerate : dict
-        Bodies that stand in with a placeholder -> their own principal moments.
-    joints : dict
-        Joint name -> names of MuJoCo's joints.
-    absorbed : set of str
-    static : set of str
-        Bodies that are fixed to the world.
-    """
+    """Where the parts of a description are in a specification."""
 
     bodies: dict[str, Any]
+    #: Principal moments of the bodies that have a placeholder instead.
     degenerate: dict[str, Array]
+    #: Names of MuJoCo's joints.
     joints: dict[str, list[str]]
     absorbed: set[str]
+    #: Bodies that are fixed to the world.
     static: set[str]
 
 
 def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
-    """Return the specification, not compiled yet, what went where in it, and what was switched off.
+    """Return the specification, not compiled yet, the places of the parts in it, and the features that are off.
 
-    Raises
-    ------
-    UnsupportedError
-        For a joint of a type that MuJoCo does not have or an unevenly damped free joint.
+    Raises `UnsupportedError` for a joint of a type that MuJoCo does not have or an unevenly damped free joint.
     """
     for joint in description.joints:
         if joint.kind not in JOINT_TYPES:
@@ -246,16 +212,16 @@ def _add_tree(spec: Any, description: Model) -> Placed:
             at[body.name] = (owner, R, p, stack)
             placed.absorbed.add(body.name)
             continue
-        made = placed.bodies[owner].add_body(name=body.name, pos=p, quat=_wxyz(R))
-        placed.bodies[body.name] = made
-        _give_inertia(made, body, description, placed)
+        new = placed.bodies[owner].add_body(name=body.name, pos=p, quat=_wxyz(R))
+        placed.bodies[body.name] = new
+        _give_inertia(new, body, description, placed)
         if len(stack) > 1 and any(stacked.kind == "prismatic" for stacked, _, _ in stack):
             # MuJoCo 4.0.0 takes the mass matrix of several slides of a "simple" body for diagonal, even
             # where they are parallel.
-            made.simple = 0
+            new.simple = 0
         at_origin = owner == "world" and np.array_equal(R, np.eye(3)) and not p.any()
         for stacked, R_PJ, p_PJ in stack:
-            _add_joint(made, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin=at_origin)
+            _add_joint(new, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin=at_origin)
         if owner == "world" and joint.kind == "fixed":
             # MuJoCo forms inertias about the centre of mass of a body's whole tree, and
             # rounds accordingly. What hangs on a body fixed to the world starts a tree
@@ -266,16 +232,16 @@ def _add_tree(spec: Any, description: Model) -> Placed:
     return placed
 
 
-def _give_inertia(made: Any, body: Body, description: Model, placed: Placed) -> None:
+def _give_inertia(new: Any, body: Body, description: Model, placed: Placed) -> None:
     inertia = np.array(body.inertia)
     if np.array_equal(inertia, np.diag(np.diag(inertia))):
         moments, axes = np.diag(inertia).copy(), np.eye(3)
     else:
         moments, axes = np.linalg.eigh(inertia)
         axes = axes * np.sign(np.linalg.det(axes))
-    made.explicitinertial = True
-    made.mass, made.ipos, made.iquat = body.mass, np.array(body.com), _wxyz(axes)
-    made.inertia = moments
+    new.explicitinertial = True
+    new.mass, new.ipos, new.iquat = body.mass, np.array(body.com), _wxyz(axes)
+    new.inertia = moments
     listed = {name for name, _ in description.nonphysical}
     low, middle, high = np.sort(moments)
     harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
@@ -285,30 +251,33 @@ def _give_inertia(made: Any, body: Body, description: Model, placed: Placed) -> 
         # needs no such rule: they are compiled with a placeholder and get their own
         # moments afterwards.
         placed.degenerate[body.name] = moments
-        made.inertia = np.ones(3)
+        new.inertia = np.ones(3)
 
 
-#: Joint type -> MuJoCo's type, axis and name suffix of each joint of its stack.
-JOINT_TYPES: Final[dict[str, Callable[[Joint], list[tuple[Any, Array, str]]]]] = {
-    "fixed": lambda _: [],
-    "revolute": lambda joint: [(_HINGE, joint.axes[0], "")],
-    "continuous": lambda joint: [(_HINGE, joint.axes[0], "")],
-    "prismatic": lambda joint: [(_SLIDE, joint.axes[0], "")],
-    "universal": lambda joint: [(_HINGE, joint.axes[0], ".1"), (_HINGE, joint.axes[1], ".2")],
-    "spherical_zyx": lambda _: [(_HINGE, _Z, ".z"), (_HINGE, _Y, ".y"), (_HINGE, _X, ".x")],
-    "ball": lambda _: [(_BALL, _Z, "")],
-    "planar": lambda _: [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_HINGE, _Z, ".theta")],
-    "free": lambda _: [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_SLIDE, _Z, ".z"), (_BALL, _Z, ".ball")],
+def _stack(joint: Joint) -> list[tuple[Any, Array, str]]:
+    """Return MuJoCo's type, axis and name suffix of each joint of a stack."""
+    if joint.kind in _OWN_STACKS:
+        return _OWN_STACKS[joint.kind]
+    types = {"revolute": _HINGE, "prismatic": _SLIDE}
+    suffixes = [f".{suffix}" if suffix else "" for suffix in joint.type.suffixes]
+    return [(types[kind], axis, x) for (kind, axis), x in zip(STACKS[joint.kind](joint), suffixes, strict=True)]
+
+
+_OWN_STACKS: Final[dict[str, list[tuple[Any, Array, str]]]] = {
+    "fixed": [],
+    "ball": [(_BALL, _Z, "")],
+    "free": [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_SLIDE, _Z, ".z"), (_BALL, _Z, ".ball")],
 }
+JOINT_TYPES: Final = frozenset(STACKS) | frozenset(_OWN_STACKS)
 
 
-def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, at_origin: bool) -> None:
+def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, at_origin: bool) -> None:
     """Add the joint, whose fixed frame at q = 0 is (R, p) in the body."""
     names: list[str] = []
 
     def add(kind: Any, axis: Array, k: int, suffix: str) -> None:
         name = joint.name + suffix
-        j = made.add_joint(name=name, type=kind, axis=R @ axis, pos=p)
+        j = new.add_joint(name=name, type=kind, axis=R @ axis, pos=p)
         if kind in (_HINGE, _SLIDE):
             j.stiffness[0], j.springref = joint.stiffness[k], joint.rest[k]
             j.damping[0], j.frictionloss = joint.damping[k], joint.friction[k]
@@ -320,7 +289,7 @@ def _add_joint(made: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, a
                 j.limited, j.range = 1, [max(low, -_OPEN), min(high, _OPEN)]
         names.append(name)
 
-    steps = JOINT_TYPES[joint.kind](joint)
+    steps = _stack(joint)
     if joint.kind == "free" and at_origin:
         # A true free joint's qpos is the pose in the world, ours too then.
         steps = [(_FREE, _Z, "")]
@@ -341,10 +310,10 @@ def _add_springs(spec: Any, description: Model, placed: Placed) -> None:
 
 
 def _add_couplings(spec: Any, description: Model, placed: Placed) -> None:
-    taken = {spring.name for spring in description.springs}
+    names = {spring.name for spring in description.springs}
     for coupling in description.couplings:
         # Springs between points are tendons too.
-        tendon = spec.add_tendon(name=unused(coupling.name, taken))
+        tendon = spec.add_tendon(name=unused(coupling.name, names))
         # A rest length of -1 would mean the length where the joints' springs rest; with all signs turned it is 1.
         sign = -1.0 if coupling.rest_length == -1.0 else 1.0
         for joint, factor in zip(coupling.joints, coupling.factors, strict=True):
@@ -357,7 +326,7 @@ def _add_couplings(spec: Any, description: Model, placed: Placed) -> None:
 def _refusal(description: Model, error: str) -> str:
     """Return MuJoCo's complaint in one line, with the body it names."""
     lines = [line.strip() for line in error.splitlines() if line.strip()]
-    told = lines[0].removeprefix("Error: ") if lines else "compile failed"
+    reason = lines[0].removeprefix("Error: ") if lines else "compile failed"
     named = next((x for x in lines if x.startswith("Element name")), "")
     name = named.split("'")[1] if "'" in named else ""
     reasons = dict(description.nonphysical)
@@ -365,8 +334,8 @@ def _refusal(description: Model, error: str) -> str:
         body = next((b for b in description.bodies if b.name == name), None)
         detail = f" (mass {body.mass:.4g} kg)" if body is not None else ""
         why = f"; {reasons[name]}" if name in reasons else ""
-        return f"the compiler refuses body {name!r}{detail}: {told}{why}"
-    return f"the compiler refuses {description.name}: {told}"
+        return f"the compiler refuses body {name!r}{detail}: {reason}{why}"
+    return f"the compiler refuses {description.name}: {reason}"
 
 
 def _set_constants(model: Any, description: Model, placed: Placed) -> None:
@@ -384,13 +353,13 @@ def _verify(model: Any, description: Model, placed: Placed) -> None:
     for body in description.bodies:
         if body.name in placed.absorbed:
             continue
-        made = model.body(body.name)
-        x, y, z = made.iquat[1:]
-        R = spatial.matrix_from_quaternion(np.array([x, y, z, made.iquat[0]]))
-        inertia = R @ np.diag(made.inertia) @ R.T
+        own = model.body(body.name)
+        x, y, z = own.iquat[1:]
+        R = spatial.matrix_from_quaternion(np.array([x, y, z, own.iquat[0]]))
+        inertia = R @ np.diag(own.inertia) @ R.T
         for what, got, wanted in (
-            ("mass", made.mass, body.mass),
-            ("centre of mass", made.ipos, body.com),
+            ("mass", own.mass, body.mass),
+            ("centre of mass", own.ipos, body.com),
             ("inertia", inertia, body.inertia),
         ):
             off = np.abs(np.asarray(got) - wanted).max()

@@ -42,8 +42,8 @@ _PERIOD: Final = 0.1
 class Rollout:
     """One call integrates one state or a batch on all cores."""
 
-    def __init__(self, description: Model, made: MujocoModel, model: Any) -> None:
-        self._description, self._made, self._m = description, made, model
+    def __init__(self, description: Model, maps: MujocoModel, model: Any) -> None:
+        self._description, self._maps, self._m = description, maps, model
 
     def __call__(
         self,
@@ -68,7 +68,7 @@ class Rollout:
             return (q[0], v[0]) if single else (q, v)
         start = np.zeros((n, mujoco.mj_stateSize(self._m, _STATE)))
         nq = self._m.nq
-        start[:, 1 : 1 + nq] = q0[:, self._made.q_index]
+        start[:, 1 : 1 + nq] = q0[:, self._maps.q_index]
         start[:, 1 + nq : 1 + nq + self._m.nv] = self._velocity_in(q0, v0)
         control = None if tau is None else self._forces(tau, n, steps)
         threads = max(1, min(n, os.cpu_count() or 1))
@@ -77,8 +77,8 @@ class Rollout:
         with heard_warnings():
             states = self._run(data, start, control, steps, progress)
         if any(d.warning.number[_SINGULAR] for d in data):
-            told = "MuJoCo met a mass matrix that is too close to singular, and went on with another one"
-            warn(f"{self._description.name}: {told}; compare with rk853", DoubtfulRunWarning)
+            reason = "MuJoCo met a mass matrix that is too close to singular, and went on with another one"
+            warn(f"{self._description.name}: {reason}; compare with rk853", DoubtfulRunWarning)
         states[np.logical_not(self._alive(states, dt))] = np.nan
         q, v = self._read(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + self._m.nv])
         return (q[0], v[0]) if single else (q, v)
@@ -98,7 +98,7 @@ class Rollout:
         while done < steps:
             end = min(done + count, steps)
             part = None if control is None else np.ascontiguousarray(control[:, done:end])
-            begun = time.perf_counter()
+            started = time.perf_counter()
             states[:, done + 1 : end + 1], _ = mujoco.rollout.rollout(
                 self._m,
                 data,
@@ -108,7 +108,7 @@ class Rollout:
                 nstep=end - done,
                 skip_checks=False,
             )
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - started
             count = max(1, int(count * min(16.0, _PERIOD / max(seconds, 1e-6))))
             done = end
             if progress is not None:
@@ -116,15 +116,15 @@ class Rollout:
         return states
 
     def _velocity_in(self, q: Array, v: Array) -> Array:
-        out = v[:, self._made.v_index].copy()
-        for iq, iv in self._made.free:
-            quaternion = q[:, self._made.q_index[iq + 3 : iq + 7]][:, [1, 2, 3, 0]]
+        out = v[:, self._maps.v_index].copy()
+        for iq, iv in self._maps.free:
+            quaternion = q[:, self._maps.q_index[iq + 3 : iq + 7]][:, [1, 2, 3, 0]]
             out[:, iv : iv + 3] = spatial.rotate(quaternion, out[:, iv : iv + 3])
         return np.asarray(out)
 
     def _forces(self, tau: Array, n: int, steps: int) -> Array:
-        out = np.broadcast_to(tau, (n, steps, self._description.nv))[..., self._made.v_index].copy()
-        for _, iv in self._made.free:
+        out = np.broadcast_to(tau, (n, steps, self._description.nv))[..., self._maps.v_index].copy()
+        for _, iv in self._maps.free:
             if out[..., iv : iv + 3].any():
                 raise UnsupportedError(
                     "mujoco: native rollouts hold a force on a free joint in world axes, mbkit in body axes; "
@@ -143,9 +143,9 @@ class Rollout:
     def _read(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         q, v = np.empty_like(qpos), np.empty_like(qvel)
         qvel = qvel.copy()
-        for iq, iv in self._made.free:
+        for iq, iv in self._maps.free:
             quaternion = qpos[..., iq + 3 : iq + 7][..., [1, 2, 3, 0]]
             qvel[..., iv : iv + 3] = spatial.rotate(spatial.conjugate(quaternion), qvel[..., iv : iv + 3])
-        q[..., self._made.q_index] = qpos
-        v[..., self._made.v_index] = qvel
+        q[..., self._maps.q_index] = qpos
+        v[..., self._maps.v_index] = qvel
         return q, v

@@ -27,14 +27,14 @@ class Variant:
     """
 
     def __init__(self, dyn: MujocoDynamics, enable: Iterable[str] = (), *, spheres: bool = False) -> None:
-        made = build(dyn.model, spheres=spheres)
-        self._m = made.model
+        maps = build(dyn.model, spheres=spheres)
+        self._m = maps.model
         flags = int(self._m.opt.disableflags)
         for name in enable:
             flags &= ~int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
         self._m.opt.disableflags = flags
         self._d = mujoco.MjData(self._m)
-        self._index = made.q_index, made.v_index
+        self._index = maps.q_index, maps.v_index
         self._layout = dyn.model.layout
 
     def set(self, q: Array, v: Array) -> None:

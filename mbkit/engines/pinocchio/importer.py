@@ -1,4 +1,4 @@
-"""Pinocchio's own importers of URDF and MJCF, and what they made of a file.
+"""Pinocchio's own importers of URDF and MJCF, and the models that they read, described.
 
 The only place that knows what a parsed `pinocchio.Model` holds: links that are fixed to each other
 are merged and survive as frames, what is fixed to the world is in joint 0, a continuous joint
@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit.engines.imported import Imported, checked, unused, written
+from mbkit.engines.imported import Imported, checked, joint_of, stacked, unused, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.urdf import joint_kind
 from mbkit.load.urdf_links import BASE_JOINT
@@ -99,8 +99,7 @@ class _Description:
 
         passive is of the damping that Pinocchio read: its algorithms leave that to the caller.
         """
-        made = [self._one(*x) for x in zip(q, v, strict=True)]
-        return {name: np.array([x[name] for x in made]) for name in ("M", "g", "nle", "passive")}
+        return stacked(self._one(*x) for x in zip(q, v, strict=True))
 
     def _one(self, q: Array, v: Array) -> dict[str, Array]:
         raw, layout = self.raw, self.model.layout
@@ -135,37 +134,20 @@ def _body(name: str, inertia: Any) -> Body:
 def _joint(
     name: str, kind: str, parent: str, child: str, X: Any, axis: Array | None, raw: Any = None, joint: Any = None
 ) -> Joint:
-    type_ = kind_of(kind)
-    numbers: dict[str, Any] = {n: np.zeros(type_.nv) for n in ("armature", "damping", "friction")}
-    limits: dict[str, Any] = {"lower": np.full(type_.nq, -np.inf), "upper": np.full(type_.nq, np.inf)}
-    limits |= {n: np.full(type_.nv, np.inf) for n in ("velocity_limit", "effort_limit")}
+    numbers: dict[str, Any] = {} if axis is None else {"axes": np.array([axis])}
+    if kind == "helical":
+        numbers["pitch"] = float(getattr(joint, "pitch", 0.0))
     if raw is not None:
         v = slice(joint.idx_v, joint.idx_v + joint.nv)
-        numbers = {
-            "armature": np.array(raw.armature[v]),
-            "damping": np.array(raw.damping[v]),
-            "friction": np.array(raw.upperDryFrictionLimit[v]),
-        }
-        if type_.nv == 1:
-            limits["velocity_limit"] = _open(raw.upperVelocityLimit[v])
-            limits["effort_limit"] = _open(raw.upperEffortLimit[v])
+        for ours, theirs in (("armature", "armature"), ("damping", "damping"), ("friction", "upperDryFrictionLimit")):
+            numbers[ours] = np.array(getattr(raw, theirs)[v])
+        if kind_of(kind).nv == 1:
+            numbers["velocity_limit"] = _open(raw.upperVelocityLimit[v])
+            numbers["effort_limit"] = _open(raw.upperEffortLimit[v])
             if joint.nq == 1:
                 q = slice(joint.idx_q, joint.idx_q + 1)
-                limits["lower"], limits["upper"] = _open(raw.lowerPositionLimit[q]), _open(raw.upperPositionLimit[q])
-    return Joint(
-        name=name,
-        kind=kind,
-        parent=parent,
-        child=child,
-        rotation=np.array(X.rotation),
-        translation=np.array(X.translation),
-        axes=np.empty((0, 3)) if axis is None else np.array([axis]),
-        pitch=float(getattr(joint, "pitch", 0.0)) if kind == "helical" else 0.0,
-        stiffness=np.zeros(type_.nv),
-        rest=np.zeros(type_.nv),
-        **numbers,
-        **limits,
-    )
+                numbers["lower"], numbers["upper"] = _open(raw.lowerPositionLimit[q]), _open(raw.upperPositionLimit[q])
+    return joint_of(name, kind, parent, child, np.array(X.rotation), np.array(X.translation), **numbers)
 
 
 def _open(x: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A `pinocchio.Model` made from a description, and how its numbers map to ours.
+"""A `pinocchio.Model` built from a description, and how its numbers map to ours.
 
 Joints are added depth first, because Pinocchio's algorithms take a subtree to be
 contiguous. Continuous joints are plain revolute ones, with one angle. A planar
@@ -24,40 +24,25 @@ _X, _Y, _Z = np.eye(3)
 
 @dataclass(frozen=True)
 class PinModel:
-    """The built model and the maps between its coordinates and the description's.
-
-    Attributes
-    ----------
-    model : pinocchio.Model
-    bodies : dict
-        Body name -> (joint index, R_JB, p_JB_J).
-    q_order, v_order : (n,) integer arrays
-        Pinocchio's coordinate i is full coordinate ``q_order[i]``.
-    ordered : bool
-        Whether both orders are the identity.
-    ground_moment : (3,) array
-        Σ m p over bodies fixed to the world: Pinocchio's energy leaves them out.
-    """
+    """A model of Pinocchio and the maps between its coordinates and the description's."""
 
     model: pin.Model
+    #: Body name -> (joint index, R_JB, p_JB_J).
     bodies: dict[str, tuple[int, Array, Array]]
+    #: Pinocchio's coordinate i is full coordinate q_order[i].
     q_order: np.ndarray
     v_order: np.ndarray
+    #: Whether both orders are the identity.
     ordered: bool
+    #: Σ m p over bodies fixed to the world, which Pinocchio's energy leaves out.
     ground_moment: Array
 
 
 def build(description: Model) -> PinModel:
-    """Return the description as Pinocchio holds it.
-
-    Raises
-    ------
-    UnsupportedError
-        For a joint of a type that Pinocchio does not have; named.
-    """
-    made = pin.Model()
-    made.name = description.name
-    made.gravity = pin.Motion(np.array(description.gravity), np.zeros(3))
+    """Return the description as Pinocchio holds it; `UnsupportedError` for a joint type that it does not have."""
+    model = pin.Model()
+    model.name = description.name
+    model.gravity = pin.Motion(np.array(description.gravity), np.zeros(3))
     layout = description.layout
     bodies: dict[str, tuple[int, Array, Array]] = {"world": (0, np.eye(3), np.zeros(3))}
     q_order: list[int] = []
@@ -70,30 +55,30 @@ def build(description: Model) -> PinModel:
             raise unknown_joint("pinocchio", joint)
         if joint.type.nv:
             for suffix, motion in _STEPS[joint.kind](joint):
-                carrier = made.addJoint(carrier, motion, pin.SE3(R, p), joint.name + suffix)
+                carrier = model.addJoint(carrier, motion, pin.SE3(R, p), joint.name + suffix)
                 R, p = np.eye(3), np.zeros(3)
-            first = made.joints[carrier].idx_v + made.joints[carrier].nv - joint.type.nv
-            armature = np.array(made.armature)
+            first = model.joints[carrier].idx_v + model.joints[carrier].nv - joint.type.nv
+            armature = np.array(model.armature)
             armature[first : first + joint.type.nv] = joint.armature
-            made.armature = armature
+            model.armature = armature
         bodies[joint.child] = (carrier, R, p)
         body = description.body(joint.child)
         if carrier:
-            made.appendBodyToJoint(carrier, _inertia(body), pin.SE3(R, p))
+            model.appendBodyToJoint(carrier, _inertia(body), pin.SE3(R, p))
         else:
             ground += body.mass * (p + R @ body.com)
         q_order.extend(range(layout.full_q[joint.name].start, layout.full_q[joint.name].stop))
         v_order.extend(range(layout.full_v[joint.name].start, layout.full_v[joint.name].stop))
     ordered = q_order == list(range(len(q_order)))
-    return PinModel(made, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground)
+    return PinModel(model, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground)
 
 
 def _inertia(body: Body) -> pin.Inertia:
     # Set part by part: the constructor refuses an inertia that is not positive, which
     # a description may hold after a warning.
-    made = pin.Inertia.Zero()
-    made.mass, made.lever, made.inertia = body.mass, np.array(body.com), np.array(body.inertia)
-    return made
+    out = pin.Inertia.Zero()
+    out.mass, out.lever, out.inertia = body.mass, np.array(body.com), np.array(body.inertia)
+    return out
 
 
 def _aligned(joint: Joint, letter: str, general: type) -> object:
@@ -125,11 +110,11 @@ _STEPS: Final[dict[str, Callable[[Joint], list[tuple[str, object]]]]] = {
 class PointSprings:
     """Forces and energy of all point springs of a model, in Pinocchio's coordinates."""
 
-    def __init__(self, model: Model, made: PinModel) -> None:
+    def __init__(self, model: Model, maps: PinModel) -> None:
         self._ends: list[tuple[PointSpring, tuple[int, Array], tuple[int, Array]]] = []
         for spring in model.springs:
             a, b = (
-                (made.bodies[body][0], made.bodies[body][2] + made.bodies[body][1] @ point)
+                (maps.bodies[body][0], maps.bodies[body][2] + maps.bodies[body][1] @ point)
                 for body, point in ((spring.body_a, spring.point_a), (spring.body_b, spring.point_b))
             )
             self._ends.append((spring, a, b))
@@ -176,20 +161,10 @@ class PointSprings:
 
 
 class JointPassive:
-    """Springs and dampers at the joints, and joint couplings, in full coordinates of a given order.
+    """Springs and dampers at the joints, and joint couplings; entry i is full coordinate q_order[i].
 
-    Parameters
-    ----------
-    model : Model
-    q_order, v_order : integer arrays
-        Entry i here is full coordinate ``q_order[i]`` of the description.
-
-    Attributes
-    ----------
-    armature : (n, n) array or None
-        What the couplings' rotors add to M; None where there are none.
-    stiffness_matrix, damping_matrix : (n, n) arrays
-        Derivatives of the force by q and by v, with the other sign.
+    `armature` is the couplings' part of M, None without one. `stiffness_matrix` and `damping_matrix` are the
+    derivatives of the force by q and by v, with the other sign.
     """
 
     def __init__(self, model: Model, q_order: np.ndarray, v_order: np.ndarray) -> None:
