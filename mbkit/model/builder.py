@@ -25,13 +25,7 @@ _LONGEST_NAME: Final = 1000
 
 
 class ArgumentReader:
-    """Converts arguments to arrays and numbers, and collects their faults; a harmless value replaces a faulty one.
-
-    Attributes
-    ----------
-    faults : list of str
-        One sentence per fault, so that the next ones are found too.
-    """
+    """Converts arguments to arrays and numbers, and collects their faults; a harmless value replaces a faulty one."""
 
     def __init__(self) -> None:
         self.faults: list[str] = []
@@ -47,6 +41,10 @@ class ArgumentReader:
         if len(text) > longest:
             self.faults.append(f"{what}: expected up to {longest} characters, got {len(text)}")
         return text[:longest]
+
+    def names(self, item: str, **values: Any) -> dict[str, Any]:
+        """Return the names of other parts, by argument."""
+        return {argument: self.name(f"{item}: {argument}", x) for argument, x in values.items()}
 
     def vector(self, name: str, value: ArrayLike, n: int) -> Array:
         """Return n finite numbers; a single one is repeated."""
@@ -101,6 +99,14 @@ class ArgumentReader:
             return np.zeros(n)
         return np.array([self.quantity(f"{name}[{i}]", x) for i, x in enumerate(array)], dtype=object)
 
+    def nonnegatives(self, item: str, **values: Any) -> dict[str, Number]:
+        """Return numbers or expressions, by argument; no number may be negative."""
+        return {n: self.quantity(f"{item}: {n}", x, nonnegative=True) for n, x in values.items()}
+
+    def places(self, item: str, **values: Any) -> dict[str, Array]:
+        """Return positions by argument; see `place`."""
+        return {argument: self.place(f"{item}: {argument}", x) for argument, x in values.items()}
+
     def place(self, name: str, value: Any) -> Array:
         """Return three lengths, or expressions, whose squares do not overflow."""
         lengths = self.quantities(name, value, 3)
@@ -111,7 +117,7 @@ class ArgumentReader:
         return lengths
 
     def inertia(self, name: str, value: Any) -> Array:
-        """Return a symmetric 3 by 3 matrix, given as such or by its diagonal, or zeros for None."""
+        """Return a symmetric 3 by 3 matrix of a matrix or its diagonal, or zeros for None."""
         if value is None:
             return np.zeros((3, 3))
         if shape_of(value) == (3,):
@@ -130,7 +136,7 @@ class ArgumentReader:
         return matrix
 
     def limits(self, name: str, value: ArrayLike | None, n: int, default: float) -> Array:
-        """Return n numbers, infinite ones among them; `default` where nothing is given."""
+        """Return n numbers, which may be infinite; `default` for None."""
         if value is None:
             return np.full(n, default)
         try:
@@ -145,7 +151,7 @@ class ArgumentReader:
         return array
 
     def rotation(self, item: str, rotation: ArrayLike | None, rpy: ArrayLike | None, name: str = "rotation") -> Array:
-        """Return a rotation matrix, given as such or as roll, pitch, yaw."""
+        """Return the matrix of a rotation matrix or of roll, pitch, yaw."""
         if rotation is not None and rpy is not None:
             self.faults.append(f"{item}: both rotation and rpy given; give one")
         if rpy is not None:
@@ -159,15 +165,15 @@ class ArgumentReader:
         return R
 
     def axes(self, item: str, kind: str, axis: ArrayLike | None, axis2: ArrayLike | None) -> Array:
-        """Return the unit axes that a joint of this kind takes."""
-        wanted = kind_of(kind).n_axes
-        given: list[ArrayLike] = [a for a in (axis, axis2) if a is not None]
-        if len(given) != wanted:
-            names = ("no axis", "axis", "axis and axis2")[wanted]
-            self.faults.append(f"{item}: a {kind} joint takes {names}; {len(given)} given")
-            given = list(np.eye(3)[:wanted])
-        out = np.zeros((wanted, 3))
-        for i, a in enumerate(given):
+        """Return the unit axes of a joint of this kind."""
+        n = kind_of(kind).n_axes
+        axes: list[ArrayLike] = [a for a in (axis, axis2) if a is not None]
+        if len(axes) != n:
+            names = ("no axis", "axis", "axis and axis2")[n]
+            self.faults.append(f"{item}: a {kind} joint takes {names}; {len(axes)} given")
+            axes = list(np.eye(3)[:n])
+        out = np.zeros((n, 3))
+        for i, a in enumerate(axes):
             vector = self.vector(f"{item}: axis", a, 3)
             # The square of a component may overflow, or vanish.
             largest = float(np.abs(vector).max())
@@ -177,7 +183,7 @@ class ArgumentReader:
             if not length:
                 self.faults.append(f"{item}: axis is zero; expected a direction")
                 vector, length = np.array([1.0, 0.0, 0.0]), 1.0
-            # An axis that is a unit vector to rounding is kept to the bit.
+            # A unit vector to rounding keeps its bits.
             out[i] = vector if abs(length - 1) < 1e-15 else vector / length
         return out
 
@@ -208,7 +214,7 @@ def _has_expressions(value: Any, depth: int = 3) -> bool:
 
 
 def shape_of(value: Any) -> tuple[int, ...] | None:
-    """Return the shape, or None of what has none, such as a ragged list."""
+    """Return the shape, or None for a ragged list and other objects without one."""
     try:
         return tuple(np.shape(value))
     except Exception:
@@ -350,7 +356,7 @@ class ModelBuilder:
             near = nearest(kind, KINDS) if isinstance(kind, str) else []
             near = near or list(KINDS)
             self._read.faults.append(f"{item}: unknown kind {shown(kind)}; use one of {', '.join(near)}")
-            # The other faults of this call would only be echoes of this one.
+            # The other faults of this call would follow from this one.
             kind, axis, axis2, pitch, mimic = FIXED.name, None, None, 0.0, None
             lower = upper = velocity_limit = effort_limit = None
             armature = damping = friction = stiffness = rest = 0.0
@@ -373,8 +379,7 @@ class ModelBuilder:
             Joint(
                 name=name,
                 kind=kind,
-                parent=self._read.name(f"{item}: parent", parent),
-                child=self._read.name(f"{item}: child", child),
+                **self._read.names(item, parent=parent, child=child),
                 rotation=self._read.rotation(item, rotation, rpy),
                 axes=self._read.axes(item, kind, axis, axis2),
                 lower=self._read.limits(f"{item}: lower", lower, type_.nq, -np.inf),
@@ -442,20 +447,10 @@ class ModelBuilder:
         numbers = self._numbers(
             "springs",
             name,
-            point_a=self._read.place(f"{item}: point_a", point_a),
-            point_b=self._read.place(f"{item}: point_b", point_b),
-            stiffness=self._read.quantity(f"{item}: stiffness", stiffness, nonnegative=True),
-            rest_length=self._read.quantity(f"{item}: rest_length", rest_length, nonnegative=True),
-            damping=self._read.quantity(f"{item}: damping", damping, nonnegative=True),
+            **self._read.places(item, point_a=point_a, point_b=point_b),
+            **self._read.nonnegatives(item, stiffness=stiffness, rest_length=rest_length, damping=damping),
         )
-        self._springs.append(
-            PointSpring(
-                name,
-                body_a=self._read.name(f"{item}: body_a", body_a),
-                body_b=self._read.name(f"{item}: body_b", body_b),
-                **numbers,
-            )
-        )
+        self._springs.append(PointSpring(name, **self._read.names(item, body_a=body_a, body_b=body_b), **numbers))
 
     def add_coupling(
         self,
@@ -483,19 +478,17 @@ class ModelBuilder:
         """
         name = self._read.name("coupling name", name)
         item = f"coupling {name!r}"
-        given: Any = factors
-        if not isinstance(given, Mapping):
-            got = shown(given)
+        value: Any = factors
+        if not isinstance(value, Mapping):
+            got = shown(value)
             self._read.faults.append(f"{item}: factors: expected a mapping from joint names to numbers, got {got}")
             return
         numbers = self._numbers(
             "couplings",
             name,
             factors=self._read.quantities(f"{item}: factors", list(factors.values()), len(factors)),
-            stiffness=self._read.quantity(f"{item}: stiffness", stiffness, nonnegative=True),
             rest_length=self._read.quantity(f"{item}: rest_length", rest_length),
-            damping=self._read.quantity(f"{item}: damping", damping, nonnegative=True),
-            armature=self._read.quantity(f"{item}: armature", armature, nonnegative=True),
+            **self._read.nonnegatives(item, stiffness=stiffness, damping=damping, armature=armature),
         )
         self._couplings.append(
             JointCoupling(name, tuple(self._read.name(f"{item}: factors", j) for j in factors), **numbers)
@@ -534,21 +527,15 @@ class ModelBuilder:
         if not isinstance(kind, str) or kind not in ("point", "frame"):
             self._read.faults.append(f"{item}: unknown kind {shown(kind)}; use 'point' or 'frame'")
             kind = "point"
-        numbers = self._numbers(
-            "loops",
-            name,
-            translation_a=self._read.place(f"{item}: translation_a", translation_a),
-            translation_b=self._read.place(f"{item}: translation_b", translation_b),
-        )
+        places = self._read.places(item, translation_a=translation_a, translation_b=translation_b)
         self._loops.append(
             Loop(
                 name=name,
                 kind=kind,
-                body_a=self._read.name(f"{item}: body_a", body_a),
+                **self._read.names(item, body_a=body_a, body_b=body_b),
                 rotation_a=self._read.rotation(item, rotation_a, None, "rotation_a"),
-                body_b=self._read.name(f"{item}: body_b", body_b),
                 rotation_b=self._read.rotation(item, rotation_b, None, "rotation_b"),
-                **numbers,
+                **self._numbers("loops", name, **places),
             )
         )
 
@@ -567,9 +554,9 @@ class ModelBuilder:
         `mbkit.lagrangian.from_model` puts it into the energies; the engines by themselves refuse it.
         """
         joint = self._read.name("prescribed joint", joint)
-        given = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
-        read = {n: self._read.quantity(f"prescribed {joint!r}: {n}", x) for n, x in given.items()}
-        self._prescribed.append(Prescribed(joint, **self._numbers("prescribed", joint, **read)))
+        values = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
+        values = {n: self._read.quantity(f"prescribed {joint!r}: {n}", x) for n, x in values.items()}
+        self._prescribed.append(Prescribed(joint, **self._numbers("prescribed", joint, **values)))
 
     def note(self, text: str) -> None:
         """Add a sentence to the model's notes."""
@@ -611,29 +598,29 @@ class ModelBuilder:
         faults = list(self._read.faults)
         faults += structure_faults(self._assemble(self._joints, self._bindings))
         faults += self._two_valued()
-        # Joints that move nothing can only be found in a tree that holds together.
-        found = body_faults(self._bodies, point_masses=point_masses)
+        parts = parts or {}
+        # Joints that move nothing can be found in a connected tree only.
+        inconsistent = body_faults(self._bodies, point_masses=point_masses)
         if not faults:
-            found = suspects(self._assemble(*_resolved(self._joints, self._bindings)), point_masses=point_masses)
+            model = self._assemble(*_resolved(self._joints, self._bindings))
+            inconsistent = suspects(model, point_masses=point_masses)
         negative = {b.name for b in self._bodies if b.mass < 0}
-        still = static_bodies(self._joints) - negative
-        idle = grouped([(n, why) for n, why in found if n in still], parts or {})
+        static = static_bodies(self._joints) - negative
+        idle = grouped([(n, why) for n, why in inconsistent if n in static], parts)
         notes = [f"never moves, so this cannot act: {text}" for text in idle]
-        found = tuple((n, why) for n, why in found if n not in still)
-        refused = [(n, why) for n, why in found if n not in negative]
+        inconsistent = tuple((n, why) for n, why in inconsistent if n not in static)
+        refused = [(n, why) for n, why in inconsistent if n not in negative]
         if nonphysical == "error" and refused:
-            faults += grouped(refused, parts or {})
+            faults += grouped(refused, parts)
             faults[-1] += '; correct it, or take it as written with nonphysical="warn"'
-        faults += grouped([(n, why) for n, why in found if n in negative], parts or {})
+        faults += grouped([(n, why) for n, why in inconsistent if n in negative], parts)
         if faults:
             raise ModelError(self._name, faults)
-        model = self._assemble(*_resolved(self._joints, self._bindings), found, notes)
-        if found:
-            warnings.warn(
-                f"{self._name}: physically impossible, used as written: {'; '.join(grouped(found, parts or {}))}",
-                NonPhysicalWarning,
-                stacklevel=2,
-            )
+        model = self._assemble(*_resolved(self._joints, self._bindings), inconsistent, notes)
+        if inconsistent:
+            listing = "; ".join(grouped(inconsistent, parts))
+            message = f"{self._name}: physically impossible, used as written: {listing}"
+            warnings.warn(message, NonPhysicalWarning, stacklevel=2)
         return model
 
     def _numbers(self, where: str, part: str, **fields: Any) -> dict[str, Any]:
@@ -677,7 +664,7 @@ def _resolved(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tup
     """Let every mimic joint point at a joint that is free itself."""
     by_name = {j.name: j for j in joints}
     bound: dict[tuple[str, str], Number] = {(b.part, b.field): b.expression for b in bindings if b.where == "joints"}
-    made = {}
+    changed = {}
     kept = list(bindings)
     for joint in by_name.values():
         if joint.mimic is None:
@@ -687,10 +674,10 @@ def _resolved(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tup
             at, r, o = _followed(at, further, bound)
             ratio, offset = ratio * r, ratio * o + offset
         numbers, new = split("joints", joint.name, {"ratio": ratio, "offset": offset})
-        made[joint.name] = replace(joint, mimic=Mimic(at, **numbers))
+        changed[joint.name] = replace(joint, mimic=Mimic(at, **numbers))
         kept = [b for b in kept if (b.where, b.part) != ("joints", joint.name) or b.field not in numbers]
         kept += new
-    return tuple(made.get(j.name, j) for j in by_name.values()), tuple(kept)
+    return tuple(changed.get(j.name, j) for j in by_name.values()), tuple(kept)
 
 
 def _followed(joint: str, mimic: Mimic, bound: Mapping[tuple[str, str], Number]) -> tuple[str, Number, Number]:
@@ -698,25 +685,7 @@ def _followed(joint: str, mimic: Mimic, bound: Mapping[tuple[str, str], Number])
 
 
 def expect_model(value: Any, name: str = "model") -> Model:
-    """Return an argument that is a `Model`.
-
-    Parameters
-    ----------
-    value : object
-    name : str
-        The argument's.
-
-    Raises
-    ------
-    InputError
-        The message says how to get one: a `Lagrangian` and a `Dynamics` have it as ``.model``.
-
-    Examples
-    --------
-    >>> expect_model("panda")
-    Traceback (most recent call last):
-    mbkit.errors.InputError: model: expected a Model, got str; mbkit.load(...) makes one
-    """
+    """Return an argument that is a `Model`, or raise `InputError` with the way to get one."""
     if isinstance(value, Model):
         return value
     holds = not isinstance(value, type) and isinstance(getattr(value, "model", None), Model)

@@ -1,7 +1,4 @@
-"""The data of a multibody system, and what follows from it by counting and naming.
-
-`Model` adds motion on the configuration manifold, variants and views. Checks and substitutions work on this class.
-"""
+"""The data of a multibody system: parts, names and index ranges, without motion."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -75,21 +72,20 @@ class Needs:
     ) -> Needs:
         """Read the flags off the parts of a description.
 
-        `bound` names the attributes that stand for parameters somewhere: what is
-        zero now may have another value when it is evaluated.
+        `bound` names the attributes with parameters: a zero may have another value when it is evaluated.
         """
         joints, bound = tuple(joints), frozenset(bound)
         couplings = tuple(couplings)
-        between: tuple[PointSpring | JointCoupling, ...] = (*springs, *couplings)
+        between = *joints, *springs, *couplings
+
+        def present(name: str, parts: Iterable[Any]) -> bool:
+            return name in bound or any(np.any(getattr(p, name)) for p in parts)
+
         return cls(
             gravity="gravity" in bound or bool(np.any(gravity)),
-            springs="stiffness" in bound
-            or any(np.any(j.stiffness) for j in joints)
-            or any(s.stiffness for s in between),
-            damping="damping" in bound or any(np.any(j.damping) for j in joints) or any(s.damping for s in between),
-            armature="armature" in bound
-            or any(np.any(j.armature) for j in joints)
-            or any(c.armature for c in couplings),
+            springs=present("stiffness", between),
+            damping=present("damping", between),
+            armature=present("armature", (*joints, *couplings)),
             friction=any(np.any(j.friction) for j in joints),
             limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
             effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),
@@ -113,16 +109,11 @@ class Needs:
 class Layout:
     """Index ranges of the coordinates, full and reduced.
 
-    The *full* coordinates hold every joint; the model's own q and v leave the
-    mimic joints out, with q_full = G_q q + c and v_full = G v.
-
-    Attributes
-    ----------
-    joints : tuple of Joint
-        In the order of the coordinates.
+    The *full* coordinates have every joint; the model's q and v leave the mimic joints out, with
+    q_full = G_q q + c and v_full = G v.
     """
 
-    joints: tuple[Joint, ...]
+    joints: tuple[Joint, ...]  # in the order of the coordinates
 
     def __repr__(self) -> str:
         nq, nv, full_nq, full_nv = self.sizes
@@ -263,20 +254,7 @@ class Description:
         object.__setattr__(self, "layout", Layout(self.joints))
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
-        return type(self), (
-            self.name,
-            self.gravity,
-            self.bodies,
-            self.joints,
-            self.frames,
-            self.springs,
-            self.couplings,
-            self.loops,
-            self.prescribed,
-            self.notes,
-            self.nonphysical,
-            self.bindings,
-        )
+        return type(self), tuple(getattr(self, f.name) for f in fields(self) if f.init)
 
     def __eq__(self, other: object) -> bool:
         return self.digest == other.digest if isinstance(other, Description) else NotImplemented
@@ -423,19 +401,11 @@ class Description:
 
     def body(self, name: str) -> Body:
         """Return the body of this name."""
-        expect_name("body", name)
-        for body in self.bodies:
-            if body.name == name:
-                return body
-        raise UnknownNameError("body", name, [b.name for b in self.bodies])
+        return _by_name("body", self.bodies, name)
 
     def joint(self, name: str) -> Joint:
         """Return the joint of this name."""
-        expect_name("joint", name)
-        for joint in self.joints:
-            if joint.name == name:
-                return joint
-        raise UnknownNameError("joint", name, [j.name for j in self.joints])
+        return _by_name("joint", self.joints, name)
 
     def frame(self, name: str) -> Frame:
         """Return the frame of this name.
@@ -466,6 +436,17 @@ class Description:
         expressions = tuple(replace(b, expression=x) for b, x in bindings if isinstance(x, Expression))
         out: Self = replace(filled("gravity", self, ""), **changes, bindings=expressions)
         return out
+
+
+_Part = TypeVar("_Part", Body, Joint)
+
+
+def _by_name(what: str, parts: tuple[_Part, ...], name: str) -> _Part:
+    expect_name(what, name)
+    for part in parts:
+        if part.name == name:
+            return part
+    raise UnknownNameError(what, name, [p.name for p in parts])
 
 
 def expect_name(what: str, name: object) -> None:

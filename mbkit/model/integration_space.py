@@ -9,26 +9,15 @@ from mbkit.model.model import Model
 
 
 class Space:
-    """Configurations and velocities of one model as the integrators hold them.
+    """Configurations q and velocities w of one model in the integrators, one state or a batch.
 
-    A configuration is mbkit's q. A velocity `w` is mbkit's v with the linear part
-    of each free joint in the axes of the joint's fixed frame; where the model has `rates` of
-    its own, it is q̇. All methods take one state or a batch; a subclass for other arithmetic
-    than arrays overrides the methods at the end. Where w is v and positions add, all
-    cost one addition.
-
-    Parameters
-    ----------
-    model : Model
-
-    Attributes
-    ----------
-    flat : bool
-        Whether positions add and w is v.
+    w is mbkit's v with the linear part of each free joint in the axes of the joint's fixed frame, and q̇ where the
+    model has a `velocity_map`. A subclass for other arithmetic than arrays overrides the methods at the end.
     """
 
     def __init__(self, model: Model) -> None:
         self._rates, self._adds = model.velocity_map, not model.quaternions
+        #: Whether positions add and w is v.
         self.flat = self._adds and self._rates is None
         self.nv = model.nv
         self._turns: list[tuple[slice, slice]] = []
@@ -76,7 +65,7 @@ class Space:
         return out
 
     def sizes(self, q: Any, u: Any) -> Any:
-        """Return how large q is along each component of a u: |q| where positions add, 1 for a rotation."""
+        """Return the size of q along each component of a u: |q| where positions add, 1 for a rotation."""
         if self._adds:
             return abs(q)
         out = 0 * u + 1
@@ -132,7 +121,7 @@ class Space:
 
     @staticmethod
     def arithmetic(x: Any) -> rotation.Arithmetic:
-        """Return how components of x are reckoned with."""
+        """Return the functions for components of x."""
         return rotation.FLOATS if x.ndim == 1 else rotation.ARRAYS
 
     @staticmethod

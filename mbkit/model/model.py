@@ -14,7 +14,7 @@ from mbkit._escape import html
 from mbkit.errors import UnknownNameError
 from mbkit.model import manifold
 from mbkit.model.description import Description, expect_name
-from mbkit.model.parameters import Binding, Parameter
+from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
 from mbkit.model.validation import check_substituted
 
@@ -24,7 +24,7 @@ _PER_VELOCITY: Final = {
     "armature": "armature",
     "friction": "friction",
 }
-#: Elements between joints or points, and what acts in them.
+#: Elements between joints or points, and the numbers that make them act.
 _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
 _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed")
 
@@ -36,7 +36,7 @@ class Model(Description):
     because the builder holds the checks. Its attributes are those of `Description`.
     """
 
-    # What engines, simulation and studies ask of every model, of bodies or of energies
+    # Questions to every model, of bodies or of energies
 
     @property
     def has_bodies(self) -> bool:
@@ -202,17 +202,14 @@ class Model(Description):
         return {name: real(f"parameter {name!r}", value) for name, value in values.items()}
 
     def _without(self, feature: str) -> Model:
-        if feature == "gravity":
-            return replace(self, gravity=np.zeros(3), bindings=self._bindings_without("gravity"))
-        if feature == "loops":
-            return replace(self, loops=(), bindings=tuple(b for b in self.bindings if b.where != "loops"))
-        if feature == "prescribed":
-            return replace(self, prescribed=(), bindings=tuple(b for b in self.bindings if b.where != "prescribed"))
+        if feature in ("gravity", "loops", "prescribed"):
+            empty: Any = {feature: np.zeros(3) if feature == "gravity" else ()}
+            return replace(self, bindings=tuple(b for b in self.bindings if b.where != feature), **empty)
         if feature == "limits":
             return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
         name = _PER_VELOCITY[feature]
         joints = tuple(replace(j, **{name: np.zeros(j.type.nv)}) for j in self.joints)  # type: ignore[arg-type]
-        bindings = self._bindings_without(name)
+        bindings = tuple(b for b in self.bindings if b.field != name)
         changes: Any = {"joints": joints}
         for where, acting in _ACTING.items():
             parts = getattr(self, where)
@@ -224,16 +221,13 @@ class Model(Description):
             bindings = tuple(b for b in bindings if b.where != where or b.part in names)
         return replace(self, bindings=bindings, **changes)
 
-    def _bindings_without(self, field: str) -> tuple[Binding, ...]:
-        return tuple(b for b in self.bindings if b.field != field)
-
     # Reading
 
     def __repr__(self) -> str:
         between = f"; joint couplings {', '.join(c.name for c in self.couplings)}" if self.couplings else ""
-        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._told_mass()}; {self.needs}{between}>"
+        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._mass_text()}; {self.needs}{between}>"
 
-    def _told_mass(self) -> str:
+    def _mass_text(self) -> str:
         unknown = any(np.isnan(b.mass) for b in self.bodies)
         return "mass not given yet" if unknown else f"{self.mass:.4g} kg"
 
@@ -247,7 +241,7 @@ class Model(Description):
         head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
         notes = "".join(f"<li>{html(n)}</li>" for n in (*map(str, self.couplings), *self.notes))
         return (
-            f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._told_mass()}; {self.needs}</p>"
+            f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._mass_text()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
 

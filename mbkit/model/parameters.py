@@ -142,8 +142,8 @@ class _Operation(Expression):
     operands: tuple[Number, ...]
 
     def evaluate(self, parameter: Callable[[Parameter], Any], number: Callable[[float], Any]) -> Any:
-        given = [x.evaluate(parameter, number) if isinstance(x, Expression) else number(x) for x in self.operands]
-        return _OPERATIONS[self.name](*given)
+        values = [x.evaluate(parameter, number) if isinstance(x, Expression) else number(x) for x in self.operands]
+        return _OPERATIONS[self.name](*values)
 
     def parameters(self) -> Iterator[Parameter]:
         for x in self.operands:
@@ -160,7 +160,7 @@ class _Operation(Expression):
 
 @dataclass(frozen=True)
 class _Power(Expression):
-    """A power with a plain exponent, which no symbol ever stands for."""
+    """A power; no symbol replaces its exponent."""
 
     base: Expression
     exponent: float
@@ -213,31 +213,14 @@ def nominal(value: Number) -> float:
     return real(f"{value} at {at}", number)
 
 
-# Which numbers of a description's parts stand for expressions of parameters.
-
-
 @dataclass(frozen=True)
 class Binding:
-    """One number of a part and the expression that it stands for.
+    """One number of a part that is an expression of parameters."""
 
-    Attributes
-    ----------
-    where : str
-        ``"bodies"``, ``"joints"``, ``"frames"``, ``"springs"``, ``"couplings"``, ``"loops"``, ``"prescribed"``, or
-        ``"gravity"``.
-    part : str
-        The part's name, of a prescribed motion its joint's; empty for gravity.
-    field : str
-        Name of its attribute; of a mimic joint also ``"ratio"`` and ``"offset"``.
-    index : tuple of int
-        Which entry of an array.
-    expression : Expression
-    """
-
-    where: str
-    part: str
-    field: str
-    index: tuple[int, ...]
+    where: str  # the description's attribute: "bodies", "joints", ... or "gravity"
+    part: str  # its name, of a prescribed motion its joint's; empty for gravity
+    field: str  # its attribute; of a mimic joint also "ratio" and "offset"
+    index: tuple[int, ...]  # of an entry of an array
     expression: Expression
 
 

@@ -1,9 +1,7 @@
 """Quaternion arithmetic on components: floats of one state, arrays of a batch, or symbols.
 
-`mbkit.spatial` has the same formulas on stacked arrays. A step needs a dozen of
-them, and on one state NumPy's call costs twenty times the arithmetic, so these
-take and return sequences of components: x, y, z, w. Where a formula needs more
-than ``+ - * /``, the first argument says how the components are reckoned with.
+`mbkit.spatial` has the same formulas on stacked arrays. These take sequences of the components x, y, z, w: on one
+state a NumPy call costs twenty times the arithmetic. Functions other than ``+ - * /`` are in the first argument.
 """
 
 from __future__ import annotations
@@ -24,20 +22,12 @@ _SMALL_DEXP: Final = 1e-2
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """Functions of one kind of scalars.
-
-    Attributes
-    ----------
-    sqrt, sin, cos : callable
-    choose : callable
-        choose(condition, yes, no); both are evaluated, and only the chosen one
-        may be other than a number.
-    """
+    """Functions of one kind of scalars."""
 
     sqrt: Callable[[Any], Any]
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]
-    choose: Callable[[Any, Any, Any], Any]
+    choose: Callable[[Any, Any, Any], Any]  # choose(condition, yes, no), both evaluated
 
 
 def _of_finite(function: Callable[[float], float]) -> Callable[[float], float]:
@@ -98,8 +88,7 @@ def exponential(m: Arithmetic, u: Components) -> list[Any]:
 
 
 def _half_angle(m: Arithmetic, square: Any) -> tuple[Any, Any]:
-    # sin(θ/2)/θ and cos(θ/2) from θ². The root is never taken of zero, where it
-    # has no derivative.
+    # sin(θ/2)/θ and cos(θ/2) from θ². The argument of the root is never zero, where it has no derivative.
     small = square < _SMALL_EXP
     angle = m.sqrt(m.choose(small, 1.0, square))
     quarter = square / 4
@@ -112,9 +101,8 @@ def _half_angle(m: Arithmetic, square: Any) -> tuple[Any, Any]:
 def dexp_inverse(m: Arithmetic, u: Components, w: Components) -> list[Any]:
     """Return the rate of u while exp(u) turns with the body-axes velocity w.
 
-    u̇ = w + ½ u × w + (1 - (θ/2) cot(θ/2))/θ² u × (u × w), θ = |u|: the inverse of
-    exp's differential (Iserles, Munthe-Kaas, Nørsett, Zanna 2000, app. B, for
-    velocities in body axes).
+    u̇ = w + ½ u × w + (1 - (θ/2) cot(θ/2))/θ² u × (u × w), θ = |u| (Iserles, Munthe-Kaas, Nørsett, Zanna 2000,
+    app. B, for velocities in body axes).
     """
     x, y, z = u
     c = _dexp_coefficient(m, x * x + y * y + z * z)

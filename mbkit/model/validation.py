@@ -13,12 +13,12 @@ from mbkit._check import Array
 from mbkit.errors import InputError, ModelError, Suggestions, nearest
 from mbkit.model import manifold
 from mbkit.model.description import Description
-from mbkit.model.parts import Body, Joint, JointCoupling, Loop
+from mbkit.model.parts import Body, Joint, JointCoupling, Loop, PointSpring
 from mbkit.spatial import skew
 
 # Names in a message.
 _MAX_NAMES: Final = 40
-# M of so many velocities takes 200 MB.
+# M of so many velocities has 200 MB.
 _MAX_VELOCITIES: Final = 5000
 
 
@@ -33,33 +33,21 @@ def structure_faults(description: Description) -> list[str]:
     velocities = sum(j.type.nv for j in joints)
     if velocities > _MAX_VELOCITIES:
         faults.append(f"{velocities} velocities; up to {_MAX_VELOCITIES} are taken, because M takes their square")
-    for what, names in (
-        ("body", [b.name for b in bodies]),
-        ("joint", [j.name for j in joints]),
-        ("frame", [f.name for f in frames]),
-        ("spring", [s.name for s in springs]),
-        ("coupling", [c.name for c in couplings]),
-        ("loop", [x.name for x in loops]),
-    ):
-        faults += [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
-    if any(f.name == "world" for f in frames):
-        faults.append("frame 'world': that name is the ground's; choose another")
-    if any(b.name == "world" for b in bodies):
-        faults.append("body 'world': that name is the ground's; choose another")
+    kinds = ("body", bodies), ("joint", joints), ("frame", frames), ("spring", springs)
+    for what, parts in (*kinds, ("coupling", couplings), ("loop", loops)):
+        names = Counter(p.name for p in parts)
+        faults += [f"{what} {n!r}: declared {k} times; names must differ" for n, k in names.items() if k > 1]
+        if what in ("body", "frame") and "world" in names:
+            faults.append(f"{what} 'world': that name is the ground's; choose another")
     suggestions = Suggestions()
-    bodily = known - {"world"}
     for joint in joints:
         faults += _unknown(f"joint {joint.name!r}", (joint.parent, joint.child), known, suggestions)
         faults += _joint_faults(joint)
     for frame in frames:
-        faults += _unknown(f"frame {frame.name!r}", (frame.body,), bodily, suggestions)
+        faults += _unknown(f"frame {frame.name!r}", (frame.body,), known - {"world"}, suggestions)
     for spring in springs:
         faults += _unknown(f"spring {spring.name!r}", (spring.body_a, spring.body_b), known, suggestions)
-        faults += [
-            f"spring {spring.name!r}: {n} {getattr(spring, n):g} is negative"
-            for n in ("stiffness", "rest_length", "damping")
-            if getattr(spring, n) < 0
-        ]
+        faults += _negative(f"spring {spring.name!r}", spring, ("stiffness", "rest_length", "damping"))
         if spring.body_a == spring.body_b:
             faults.append(f"spring {spring.name!r}: both ends on {spring.body_a!r}; it would never act")
     for coupling in couplings:
@@ -80,6 +68,10 @@ def structure_faults(description: Description) -> list[str]:
     moved = Counter(p.joint for p in description.prescribed)
     faults += [f"prescribed {n!r}: moved {k} times; give one motion" for n, k in moved.items() if k > 1]
     return faults
+
+
+def _negative(item: str, part: PointSpring | JointCoupling, names: Iterable[str]) -> list[str]:
+    return [f"{item}: {n} {getattr(part, n):g} is negative" for n in names if getattr(part, n) < 0]
 
 
 def _unknown(item: str, names: Iterable[str], known: Set[str], suggestions: Suggestions) -> list[str]:
@@ -124,9 +116,7 @@ def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterat
             yield f"{item}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
         elif sizes[name] != 1:
             yield f"{item}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
-    for n in ("stiffness", "damping", "armature"):
-        if getattr(coupling, n) < 0:
-            yield f"{item}: {n} {getattr(coupling, n):g} is negative"
+    yield from _negative(item, coupling, ("stiffness", "damping", "armature"))
     if not np.any(coupling.factors):
         yield f"{item}: no joint has a factor other than zero; it would never act"
 
@@ -189,8 +179,7 @@ def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
     return out
 
 
-# Descriptions carry rounded decimals; a thin plate written with six digits may
-# miss A + B >= C by its last digit.
+# A thin plate written with six digits may miss A + B >= C by its last digit.
 _TRIANGLE = 1e-6
 # Bodies in one sentence.
 _MAX_LISTED = 20
@@ -204,16 +193,9 @@ _FAR = 1e6
 
 
 def body_fault(body: Body, *, point_masses: bool) -> str | None:
-    """Return why mass and inertia are inconsistent, or None.
+    """Return why mass and inertia are inconsistent, or None; zero mass with zero inertia is a frame.
 
-    A body of zero mass and zero inertia is no fault: it is a frame, and
-    `idle_joints` finds the joints that would then move nothing.
-
-    Parameters
-    ----------
-    body : Body
-    point_masses : bool
-        Whether a positive mass with zero inertia is meant that way.
+    A positive mass without inertia is allowed where `point_masses`.
     """
     eigenvalues = np.asarray(np.linalg.eigvalsh(body.inertia), dtype=np.float64)
     largest = float(np.max(np.abs(eigenvalues)))
@@ -223,12 +205,11 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
         return f"no mass but inertia: up to {largest:.3g} kg m²" if largest else None
     if largest == 0:
         return None if point_masses else "mass without inertia: give the inertia, however small"
-    if eigenvalues[0] < -1e-12 * largest:
-        return f"inertia is not positive: principal moments {_moments(eigenvalues)} kg m²"
-    if eigenvalues[0] <= 1e-12 * largest and not point_masses:
-        return f"inertia is not positive: principal moments {_moments(eigenvalues)} kg m²"
+    moments = f"principal moments {', '.join(f'{x:.4g}' for x in eigenvalues)} kg m²"
+    if eigenvalues[0] < -1e-12 * largest or (eigenvalues[0] <= 1e-12 * largest and not point_masses):
+        return f"inertia is not positive: {moments}"
     if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
-        return f"inertia violates A + B >= C: principal moments {_moments(eigenvalues)} kg m²"
+        return f"inertia violates A + B >= C: {moments}"
     return None
 
 
@@ -238,24 +219,17 @@ def static_bodies(joints: Iterable[Joint]) -> set[str]:
     for joint in joints:
         if not joint.type.nv:
             below.setdefault(joint.parent, []).append(joint.child)
-    found: set[str] = set()
+    out: set[str] = set()
     waiting = ["world"]
     while waiting:
-        new = [child for child in below.get(waiting.pop(), ()) if child not in found]
-        found.update(new)
+        new = [child for child in below.get(waiting.pop(), ()) if child not in out]
+        out.update(new)
         waiting += new
-    return found
-
-
-def _moments(values: Array) -> str:
-    return ", ".join(f"{x:.4g}" for x in values)
+    return out
 
 
 def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[str, str], ...]:
-    """Return the bodies with inconsistent inertias, each with the reason.
-
-    A body with a parameter without value is not checked.
-    """
+    """Return the bodies of known but inconsistent inertia, each with the reason."""
     return tuple(
         (b.name, why)
         for b in bodies
@@ -264,11 +238,8 @@ def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[st
 
 
 def suspects(model: Description, *, point_masses: bool) -> tuple[tuple[str, str], ...]:
-    """Return the bodies that are inconsistent or leave a joint idle, each with the reason.
-
-    Bodies with a parameter without value are not checked.
-    """
-    found = dict(body_faults(model.bodies, point_masses=point_masses))
+    """Return the bodies of known numbers that are inconsistent or leave a joint idle, each with the reason."""
+    reasons = dict(body_faults(model.bodies, point_masses=point_masses))
     # A negative mass makes M indefinite, and joints look idle that are not.
     if all(x is not None for x in model.parameters.values()) and not any(b.mass < 0 for b in model.bodies):
         idle, alone = idle_joints(model)
@@ -277,8 +248,8 @@ def suspects(model: Description, *, point_masses: bool) -> tuple[tuple[str, str]
             why = f"no mass moves with joint {name!r}" if alone else f"joints {name!r} and {others} move the same mass"
             if not alone and not others:
                 why = f"two velocities of joint {name!r} move the same mass"
-            found.setdefault(model.joint(name).child, f"{why}, so M is singular: give mass, inertia or armature")
-    return tuple(found.items())
+            reasons.setdefault(model.joint(name).child, f"{why}, so M is singular: give mass, inertia or armature")
+    return tuple(reasons.items())
 
 
 _D = TypeVar("_D", bound=Description)
@@ -289,25 +260,17 @@ def check_substituted(before: _D, after: _D) -> _D:
     faults = structure_faults(after)
     # An impossible body that was accepted before stays accepted, but a mass must not become negative.
     accepted = {name for name, _ in before.nonphysical}
-    found = suspects(after, point_masses=True)
-    faults += [f"body {n!r}: {why}" for n, why in found if n not in accepted or after.body(n).mass < 0]
+    reasons = suspects(after, point_masses=True)
+    faults += [f"body {n!r}: {why}" for n, why in reasons if n not in accepted or after.body(n).mass < 0]
     if faults:
         raise ModelError(before.name, faults)
     return after
 
 
-def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
-    """Return one sentence for each kind of fault, with all its bodies.
-
-    Parameters
-    ----------
-    found : iterable of (str, str)
-        Bodies with the reason.
-    parts : mapping of str to sequence of (str, str)
-        Of a body that was merged from links: the links at fault, each with the reason. They are named instead.
-    """
+def grouped(reasons: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
+    """Return one sentence for each kind of fault of bodies, with all their names or those of their faulty `parts`."""
     kinds: dict[str, list[tuple[str, str, str, str]]] = {}
-    for body, why in found:
+    for body, why in reasons:
         moved = _JOINT.search(why)
         named = [("link", *part) for part in parts.get(body, ())] if not moved else []
         for what, name, reason in named or [("body", body, why)]:
@@ -331,10 +294,9 @@ def grouped(found: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple
 
 
 def idle_joints(model: Description) -> tuple[list[str], bool]:
-    """Return the joints with motions of no kinetic energy, so that M is singular, and whether each alone has one.
+    """Return the joints with motions of no kinetic energy, and whether each alone has one, from M at a random state.
 
-    M is formed at one random state from the definition, Σ Jᵀ I J, and scaled to
-    a unit diagonal; a null vector names its joints. Motions that violate loops count as if they moved mass.
+    A null vector of M, scaled to a unit diagonal, names its joints. Motions that loops forbid count as moving mass.
     """
     if not model.nv:
         return [], True
@@ -348,7 +310,7 @@ def idle_joints(model: Description) -> tuple[list[str], bool]:
     rows = [sample.held(loop) @ model.layout.G for loop in model.loops]
     if rows and (size := float(np.trace(M))):
         held = np.concatenate(rows)
-        # M need have an inverse only on what loops allow.
+        # M needs an inverse only for motions that the loops allow.
         M = M + size / len(M) * held.T @ held
     diagonal, alone = np.diag(M), True
     # A mass on its own axis leaves the square of a rounded length.
@@ -366,12 +328,10 @@ def idle_joints(model: Description) -> tuple[list[str], bool]:
 
 
 def scale_doubts(model: Description) -> list[str]:
-    """Return why engines may lose digits: sizes too far apart for double precision, one sentence for each cause.
+    """Return why engines may lose digits in double precision, a sentence for each cause.
 
-    For a hinge, the inertia about its axis M_ii stands against m L², with m the mass that it carries and L the
-    extent of the mechanism: an engine whose moments are about a common centre takes M_ii as a difference of numbers
-    of that size. MuJoCo takes inertias below 1e-15 (mjMINVAL) for zero. And a null direction of the scaled M to
-    rounding leaves no digits in accelerations.
+    A hinge's M_ii is a difference of numbers of size m L² in an engine with moments about a common centre (m: the mass
+    that it carries, L: the mechanism's extent). MuJoCo takes inertias below 1e-15 (mjMINVAL) for zero.
     """
     if not model.nv or any(x is None for x in model.parameters.values()):
         return []
@@ -412,38 +372,28 @@ def _listed(names: list[str]) -> str:
 
 
 def sample_mass_matrix(model: Description, q: Array | None = None) -> Array:
-    """Return M at a pose, or at one fixed random state: composite inertias give it, and Σ Jᵀ I J its diagonal.
+    """Return M at a pose, or at one fixed random state, by composite inertias.
 
-    The definition gives the diagonal as a sum of squares, which stays small where a mass is on its own axis; it alone
-    takes the square of the number of joints, as does M itself.
+    Its diagonal is Σ Jᵀ I J, a sum of squares, which stays small where a mass is on its own axis.
     """
     return _sample(model, q).M
 
 
 class _Sample(NamedTuple):
-    """M at one pose, and where bodies are there.
-
-    Attributes
-    ----------
-    M : (nv, nv) array
-    places : dict of str to (3,) array
-        Centre of mass in the world of each body with mass.
-    jacobians : dict of str to (list of int, (6, k) array)
-        Of each body the velocities that move it, and its Jacobian for them in its own axes, linear above angular.
-    rotations : dict of str to (3, 3) array
-        From each body's axes to the world's.
-    size : int
-        Number of velocities before reduction.
-    """
+    """M and the bodies' poses at one state."""
 
     M: Array
+    #: Centre of mass in the world of each body with mass.
     places: dict[str, Array]
+    #: Of each body the velocities that move it, and its (6, k) Jacobian for them in its axes, linear above angular.
     jacobians: dict[str, tuple[list[int], Array]]
+    #: From each body's axes to the world's.
     rotations: dict[str, Array]
+    #: Number of velocities before reduction.
     size: int
 
     def held(self, loop: Loop) -> Array:
-        """Return the rows of what a loop holds at rest, in world axes, for all velocities."""
+        """Return the Jacobian of a loop's constraints in world axes, for all velocities."""
         ends = []
         for body, point in ((loop.body_a, loop.translation_a), (loop.body_b, loop.translation_b)):
             moving, own = self.jacobians[body]
