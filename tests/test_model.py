@@ -464,7 +464,7 @@ FAULTS = {
     "frame of the ground": (lambda b: b.add_frame("world", body="bob"), "frame 'world'"),
     "skewed rotation": (joint_k(rotation=2 * np.eye(3)), "joint 'k': rotation is not a rotation matrix"),
     "reflection": (joint_k(rotation=np.diag([1, 1, -1])), "joint 'k': rotation is not a rotation matrix"),
-    "rotation twice": (joint_k(rotation=np.eye(3), rpy=(0, 0, 0)), "both rotation and rpy"),
+    "rotation twice": (joint_k(rotation=np.eye(3), rpy=(0, 0, 0)), "rotation or rpy"),
     "mimics nobody": (joint_k(mimic=("hinje", 1.0, 0.0)), "joint 'k': mimics unknown joint 'hinje'; near: 'hinge'"),
     "mimics itself": (joint_k(mimic=("k", 1.0, 0.0)), "joint 'k': mimics in a circle"),
     "mimic on a ball": (

@@ -87,7 +87,7 @@ def model_of_mjcf(
     transmissions = Transmissions(mujoco, scene, off)
     if read.faults:
         raise ModelError(str(path), read.faults)
-    sprung = f"springdamper made stiffness and damping, by MuJoCo's compiler: {listed(springs)}" if springs else ""
+    sprung = f"stiffness and damping of springdamper are from MuJoCo's compiler: {listed(springs)}" if springs else ""
     for note in (*_notes(mujoco, path, scene, flags, scale), inferred, sprung, misspelt, snap.note):
         if note:
             b.note(note)
@@ -246,7 +246,12 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
     if scene.left_out:
         listing = ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()))
         out.append(f"not represented here, and left out: {listing}")
-    out += _fluid_note(mujoco, scene)
+    medium = Element("option", {}, 0)
+    for element in mujoco.all("option"):
+        medium.attributes |= {k: v for k, v in element.attributes.items() if k in ("density", "viscosity", "wind")}
+    if any(scene.read.number(medium, name, "the file", 0.0) for name in ("density", "viscosity")):
+        listing = ", ".join(f"{k} {v}" for k, v in sorted(medium.attributes.items()))
+        out.append(f"the forces of a fluid were left out (option {listing}), with fluidshape and fluidcoef of geoms")
     listing = ", ".join(f"{k}={v}" for k, v in sorted(flags.items()) if k not in _HONOURED)
     if listing:
         out.append(f"option flags are an engine's, and were left out: {listing}")
@@ -258,23 +263,11 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
         out.append(f"compiler {setting} changed the {what} of {listed(bodies)}")
     if scale != 1:
         out.append(f"compiler settotalmass: all masses and inertias times {scale:.9g}")
-    drawn = [b for b in scene.bodies if np.any(b.pose.p) or not np.array_equal(b.pose.R, np.eye(3))]
-    free = [b.name for b in drawn if b.joints and b.joints[0].kind == "free"]
+    moved = [b for b in scene.bodies if np.any(b.pose.p) or not np.array_equal(b.pose.R, np.eye(3))]
+    free = [b.name for b in moved if b.joints and b.joints[0].kind == "free"]
     if free:
-        out.append(f"q of a free body is its pose in the world; where the file draws it was left out: {listed(free)}")
+        out.append(f"q of a free body is its pose in the world; its pose in the file was left out: {listed(free)}")
     stacked = [b.name for b in scene.bodies if len(b.joints) > 1]
     if stacked:
         out.append(f"massless bodies stand between the joints of bodies with several: {listed(stacked)}")
     return out
-
-
-def _fluid_note(mujoco: Element, scene: Scene) -> list[str]:
-    """Return a note where MuJoCo's medium has density or viscosity, whose forces are left out."""
-    option: dict[str, str] = {}
-    for element in mujoco.all("option"):
-        option |= {k: v for k, v in element.attributes.items() if k in ("density", "viscosity", "wind")}
-    medium = Element("option", option, 0)
-    if not any(scene.read.number(medium, name, "the file", 0.0) for name in ("density", "viscosity")):
-        return []
-    listing = ", ".join(f"{k} {v}" for k, v in sorted(option.items()))
-    return [f"the forces of a fluid were left out (option {listing}), with fluidshape and fluidcoef of geoms"]

@@ -80,7 +80,7 @@ def joint_kind(joint: Any) -> tuple[str, Array | None]:
     if name[:-1] in _ALIGNED:
         return _ALIGNED[name[:-1]], _AXES[name[-1]]
     if name not in _UNALIGNED:
-        raise UnsupportedError(f"pinocchio: made a {name} joint, which has no counterpart here")
+        raise UnsupportedError(f"pinocchio: a {name} joint has no counterpart here")
     kind = _UNALIGNED[name]
     if not kind_of(kind).n_axes:
         return kind, None

@@ -153,7 +153,7 @@ class ArgumentReader:
     def rotation(self, item: str, rotation: ArrayLike | None, rpy: ArrayLike | None, name: str = "rotation") -> Array:
         """Return the matrix of a rotation matrix or of roll, pitch, yaw."""
         if rotation is not None and rpy is not None:
-            self.faults.append(f"{item}: both rotation and rpy given; give one")
+            self.faults.append(f"{item}: expected rotation or rpy, got both; give one")
         if rpy is not None:
             return spatial.matrix_from_rpy(*self.vector(f"{item}: rpy", rpy, 3))
         if rotation is None:

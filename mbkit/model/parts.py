@@ -215,8 +215,8 @@ class JointCoupling(_Frozen):
         return " + ".join(terms).replace("+ -", "- ")
 
     def __str__(self) -> str:
-        given = [f"{n.replace('_', ' ')} {x:g}" for n in _OF_COUPLING if (x := getattr(self, n))]
-        return f"coupling {self.name!r} on {self.length}: {', '.join(given) or 'no force'}"
+        numbers = [f"{n.replace('_', ' ')} {x:g}" for n in _OF_COUPLING if (x := getattr(self, n))]
+        return f"coupling {self.name!r} on {self.length}: {', '.join(numbers) or 'no force'}"
 
 
 @dataclass(frozen=True, eq=False)

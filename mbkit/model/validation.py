@@ -32,7 +32,7 @@ def structure_faults(description: Description) -> list[str]:
         faults.append("no bodies; add at least one")
     velocities = sum(j.type.nv for j in joints)
     if velocities > _MAX_VELOCITIES:
-        faults.append(f"{velocities} velocities; up to {_MAX_VELOCITIES} are taken, because M takes their square")
+        faults.append(f"{velocities} velocities; expected up to {_MAX_VELOCITIES}, because M has their square")
     kinds = ("body", bodies), ("joint", joints), ("frame", frames), ("spring", springs)
     for what, parts in (*kinds, ("coupling", couplings), ("loop", loops)):
         names = Counter(p.name for p in parts)
