@@ -15,8 +15,6 @@ from mbkit._version import __version__
 from mbkit.cli import baseline, bench, check, convert, derive, diff, export, robots, stress
 from mbkit.cli._shared import Door
 
-__all__ = ["cli", "main"]
-
 
 @click.group(cls=Door, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="mbkit")

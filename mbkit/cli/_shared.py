@@ -24,34 +24,6 @@ if TYPE_CHECKING:
 
     from mbkit.report.document import Document
 
-__all__ = [
-    "AGREE",
-    "DIFFER",
-    "DONE",
-    "INTERNAL",
-    "INTERRUPTED",
-    "MISUSE",
-    "Door",
-    "check_engines",
-    "console",
-    "engines_option",
-    "in_options",
-    "json_option",
-    "leave",
-    "load_options",
-    "out_option",
-    "prepare",
-    "report_options",
-    "samples_option",
-    "say",
-    "seed_option",
-    "show",
-    "split",
-    "stem_of",
-    "tell",
-]
-
-
 # Options that several commands have.
 
 # Keyword arguments of `mbkit.load` that messages name, as options of the command line.
@@ -155,8 +127,10 @@ def check_engines(names: tuple[str, ...], least: int) -> None:
         if name not in comparable:
             raise UnknownNameError("engine", name, comparable)
     if len(set(names)) < least:
-        told, count = ", ".join(comparable), {1: "one", 2: "two"}.get(least, str(least))
-        raise InputError(f"--engines: expected at least {count} of {told}, got {', '.join(names) or 'none'}")
+        count = {1: "one", 2: "two"}[least]
+        raise InputError(
+            f"--engines: expected at least {count} of {', '.join(comparable)}, got {', '.join(names) or 'none'}"
+        )
 
 
 AGREE: Final = 0
@@ -171,11 +145,11 @@ class Door(click.Group):
     """Turns what the library raises into one message and an exit status."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command that was asked for."""
+        """Run the command."""
         try:
             return self._invoke(ctx)
         finally:
-            # A library may have swallowed it, or taken it for a failure of its own.
+            # A library may have swallowed the interruption, or treated it as its own failure.
             if _interrupt.received():
                 ctx.exit(INTERRUPTED)
 
@@ -197,21 +171,21 @@ class Door(click.Group):
         except (click.exceptions.Exit, click.Abort):
             raise
         except Exception:
-            # A status of its own: "differ" is a verdict, and this is none.
+            # "differ" is a verdict, so a fault has a status of its own.
             traceback.print_exc()
             say("error", "this is a fault of mbkit's; please report it with the lines above")
             ctx.exit(INTERNAL)
 
 
 def say(what: str, text: str) -> None:
-    """Print a message on stderr, with what it is before it; a line feed in it begins no message of its own."""
-    told = re.sub(r"\n(?! )", "\n  ", terminal(text))
+    """Print a message on stderr after its kind; lines after the first are indented."""
+    text = re.sub(r"\n(?! )", "\n  ", terminal(text))
     colour = {"error": "red", "warning": "yellow"}.get(what)
-    click.echo(f"{click.style(what, fg=colour, bold=True)}: {told}", err=True)
+    click.echo(f"{click.style(what, fg=colour, bold=True)}: {text}", err=True)
 
 
 def tell(text: str) -> None:
-    """Print text on stdout, with what a terminal would obey spelled out."""
+    """Print text on stdout, with control characters spelled out."""
     click.echo(terminal(text))
 
 
@@ -259,20 +233,9 @@ def show(
     table: Callable[[], str] | None = None,
     figure: Callable[[], bytes] | None = None,
 ) -> bool:
-    """Write a result as files and print it; return whether all files could be written.
+    """Write JSON, CSV (`table`), PNG (`figure`) and a page of a result; print its view, or the JSON.
 
-    Parameters
-    ----------
-    result : Result
-        Its JSON is written first, and printed with `as_json`.
-    view : callable
-        Returns the document for the terminal and the page.
-    stem, out : str, Path
-        Stem of the files' names, and their folder.
-    as_json, force : bool
-        Whether JSON is printed, and whether files are replaced that mbkit did not write.
-    table, figure : callable, optional
-        Return CSV and PNG.
+    Return whether all files could be written. With `force`, files are replaced that mbkit did not write.
     """
     from mbkit.report import output_folder
 
@@ -325,7 +288,7 @@ def console() -> Console:
     from rich.segment import Segment
 
     class Screen(Console):
-        """Prints no character of a name that a terminal would obey; leaves a closed pipe to the caller."""
+        """Prints no control character of a name; leaves a closed pipe to the caller."""
 
         def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
             for text, style, control in super().render(renderable, options):
@@ -334,8 +297,8 @@ def console() -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    made: Console = Screen(highlight=False)
-    if not made.is_terminal and "COLUMNS" not in os.environ:
+    screen: Console = Screen(highlight=False)
+    if not screen.is_terminal and "COLUMNS" not in os.environ:
         # A file has no width; rich would fold at 80.
-        made.width = 140
-    return made
+        screen.width = 140
+    return screen

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.studies.baseline import Baseline, BaselineResult
 
-__all__ = ["baseline"]
-
 
 @click.group()
 def baseline() -> None:
@@ -88,7 +86,7 @@ def _record_one(
 
     model = model_of(target, options)
     with Bar(f"record {model.name}") as bar:
-        made = baselines.record(
+        recorded = baselines.record(
             model,
             file,
             engines or None,
@@ -99,11 +97,11 @@ def _record_one(
             force=force,
             progress=bar,
         )
-    tell(f"{file}: {one_line(model.name)}, {', '.join(made.engines)}, {file.stat().st_size / 1000:.0f} kB")
-    for refusal in made.left_out:
+    tell(f"{file}: {one_line(model.name)}, {', '.join(recorded.engines)}, {file.stat().st_size / 1000:.0f} kB")
+    for refusal in recorded.left_out:
         say("note", f"{refusal.engine}{' ' * bool(refusal.term)}{refusal.term}: {refusal.reason}")
-    for told in made.disagreements:
-        say("warning", told)
+    for disagreement in recorded.disagreements:
+        say("warning", disagreement)
 
 
 @baseline.command()
@@ -112,7 +110,7 @@ def _record_one(
     "--target", help="Check this instead of what was recorded, or the function that was recorded; with one file."
 )
 @click.option("--strict", is_flag=True, help="Fail where an engine that was recorded is not installed.")
-@click.option("--rebaseline", is_flag=True, help="Tell what differs, and record it anew.")
+@click.option("--rebaseline", is_flag=True, help="Show what differs, and record it again.")
 @load_options
 @json_option
 def check(
@@ -150,14 +148,14 @@ def check(
         nothing = result.status == "skipped" and not strict
         statuses.append(MISUSE if nothing else AGREE if result.passed or recorded else DIFFER)
     if as_json:
-        _print_json(results)
+        tell("[" + ",\n".join(r.to_json() for r in results) + "]")
     leave(max(statuses))
 
 
 def _check_one(
     file: Path, target: str | None, options: dict[str, Any], strict: bool, rebaseline: bool, *, table: bool
 ) -> tuple[BaselineResult, bool]:
-    """Return what was found, and whether it was recorded anew."""
+    """Return the result, and whether it was recorded again."""
     from mbkit.report.explain_view import baseline_view
     from mbkit.report.progress import Bar
     from mbkit.report.terminal import render
@@ -168,9 +166,9 @@ def _check_one(
     # A target of other options is recorded with them.
     options = {**recorded.options, **options}
     model = _model(recorded, file) if target is None else model_of(target, options)
-    asked = None if target is None else kept(target, file)
+    new_target = None if target is None else kept(target, file)
     with Bar(f"check {file.name}") as bar:
-        result = baselines.check(model, file, strict=strict, target=asked, progress=bar)
+        result = baselines.check(model, file, strict=strict, target=new_target, progress=bar)
     if table:
         console().print(render(baseline_view(result, _again(file, target))))
     differs = result.status not in ("same", "skipped")
@@ -186,9 +184,9 @@ def _check_one(
         recorded.engines,
         samples=recorded.states.kinds.count("random"),
         seed=recorded.seed,
-        target=recorded.target if asked is None else asked,
+        target=recorded.target if new_target is None else new_target,
         options=options,
-        # Whoever reads it knows whose it is.
+        # It was read above, so it is this robot's.
         force=True,
     )
     say("recorded", str(file))
@@ -196,7 +194,7 @@ def _check_one(
 
 
 def _confirmed(file: Path) -> bool:
-    """Return whether a person at a terminal wants a baseline recorded anew."""
+    """Return whether a person at a terminal wants a baseline recorded again."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         return False
     return click.confirm(f"Record {file} anew with these versions?", default=False)
@@ -238,7 +236,7 @@ def _name(target: str) -> str:
 
 
 def _again(file: Path, target: str | None) -> str:
-    """Return the command that records anew."""
+    """Return the command that records again."""
     return f"mbkit baseline check {file}{f' --target {target}' if target else ''} --rebaseline"
 
 
@@ -265,12 +263,8 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
         if not path.is_dir():
             out.append(path)
             continue
-        found = sorted(p for p in path.glob("*.toml") if is_baseline(p))
-        if not found:
+        baselines = sorted(p for p in path.glob("*.toml") if is_baseline(p))
+        if not baselines:
             raise InputError(f"{path}: no baseline in this folder; mbkit baseline record TARGET {path} makes one")
-        out += found
+        out += baselines
     return out
-
-
-def _print_json(results: list[BaselineResult]) -> None:
-    tell("[" + ",\n".join(r.to_json() for r in results) + "]")

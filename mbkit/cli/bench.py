@@ -29,8 +29,6 @@ from mbkit.cli._shared import (
     stem_of,
 )
 
-__all__ = ["bench"]
-
 _QUICK: Final[dict[str, Any]] = {"repeats": 3, "work": 24_000}
 _USUAL: Final[dict[str, Any]] = {"repeats": 5, "work": None}
 
@@ -84,7 +82,7 @@ def bench(
     stem = f"{stem_of(target, model.name)}-bench"
     prepare(out, stem, "json", "csv", "png", "html", force=force)
     if quick and not methods:
-        # Those that none of the engines has would be refused as asked for in error.
+        # A method that none of the engines has would be refused.
         methods = tuple(m for m in QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
     usual = _QUICK if quick else _USUAL
     try:

@@ -33,8 +33,6 @@ from mbkit.cli._shared import (
 if TYPE_CHECKING:
     from mbkit.model import Model
 
-__all__ = ["check"]
-
 
 @click.command()
 @click.argument("target", required=False)

@@ -10,8 +10,6 @@ import click
 from mbkit.cli._shared import load_options, say, tell
 from mbkit.errors import OutputError
 
-__all__ = ["convert"]
-
 
 @click.command()
 @click.argument("target")
@@ -19,13 +17,7 @@ __all__ = ["convert"]
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="File to write.  [default: print]")
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
 @load_options
-def convert(
-    target: str,
-    to: str,
-    output: Path | None,
-    force: bool,
-    options: dict[str, Any],
-) -> None:
+def convert(target: str, to: str, output: Path | None, force: bool, options: dict[str, Any]) -> None:
     """Write TARGET as MJCF or URDF: its motion alone, without geometry.
 
     TARGET is what `mbkit check` takes. The text is read back with MuJoCo's or Pinocchio's own parser before
@@ -36,12 +28,12 @@ def convert(
 
     if output is not None and output.exists() and not force:
         raise OutputError(f"{output} is there already; choose another with -o, or replace it with --force")
-    made = converted(model_of(target, options), to)
+    result = converted(model_of(target, options), to)
     if output is None:
-        tell(made.text.removesuffix("\n"))
+        tell(result.text.removesuffix("\n"))
     else:
-        made.write(output)
-    for note in made.notes:
+        result.write(output)
+    for note in result.notes:
         say("note", note)
     where = "printed" if output is None else f"written to {output}"
-    say("checked", f"{made.model} as {to}, {where}: read back, every term agrees to {made.worst:.1e}")
+    say("checked", f"{result.model} as {to}, {where}: read back, every term agrees to {result.worst:.1e}")

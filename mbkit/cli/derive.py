@@ -11,12 +11,11 @@ import click
 from mbkit._escape import json_text
 from mbkit._version import __version__
 from mbkit.cli._shared import json_option, load_options, say, tell
+from mbkit.cli.export import list_functions
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
     from mbkit.model import Model
-
-__all__ = ["derive"]
 
 _WIDTH: Final = 100
 
@@ -75,9 +74,9 @@ def derive(
     with Bar(f"derive {target.name}") as bar:
         names = None if isinstance(target, EnergyModel) else letters(target)
         lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.1 * x, text))
-        # What is prescribed is no coordinate of the equation.
-        told = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
-        text, ending = _text(lag, told, form, as_json, bar)
+        # Prescribed joints are no coordinates of the equation.
+        own = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
+        text, ending = _text(lag, own, form, as_json, bar)
     if out is None:
         tell(text)
         return
@@ -98,20 +97,20 @@ def _model(name: str, options: dict[str, Any]) -> Model:
     from mbkit.load.robot_data import find
     from mbkit.studies._targets import model_of
 
-    made = catalog.systems()[name]() if name in catalog.systems() and not options else None
-    if name in systems.names() and not options and (made is None or made.quaternions or made.loops):
-        if made is not None and made.loops:
-            told = f"the catalog's has bodies and a loop, and mbkit derive mbkit.catalog:{name} takes that one"
-            say("note", f"{name} is in independent coordinates here; {told}")
-        elif made is not None:
+    model = catalog.systems()[name]() if name in catalog.systems() and not options else None
+    if name in systems.names() and not options and (model is None or model.quaternions or model.loops):
+        if model is not None and model.loops:
+            other = f"the catalog's has bodies and a loop, and mbkit derive mbkit.catalog:{name} takes that one"
+            say("note", f"{name} is in independent coordinates here; {other}")
+        elif model is not None:
             say("note", f"{name} is in Euler angles here; the catalog's has a quaternion, which mbkit check takes")
         say("note", _described(systems.get(name)))
         return systems.get(name)().model
-    if made is not None:
+    if model is not None:
         robot = find(name)
         if robot is not None:
             say("note", f"{name} is also a robot; this is the catalog's system, and {robot.path} is the robot")
-        return made
+        return model
     try:
         return model_of(name, options)
     except UnknownNameError as error:
@@ -139,11 +138,8 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     if not isinstance(model, EnergyModel):
         model = in_symbols(model) or model
     robot = canonical(name)
-    made = export_c(model, name=None if robot is None else c_identifier(robot))
-    paths = made.write(out, force=force)
-    for function in made.functions:
-        tell(f"{function.signature}: {function.operations} operations")
-    tell(f"header {paths[0]}\nsource {paths[1]}")
+    source = export_c(model, name=None if robot is None else c_identifier(robot))
+    list_functions(source, source.write(out, force=force))
 
 
 def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:

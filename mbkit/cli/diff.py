@@ -26,8 +26,6 @@ from mbkit.errors import MbkitError
 if TYPE_CHECKING:
     from mbkit.model import Model
 
-__all__ = ["diff"]
-
 
 @click.command()
 @click.argument("first")
@@ -89,18 +87,18 @@ def _short(target: str) -> str:
 
 
 def _model(target: str, options: Mapping[str, Any]) -> Model:
-    """Return a file as it is written where nothing else is asked for, and any other target as it loads."""
+    """Return a file as it is written if there are no options, and any other target as it loads."""
     from mbkit import catalog
     from mbkit.load.robot_data import find
     from mbkit.studies._targets import model_of
     from mbkit.studies.importers.study import written
 
-    # A robot that is also a catalog system is told about where targets are told apart.
+    # `model_of` says which one it takes where a robot is also a catalog system.
     plain = not options and (os.path.isfile(target) or (find(target) is not None and target not in catalog.systems()))
     if plain:
         try:
             return written(target)
         except MbkitError:
-            # What is wrong with it is told better by the loader, which may also read it.
+            # The loader has the better message, or reads it after all.
             pass
     return model_of(target, options)

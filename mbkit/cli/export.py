@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mbkit.cli._shared import json_option, load_options, out_option, tell
 
-__all__ = ["export"]
+if TYPE_CHECKING:
+    from mbkit.codegen.c_source import CSource
 
 
 @click.command()
@@ -49,17 +51,24 @@ def export(
     # Several robots' files hold the same name.
     robot = canonical(target)
     stem = name if name is not None else c_identifier(robot) if robot is not None else None
-    made = export_c(model, quantities or DEFAULT, name=stem)
-    paths = made.write(out, force=force)
+    source = export_c(model, quantities or DEFAULT, name=stem)
+    paths = source.write(out, force=force)
     if as_json:
         import json
         from dataclasses import asdict
 
-        told: dict[str, Any] = {"name": made.name, "model": model.name, "digest": made.digest}
-        told |= {"versions": made.versions, "header": str(paths[0]), "source": str(paths[1])}
-        told["functions"] = [asdict(f) | {"inputs": dict(f.inputs), "outputs": dict(f.outputs)} for f in made.functions]
-        tell(json.dumps(told, indent=1))
+        data: dict[str, Any] = {"name": source.name, "model": model.name, "digest": source.digest}
+        data |= {"versions": source.versions, "header": str(paths[0]), "source": str(paths[1])}
+        data["functions"] = [
+            asdict(f) | {"inputs": dict(f.inputs), "outputs": dict(f.outputs)} for f in source.functions
+        ]
+        tell(json.dumps(data, indent=1))
         return
-    for function in made.functions:
+    list_functions(source, paths)
+
+
+def list_functions(source: CSource, paths: Sequence[Path]) -> None:
+    """Print the signatures of C functions and the files that hold them."""
+    for function in source.functions:
         tell(f"{function.signature}: {function.operations} operations")
     tell(f"header {paths[0]}\nsource {paths[1]}")

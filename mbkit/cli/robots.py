@@ -1,12 +1,10 @@
-"""`mbkit robots`: what can be asked for by name."""
+"""`mbkit robots`: robots and systems by name."""
 
 from __future__ import annotations
 
 import click
 
 from mbkit.cli._shared import console, tell
-
-__all__ = ["robots"]
 
 
 @click.command()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -24,11 +24,6 @@ from mbkit.cli._shared import (
     split,
     tell,
 )
-
-if TYPE_CHECKING:
-    pass
-
-__all__ = ["stress"]
 
 
 @click.command()
@@ -84,10 +79,10 @@ def stress(
     # One case has files of its own; several share theirs.
     stem = f"{cases[0]}-stress" if len(cases) == 1 else "stress"
     prepare(out, stem, "json", "csv", "html", force=force)
-    given: dict[str, Any] = {name: x for name, x in numbers.items() if x is not None}
+    limits: dict[str, Any] = {name: x for name, x in numbers.items() if x is not None}
     try:
         with _interrupt.keeping, Bar("stress") as bar:
-            result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **given)
+            result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **limits)
     except InterruptedSweepError as stopped:
         result = stopped.result
     written = show(result, lambda: view(result), stem, out, as_json=as_json, force=force, table=result.to_csv)

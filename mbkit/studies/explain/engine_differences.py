@@ -1,6 +1,6 @@
 """Why two engines differ on one description: a convention, a left-out quantity or a known defect.
 
-Only the answers of the engines are known. So each usual mistake is made in the questions to the first engine or in its
+Only the answers of the engines are known. So each usual mistake is put into the questions to the first engine or its
 answers, one at a time, until it answers as the second does. Gravity, armature, damping and the ten inertial numbers of
 a body enter the terms linearly; these are fitted, and what has another origin leaves a residual.
 """
@@ -37,8 +37,6 @@ from mbkit.studies.explain.terms import (
     states_of,
     velocity_joints,
 )
-
-__all__ = ["engine_causes"]
 
 #: Pairs of joints tried in each other's place.
 _MAX_SWAPS: Final = 400
@@ -101,26 +99,17 @@ def _larger(one: Iterable[Gap], other: Iterable[Gap]) -> tuple[Gap, ...]:
 
 @dataclass(frozen=True)
 class _Convention:
-    """A convention in which a second engine would differ from the first.
-
-    Attributes
-    ----------
-    kind, says : str
-    coordinates : (nq,) array of int, optional
-        Entry i of the second engine's q is entry ``coordinates[i]`` of the first's.
-    velocities : callable, optional
-        From states to T, (N, nv, nv), with T v the velocity for the first engine.
-    slip : callable, optional
-        From velocities to the accelerations that nle must hold in addition.
-    terms : mapping
-        Term -> the terms, with factors, that the second engine returns for it.
-    """
+    """A convention in which a second engine would differ from the first."""
 
     kind: str
     says: str
+    #: Entry i of the second engine's q is entry ``coordinates[i]`` of the first's.
     coordinates: np.ndarray | None = None
+    #: From states to T, (N, nv, nv), with T v the velocity for the first engine.
     velocities: Callable[[States], Array] | None = None
+    #: From velocities to the accelerations that nle must hold in addition.
     slip: Callable[[Array], Array] | None = None
+    #: Term -> the terms, with factors, that the second engine returns for it.
     terms: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def answer(self, ask: Callable[[States], Values], at: States) -> Values:

@@ -20,20 +20,6 @@ from mbkit.load.shapes import NOTHING, Lump
 from mbkit.model import Joint, Mimic, Model
 from mbkit.studies.explain.merged_model import LinkInBody, MergedModel, Tolerances, composite
 
-__all__ = [
-    "CONSTRAINTS",
-    "Hypothesis",
-    "Mistake",
-    "angle_of",
-    "body_mistakes",
-    "differences",
-    "joint_mistakes",
-    "link_differences",
-    "links_in_common_axes",
-    "number_text",
-    "rotation_mistakes",
-]
-
 #: Kinds that act on the motion through no term, but through constraints.
 CONSTRAINTS: Final = frozenset({"loop", "prescribed motion"})
 _WATER: Final = 1000.0  # kg/m³
@@ -55,29 +41,15 @@ class Mistake:
     fields: Mapping[str, Any]
 
 
-def _unchanged(x: MergedModel, _: Mapping[str, Any]) -> MergedModel:
-    return x
-
-
 @dataclass(frozen=True)
 class Hypothesis:
-    """A difference between two descriptions: fields of one part, with a name.
-
-    Attributes
-    ----------
-    kind, subject, says : str
-    put : callable
-        (description, fields) -> the description with these fields in the part.
-    ours, theirs : mapping
-        The fields in the first and in the second description.
-    a, b : Any
-        The numbers of the two sides, where they are numbers.
-    """
+    """A difference between two descriptions: fields of one part in either, with a name, and their numbers."""
 
     kind: str
     subject: str
     says: str
-    put: Callable[[MergedModel, Mapping[str, Any]], MergedModel] = field(default=_unchanged, compare=False)
+    #: (description, fields) -> the description with these fields in the part.
+    put: Callable[[MergedModel, Mapping[str, Any]], MergedModel] = field(default=lambda x, _: x, compare=False)
     ours: Mapping[str, Any] = field(default_factory=dict, compare=False)
     theirs: Mapping[str, Any] = field(default_factory=dict, compare=False)
     a: Any = None
@@ -155,16 +127,9 @@ def rotation_mistakes(R: Array) -> Iterator[Mistake]:
 
 
 def body_mistakes(links: Sequence[LinkInBody], R_PJ: Array, *, base: bool = False) -> list[Mistake]:
-    """Return the usual mistakes with a body, found without the other side.
+    """Return the usual mistakes with a body of these links, its own first, whatever the other side has.
 
-    Parameters
-    ----------
-    links : sequence of LinkInBody
-        The body's links, its own first.
-    R_PJ : (3, 3) array
-        Rotation of the joint that carries the body.
-    base : bool
-        Whether it is a base that moves freely.
+    The joint that carries the body has the rotation R_PJ; `base` says whether it is a base that moves freely.
     """
     at = composite(links)
     m, c, I = at.mass, at.com, at.inertia
@@ -175,18 +140,10 @@ def body_mistakes(links: Sequence[LinkInBody], R_PJ: Array, *, base: bool = Fals
     if m and c.any():
         d = spatial.skew(c)
         steiner, kind = -m * d @ d, "inertia about the wrong point"
-        rows += [
-            (
-                kind,
-                "has the inertia about the body's origin for that about the centre of mass",
-                {"inertia": I + steiner},
-            ),
-            (
-                kind,
-                "takes the inertia to be about the body's origin, and moves it to the centre of mass",
-                {"inertia": I - steiner},
-            ),
-        ]
+        says = "has the inertia about the body's origin for that about the centre of mass"
+        rows.append((kind, says, {"inertia": I + steiner}))
+        says = "takes the inertia to be about the body's origin, and moves it to the centre of mass"
+        rows.append((kind, says, {"inertia": I - steiner}))
     for R, whose in ((R_PJ, "the parent's axes"), (R_PJ.T, "axes turned against its own")):
         if not _is_identity(R):
             rows.append(("inertia axes", f"has the inertia in {whose}", {"inertia": R @ I @ R.T}))
@@ -358,7 +315,7 @@ def link_differences(
 def links_in_common_axes(one: MergedModel, other: MergedModel, near: Tolerances) -> tuple[MergedModel, MergedModel]:
     """Return both descriptions with their common links in the same axes.
 
-    A link whose frame differs between the two is given in its body's axes in both.
+    A link whose frame differs between the two has its body's axes in both.
     """
     sides: tuple[dict[str, tuple[LinkInBody, ...]], ...] = (dict(one.links), dict(other.links))
     for name in sides[0].keys() & sides[1].keys():
@@ -379,7 +336,7 @@ def links_in_common_axes(one: MergedModel, other: MergedModel, near: Tolerances)
 
 
 def joint_mistakes(joint: Joint) -> list[Mistake]:
-    """Return the usual mistakes with a joint, found without the other side."""
+    """Return the usual mistakes with a joint, whatever the other side has."""
     R, p = joint.rotation, joint.translation
     rows: list[tuple[str, str, dict[str, Any]]] = []
     for name, kind in _NUMBERS.items():
@@ -405,14 +362,11 @@ def joint_mistakes(joint: Joint) -> list[Mistake]:
             rows.append(("axis", "has the axis in other axes", {"axes": joint.axes @ R.T}))
     rows += [(x.kind, x.says, dict(x.fields)) for x in rotation_mistakes(R)]
     if p.any():
+        far = "has the joint's origin 1000 times too far, as of millimetres"
         rows += [
             ("joint origin", "has the joint's origin on the other side", {"translation": -p}),
             ("joint origin", "has the joint at the parent's origin", {"translation": 0.0 * p}),
-            (
-                "unit of length",
-                "has the joint's origin 1000 times too far, as of millimetres",
-                {"translation": 1e3 * p},
-            ),
+            ("unit of length", far, {"translation": 1e3 * p}),
             ("unit of length", "has the joint's origin 1000 times too near", {"translation": 1e-3 * p}),
         ]
         if not _is_identity(R):
@@ -540,26 +494,16 @@ def differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[
         b = theirs.get(a.name)
         if b is None:
             continue
-        put = partial(_put_joint, a.name)
+        put = partial(_put, MergedModel.with_joint, a.name)
         out += [_hypothesis(x, f"joint {a.name!r}", put, a, b) for x in _joint_differences(a, b, near)]
         out += _matter_differences(one, a, other, near)
     return out
 
 
-def _put_joint(name: str, x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
-    return x.with_joint(name, values)
-
-
-def _put_body(name: str, x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
-    return x.with_body(name, values)
-
-
-def _put_link(body: str, link: str, x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
-    return x.with_link(body, link, values)
-
-
-def _put_fields(x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
-    return x.with_fields(**values)
+def _put(change: Callable[..., MergedModel], *arguments: Any) -> MergedModel:
+    """Call a method of a description with the names of a part, which come first here, and its fields."""
+    *names, x, values = arguments
+    return change(x, *names, values)
 
 
 def _put_parts(section: str, key: str, x: MergedModel, parts: Mapping[str, Any]) -> MergedModel:
@@ -590,7 +534,7 @@ def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near
             _hypothesis(
                 x,
                 f"link {name!r}, fixed to {body!r}" if name != body else f"link {name!r}",
-                partial(_put_link, body, name),
+                partial(_put, MergedModel.with_link, body, name),
                 ours[name],
                 theirs[name],
             )
@@ -598,7 +542,11 @@ def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near
         ]
     base = joint.type.floating and joint.parent == "world"
     mistakes = _body_differences(one.links[body], joint.rotation, b, near, base=base)
-    return [_hypothesis(x, f"body {body!r}", partial(_put_body, body), a, b) for x in mistakes]
+    return [_hypothesis(x, f"body {body!r}", partial(_put, MergedModel.with_body, body), a, b) for x in mistakes]
+
+
+def _put_gravity(x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
+    return x.with_fields(**values)
 
 
 def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis]:
@@ -610,7 +558,7 @@ def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis
             says = "has no gravity"
         elif a.gravity.any() and near.vector(-a.gravity, b.gravity):
             says = "has gravity with the other sign"
-        out.append(_hypothesis(Mistake("gravity", says, {"gravity": b.gravity}), "", _put_fields, a, b))
+        out.append(_hypothesis(Mistake("gravity", says, {"gravity": b.gravity}), "", _put_gravity, a, b))
     for section, kind, what in (
         ("springs", "point spring", "spring"),
         ("couplings", "joint coupling", "coupling"),

@@ -20,8 +20,6 @@ from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.merged_model import FrameChange, MergedModel, Tolerances, merge, reattached
 from mbkit.studies.explain.terms import restricted, trimmed_couplings
 
-__all__ = ["Match", "Matching", "align_frames", "match", "reconcile_joint_sets", "rename_joints"]
-
 #: Deeper chains are compared by name, because the assignment is recursive.
 _MAX_DEPTH: Final = 150
 _NAME, _FRAME, _NUMBER, _KIND, _ALONE = 0.1, 0.25, 1.0, 3.0, 2.0
@@ -216,10 +214,9 @@ def _unused(name: str, used: set[str]) -> str:
 def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedModel, tuple[str, ...]]:
     """Return `b`, in the names of `a`, with its frames where `a` has them, and the joints of moved frames.
 
-    A frame may turn freely about its joint's axis and slide along it; importers and converters make use of that.
-    It is moved if then nothing of its joint and body differs, or at least two parts less. One part less is no
-    evidence: between different robots a frame can always slide to the other's place, and its centre of mass and
-    the next joint then have numbers that are in neither file.
+    A frame may turn freely about its joint's axis and slide along it. It is moved if then nothing of its joint and
+    body differs, or at least two parts less. One part less is no evidence: between different robots a frame can always
+    slide to the other's place, and its centre of mass and the next joint then have numbers that are in neither file.
     """
     joints = {j.name: j for j in a.joints}
     matter = {x.name: x for x in a.bodies}

@@ -17,21 +17,13 @@ from mbkit.load.shapes import NOTHING, Lump, together
 from mbkit.model import Body, Joint, Model
 from mbkit.studies._targets import with_values
 
-__all__ = ["FrameChange", "LinkInBody", "MergedModel", "Tolerances", "composite", "merge", "reattached", "with_lump"]
-
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Comparison of parts of descriptions to a relative tolerance.
-
-    Attributes
-    ----------
-    relative : float
-    length : float
-        Size of the robot, m: the scale for coordinates that should be zero.
-    """
+    """Comparison of parts of descriptions to a relative tolerance."""
 
     relative: float
+    #: Size of the robot, m: the scale for coordinates that should be zero.
     length: float
 
     @classmethod
@@ -71,16 +63,7 @@ class Tolerances:
 
 @dataclass(frozen=True)
 class LinkInBody:
-    """A link merged into a body.
-
-    Attributes
-    ----------
-    name : str
-    R, p : (3, 3) and (3,) arrays
-        Pose of its frame in the body's.
-    matter : Lump
-        In its own axes.
-    """
+    """A link merged into a body: the pose of its frame in the body's, and its matter in its own axes."""
 
     name: str
     R: Array
@@ -100,17 +83,10 @@ class LinkInBody:
 
 @dataclass(frozen=True)
 class MergedModel:
-    """A merged description.
-
-    Attributes
-    ----------
-    model : Model
-        Without fixed joints, and without links fixed to the world.
-    links : mapping of str to tuple of LinkInBody
-        Body -> its links, its own first; ``"world"`` has those that stand still.
-    """
+    """A description without fixed joints and without links fixed to the world."""
 
     model: Model
+    #: Body -> its links, its own first; ``"world"`` has those that stand still.
     links: Mapping[str, tuple[LinkInBody, ...]]
 
     @property
@@ -203,12 +179,8 @@ def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
     springs = []
     for s in model.springs:
         a, b = changes[s.body_a], changes[s.body_b]
-        ends: dict[str, Any] = {
-            "body_a": a.body,
-            "point_a": a.point(s.point_a),
-            "body_b": b.body,
-            "point_b": b.point(s.point_b),
-        }
+        ends: dict[str, Any] = {"body_a": a.body, "point_a": a.point(s.point_a)}
+        ends |= {"body_b": b.body, "point_b": b.point(s.point_b)}
         springs.append(replace(s, **ends))
     loops = []
     for x in model.loops:

@@ -13,8 +13,6 @@ from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.terms import Gap
 from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
 
-__all__ = ["Cause", "Explanation", "effect", "grouped"]
-
 #: More causes of one kind than this are one line.
 _MAX_LINES: Final = 3
 

@@ -41,8 +41,6 @@ from mbkit.studies.explain.terms import (
 )
 from mbkit.studies.results import to_plain
 
-__all__ = ["explain"]
-
 #: Relative difference of numbers written with five digits.
 _ROUNDED: Final = 2e-5
 #: More differences than this may be summarized as rounding.
@@ -148,10 +146,10 @@ class _Descriptions:
         before = by_name or self._gaps(one.model, theirs.model)
         one, target = links_in_common_axes(one, target, near)
         hypotheses = _summarized_differences(one, target, near) if one.model.nv else []
-        made = one
+        changed = one
         for h in hypotheses:
-            made = h.apply(made)
-        after = self._gaps(made.model, target.model)
+            changed = h.apply(changed)
+        after = self._gaps(changed.model, target.model)
         causes = (
             *(self._cause(h, {"M": np.inf}) for h in structural),
             *self._naming_causes(one, other, matching, by_name),
@@ -175,7 +173,7 @@ class _Descriptions:
             notes=tuple(_notes(one, moved_frames, matching)),
             explained=explained,
             left=after.terms,
-            subtree=() if explained else self._subtree(made.model, target.model),
+            subtree=() if explained else self._subtree(changed.model, target.model),
             samples=self.samples,
             seed=self.seed,
             tolerance=self.tolerance,
@@ -260,8 +258,8 @@ class _Descriptions:
         return minimal_differing_subtree(a, differs)
 
 
-def _effects(found: Gaps) -> dict[str, float]:
-    return {g.term: g.relative for g in found.terms} if found.comparable else {"M": np.inf}
+def _effects(measured: Gaps) -> dict[str, float]:
+    return {g.term: g.relative for g in measured.terms} if measured.comparable else {"M": np.inf}
 
 
 def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) -> Iterator[str]:

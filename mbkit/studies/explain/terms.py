@@ -15,23 +15,6 @@ from mbkit.errors import KnownDefectWarning, MbkitError, NonPhysicalWarning
 from mbkit.model import JointCoupling, Model
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
 
-__all__ = [
-    "TERMS",
-    "Gap",
-    "Gaps",
-    "States",
-    "Values",
-    "evaluated",
-    "gaps",
-    "minimal_differing_subtree",
-    "model_terms",
-    "part",
-    "restricted",
-    "states_of",
-    "trimmed_couplings",
-    "velocity_joints",
-]
-
 #: Compared terms: name in tables, quantity, arguments.
 TERMS: Final = (
     ("M", "mass_matrix", "q"),
@@ -52,15 +35,9 @@ class States:
 
 @dataclass(frozen=True)
 class Gap:
-    """The largest difference of one term.
+    """The largest difference of one term, scaled as in `mbkit.studies.compare.errors`, and the joint where it is.
 
-    Attributes
-    ----------
-    term : str
-    relative : float
-        Scaled as in `mbkit.studies.compare.errors`; infinite for NaN.
-    joint : str
-        Where it is largest.
+    Infinite for NaN.
     """
 
     term: str
@@ -120,17 +97,7 @@ def evaluated(dyn: Dynamics, at: States) -> Values:
 
 
 def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
-    """Return the differences of values, scaled by those of `a`.
-
-    Parameters
-    ----------
-    a, b : dict
-        Term -> values at the same states.
-    v : (N, nv) array
-        Velocities of the states.
-    joints : sequence of str
-        The joint of each velocity.
-    """
+    """Return the differences of values at states with velocities v of these joints, scaled by those of `a`."""
     # An engine may refuse the state, or have another number of velocities.
     if "M" not in a or "M" not in b or a["M"].shape != b["M"].shape:
         return Gaps((), comparable=False)
@@ -205,19 +172,9 @@ def part(model: Model, joints: Collection[str]) -> Model:
 
 
 def minimal_differing_subtree(model: Model, differs: Callable[[set[str]], bool]) -> tuple[str, ...]:
-    """Return the joints of the smallest part that still differs: none of them can be left out.
+    """Return the joints of the smallest part of a merged model that differs between the two sides.
 
-    Parameters
-    ----------
-    model : Model
-        Merged.
-    differs : callable
-        Whether the part with these joints differs between the two sides.
-
-    Returns
-    -------
-    tuple of str
-        In the model's order; empty where only the whole differs.
+    None of them can be left out. Empty where only the whole differs.
     """
     below: dict[str, set[str]] = {}
     for joint in reversed(model.tree):

@@ -10,8 +10,6 @@ import numpy as np
 
 from mbkit._check import Array
 
-__all__ = ["Curve", "ObservedOrder", "PrecisionPoint", "observed_order"]
-
 #: Errors below so many times the reference's floor, or the rounding level, are not in the regression.
 _ABOVE_ROUNDING: Final = 100.0
 #: Errors above this part of the motion are pre-asymptotic.
@@ -114,20 +112,10 @@ class ObservedOrder(NamedTuple):
 def observed_order(steps: Sequence[float], errors: Sequence[float], *, floor: float, motion: float) -> ObservedOrder:
     """Return the slope of log error over log step in the asymptotic range.
 
-    Left out are errors above 3 % of the motion (pre-asymptotic), errors below 100 times the
-    reference's floor, and, where errors no longer fall, those below 100 times the least of
-    them (rounding). Of the rest, the regression takes the longest run of neighbours whose
-    slopes from point to point lie within 0.3 of each other; of two as long, the finer. The
-    expected order plays no part in the choice.
-
-    Parameters
-    ----------
-    steps, errors : sequences of float
-        s; rad or m, NaN where a run failed.
-    floor : float
-        How well the reference is known.
-    motion : float
-        Size of the motion in the units of the errors.
+    Left out are failed runs (NaN), errors above 3 % of the motion (pre-asymptotic), errors below 100 times the
+    reference's floor, and, where errors no longer fall, those below 100 times the least of them (rounding). Of the
+    rest, the regression takes the longest run of neighbours whose slopes from point to point lie within 0.3 of each
+    other; of two as long, the finer. The expected order plays no part in the choice.
 
     Examples
     --------

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["USEFUL", "figure"]
-
 _Place = tuple[float, float]
 _Measure = Callable[[PrecisionPoint], float]
 
@@ -39,25 +37,10 @@ _EPS: Final = 2.0**-52
 
 
 def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Palette = PLAIN) -> Figure:
-    """Draw curves of error against run time.
+    """Draw all curves of error against run time, thin, the best of each engine, and the front.
 
-    Above stand all curves, thin, the best of each engine, and the front; at the right the
-    same for energy. Below, one panel for each method.
-
-    Parameters
-    ----------
-    curves : sequence of Curve
-    duration : float
-        Horizon, s.
-    floor : float
-        How well the reference is known, rad or m.
-    palette : Palette
-        By default for white paper.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Without a window; ``savefig`` writes it, and a notebook shows it.
+    At the right stands the same for energy, below one panel for each method. The floor says how well the reference is
+    known, rad or m.
     """
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib import rc_context

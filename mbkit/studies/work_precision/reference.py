@@ -35,16 +35,11 @@ from mbkit.simulate.solvers.taylor import StoppedError, TaylorSteps
 from mbkit.simulate.time_grid import save_times
 from mbkit.simulate.torque import Torque, TorqueFunction
 
-__all__ = ["Deadline", "Known", "LateError", "Motion", "Reference", "gap", "reference", "taylor_pair", "two_engines"]
-
-
 # Pairs of runs of one motion: their difference bounds the error of either.
 
-# Times between which two engines march on by turns: enough to stop soon after they
-# part, few enough for a method's start to cost nothing.
+# Parts of the motion that two engines run by turns: they stop soon after they part, and a start costs nothing.
 _LEGS: Final = 20
-# Tolerance of the second Taylor run: one order less, so with other steps, other
-# rounding and a larger truncation, which is still about the rounding's size.
+# Tolerance of the second Taylor run: one order less, so with other steps, rounding and truncation.
 _COARSER: Final = 8.0
 #: Engine and method of each of two independent roads, best first.
 _ROADS: Final = (
@@ -58,16 +53,7 @@ class LateError(Exception):
 
 
 class Deadline:
-    """The time limit and the progress of a search.
-
-    Parameters
-    ----------
-    seconds : float
-    tell : callable
-        Gets the fraction done.
-    clock : callable
-        Seconds.
-    """
+    """The time limit of a search, and its progress: `tell` gets the fraction done."""
 
     def __init__(
         self, seconds: float, tell: Callable[[float], None], clock: Callable[[], float] = time.perf_counter
@@ -90,7 +76,7 @@ class Deadline:
         self._uncounted[0] += self._clock() - start
 
     def part(self, start: float, length: float, seconds: float | None = None) -> Deadline:
-        """Return the limit for a part of the way, with a shorter time if given."""
+        """Return the limit for a part of the way, which may have a shorter time."""
         out = Deadline(self.left if seconds is None else min(seconds, self.left), self._tell, self._clock)
         out._uncounted, out._before = self._uncounted, self._uncounted[0]
         out._start, out._length = self._start + start * self._length, length * self._length
@@ -113,7 +99,8 @@ class Motion:
     duration: float
     save: Array
     torque: Torque
-    given: Any
+    #: The torque as the caller passed it.
+    torque_argument: Any
 
     @cached_property
     def equations(self) -> Equations:
@@ -129,29 +116,18 @@ class Motion:
 
 @dataclass(frozen=True)
 class Known:
-    """The states of a pair of runs, at the times that both reached.
-
-    Attributes
-    ----------
-    q, v : pairs (high, low) of (K, nq) and (K, nv) arrays
-    apart : (2, K) array
-        Largest difference of q and of v between the two.
-    how : str
-        Which runs these are.
-    why : str
-        Why they ended before the duration did; empty if they did not.
-    steps : int
-        Of the first run, 0 if not known.
-    shared : bool
-        Whether both runs have the same formulas.
-    """
+    """The states of a pair of runs, at the times that both reached: (high, low) parts of (K, nq) and (K, nv) arrays."""
 
     q: tuple[Array, Array]
     v: tuple[Array, Array]
+    #: (2, K), the largest difference of q and of v between the two runs.
     apart: Array
     how: str
+    #: Why they ended before the duration did.
     why: str = ""
+    #: Of the first run, 0 if not known.
     steps: int = 0
+    #: Whether both runs have the same formulas.
     shared: bool = False
 
 
@@ -170,14 +146,9 @@ def gap(model: Model, a: Any, b: Any) -> Array:
 
 
 def taylor_pair(motion: Motion, bits: int, deadline: Deadline) -> Known:
-    """Return what two Taylor runs at different orders say, in a format of so many bits.
+    """Return two Taylor runs at different orders, in a format of so many bits, from exactly the doubles of the model.
 
-    Every number of the model and of the state is the double that it is, exactly.
-
-    Raises
-    ------
-    UnsupportedError
-        No heyoka, no such format, or a model too large.
+    `UnsupportedError` without heyoka or this format, and for a model too large.
     """
     kind = precision(bits)
     why = ""
@@ -237,13 +208,7 @@ def _largest(x: Any) -> Array:
 
 
 def two_engines(motion: Motion, deadline: Deadline) -> Known:
-    """Return what two engines say, each with a method of its own, marching by turns until they part.
-
-    Raises
-    ------
-    UnsupportedError
-        There are no two engines that hold the model.
-    """
+    """Return runs of two engines, each with a method of its own, marching by turns until they part."""
     with deadline.paused():
         roads = [_road(motion, choices) for choices in _ROADS]
     how = " and ".join(f"{method} on {engine}" for engine, method, _ in roads)
@@ -283,7 +248,7 @@ def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[str, st
             if motion.torque.callable and not METHODS[method].callables:
                 continue
             dyn = dynamics(motion.model, engine)
-            # Whether the method is there shows when it is asked for nothing.
+            # A run of no length shows whether the engine has the method.
             simulate(dyn, motion.q0, motion.v0, 0.0, method)
         except UnsupportedError as error:
             reasons.append(f"{engine}: {error}")
@@ -296,11 +261,11 @@ def _leg(motion: Motion, dyn: Any, method: str, q: Array, v: Array, rows: slice,
     """Return the motion between two of the saved times, or None when the time is up."""
     times = motion.save[rows]
     start = float(times[0])
-    given: Any = motion.given
+    applied: Any = motion.torque_argument
     if motion.torque.held:
-        given = np.asarray(given)[rows.start : rows.stop - 1]
-    elif callable(given):
-        given = _later(given, start)
+        applied = np.asarray(applied)[rows.start : rows.stop - 1]
+    elif callable(applied):
+        applied = _later(applied, start)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MbkitWarning)
@@ -311,7 +276,7 @@ def _leg(motion: Motion, dyn: Any, method: str, q: Array, v: Array, rows: slice,
                 float(times[-1] - start),
                 method,
                 rtol=METHODS[method].least,
-                torque=given,
+                torque=applied,
                 save=times - start,
                 progress=deadline.look,
             )
@@ -325,8 +290,7 @@ def _later(function: TorqueFunction, start: float) -> TorqueFunction:
 
 #: How well two runs must agree, relative to the size of the motion.
 AGREE: Final = 1e-12
-# The errors of two runs can partly cancel in their difference: measured against more
-# digits, either was up to three times as wrong as they were apart.
+# Errors partly cancel in a difference: against more digits, a run was up to three times as wrong as two were apart.
 _SAFETY: Final = 4.0
 # Quadruple numbers cost about this many seconds per operation, order² and step.
 _QUADRUPLE: Final = 1.0e-8
@@ -346,7 +310,7 @@ class Reference:
     Attributes
     ----------
     t : (K,) array
-        The times asked for, up to `horizon`; s.
+        The times of `save`, up to `horizon`; s.
     q : (K, nq) array
     v : (K, nv) array
         Rounded to double.
@@ -365,7 +329,7 @@ class Reference:
         The last of the times up to which both runs agree to 1e-12 of the size of
         the motion, in q and in v; s.
     how : str
-        How it was made, and why it ends where it ends, for a report.
+        How it was computed, and why it ends where it ends, for a report.
     """
 
     t: Array
@@ -386,7 +350,7 @@ class Reference:
             object.__setattr__(self, name, array)
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
-        # Arrays come out of a pickle writeable, unless they are made read-only anew.
+        # Arrays come out of a pickle writeable; the constructor makes them read-only again.
         return type(self), tuple(getattr(self, f.name) for f in fields(self))
 
     def __repr__(self) -> str:
@@ -460,12 +424,12 @@ def reference(
         return _nothing_moves(motion)
     with Progress(progress, f"{model.name}: reference") as bar:
         deadline = Deadline(seconds, bar.update)
-        found, refused = _search(motion, deadline, seconds)
+        pairs, refused = _search(motion, deadline, seconds)
         bar.update(1.0)
-    if not found:
+    if not pairs:
         raise UnsupportedError(f"reference: {'; '.join(refused)}")
     # The one that holds longest, and of those the first.
-    best, known = max(((_cut(motion, known), known) for known in found), key=lambda pair: pair[0].horizon)
+    best, known = max(((_cut(motion, known), known) for known in pairs), key=lambda pair: pair[0].horizon)
     return replace(best, how=best.how + _witness(motion, best)) if known.shared else best
 
 
@@ -493,33 +457,33 @@ def _nothing_moves(motion: Motion) -> Reference:
 
 
 def _search(motion: Motion, deadline: Deadline, seconds: float) -> tuple[list[Known], list[str]]:
-    found: list[Known] = []
+    pairs: list[Known] = []
     refused: list[str] = []
 
-    def look(way: Any, *given: Any, within: float | None = None) -> bool:
+    def holds(way: Any, *bits: int, within: float | None = None) -> bool:
         # Whether a way leads to the end is known at its end: the first gets half of the bar.
-        tried = len(found) + len(refused)
+        tried = len(pairs) + len(refused)
         part = deadline.part(1 - 0.5**tried, 0.5 ** (tried + 1), within)
         try:
-            found.append(way(motion, *given, part))
+            pairs.append(way(motion, *bits, part))
         except UnsupportedError as error:
             refused.append(str(error))
             return False
-        return bool(_cut(motion, found[-1]).horizon == motion.save[-1])
+        return bool(_cut(motion, pairs[-1]).horizon == motion.save[-1])
 
     if not motion.torque.callable:
         small = _quadruple_seconds(motion, _STEPS * motion.duration) < seconds / 6
-        if small and look(taylor_pair, 113, within=seconds / 2):
-            return found, refused
-        if look(taylor_pair, 64):
-            return found, refused
-        steps = found[-1].steps if found else _STEPS * motion.duration
+        if small and holds(taylor_pair, 113, within=seconds / 2):
+            return pairs, refused
+        if holds(taylor_pair, 64):
+            return pairs, refused
+        steps = pairs[-1].steps if pairs else _STEPS * motion.duration
         if not small and _quadruple_seconds(motion, steps) < deadline.left:
-            look(taylor_pair, 113)
-    if not found:
-        # Double is never better than what was found with more.
-        look(two_engines)
-    return found, refused
+            holds(taylor_pair, 113)
+    if not pairs:
+        # Double is never better than more digits.
+        holds(two_engines)
+    return pairs, refused
 
 
 def _quadruple_seconds(motion: Motion, steps: float) -> float:
@@ -562,10 +526,10 @@ def _cut(motion: Motion, known: Known) -> Reference:
     )
 
 
-def _witness(motion: Motion, found: Reference) -> str:
+def _witness(motion: Motion, best: Reference) -> str:
     """Return a text that compares accelerations along a motion with those of another engine."""
-    which = np.unique(np.linspace(0, len(found.t) - 1, min(_WITNESSED, len(found.t))).astype(int))
-    q, v = found.q[which], found.v[which]
+    which = np.unique(np.linspace(0, len(best.t) - 1, min(_WITNESSED, len(best.t))).astype(int))
+    q, v = best.q[which], best.v[which]
     force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
     tau = np.array([force(min(int(k), last)) for k in which])
     constants = np.broadcast_to(motion.equations.constant_values, (len(q), len(motion.equations.constant_values)))

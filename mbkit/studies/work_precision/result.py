@@ -15,8 +15,6 @@ from mbkit.studies.work_precision.figure import figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["InterruptedSweepError", "WorkPrecision"]
-
 
 def _of_curve(name: str, head: str = "") -> Column:
     return Column(head or name, lambda row: getattr(row[0], name))

@@ -13,8 +13,6 @@ from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.studies._targets import engine_names, names_of
 
-__all__ = ["INTERVALS", "Settings", "pairs", "plans", "save_grid"]
-
 #: Errors are measured at the ends of this many equal parts of the horizon.
 INTERVALS: Final = 10
 #: The coarsest step, s, and the finest, as a part of the horizon.
@@ -28,23 +26,14 @@ _PYTHON_CALL: Final = 8
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of one method on one engine, coarse to fine.
-
-    Attributes
-    ----------
-    engine, method : str
-    setting : {"dt", "rtol"}
-    values : tuple of float
-        Steps, s, or tolerances.
-    required : bool
-        Whether the caller chose the values, so that each is reported. Otherwise the sweep
-        ends where finer values improve nothing or take too much work.
-    """
+    """The steps, s, or tolerances of one method on one engine, coarse to fine."""
 
     engine: str
     method: str
     setting: Literal["dt", "rtol"]
     values: tuple[float, ...]
+    #: Whether the caller chose the values, so that each is reported. Otherwise the sweep ends where finer values
+    #: improve nothing or take too much work.
     required: bool
 
     @property
@@ -71,15 +60,8 @@ def plans(
 ) -> tuple[Settings, ...]:
     """Return the settings for every engine's methods.
 
-    Parameters
-    ----------
-    pairs : mapping of str to sequence of str
-        Engine -> methods.
-    interval : float
-        Time between two saved states, s, on which steps must end.
-    steps, tolerances : sequences of float, optional
-        The caller's values. A step is shortened so that a whole number of them is an interval; a
-        tolerance below a method's least is left out.
+    A step of the caller is shortened so that a whole number of them is an interval between two saved states; a
+    tolerance below a method's least is left out.
     """
     out = []
     for engine, names in pairs.items():
@@ -111,19 +93,7 @@ def _steps(method: Method, interval: float) -> tuple[float, ...]:
 def pairs(
     engines: Sequence[str], methods: Sequence[str] | Mapping[str, Sequence[str]] | None
 ) -> dict[str, tuple[str, ...]]:
-    """Return the methods of each engine, checked.
-
-    Parameters
-    ----------
-    engines : sequence of str
-    methods : sequence of str, or mapping of str to sequence of str, or None
-        For all engines that have them, or for each; None for all methods.
-
-    Raises
-    ------
-    InputError, UnknownNameError
-        An unknown engine or method, or a method that the engine does not have.
-    """
+    """Return the methods of each engine, checked: all, those named for all engines that have them, or for each."""
     names = engine_names(engines)
     if isinstance(methods, Mapping):
         for engine in methods:

@@ -29,8 +29,6 @@ from mbkit.studies.work_precision.result import InterruptedSweepError, WorkPreci
 from mbkit.studies.work_precision.settings import INTERVALS, pairs, plans, save_grid
 from mbkit.studies.work_precision.sweep import Problem, Sweep, TimeBudget
 
-__all__ = ["Exact", "work_precision"]
-
 #: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 

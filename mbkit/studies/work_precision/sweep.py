@@ -31,8 +31,6 @@ from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_o
 from mbkit.studies.work_precision.settings import Settings
 from mbkit.studies.worker import run
 
-__all__ = ["CurveMeasurement", "Problem", "Sweep", "TimeBudget", "first_run", "repetitions"]
-
 #: A run shorter than this is repeated within a round, s.
 _SHORT: Final = 2e-3
 _MAX_IN_A_ROUND: Final = 100
@@ -57,17 +55,10 @@ _HEYOKA_LOCK: Final = fork_safe(threading.RLock())
 
 
 def first_run(model: Model, engine: str, method: str, start: Callable[[Dynamics], Any]) -> tuple[Dynamics, float]:
-    """Return an engine that has run a method once, and the seconds of that beyond the run itself.
+    """Return an engine on which `start` ran a method briefly, and the seconds of that beyond the run itself.
 
     Everything that belongs to the model is derived, compiled and built, whatever the caches in memory and on disk
     hold. Imports, and what is the same for every model, are done before the clock starts.
-
-    Parameters
-    ----------
-    model : Model
-    engine, method : str
-    start : callable
-        Runs the method briefly on the engine.
     """
     _import_for(engine, method)
     with _empty_caches():
@@ -120,20 +111,7 @@ def _without_heyoka_cache() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Problem:
-    """The initial value problem that every method solves, and its reference.
-
-    Attributes
-    ----------
-    model : Model
-    q0, v0 : (nq,), (nv,) arrays
-    torque : (nv,) array, callable or None
-    times : (K,) array
-        From 0 to the horizon, s.
-    q : (K, nq) array
-        The reference there.
-    floor : float
-        How well it is known.
-    """
+    """The initial value problem that every method solves, and its reference q at times from 0 to the horizon."""
 
     model: Model
     q0: Array
@@ -176,8 +154,7 @@ class Problem:
     def energy_drift(self, dyn: Dynamics, run: Trajectory) -> float:
         """Return the drift of the energy, relative to the larger of T and of the change of V.
 
-        NaN with dampers, applied forces or explicit time: the saved states are too few to know their work as
-        well as the methods are good.
+        NaN with dampers, applied forces or explicit time: the saved states are too few to know their work.
         """
         if self.torque is not None or self.model.needs.damping or self.model.time_parameter is not None:
             return math.nan
@@ -207,21 +184,11 @@ class _Run:
 
 
 class CurveMeasurement:
-    """The measurement of one curve.
-
-    Parameters
-    ----------
-    problem : Problem
-    settings : Settings
-
-    Attributes
-    ----------
-    refusal : Refusal or None
-        Why the engine and method have no further points.
-    """
+    """The measurement of one curve."""
 
     def __init__(self, problem: Problem, settings: Settings) -> None:
         self.problem, self.settings = problem, settings
+        #: Why the engine and method have no further points.
         self.refusal: Refusal | None = None
         self._left = list(settings.values)
         self._runs: list[_Run] = []
@@ -367,12 +334,9 @@ class CurveMeasurement:
             return None
         settings, problem = self.settings, self.problem
         fixed = settings.setting == "dt"
-        order = observed_order(
-            [one.value for one in self._runs] if fixed else [],
-            [one.error for one in self._runs] if fixed else [],
-            floor=problem.floor,
-            motion=problem.motion,
-        )
+        runs = self._runs if fixed else []
+        steps, errors = [one.value for one in runs], [one.error for one in runs]
+        order = observed_order(steps, errors, floor=problem.floor, motion=problem.motion)
         return Curve(
             settings.engine,
             settings.method,
@@ -427,22 +391,12 @@ def repetitions(seconds: Sequence[float], most: int, budget: float) -> list[int]
 
 @dataclass(frozen=True)
 class TimeBudget:
-    """What a sweep may take, in seconds of the processor: other load on the machine ends no sweep.
+    """Limits of a sweep, in seconds of the processor: other load on the machine ends no sweep."""
 
-    Attributes
-    ----------
-    seconds : float
-        After which nothing is begun, counted from `begun`.
-    usual : float
-        After which runs are not timed again.
-    work : float
-        Counted work of a run with the study's own settings; see `Settings.work`.
-    clock : callable
-        Seconds, by default of the processor.
-    """
-
+    #: Nothing is begun after these, counted from `begun`, and no run is timed again after the usual ones.
     seconds: float
     usual: float
+    #: Counted work of a run with the study's own settings; see `Settings.work`.
     work: float
     clock: Callable[[], float] = field(default_factory=lambda: time.process_time)
     begun: float = math.nan
@@ -467,15 +421,7 @@ Outcome = tuple[Curve | None, Refusal | None]
 class Sweep:
     """The measurement of all curves: interleaved in this process, or one curve a call of an executor.
 
-    Parameters
-    ----------
-    problem : Problem
-    settings : sequence of Settings
-        One for each curve.
-    repeats, seed : int
-    budget : TimeBudget
-    executor : concurrent.futures.Executor, optional
-        Then each curve has its part of the time, however many run side by side.
+    With an executor each curve has its part of the time, however many run side by side.
     """
 
     def __init__(
