@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import re
@@ -307,7 +308,7 @@ def test_the_command_asks_once_and_records_anew_where_a_person_says_yes(monkeypa
     assert asked.exit_code == 0
     assert "rebaseline?" in asked.stdout
     assert '"99.0"' not in recorded.read_text()
-    check = cli.commands["baseline"].commands["check"].callback
+    check = inspect.unwrap(cli.commands["baseline"].commands["check"].callback)
     monkeypatch.setitem(check.__globals__, "_confirmed", lambda _: True)
     assert call("check", str(recorded)).exit_code == 0
     assert 'mujoco = "99.0"' in recorded.read_text()
