@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 import warnings
 
-__all__ = ["warn"]
-
 
 def warn(message: str, category: type[Warning]) -> None:
     """Warn at the line that called the library, however deep in it this is."""

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from mbkit.engines import Dynamics
     from mbkit.model import Model
 
-__all__ = ["MbkitBaseline", "mbkit_baseline", "mbkit_dynamics", "mbkit_engine", "mbkit_model"]
-
 _MARK = (
     "mbkit(robots=[...], engines=[...], **load): run a test for each robot (mbkit_model) and engine (mbkit_engine); "
     "a robot is a name, a file beside the test, package.module:function, or a Model; load are options of mbkit.load"

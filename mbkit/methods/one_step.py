@@ -16,24 +16,6 @@ from mbkit._check import Array
 from mbkit.model.integration_space import Space
 from mbkit.model.quaternions import FLOATS, Arithmetic
 
-__all__ = [
-    "FIRST_ROOT",
-    "MAX_GROWTH",
-    "SCALARS",
-    "ArrayStages",
-    "SemiImplicitEuler",
-    "StageRates",
-    "Stages",
-    "StepFactors",
-    "elementary_factors",
-    "embedded_error",
-    "end_of_attempt",
-    "larger",
-    "next_step",
-    "predictive_factors",
-    "with_defect",
-]
-
 #: (t, q, u, w) -> (u̇, ẇ) at a stage; u is None where it is zero.
 StageRates = Callable[[Any, Any, Any, Any], tuple[Any, Any]]
 

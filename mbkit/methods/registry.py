@@ -33,27 +33,6 @@ from mbkit.methods.tableaus import (
     rodas5p,
 )
 
-__all__ = [
-    "ADAPTIVE_METHOD",
-    "AUTOMATIC_METHOD",
-    "BDF_METHOD",
-    "DEFAULT_METHOD",
-    "EULER_METHOD",
-    "GAUSS_METHOD",
-    "IMPLICIT_METHODS",
-    "METHODS",
-    "QUICK_METHODS",
-    "SCIPY_METHOD",
-    "SCIPY_STIFF_METHOD",
-    "SERIES_METHOD",
-    "STIFF_METHOD",
-    "Method",
-    "Tolerances",
-    "method_of",
-    "register_method",
-    "registered_methods",
-]
-
 _EPS: Final = 2.0**-52
 #: With a step, when nothing else is said.
 DEFAULT_METHOD: Final = "rk4"

@@ -18,8 +18,6 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.methods.tableaus import Tableau
 
-__all__ = ["IMPLICIT_EULER", "IMPLICIT_IN_VELOCITY", "SYMPLECTIC_EULER", "Stability", "TableauStability", "companion"]
-
 #: Coefficients of a stability function below this part of the largest are rounding.
 _ROUNDING: Final = 1e-13
 

@@ -18,21 +18,6 @@ from mbkit.errors import InputError
 from mbkit.methods.one_step import StageRates, Stages
 from mbkit.model.integration_space import Space
 
-__all__ = [
-    "RK4",
-    "EmbeddedTableau",
-    "ImplicitTableau",
-    "RosenbrockTableau",
-    "Tableau",
-    "Tree",
-    "density",
-    "dormand_prince_853",
-    "gauss_legendre",
-    "rodas5p",
-    "rooted_trees",
-]
-
-
 Tree = tuple[Any, ...]  # a tree is the tuple of its branches, each a tree
 
 

@@ -13,18 +13,6 @@ from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Frame, Model
 from mbkit.simulate.torque import PiecewiseConstantTorque, SampledTorque
 
-__all__ = [
-    "along",
-    "canonical_momentum",
-    "dynamics_of_trajectory",
-    "kinetic_energy",
-    "momentum",
-    "moved",
-    "potential_energy",
-    "work",
-]
-
-
 # States at once: the matrices of a long run would fill the memory.
 _MANY: Final = 4096
 

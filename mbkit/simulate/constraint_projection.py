@@ -20,17 +20,6 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, IMPLICIT_METHODS, SERIES_METHOD
 from mbkit.simulate.result import SolverResult
 
-__all__ = [
-    "LOOSEST",
-    "Approach",
-    "SingularPoses",
-    "along_constraints",
-    "beside",
-    "from_consistent",
-    "refuse_constraints",
-    "settled",
-]
-
 #: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
 LOOSEST: Final = 1e-9
 #: Steps ahead in which a pose would be singular at the present pace.

@@ -18,8 +18,6 @@ from mbkit.engines.base import at_time
 from mbkit.errors import EventError, InputError, UnknownNameError
 from mbkit.model import Model
 
-__all__ = ["Event", "Hit", "State", "Watch", "as_events", "at_energy", "at_limits", "at_section"]
-
 #: state(t) -> (q, v) within a step
 State = Callable[[float], tuple[Array, Array]]
 

@@ -32,8 +32,6 @@ from mbkit.simulate.run_data import RunData
 from mbkit.simulate.time_grid import Grid, save_times
 from mbkit.simulate.torque import Force, Torque, TorqueFunction
 
-__all__ = ["integrate_on_charts"]
-
 _WORN: Final = "the dependent coordinates are badly chosen"
 _NEAR: Final = "near a singular pose"
 # Steps of a fixed-step method between two looks at the chart.

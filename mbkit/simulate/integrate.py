@@ -27,8 +27,6 @@ from mbkit.simulate.run_data import RunData, RunSettings
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.torque import Applied, Torque, TorqueFunction
 
-__all__ = ["integrate", "times_of"]
-
 #: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
 _LEAST_EXTENDED: Final = 1e-32
 #: Time of an evaluation from Python, in those in machine code.

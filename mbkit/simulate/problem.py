@@ -16,8 +16,6 @@ from mbkit.simulate.progress import Progress, reporter
 from mbkit.simulate.time_grid import check_save
 from mbkit.simulate.torque import Torque
 
-__all__ = ["IntegrationProblem"]
-
 
 @dataclass(frozen=True, eq=False)
 class IntegrationProblem:

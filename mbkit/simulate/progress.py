@@ -9,8 +9,6 @@ from typing import Any
 
 from mbkit.errors import InputError
 
-__all__ = ["Progress", "ProgressFunction", "reporter"]
-
 #: progress(fraction), from 0 to 1
 ProgressFunction = Callable[[float], object]
 

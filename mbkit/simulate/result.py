@@ -9,9 +9,6 @@ from mbkit._check import Array
 from mbkit.errors import FunctionError
 from mbkit.simulate.events import Hit
 
-__all__ = ["Ended", "SolverResult", "Stats"]
-
-
 Ended = Literal["finished", "event", "diverged", "step_too_small", "function_failed"]
 
 

@@ -21,8 +21,6 @@ from mbkit.simulate.trajectory import Trajectory
 if TYPE_CHECKING:
     from mbkit.lagrangian.independent_coordinates import Embedded
 
-__all__ = ["simulate"]
-
 
 def simulate(
     dyn: Dynamics | Embedded,

@@ -18,8 +18,6 @@ from mbkit.simulate.diagnostics.checks import CHECKED_TIMES, diagnostics
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.run_data import RunData, RunSettings
 
-__all__ = ["RunCheck", "check_run"]
-
 #: Numbers of steps for which a method of first order is compared with itself at twice the step.
 _STEPS: Final = (4, 20_000)
 #: Part of the motion: a hundredth is wrong, and at a few times the gap is not yet the largest.

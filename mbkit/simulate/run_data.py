@@ -18,8 +18,6 @@ from mbkit.simulate.events import Hit
 from mbkit.simulate.result import Stats
 from mbkit.simulate.torque import Applied, PiecewiseConstantTorque, SampledTorque, TorqueCallback
 
-__all__ = ["RunData", "RunSettings"]
-
 
 @dataclass(frozen=True, eq=False)
 class RunSettings:

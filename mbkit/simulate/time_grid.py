@@ -13,8 +13,6 @@ from mbkit.errors import InputError
 
 Indices = NDArray[np.intp]
 
-__all__ = ["DEFAULT_STEP", "Grid", "Indices", "check_room", "check_save", "save_times"]
-
 #: s
 DEFAULT_STEP: Final = 1e-3
 

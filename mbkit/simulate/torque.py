@@ -15,9 +15,6 @@ from mbkit.errors import InputError, TorqueError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.time_grid import Indices
 
-__all__ = ["Applied", "Force", "PiecewiseConstantTorque", "SampledTorque", "Torque", "TorqueCallback", "TorqueFunction"]
-
-
 #: torque(t, q, v) -> (nv,), of one state
 TorqueFunction = Callable[[float, Array, Array], ArrayLike]
 

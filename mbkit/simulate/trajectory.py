@@ -21,8 +21,6 @@ from mbkit.simulate.run_data import RunData
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Trajectory"]
-
 #: Times of an event that `repr` shows.
 _SHOWN: Final = 4
 

@@ -12,8 +12,6 @@ from typing import Any, Final, Protocol
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.studies.results import write_whole
 
-__all__ = ["Checkpoint", "Checkpointer", "Progress", "silent"]
-
 
 class _Result(Protocol):
     def to_json(self) -> str:

@@ -11,8 +11,6 @@ from mbkit.engines import ENGINES
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["PLAIN", "Palette", "engine_index", "engine_mark", "log_ticks", "style"]
-
 _MARKS: Final = "osD^vP"
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

@@ -20,18 +20,6 @@ from mbkit.load import load
 from mbkit.load.robot_data import find
 from mbkit.model import Model
 
-__all__ = [
-    "checked_target",
-    "engine_names",
-    "is_code",
-    "kept",
-    "model_of",
-    "names_of",
-    "not_installed",
-    "resolved",
-    "with_values",
-]
-
 _FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
 
 

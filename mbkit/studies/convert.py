@@ -25,8 +25,6 @@ from mbkit.studies.explain.result import Cause
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of, velocity_joints
 
-__all__ = ["FORMATS", "Converted", "convert"]
-
 FORMATS: Final = ("mjcf", "urdf")
 #: What rounding of rotations and of principal axes may cost.
 _TOLERANCE: Final = 1e-11

@@ -28,25 +28,6 @@ from mbkit.engines.registry import ENGINES
 from mbkit.errors import InputError, OutputError
 from mbkit.model import Model
 
-__all__ = [
-    "NO_LIMIT",
-    "Block",
-    "Column",
-    "Items",
-    "Refusal",
-    "ResultTable",
-    "Table",
-    "Title",
-    "columns_of",
-    "from_plain",
-    "model_info",
-    "processor",
-    "to_plain",
-    "versions",
-    "write",
-    "write_whole",
-]
-
 #: What JSON has for an infinite limit, where null stands for an unknown one.
 NO_LIMIT: Final = "no limit"
 

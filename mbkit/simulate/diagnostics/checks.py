@@ -22,8 +22,6 @@ from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.diagnostics.eigenvalues import linearized
 from mbkit.simulate.diagnostics.stability import growth, lost
 
-__all__ = ["CHECKED_TIMES", "diagnostics", "massless_joints"]
-
 _EPS: Final = sys.float_info.epsilon
 #: Times and trajectories of a batch at which the mass matrix and the energy are evaluated, at most.
 CHECKED_TIMES: Final = 7

@@ -20,8 +20,6 @@ from mbkit.errors import InputError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.torque import TorqueCallback, TorqueFunction
 
-__all__ = ["Stiffness", "linearized", "stiffness", "stiffness_of"]
-
 _EPS: Final = float(np.finfo(float).eps)
 #: Of central differences in q: where truncation and rounding are alike for a function of its own size.
 _STEP: Final = _EPS ** (1 / 3)

@@ -22,8 +22,6 @@ from mbkit.model.joint_types import JointType
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.torque import Force
 
-__all__ = ["Linearization"]
-
 _TWIN = "_derived_twin"
 
 

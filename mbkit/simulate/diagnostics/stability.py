@@ -10,9 +10,6 @@ from mbkit._check import Array
 from mbkit.methods.registry import method_of
 from mbkit.methods.stability import companion
 
-__all__ = ["growth", "lost"]
-
-
 #: Of a run: what is gone after that is a transient.
 _BRIEF: Final = 0.01
 

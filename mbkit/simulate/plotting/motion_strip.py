@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-__all__ = ["Strip", "picture"]
-
-
 # Inches, at most.
 _WIDTH: Final = 11.0
 _HEIGHT: Final = 8.0

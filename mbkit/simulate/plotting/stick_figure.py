@@ -16,8 +16,6 @@ from mbkit._check import Array, finite_array
 from mbkit.errors import InputError
 from mbkit.model import Joint, Model
 
-__all__ = ["Plane", "Skeleton", "plane_of", "skeleton"]
-
 
 @dataclass(frozen=True)
 class Skeleton:

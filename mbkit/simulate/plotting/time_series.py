@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-__all__ = ["ACCENT", "BAD", "FAINT", "GHOST", "INK", "MUTED", "drawing", "plot"]
-
-
 INK: Final = "#22303c"
 MUTED: Final = "#7b8794"
 FAINT: Final = "#e3e7eb"

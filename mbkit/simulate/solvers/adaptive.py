@@ -26,8 +26,6 @@ from mbkit.simulate.solvers.vector_field import DIVERGED, is_bounded
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Torque
 
-__all__ = ["TrajectoryRecorder", "make_attempts", "march", "run_embedded", "stop_times"]
-
 _BEYOND: Final = f"diverged: {DIVERGED}"
 
 

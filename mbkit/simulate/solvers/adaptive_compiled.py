@@ -26,8 +26,6 @@ from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, first_le
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Torque
 
-__all__ = ["CompiledAttempts"]
-
 #: Larger than any scale or length: no error is seen, and a step is as long as its gap.
 _HUGE: Final = 1e300
 

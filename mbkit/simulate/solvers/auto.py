@@ -27,22 +27,6 @@ from mbkit.simulate.solvers.adaptive import TrajectoryRecorder, make_attempts, m
 from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, StepAttempts
 from mbkit.simulate.solvers.trajectory_record import assemble_result
 
-__all__ = [
-    "EXPLICIT",
-    "IMPLICIT",
-    "LEAST",
-    "AutoContext",
-    "Costs",
-    "Segment",
-    "StepRateMonitor",
-    "SwitchingController",
-    "describe",
-    "limit_rounds",
-    "method_sequence",
-    "run_auto",
-]
-
-
 EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
 #: No tolerance below: rounding would count as error, and steps shrink without end.
 LEAST: Final = 1e-13

@@ -29,9 +29,6 @@ from mbkit.simulate.solvers.vector_field import BOUND, is_bounded
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
-__all__ = ["BLOCK", "BlockLoop", "Chunk", "Plan", "blocks", "padded", "run_parts", "run_rollout"]
-
-
 #: Steps that are made without a look at them, at most.
 BLOCK: Final = 16
 

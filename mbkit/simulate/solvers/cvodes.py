@@ -23,8 +23,6 @@ from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
 from mbkit.simulate.solvers.vector_field import DIVERGED, is_bounded
 
-__all__ = ["run_cvodes"]
-
 _GRAPH: Final = "_cvodes_graph"
 _EPS: Final = float(np.finfo(float).eps)
 # Steps of a call. Progress is reported after it, and each starts with order 1, which costs some tens of steps.

@@ -23,8 +23,6 @@ from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED, DivergenceError
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Force, Torque
 
-__all__ = ["divergence_reason", "make_step", "run_fixed"]
-
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
 

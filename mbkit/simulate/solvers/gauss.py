@@ -20,8 +20,6 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
-__all__ = ["CollocationStep"]
-
 _EPS: Final = float(np.finfo(float).eps)
 _MOST: Final = 60
 _MOST_NEWTON: Final = 25

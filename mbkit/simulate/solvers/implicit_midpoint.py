@@ -31,9 +31,6 @@ from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import Torque
 
-__all__ = ["MidpointSolver", "called", "run_midpoint"]
-
-
 # With a torque function the iteration converges linearly.
 _WITH_FUNCTION: Final = 60
 _EPS: Final = float(np.finfo(float).eps)

@@ -16,8 +16,6 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.simulate.solvers.compiled_fixed_step import BlockLoop, padded
 from mbkit.simulate.time_grid import Indices
 
-__all__ = ["WIDEST", "MidpointChunk"]
-
 #: States that go side by side, at most: enough for the processor's vectors, and nine
 #: cache lines in a row of them, because an even number would meet in the same sets.
 WIDEST: Final = 72

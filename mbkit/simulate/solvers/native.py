@@ -22,8 +22,6 @@ from mbkit.simulate.torque import Torque
 if TYPE_CHECKING:
     from mbkit.engines.drake.engine import DrakeRun
 
-__all__ = ["HasRollout", "run_drake", "run_native"]
-
 
 @runtime_checkable
 class HasRollout(Protocol):

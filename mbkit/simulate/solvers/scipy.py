@@ -27,8 +27,6 @@ from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_
 from mbkit.simulate.solvers.vector_field import DIVERGED, Rates, is_bounded
 from mbkit.simulate.torque import Force
 
-__all__ = ["run_scipy"]
-
 _EPS: Final = float(np.finfo(float).eps)
 
 

@@ -35,8 +35,6 @@ from mbkit.simulate.diagnostics.linearization import Linearization
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field, Rates
 from mbkit.simulate.torque import Force, Torque
 
-__all__ = ["ROUNDS", "AcceptedSteps", "RosenbrockAttempts", "RungeKuttaAttempts", "StepAttempts", "first_length"]
-
 #: Tries between two looks at them, at most.
 ROUNDS: Final = 256
 

@@ -25,8 +25,6 @@ from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
 from mbkit.simulate.solvers.vector_field import DIVERGED, Rates, is_bounded
 
-__all__ = ["StoppedError", "TaylorSteps", "run_taylor"]
-
 # Of a rate, relative to the largest or 1: what no truncation of a series makes.
 _JUMP: Final = 1e-6
 

@@ -20,8 +20,6 @@ from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.time_grid import Grid, Indices
 
-__all__ = ["TrajectoryRecord", "assemble_result", "grid_result", "record_of"]
-
 #: Attempted steps between two looks at the time that they covered, and the least part of the run that they must
 #: cover. A run at that pace takes 2e10 steps.
 _ATTEMPTS: Final = 20_000

@@ -17,15 +17,6 @@ from mbkit.simulate.constraint_projection import Approach, beside, settled
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
-__all__ = [
-    "BOUND",
-    "DIVERGED",
-    "DivergenceError",
-    "Field",
-    "Rates",
-    "is_bounded",
-]
-
 DIVERGED: Final = "the state grew beyond all bounds"
 #: A state with a number of this size has diverged.
 BOUND: Final = 1e100
