@@ -77,11 +77,11 @@ def assert_engines_agree(
 
     missing = {} if isinstance(engines, str) else not_installed(engines)
     present = [name for name in engines if name not in missing]
-    told = "; ".join(f"{name}: {why}" for name, why in missing.items())
+    message = "; ".join(f"{name}: {why}" for name, why in missing.items())
     if missing and _strict(strict):
-        raise AssertionError(f"engines are missing, and the test is strict: {told}")
+        raise AssertionError(f"engines are missing, and the test is strict: {message}")
     if missing and len(present) < 2:
-        raise unittest.SkipTest(told)
+        raise unittest.SkipTest(message)
     result = compare(model, present if missing else engines, samples, seed, tolerance=rtol, terms_only=True)
     refused = [r for r in result.refusals if not r.term]
     failed = [r for r in result.rows if not r.passed]
@@ -191,7 +191,7 @@ def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterabl
     lines += [f"  {r.engine}, {r.term}: {r.reason}" for r in worst[:_MOST]]
     if len(worst) > _MOST:
         lines.append(f"  and {len(worst) - _MOST} more")
-    lines += [f"  {told}" for told in refused]
+    lines += [f"  {reason}" for reason in refused]
     if worst and worst[0].worst_q:
         lines.append(f"  worst state ({worst[0].worst_kind}): q = {_numbers(worst[0].worst_q)}")
         lines.append(f"                v = {_numbers(worst[0].worst_v)}")

@@ -154,8 +154,8 @@ class ParameterValues:
         kept = {name: x for name, x in self.batched.items() if name not in values}
         batched = {**kept, **many}
         if len({len(x) for x in batched.values()}) > 1:
-            told = ", ".join(f"{name} has {len(x)}" for name, x in batched.items())
-            raise InputError(f"parameters: batches of different sizes: {told}")
+            message = ", ".join(f"{name} has {len(x)}" for name, x in batched.items())
+            raise InputError(f"parameters: batches of different sizes: {message}")
         single: dict[str, Any] = {name: x for name, x in values.items() if name not in many}
         return ParameterValues(self.model.with_nominal(single) if single else self.model, batched)
 
@@ -200,10 +200,10 @@ class ParameterValues:
         parameters = self.model.parameters
         missing = [name for name, x in parameters.items() if x is None and name not in self.batched]
         if missing:
-            told = ", ".join(f"{name}=..." for name in missing)
+            message = ", ".join(f"{name}=..." for name in missing)
             raise InputError(
                 f"{self.model.name}: no value for parameter {', '.join(map(repr, missing))}; "
-                f"give it with dynamics.at({told})"
+                f"give it with dynamics.at({message})"
             )
         columns = np.broadcast_arrays(*(np.asarray(self.batched.get(name, x)) for name, x in parameters.items()))
         return np.stack(columns, axis=-1).astype(np.float64)

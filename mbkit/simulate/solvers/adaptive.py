@@ -29,18 +29,18 @@ from mbkit.simulate.torque import Torque
 _BEYOND: Final = f"diverged: {DIVERGED}"
 
 
-def run_embedded(asked: IntegrationProblem) -> SolverResult:
+def run_embedded(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, each with steps of its own.
 
     Where the own derivation is compiled and the torque is no function, the steps run
     as machine code; elsewhere stage by stage, by the same formulas. Torques held as an
     array start a new step at each interval.
     """
-    dyn, tolerances, batch = asked.dyn, asked.tolerances, asked.batch
-    q0, v0, space = asked.q, asked.v, Space(asked.dyn.model)
-    trials = make_attempts(asked.method, dyn, space, tolerances, asked.torque, asked.duration, batch)
-    tracks = [TrajectoryRecorder(asked, space, i) for i in range(len(q0))]
-    stops = stop_times(asked)
+    dyn, tolerances, batch = problem.dyn, problem.tolerances, problem.batch
+    q0, v0, space = problem.q, problem.v, Space(problem.dyn.model)
+    trials = make_attempts(problem.method, dyn, space, tolerances, problem.torque, problem.duration, batch)
+    tracks = [TrajectoryRecorder(problem, space, i) for i in range(len(q0))]
+    stops = stop_times(problem)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for first in range(0, len(q0), trials.width):
             part = slice(first, first + trials.width)
@@ -49,17 +49,17 @@ def run_embedded(asked: IntegrationProblem) -> SolverResult:
                 for track, q, v in zip(group, q0[part], v0[part], strict=True):
                     track.begin(q, v)
                 begun = space.enter(q0[part], v0[part])
-                trials.start(range(first, first + len(group)), q0[part], begun, asked.start)
+                trials.start(range(first, first + len(group)), q0[part], begun, problem.start)
                 for _ in march(trials, group, stops):
-                    done = sum(track.member.reached - asked.start for track in group) / asked.duration
-                    asked.bar.update((first + done) / len(q0))
+                    done = sum(track.member.reached - problem.start for track in group) / problem.duration
+                    problem.bar.update((first + done) / len(q0))
             except FunctionError as error:
                 # Where the torque is a function, trajectories run one by one.
                 which = getattr(error, "member", None)
                 group[0 if which is None else which - first].member.fail(error)
                 break
     records = [track.member for track in tracks]
-    return assemble_result(asked, records, evaluations=trials.evaluations, jacobians=trials.jacobians)
+    return assemble_result(problem, records, evaluations=trials.evaluations, jacobians=trials.jacobians)
 
 
 def make_attempts(
@@ -93,10 +93,10 @@ def make_attempts(
     return RungeKuttaAttempts(*given)
 
 
-def stop_times(asked: IntegrationProblem) -> list[float]:
+def stop_times(problem: IntegrationProblem) -> list[float]:
     """Return the times at which a run must stop on its way: where a held torque jumps, and the end."""
-    held = asked.save.tolist() if asked.save is not None and asked.torque.held else []
-    return sorted({*held, asked.end} - {asked.start})
+    held = problem.save.tolist() if problem.save is not None and problem.torque.held else []
+    return sorted({*held, problem.end} - {problem.start})
 
 
 def march(

@@ -40,36 +40,36 @@ _OTHERS: Final = "method=" + " or ".join(repr(m.name) for m in METHODS.values() 
 
 class _Failure(NamedTuple):
     ended: Ended
-    told: str
+    message: str
 
 
-def run_cvodes(asked: IntegrationProblem) -> SolverResult:
+def run_cvodes(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself; CVODES interpolates, and starts again where a torque jumps."""
-    dyn, torque = asked.dyn, asked.torque
+    dyn, torque = problem.dyn, problem.torque
     if not isinstance(dyn, LagrangianDynamics):
         raise UnsupportedError(
-            f"{asked.method}: integrates expressions, which {dyn.engine} has not; "
+            f"{problem.method}: integrates expressions, which {dyn.engine} has not; "
             f"use mbkit.dynamics(model, 'lagrangian'), or {_OTHERS}"
         )
-    if torque.callable or asked.events:
-        raise UnsupportedError(f"{asked.method}: takes neither torque functions nor events; use {_OTHERS}")
-    save, times = asked.saved_times()
-    solve = _Solve(dyn, asked.tolerances)
+    if torque.callable or problem.events:
+        raise UnsupportedError(f"{problem.method}: takes neither torque functions nor events; use {_OTHERS}")
+    save, times = problem.saved_times()
+    solve = _Solve(dyn, problem.tolerances)
     members = []
-    for i, start in enumerate(asked.y):
-        which = asked.member(i)
-        run = _Run(solve, record_of(asked, i), save, asked.report(i))
+    for i, start in enumerate(problem.y):
+        which = problem.member(i)
+        run = _Run(solve, record_of(problem, i), save, problem.report(i))
         values = dyn.parameter_values if which is None else dyn.of_samples([which]).parameter_values
         force = torque.of_member(which)
         # A jump within a call is one that CVODES does not know of: its error test fails.
         pieces = [times[k : k + 2] for k in range(len(times) - 1)] if torque.held else [times]
-        run.keep(asked.start, start)
+        run.keep(problem.start, start)
         for k, piece in enumerate(pieces):
             given = np.concatenate([np.asarray(force(k)), np.ravel(values)])
             if not run.over(piece, given):
                 break
         members.append(run.record)
-    return assemble_result(asked, members, evaluations=solve.evaluations, jacobians=solve.jacobians)
+    return assemble_result(problem, members, evaluations=solve.evaluations, jacobians=solve.jacobians)
 
 
 class _Run:
@@ -133,7 +133,7 @@ class _Solve:
             "abstol": tolerances.atol,
             "max_num_steps": _MOST_STEPS,
             "min_step_size": _EPS,
-            # What goes wrong is told by the outcome, not on the terminal.
+            # The result reports failures, not on the terminal.
             "show_eval_warnings": False,
             "disable_internal_warnings": True,
         }
@@ -167,8 +167,8 @@ class _Solve:
         return np.array(out["xf"]).T, int(stats["nsteps"]), int(stats["netfails"]) + int(stats["nncfails"])
 
 
-def _read(told: str, rtol: float) -> _Failure:
-    found = re.search(r'"(CV_\w+)"', told)
+def _read(message: str, rtol: float) -> _Failure:
+    found = re.search(r'"(CV_\w+)"', message)
     code = found[1] if found else ""
     # CasADi looks for signals while it evaluates, and takes Ctrl-C for a failure of the function.
     if code in ("CV_RHSFUNC_FAIL", "CV_LSETUP_FAIL"):
@@ -176,7 +176,7 @@ def _read(told: str, rtol: float) -> _Failure:
     if "RHSFUNC" in code:
         return _Failure("diverged", f"diverged: the acceleration is not finite ({code})")
     return _Failure(
-        "step_too_small", f"step below rounding at rtol = {rtol:g}: stiff, singular or diverging ({code or told})"
+        "step_too_small", f"step below rounding at rtol = {rtol:g}: stiff, singular or diverging ({code or message})"
     )
 
 

@@ -149,13 +149,13 @@ class CollocationStep:
         """Return, per state, whether the rates are solved for, and whether that takes too long."""
         speed = np.maximum(_largest(w), self._size(h, rates))
         # The first correction follows from the guess, and tells no factor.
-        told = np.isfinite(last)
+        measurable = np.isfinite(last)
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = size / last
             rest = size * factor / (1 - factor)
-        done = (size <= _EPS * speed) | (told & (factor < 1) & (rest <= _EPS / 4 * speed))
-        done |= told & (factor > 0.5) & ((size <= _ROUNDING * speed) | (h * size <= _LEAST))
-        return done, told & ~(factor < _SLOW)
+        done = (size <= _EPS * speed) | (measurable & (factor < 1) & (rest <= _EPS / 4 * speed))
+        done |= measurable & (factor > 0.5) & ((size <= _ROUNDING * speed) | (h * size <= _LEAST))
+        return done, measurable & ~(factor < _SLOW)
 
     def _size(self, h: float, rates: Array) -> Array:
         """Return, per state, the largest velocity among u̇ and h ẇ of all stages."""

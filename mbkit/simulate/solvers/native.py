@@ -100,31 +100,31 @@ def _result(method: Method, grid: Grid, kept: Indices, q: Array, v: Array, *, si
 # Drake's own integrators, with a tolerance.
 
 
-def run_drake(asked: IntegrationProblem) -> SolverResult:
+def run_drake(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself, to the times of `save`.
 
     Steps end on the saved times. Drake has one accuracy, relative to a state of size 1 and above, for which
     `rtol` is taken.
     """
-    dyn, torque = asked.dyn, asked.torque
+    dyn, torque = problem.dyn, problem.torque
     # Drake is an extra.
     from mbkit.engines.drake.engine import DrakeDynamics, DrakeRun
 
-    if not isinstance(dyn, DrakeDynamics) or torque.callable or asked.events:
+    if not isinstance(dyn, DrakeDynamics) or torque.callable or problem.events:
         raise UnsupportedError(
-            f"{asked.method}: takes neither torque functions nor events; use method={ADAPTIVE_METHOD!r}"
+            f"{problem.method}: takes neither torque functions nor events; use method={ADAPTIVE_METHOD!r}"
         )
-    save, times = asked.saved_times()
-    scheme, accuracy = method_of(asked.method).scheme, asked.tolerances.rtol
+    save, times = problem.saved_times()
+    scheme, accuracy = method_of(problem.method).scheme, problem.tolerances.rtol
     records, evaluations = [], 0
-    for i, (q, v) in enumerate(zip(asked.q, asked.v, strict=True)):
-        record = record_of(asked, i)
-        run = DrakeRun(dyn, scheme, accuracy, asked.start, q, v, asked.report(i))
-        _over(record, run, times, frozenset(save.tolist()), torque.of_member(asked.member(i)))
+    for i, (q, v) in enumerate(zip(problem.q, problem.v, strict=True)):
+        record = record_of(problem, i)
+        run = DrakeRun(dyn, scheme, accuracy, problem.start, q, v, problem.report(i))
+        _over(record, run, times, frozenset(save.tolist()), torque.of_member(problem.member(i)))
         record.steps, record.rejected = run.steps, run.rejected
         evaluations += run.evaluations
         records.append(record)
-    return assemble_result(asked, records, evaluations=evaluations)
+    return assemble_result(problem, records, evaluations=evaluations)
 
 
 def _over(record: TrajectoryRecord, run: DrakeRun, times: Array, saved: frozenset[float], force: object) -> None:

@@ -54,34 +54,34 @@ class _Task:
     watch: Watch | None
 
 
-def run_scipy(asked: IntegrationProblem) -> SolverResult:
+def run_scipy(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself; a jump of a held torque starts every method again."""
-    dyn, save, torque = asked.dyn, asked.save, asked.torque
-    method = method_of(asked.method)
+    dyn, save, torque = problem.dyn, problem.save, problem.torque
+    method = method_of(problem.method)
     dense = method.multistep
-    ends = (asked.end,) if save is None or (dense and not torque.held) else (*save.tolist(), asked.end)
-    stops = tuple(sorted({*ends} - {asked.start}))
-    solve = _Solve(dyn, method, asked.tolerances)
+    ends = (problem.end,) if save is None or (dense and not torque.held) else (*save.tolist(), problem.end)
+    stops = tuple(sorted({*ends} - {problem.start}))
+    solve = _Solve(dyn, method, problem.tolerances)
     records = []
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"), _quiet():
-        for i, start in enumerate(asked.y):
-            which = asked.member(i)
+        for i, start in enumerate(problem.y):
+            which = problem.member(i)
             if which is not None:
                 solve.only(which)
-            watch = Watch(asked.events, which) if asked.events else None
-            task = _Task(asked.start, start, stops, torque.of_member(which), torque.held, watch)
-            records.append(record_of(asked, i))
+            watch = Watch(problem.events, which) if problem.events else None
+            task = _Task(problem.start, start, stops, torque.of_member(which), torque.held, watch)
+            records.append(record_of(problem, i))
             try:
-                solve.integrate(records[-1], task, asked.report(i))
+                solve.integrate(records[-1], task, problem.report(i))
             except FunctionError as error:
                 records[-1].fail(error)
                 break
-    return assemble_result(asked, records, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations)
+    return assemble_result(problem, records, evaluations=solve.rates.evaluations, jacobians=solve.jacobian_evaluations)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    # LSODA warns of what is told as the end of the run.
+    # LSODA warns of what the result reports as the end of the run.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="lsoda: ", category=UserWarning)
         yield

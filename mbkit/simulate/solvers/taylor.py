@@ -29,7 +29,7 @@ from mbkit.simulate.solvers.vector_field import DIVERGED, Rates, is_bounded
 _JUMP: Final = 1e-6
 
 
-def run_taylor(asked: IntegrationProblem) -> SolverResult:
+def run_taylor(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself.
 
     The tolerance bounds each step's error, with the smaller of rtol and atol: absolute up to a factor of ten in the
@@ -43,33 +43,33 @@ def run_taylor(asked: IntegrationProblem) -> SolverResult:
         heyoka is not installed; another engine; a torque that is a function, of which
         there is no series; or a model too large to be written out.
     """
-    dyn, save, torque = asked.dyn, asked.save, asked.torque
+    dyn, save, torque = problem.dyn, problem.save, problem.torque
     if torque.callable:
         raise UnsupportedError(
-            f"{asked.method}: a torque function has no Taylor series; use method={ADAPTIVE_METHOD!r}, "
+            f"{problem.method}: a torque function has no Taylor series; use method={ADAPTIVE_METHOD!r}, "
             "or an array held over each interval of save"
         )
     if not isinstance(dyn, (LagrangianDynamics, OracleDynamics)):
         raise UnsupportedError(
-            f"{asked.method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')"
+            f"{problem.method}: not on the {dyn.engine} engine; use mbkit.dynamics(model, 'lagrangian')"
         )
     kind = precision(dyn.bits)
-    system, tolerance = taylor_system(dyn.equations), max(min(asked.tolerances) / magnitude(asked.y), kind.eps)
-    ends = [asked.end, *(save.tolist() if save is not None and torque.held else [])]
-    stops = sorted({*ends} - {asked.start})
+    system, tolerance = taylor_system(dyn.equations), max(min(problem.tolerances) / magnitude(problem.y), kind.eps)
+    ends = [problem.end, *(save.tolist() if save is not None and torque.held else [])]
+    stops = sorted({*ends} - {problem.start})
     members = []
     with system.integrator(kind, tolerance) as integrator:
-        for i, start in enumerate(asked.y):
-            which = asked.member(i)
+        for i, start in enumerate(problem.y):
+            which = problem.member(i)
             own: Any = dyn if which is None else dyn.of_samples([which])
             # With 34 digits the drift is far below what a double tells.
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             steps = TaylorSteps(system, integrator, kind, _behind(own, kind), settled)
-            watch = Watch(asked.events, which) if asked.events else None
-            one = _Run(own, steps, watch, record_of(asked, i), asked.report(i))
-            members.append(one.all(asked.start, start, stops, torque.of_member(which)))
+            watch = Watch(problem.events, which) if problem.events else None
+            one = _Run(own, steps, watch, record_of(problem, i), problem.report(i))
+            members.append(one.all(problem.start, start, stops, torque.of_member(which)))
     evaluations = sum(member.steps for member in members)
-    return assemble_result(asked, members, evaluations=evaluations)
+    return assemble_result(problem, members, evaluations=evaluations)
 
 
 def _behind(dyn: LagrangianDynamics | OracleDynamics, kind: Precision) -> Any:

@@ -95,10 +95,10 @@ class Field:
         return a if self._flat else np.asarray(self._space.acceleration(q, v, a))
 
 
-def _blamed(told: str, q: Array, v: Array) -> str:
+def _blamed(message: str, q: Array, v: Array) -> str:
     # An engine overflows before its state does, and blames the model for it.
     largest = max(float(np.abs(x).max()) for x in (q, v))
-    return told if largest < 1e50 else DIVERGED
+    return message if largest < 1e50 else DIVERGED
 
 
 class Rates:
