@@ -16,7 +16,7 @@ from mbkit.engines.base import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
-from mbkit.methods.registry import ADAPTIVE_METHOD
+from mbkit.methods.registry import ADAPTIVE_METHOD, SCIPY_METHOD
 from mbkit.model import Model
 from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.events import State, Watch
@@ -46,8 +46,8 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
     dyn, save, torque = problem.dyn, problem.save, problem.torque
     if torque.callable:
         raise UnsupportedError(
-            f"{problem.method}: a torque function has no Taylor series; use method={ADAPTIVE_METHOD!r}, "
-            "or an array held over each interval of save"
+            f"{problem.method}: a torque function has no Taylor series; use method={ADAPTIVE_METHOD!r} "
+            f"or {SCIPY_METHOD!r}, or an array held over each interval of save"
         )
     if not isinstance(dyn, (LagrangianDynamics, OracleDynamics)):
         raise UnsupportedError(
