@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Iterable, Iterator
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import mbkit
@@ -112,3 +114,15 @@ def test_folders_hold_few_modules():
     folders = {path.parent for path in FILES.values()}
     sizes = {f.relative_to(ROOT).as_posix(): sum(p.name != "__init__.py" for p in f.glob("*.py")) for f in folders}
     assert {n: k for n, k in sizes.items() if k > LARGE_FOLDERS.get(n, MAX_MODULES)} == {}
+
+
+def test_validation_scripts_import_names_that_exist():
+    missing = []
+    for path in sorted((ROOT.parent / "validation").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "mbkit":
+                for name in (alias.name for alias in node.names):
+                    module = node.module if find_spec(node.module) else ""
+                    if not module or not (hasattr(import_module(module), name) or find_spec(f"{module}.{name}")):
+                        missing.append(f"{path.name}: {node.module}.{name}")
+    assert not missing

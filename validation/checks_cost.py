@@ -12,9 +12,9 @@ import time
 import warnings
 
 import numpy as np
-from mbkit.studies._results import processor, versions
 
 import mbkit as mb
+from mbkit.studies.results import processor, versions
 
 ROUNDS, BATCH = 25, 16
 #: Method, setting, durations in s.
