@@ -187,7 +187,10 @@ class EnergyModel(Model):
         for _ in range(_DRAWS):
             # From some places there is no way to the constraints; on some branches they depend on each other.
             with suppress(InputError, NumericalError):
-                state = self._states.project(*super().random_state(rng))
+                q, v = super().random_state(rng)
+                # Some pose is far cheaper than the nearest one, and on such a branch refused all the same.
+                require_independent(self._states.dyn, self._states.restored(q, v))
+                state = self._states.project(q, v)
                 require_independent(self._states.dyn, state[0])
                 return state
         refuse_unreachable(self._states.dyn)
