@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mbkit import errors
 from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
 from mbkit.load import load, xml_reader
-from mbkit.load.robot_data import find
+from mbkit.load.loader import find
 from mbkit.load.urdf_links import read_links
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'

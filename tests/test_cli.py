@@ -156,7 +156,7 @@ def test_a_catalog_system_a_file_and_a_model_itself(here):
     assert call("check", "cart_pole", *QUICK).exit_code == 0
     module(here, "ready", "import mbkit\nmodel = mbkit.catalog.pendulum()")
     assert call("check", "ready:model", *QUICK).exit_code == 0
-    from mbkit.load.robot_data import find
+    from mbkit.load.loader import find
 
     robot = find("ur5")
     assert robot is not None

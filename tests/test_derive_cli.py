@@ -18,7 +18,7 @@ from mbkit.lagrangian.printer import ExpressionPrinter, folded, written
 from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
 from mbkit.lagrangian.printing.numpy_module import python_code
 from mbkit.lagrangian.printing.summary import SystemSummary
-from mbkit.load.robot_data import find
+from mbkit.load.loader import find
 
 
 def derive(*arguments, status=0):

@@ -32,8 +32,8 @@ from mbkit.errors import (
     UnknownNameError,
 )
 from mbkit.load import load, robots
+from mbkit.load.loader import find
 from mbkit.load.mjcf_attributes import rules as mjcf_rules
-from mbkit.load.robot_data import find
 from mbkit.load.sanitized_text import strip
 from mbkit.load.shapes import solid
 from mbkit.load.urdf import Snapper

@@ -476,7 +476,7 @@ FAULTS = {
     "spring to itself": (lambda b: b.add_spring("s", body_a="bob", body_b="bob"), "spring 's': both ends on 'bob'"),
     "soft spring": (
         lambda b: b.add_spring("s", body_a="bob", body_b="world", stiffness=-1.0),
-        "spring 's': stiffness: expected a number of at least 0",
+        "spring 's': stiffness -1 is negative",
     ),
     "frame nowhere": (lambda b: b.add_frame("f", body="bub"), "frame 'f': unknown body 'bub'"),
     "loop kind": (lambda b: b.add_loop("l", "line", body_a="bob", body_b="world"), "loop 'l': unknown kind 'line'"),

@@ -19,7 +19,7 @@ from mbkit.engines import imported
 from mbkit.engines.mujoco import importer
 from mbkit.errors import InputError, LoadError, ModelError, UnknownNameError
 from mbkit.load import xml_reader
-from mbkit.load.robot_data import find
+from mbkit.load.loader import find
 from mbkit.load.sanitized_text import strip
 from mbkit.load.urdf_links import urdf_links
 from mbkit.load.xml_reader import Element

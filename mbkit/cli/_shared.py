@@ -103,7 +103,7 @@ def prepare(out: Path, stem: str, *endings: str, force: bool) -> None:
 
 def stem_of(target: str, name: str) -> str:
     """Return the stem of a target's files: the robot's name, because several robots' files hold the same name."""
-    from mbkit.load.robot_data import canonical
+    from mbkit.load.loader import canonical
     from mbkit.report.output_folder import file_stem
 
     return file_stem(canonical(target) or name)

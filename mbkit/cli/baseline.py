@@ -227,7 +227,7 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
 
 def _name(target: str) -> str:
     """Return what a target's file is called in a folder: as the robot, the file or the function."""
-    from mbkit.load.robot_data import canonical
+    from mbkit.load.loader import canonical
     from mbkit.report.output_folder import file_stem
 
     robot = canonical(target)

@@ -94,7 +94,7 @@ def _model(name: str, options: dict[str, Any]) -> Model:
     from mbkit import catalog
     from mbkit.errors import UnknownNameError
     from mbkit.lagrangian import systems
-    from mbkit.load.robot_data import find
+    from mbkit.load.loader import find
     from mbkit.studies._targets import model_of
 
     model = catalog.systems()[name]() if name in catalog.systems() and not options else None
@@ -133,7 +133,7 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
     from mbkit.codegen.c_source import c_identifier, export_c
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.printing.catalog_symbols import in_symbols
-    from mbkit.load.robot_data import canonical
+    from mbkit.load.loader import canonical
 
     if not isinstance(model, EnergyModel):
         model = in_symbols(model) or model

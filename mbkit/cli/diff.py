@@ -89,7 +89,7 @@ def _short(target: str) -> str:
 def _model(target: str, options: Mapping[str, Any]) -> Model:
     """Return a file as it is written if there are no options, and any other target as it loads."""
     from mbkit import catalog
-    from mbkit.load.robot_data import find
+    from mbkit.load.loader import find
     from mbkit.studies._targets import model_of
     from mbkit.studies.importers.study import written
 

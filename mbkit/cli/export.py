@@ -44,7 +44,7 @@ def export(
     replaced; an unknown quantity lists those that there are.
     """
     from mbkit.codegen.c_source import DEFAULT, c_identifier, export_c
-    from mbkit.load.robot_data import canonical
+    from mbkit.load.loader import canonical
     from mbkit.studies._targets import model_of
 
     model = model_of(target, options)

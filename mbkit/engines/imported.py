@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -15,6 +15,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import UnsupportedError
+from mbkit.load.xml_reader import unused as unused
 from mbkit.model import Joint, Model
 from mbkit.model.joint_types import kind_of
 
@@ -83,13 +84,6 @@ def stacked(states: Iterable[dict[str, Array]]) -> dict[str, Array]:
     """Return the terms of each state as arrays over a batch."""
     values = list(states)
     return {name: np.array([x[name] for x in values]) for name in ("M", "g", "nle", "passive")}
-
-
-def unused(name: str, taken: Container[str]) -> str:
-    """Return a name that nothing has yet; an importer may take what mbkit's loader refuses."""
-    while name in taken:
-        name += "_"
-    return name
 
 
 def checked(engine: str, model: Model) -> Model:

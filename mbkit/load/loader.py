@@ -1,10 +1,12 @@
-"""`load`: a robot's name or a file in, a `Model` out."""
+"""`load`: a robot's name or a file in, a `Model` out; and the robots of example-robot-data by name."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import re
 import warnings
+from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -16,17 +18,43 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import shown
 from mbkit._warn import warn
-from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, ModelError
-from mbkit.load import robot_data, xml_reader
-from mbkit.load.robot_data import entries
+from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, ModelError, UnknownNameError
+from mbkit.load import xml_reader
 from mbkit.load.urdf_check import examine
-from mbkit.load.xml_reader import expanded
 from mbkit.model import Model
 from mbkit.model.validation import scale_doubts
 
 # `Path` drops one of the two slashes.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
-_GRAVITY: Final = (0.0, 0.0, -9.81)
+_PACKAGE: Final = "example-robot-data"
+
+# Common names of files with another stem: folder and stem.
+_SHORT: Final = {
+    "alexander": "alexander_description/alexander_v1.lowerBodyOnly",
+    "anymal": "anymal_b_simple_description/anymal",
+    "anymal_b": "anymal_b_simple_description/anymal",
+    "anymal_b_kinova": "anymal_b_simple_description/anymal-kinova",
+    "anymal_c": "anymal_c_simple_description/anymal",
+    "asr_twodof": "asr_twodof_description/TwoDofs",
+    "borinot": "borinot_description/borinot_flying_arm_2",
+    "g1": "g1_description/g1_29dof_rev_1_0",
+    "g1_with_hand": "g1_description/g1_29dof_with_hand_rev_1_0",
+    "hector": "hector_description/quadrotor_base",
+    "hextilt": "hextilt_description/hextilt_flying_arm_5",
+    "hyq": "hyq_description/hyq_no_sensors",
+    "solo8": "solo_description/solo",
+    "talos": "talos_data/talos_reduced",
+    "talos_arm": "talos_data/talos_left_arm",
+    "talos_box": "talos_data/talos_reduced_box",
+    "talos_full": "talos_data/talos_full_v2",
+    "talos_full_box": "talos_data/talos_full_v2_box",
+    "ur10": "ur_description/ur10_robot",
+    "ur10_limited": "ur_description/ur10_joint_limited_robot",
+    "ur3": "ur_description/ur3_robot",
+    "ur3_limited": "ur_description/ur3_joint_limited_robot",
+    "ur5": "ur_description/ur5_robot",
+    "ur5_limited": "ur_description/ur5_joint_limited_robot",
+}
 
 
 def load(
@@ -40,38 +68,34 @@ def load(
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
-    The only other files that are opened are those that an MJCF includes, and the meshes that give a body of an
-    MJCF its inertia. The model's ``notes`` name all decisions (mimic joints, parts left out, rounded zeros, opened
-    files). Tendons and actuators of an MJCF act as springs, dampers and
+    No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF its
+    inertia. The model's ``notes`` name all decisions. Tendons and actuators of an MJCF act as springs, dampers and
     rotors where their forces at zero control are linear.
 
     Parameters
     ----------
     source : str or path
-        A robot of example-robot-data, such as ``"panda"`` or
-        ``"ur_description/ur5_gripper"`` (`robots` lists them), or a path.
+        A robot of example-robot-data, such as ``"panda"`` or ``"ur_description/ur5_gripper"`` (`robots` lists them),
+        or a path.
     floating_base : bool
         Whether the base link moves freely, on a joint named ``"root_joint"``.
     mimic : {"reduce", "free"}
-        What a URDF's mimic joints become: functions of the joints they follow,
-        without coordinates of their own, or independent joints. MJCF has none: its
-        equality constraints are left out, and noted.
+        What a URDF's mimic joints become: functions of the joints they follow, without coordinates of their own, or
+        independent joints. An MJCF's equality constraints are left out, and noted.
     nonphysical : {"error", "warn"}, optional
-        What to do about inconsistent inertias: refuse them, or use them as
-        written with a warning. By default robots by name warn, and files are refused.
-        A negative mass is always refused.
+        What to do about inconsistent inertias: refuse them, or use them as written with a warning. By default robots
+        by name warn, and files are refused. A negative mass is always refused.
     gravity : (3,) array_like, optional
         m/s², in world axes; by default the file's own (MJCF), else (0, 0, -9.81).
     meshes : {"auto", "never"}
-        Whether an MJCF's meshes are read where a body has no other inertia. MuJoCo's compiler infers it.
-        With "never" such bodies are refused.
+        Whether an MJCF's meshes are read where a body has no other inertia, which MuJoCo's compiler then infers; with
+        "never" such bodies are refused.
 
     Returns
     -------
     Model
-        With one body for every moving joint of a URDF (links fixed to each other are
-        merged and stay as frames), joints in Pinocchio's order; for an MJCF with its
-        bodies and joints in the file's order.
+        Of a URDF with one body for every moving joint (links fixed to each other are merged and stay as frames), in
+        Pinocchio's order; of an MJCF with its bodies and joints in the file's order.
 
     Raises
     ------
@@ -112,26 +136,17 @@ def load(
         # Pinocchio is imported only for a URDF.
         from mbkit.load.urdf import model_of
 
-        urdf = examine(
-            root, str(path), floating_base=floating_base, mimic_matters=mimic == "reduce", lenient=policy == "warn"
-        )
-        model = model_of(
-            urdf,
-            str(path),
-            floating_base=floating_base,
-            mimic=mimic,
-            nonphysical=policy,
-            gravity=_GRAVITY if gravity is None else gravity,
-        )
+        reduce, lenient = mimic == "reduce", policy == "warn"
+        urdf = examine(root, str(path), floating_base=floating_base, mimic_matters=reduce, lenient=lenient)
+        g = (0.0, 0.0, -9.81) if gravity is None else gravity
+        model = model_of(urdf, str(path), floating_base, mimic, policy, g)
     elif root.tag == "mujoco":
         from mbkit.load.mjcf import model_of_mjcf
 
-        root_with_includes = expanded(root, path)
-        model = model_of_mjcf(
-            root_with_includes, path, floating_base=floating_base, nonphysical=policy, gravity=gravity, meshes=meshes
-        )
+        whole = xml_reader.expanded(root, path)
+        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes)
     else:
-        raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+        raise xml_reader.unknown_root(path, root)
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
@@ -151,12 +166,15 @@ def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
         raise LoadError(f"{text}: this is a URL, and mbkit reads local files; download it and give its path")
     if isinstance(source, str):
         looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf"))
-        robot = None if looks_like_path else robot_data.find(text)
+        robot = None if looks_like_path else find(text)
         if robot is not None:
             return robot.path, True
         if not looks_like_path and not os.path.exists(text):
-            raise robot_data.unknown(text)
+            raise unknown(text)
     return Path(text), False
+
+
+# Robots by name
 
 
 @dataclass(frozen=True)
@@ -182,10 +200,8 @@ class Robot:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", MbkitWarning)
                 model = load(self.name)
-        except ModelError as error:
-            return None, None, None, "; ".join(error.faults)
         except MbkitError as error:
-            return None, None, None, str(error)
+            return None, None, None, "; ".join(error.faults) if isinstance(error, ModelError) else str(error)
         return model.nq, model.nv, model.mass, None
 
     @property
@@ -208,6 +224,13 @@ class Robot:
         """Why it does not load; None if it does."""
         return self._facts[3]
 
+    @property
+    def _spellings(self) -> tuple[str, ...]:
+        """The names that mean this robot, its usual one first."""
+        folder, stem = self.name.split("/")
+        short = folder.removesuffix("_description").removesuffix("_data")
+        return (*self.aliases, self.name, f"{short}/{stem}")
+
 
 def robots() -> tuple[Robot, ...]:
     """Return a record of every robot of example-robot-data, by name.
@@ -215,17 +238,61 @@ def robots() -> tuple[Robot, ...]:
     Returns
     -------
     tuple of Robot
-        Each with ``name``, ``aliases``, ``path``, and ``nq``, ``nv``, ``mass`` or the
-        ``reason`` why it does not load; the last four load the file at their first use.
+        Each with ``name``, ``aliases``, ``path``, and ``nq``, ``nv``, ``mass`` or the ``reason`` why it does not load;
+        the last four load the file at their first use.
 
     Raises
     ------
     LoadError
         example-robot-data is not installed.
     """
-    return _records()
+    return _table()[0]
+
+
+def find(name: str) -> Robot | None:
+    """Return the robot of this name, or None; case and ``-`` or ``_`` do not matter."""
+    return _table()[1].get(_key(name))
+
+
+def canonical(name: str) -> str | None:
+    """Return a robot's name as it is listed, whatever its case here; None for any other text."""
+    robot = find(name)
+    return next((s for s in robot._spellings if _key(s) == _key(name)), None) if robot else None
+
+
+def unknown(name: str) -> UnknownNameError:
+    """Return the error for a name that is neither a robot nor a path."""
+    known = sorted({x for r in robots() for x in (r.name, r._spellings[0])} | _SHORT.keys())
+    return UnknownNameError(
+        "robot", name, known, "(a path to a file ends in .urdf or .xml; mbkit robots lists all names)"
+    )
+
+
+def _key(name: str) -> str:
+    return name.lower().replace("-", "_")
 
 
 @lru_cache(maxsize=1)
-def _records() -> tuple[Robot, ...]:
-    return tuple(Robot(*entry) for entry in entries())
+def _table() -> tuple[tuple[Robot, ...], dict[str, Robot]]:
+    """Return every URDF on the package's file list, in order and by all its names."""
+    try:
+        files = importlib.metadata.files(_PACKAGE)
+    except importlib.metadata.PackageNotFoundError:
+        files = None
+    if files is None:
+        raise LoadError(f"robots by name come from {_PACKAGE}, which is not installed; pip install {_PACKAGE}")
+    urdfs = sorted(
+        (f"{file.parts[file.parts.index('robots') + 1]}/{file.stem}", file.stem, Path(str(file.locate())))
+        for file in files
+        if file.suffix == ".urdf" and "robots" in file.parts[:-2]
+    )
+    stems = Counter(_key(stem) for _, stem, _ in urdfs)
+    short = {_key(alias) for alias in _SHORT}
+    out, by_key = [], dict[str, Robot]()
+    for name, stem, path in urdfs:
+        own = (stem,) if stems[_key(stem)] == 1 and _key(stem) not in short else ()
+        out.append(Robot(name, (*(a for a, full in _SHORT.items() if full == name), *own), path))
+    for robot in out:
+        for spelling in (robot.name, robot._spellings[-1], *robot.aliases):
+            by_key.setdefault(_key(spelling), robot)
+    return tuple(out), by_key

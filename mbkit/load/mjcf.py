@@ -45,11 +45,10 @@ _HONOURED: Final = frozenset({"gravity", "spring", "damper", "actuation"})
 def model_of_mjcf(
     mujoco: Element,
     path: Path,
-    *,
     floating_base: bool,
     nonphysical: Literal["error", "warn"],
     gravity: ArrayLike | None,
-    meshes: Literal["auto", "never"] = "never",
+    meshes: Literal["auto", "never"],
 ) -> Model:
     """Return the model of a <mujoco> element; for the arguments see `mbkit.load.load`."""
     read = Reader()

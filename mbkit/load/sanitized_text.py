@@ -56,7 +56,7 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
     root = xml_reader.read(path)
     format_ = _FORMATS.get(root.tag)
     if format_ is None:
-        raise LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+        raise xml_reader.unknown_root(path, root)
     if format_ == "mjcf":
         root = expanded(root, path)
     foreign = [e for e in root.walk() if e.tag in _FOREIGN]

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.errors import LoadError, ModelError, UnsupportedError
-from mbkit.load.urdf_check import UrdfFile, UrdfJoint, unbounded
+from mbkit.load.urdf_check import UrdfFile, unbounded
+from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Model, ModelBuilder, kind_of
 from mbkit.model.validation import body_fault
 
@@ -93,7 +94,6 @@ def joint_kind(joint: Any) -> tuple[str, Array | None]:
 def model_of(
     urdf: UrdfFile,
     source: str,
-    *,
     floating_base: bool,
     mimic: Literal["reduce", "free"],
     nonphysical: Literal["error", "warn"],
@@ -107,103 +107,96 @@ def model_of(
             raw = pin.buildModelFromXML(urdf.text)
     except Exception as error:
         raise LoadError(f"{source}: Pinocchio's URDF parser refuses this file: {error}") from None
-    return _Conversion(raw, urdf, floating_base, mimic).run(source, nonphysical, gravity)
+    try:
+        b = ModelBuilder(urdf.name, gravity=gravity)
+        return _Conversion(b, raw, urdf, floating_base, mimic).build(nonphysical)
+    except ModelError as error:
+        raise ModelError(source, error.faults) from None
 
 
 class _Conversion:
-    def __init__(self, raw: Any, urdf: UrdfFile, floating_base: bool, mimic: str) -> None:
-        self.raw, self.urdf, self.floating_base, self.mimic = raw, urdf, floating_base, mimic
+    """Adds what Pinocchio parsed to a builder, joint by joint."""
+
+    def __init__(self, b: ModelBuilder, raw: Any, urdf: UrdfFile, floating_base: bool, mimic: str) -> None:
+        self.b, self.raw, self.urdf, self.mimic = b, raw, urdf, mimic
         self.joints = {j.name: j for j in urdf.joints}
         self.snap = Snapper()
-        self.bodies: list[str] = []
+        self.links = {link.name for link in urdf.links}
+        self.names: dict[str, str] = {}  # of links called otherwise here
+        self.bodies = ["world"]  # by Pinocchio's joint
         self.suspects: set[str] = set()
-        self.renamed: list[str] = []
-        # Links with inconsistent inertias, by the body that they were merged into.
-        self.odd: dict[str, list[tuple[str, str]]] = {}
+        #: Pose of the base, the links that Pinocchio has merged into its universe, where it is a body here.
+        self.X_base = None if floating_base else self._add_base()
+        for index in range(1, raw.njoints):
+            self._add_joint(index)
+        self._add_frames()
 
-    def run(self, source: str, nonphysical: Literal["error", "warn"], gravity: ArrayLike) -> Model:
-        """Return the model of the parsed one, joint by joint."""
-        b = ModelBuilder(self.urdf.name, gravity=gravity)
-        X_base = self._add_base(b)
-        for index in range(1, self.raw.njoints):
-            self._add_joint(b, index, X_base)
-        self._add_frames(b, X_base)
+    def build(self, nonphysical: Literal["error", "warn"]) -> Model:
+        """Return the model, with notes on all decisions."""
+        odd: dict[str, list[tuple[str, str]]] = {}
         for link, why in self.urdf.odd_links.items():
-            frame = self.raw.frames[self.raw.getFrameId(link, pin.BODY)]
-            self.odd.setdefault(self.bodies[frame.parentJoint], []).append((link, why))
-        renamed = (f"link 'world' is called {n!r} here, because 'world' is the ground" for n in self.renamed)
-        for note in (*self.urdf.notes, self._mimic_note(), self._odd_note(), *renamed, self.snap.note):
-            if note:
-                b.note(note)
-        try:
-            return b.build(nonphysical=nonphysical, point_masses=False, parts=self.odd)
-        except ModelError as error:
-            raise ModelError(source, error.faults) from None
+            odd.setdefault(self.bodies[self._frame(link).parentJoint], []).append((link, why))
+        healed = [f"{link} ({why})" for body, links in odd.items() for link, why in links if body not in self.suspects]
+        mimics = [(j.name, j.mimic) for j in self.urdf.joints if j.mimic]
+        notes = [*self.urdf.notes]
+        if mimics:
+            how = "reduced, so that they have no coordinate of their own"
+            how = "kept independent, as mimic='free' asks" if self.mimic == "free" else how
+            formulas = ", ".join(f"{name} = {m.ratio:g} {m.joint} {m.offset:+g}" for name, m in mimics)
+            notes.append(f"mimic joints {how}: {formulas}")
+        if healed:
+            several = "; ".join(healed[:5]) + (f"; and {len(healed) - 5} more" if len(healed) > 5 else "")
+            notes.append(f"links of inconsistent inertia, sound together with the links fixed to them: {several}")
+        notes += [f"link {x!r} is called {n!r} here, because 'world' is the ground" for x, n in self.names.items()]
+        for note in notes if self.snap.note is None else [*notes, self.snap.note]:
+            self.b.note(note)
+        return self.b.build(nonphysical=nonphysical, point_masses=False, parts=odd)
 
-    # The base: the links that Pinocchio has merged into its universe
+    def _frame(self, link: str) -> Any:
+        return self.raw.frames[self.raw.getFrameId(link, pin.BODY)]
 
-    def _add_base(self, b: ModelBuilder) -> Any:
-        """Add the body that does not move, and return its pose in the world, or None."""
-        if self.floating_base:
-            self.bodies.append("world")
-            return None
-        joint, X = self._base_link()
-        if joint is None and self.urdf.root == "world" and not self.raw.inertias[0].mass:
-            self.bodies.append("world")
-            return None
-        link = self.urdf.root if joint is None else joint.child
-        name = self._body_name(link)
-        self._add_body(b, name, X.actInv(self.raw.inertias[0]))
-        joint_name = self._unused("world_to_" + name) if joint is None else joint.name
-        b.add_joint(
-            joint_name, "fixed", parent="world", child=name, translation=X.translation, rotation=self.snap(X.rotation)
+    def _add_base(self) -> Any:
+        """Add the body that does not move, and return its pose in the world; None where the world holds nothing."""
+        root, X, joint = self.urdf.root, pin.SE3.Identity(), None
+        if root == "world":
+            joint = next((j for j in self.urdf.joints if j.parent == "world" and j.kind == "fixed"), None)
+            if joint is not None:
+                root, X = joint.child, self._frame(joint.child).placement
+            elif not self.raw.inertias[0].mass:
+                return None
+        name = self._body_name(root)
+        self._add_body(name, X.actInv(self.raw.inertias[0]))
+        self.bodies[0] = name
+        self.b.add_joint(
+            unused(f"world_to_{name}", self.joints) if joint is None else joint.name,
+            "fixed",
+            parent="world",
+            child=name,
+            translation=X.translation,
+            rotation=self.snap(X.rotation),
         )
-        return X
+        return None if X.isIdentity(0.0) else X
 
-    def _add_body(self, b: ModelBuilder, name: str, inertia: Any) -> None:
-        self.bodies.append(name)
+    def _add_body(self, name: str, inertia: Any) -> None:
         body = Body(name, inertia.mass, inertia.lever, inertia.inertia)
         if body_fault(body, point_masses=False):
             self.suspects.add(name)
-        b.add_body(name, mass=body.mass, com=body.com, inertia=body.inertia)
-
-    def _base_link(self) -> tuple[UrdfJoint | None, Any]:
-        """Return the fixed joint whose child is the base, where the root link is the ground, and the base's pose."""
-        here = pin.SE3.Identity()
-        if self.urdf.root != "world":
-            return None, here
-        for joint in self.urdf.joints:
-            if joint.parent == "world" and joint.kind == "fixed":
-                return joint, self.raw.frames[self.raw.getFrameId(joint.child, pin.BODY)].placement
-        return None, here
+        self.b.add_body(name, mass=body.mass, com=body.com, inertia=body.inertia)
 
     def _body_name(self, link: str) -> str:
         """Return the link's name; "world" is the ground's in a `Model`."""
-        if link != "world":
-            return link
-        name = "world_link"
-        while name in self.urdf.links:
-            name += "_"
-        self.renamed.append(name)
-        return name
+        if link == "world":
+            self.names[link] = unused("world_link", self.links)
+        return self.names.get(link, link)
 
-    def _unused(self, name: str) -> str:
-        while name in self.joints:
-            name += "_"
-        return name
-
-    def _add_joint(self, b: ModelBuilder, index: int, X_base: Any) -> None:
+    def _add_joint(self, index: int) -> None:
         raw, name = self.raw, str(self.raw.names[index])
-        joint = raw.joints[index]
+        joint, X, above = raw.joints[index], raw.jointPlacements[index], raw.parents[index]
         kind, axis = joint_kind(joint)
-        link = self.joints[name].child if name in self.joints else self.urdf.root
-        body = self._body_name(link)
-        X = raw.jointPlacements[index]
-        parent = self.bodies[raw.parents[index]]
-        if raw.parents[index] == 0 and X_base is not None and not X_base.isIdentity(0.0):
-            # Kept as written: a placement relative to the base would be rounded again.
-            parent = "world"
-        self._add_body(b, body, raw.inertias[index])
+        own = self.joints.get(name)
+        body = self._body_name(own.child if own else self.urdf.root)
+        self._add_body(body, raw.inertias[index])
+        self.bodies.append(body)
         v = slice(joint.idx_v, joint.idx_v + joint.nv)
         limits: dict[str, Any] = {}
         if kind in ("revolute", "prismatic"):
@@ -212,10 +205,11 @@ class _Conversion:
         if joint.nv == 1:
             limits["velocity_limit"] = unbounded(raw.upperVelocityLimit[joint.idx_v])
             limits["effort_limit"] = unbounded(raw.upperEffortLimit[joint.idx_v])
-        b.add_joint(
+        self.b.add_joint(
             name,
             kind,
-            parent=parent,
+            # Kept as written: a placement relative to the base would be rounded again.
+            parent="world" if not above and self.X_base is not None else self.bodies[above],
             child=body,
             translation=X.translation,
             rotation=self.snap(X.rotation),
@@ -223,11 +217,11 @@ class _Conversion:
             armature=raw.armature[v],
             damping=raw.damping[v],
             friction=raw.upperDryFrictionLimit[v],
-            mimic=self.joints[name].mimic if self.mimic == "reduce" and name in self.joints else None,
+            mimic=own.mimic if own and self.mimic == "reduce" else None,
             **limits,
         )
 
-    def _add_frames(self, b: ModelBuilder, X_base: Any) -> None:
+    def _add_frames(self) -> None:
         """Add the links and fixed joints that were merged."""
         names = {*self.bodies, "world"}
         for type_ in (pin.BODY, pin.FIXED_JOINT):
@@ -237,22 +231,6 @@ class _Conversion:
                     continue
                 names.add(frame.name)
                 X = frame.placement
-                if frame.parentJoint == 0 and X_base is not None and not X_base.isIdentity(0.0):
-                    X = X_base.actInv(X)
-                b.add_frame(frame.name, body=body, translation=X.translation, rotation=self.snap(X.rotation))
-
-    def _mimic_note(self) -> str:
-        mimics = [(j.name, j.mimic) for j in self.urdf.joints if j.mimic]
-        listing = ", ".join(f"{name} = {m.ratio:g} {m.joint} {m.offset:+g}" for name, m in mimics)
-        what = "reduced, so that they have no coordinate of their own"
-        if self.mimic == "free":
-            what = "kept independent, as mimic='free' asks"
-        return f"mimic joints {what}: {listing}" if mimics else ""
-
-    def _odd_note(self) -> str:
-        odd = [(body, link, why) for body, links in self.odd.items() for link, why in links]
-        healed = [f"{link} ({why})" for body, link, why in odd if body not in self.suspects]
-        listing = "; ".join(healed[:5]) + (f"; and {len(healed) - 5} more" if len(healed) > 5 else "")
-        return (
-            f"links of inconsistent inertia, sound together with the links fixed to them: {listing}" if healed else ""
-        )
+                if frame.parentJoint == 0 and self.X_base is not None:
+                    X = self.X_base.actInv(X)
+                self.b.add_frame(frame.name, body=body, translation=X.translation, rotation=self.snap(X.rotation))

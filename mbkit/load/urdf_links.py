@@ -6,20 +6,19 @@ its origin, rpy are turns about fixed x, y and z, and a missing axis is x.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
 from mbkit.load import xml_reader
 from mbkit.load.urdf import Snapper
-from mbkit.load.urdf_check import examine, unbounded
-from mbkit.load.xml_reader import Element, Reader
-from mbkit.model import Mimic, Model, ModelBuilder
+from mbkit.load.urdf_check import examine
+from mbkit.load.xml_reader import Element, Reader, unused
+from mbkit.model import Model, ModelBuilder, kind_of
 
 #: The joint on which a floating base moves.
 BASE_JOINT: Final = "root_joint"
@@ -51,9 +50,7 @@ def with_base(robot: Element) -> tuple[Element, str]:
     links = {e.attributes.get("name") for e in robot.all("link")}
     if "world" not in links or any(e.attributes.get("link") == "world" for j in joints for e in j.all("child")):
         return robot, ""
-    name = _BASE_LINK
-    while name in links:
-        name += "_"
+    name = unused(_BASE_LINK, links)
 
     def renamed(element: Element) -> Element:
         attribute = {"link": "name", "parent": "link"}.get(element.tag, "")
@@ -94,72 +91,26 @@ def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Mo
     The root link is fixed to the world or floats; a root link called ``world`` is the world.
     """
     urdf = examine(root, source, floating_base=floating_base, mimic_matters=False, lenient=True)
-    # The checked text has known elements alone.
-    robot = xml_reader.parse(urdf.text.encode(), source)
-    snap = Snapper()
-    b = ModelBuilder(urdf.name)
-    for link in robot.all("link"):
-        if link.attributes["name"] != "world":
-            _add_link(b, link, snap)
-    base = urdf.root
+    snap, b = Snapper(), ModelBuilder(urdf.name)
+    for link in (x for x in urdf.links if x.name != "world"):
+        if link.inertia is None:
+            b.add_body(link.name)
+            continue
+        R, I = snap(spatial.matrix_from_rpy(*link.rpy)), link.inertia
+        turned = I if np.array_equal(R, np.eye(3)) else R @ I @ R.T
+        b.add_body(link.name, mass=link.mass, com=link.com, inertia=0.5 * (turned + turned.T))
     if floating_base:
-        b.add_joint(BASE_JOINT, "free", parent="world", child=base)
-    elif base != "world":
-        names = {j.name for j in urdf.joints}
-        name = f"world_to_{base}"
-        while name in names:
-            name += "_"
-        b.add_joint(name, "fixed", parent="world", child=base)
-    mimics = {j.name: j.mimic for j in urdf.joints}
-    for joint in robot.all("joint"):
-        _add_joint(b, joint, mimics, snap)
+        b.add_joint(BASE_JOINT, "free", parent="world", child=urdf.root)
+    elif urdf.root != "world":
+        name = unused(f"world_to_{urdf.root}", {j.name for j in urdf.joints})
+        b.add_joint(name, "fixed", parent="world", child=urdf.root)
+    for j in urdf.joints:
+        numbers = {**j.numbers, "mimic": j.mimic} if kind_of(j.kind).nv == 1 else {}
+        R = snap(spatial.matrix_from_rpy(*j.rpy))
+        b.add_joint(j.name, j.kind, parent=j.parent, child=j.child, translation=j.translation, rotation=R, **numbers)
     for note in urdf.notes:
         b.note(note)
     return b.build(nonphysical="warn", point_masses=False)
-
-
-def _numbers(element: Element | None, attribute: str, default: str) -> Array:
-    text = default if element is None else element.attributes.get(attribute, default)
-    return np.array([float(x) for x in text.split()])
-
-
-def _pose(owner: Element, snap: Snapper) -> tuple[Array, Array]:
-    origin = owner.first("origin")
-    rpy = _numbers(origin, "rpy", "0 0 0")
-    return snap(spatial.matrix_from_rpy(*rpy)), _numbers(origin, "xyz", "0 0 0")
-
-
-def _add_link(b: ModelBuilder, link: Element, snap: Snapper) -> None:
-    name = link.attributes["name"]
-    inertial = link.first("inertial")
-    if inertial is None:
-        b.add_body(name)
-        return
-    R, p = _pose(inertial, snap)
-    mass, moments = inertial.first("mass"), inertial.first("inertia")
-    xx, xy, xz, yy, yz, zz = (float(_numbers(moments, f"i{k}", "0")[0]) for k in ("xx", "xy", "xz", "yy", "yz", "zz"))
-    I = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    turned = I if np.array_equal(R, np.eye(3)) else R @ I @ R.T
-    b.add_body(name, mass=float(_numbers(mass, "value", "0")[0]), com=p, inertia=0.5 * (turned + turned.T))
-
-
-def _add_joint(b: ModelBuilder, joint: Element, mimics: Mapping[str, Mimic | None], snap: Snapper) -> None:
-    name, kind = joint.attributes["name"], joint.attributes["type"].replace("floating", "free")
-    R, p = _pose(joint, snap)
-    parent, child = (e.attributes["link"] for tag in ("parent", "child") for e in joint.all(tag))
-    values: dict[str, Any] = {}
-    limit, dynamics = joint.first("limit"), joint.first("dynamics")
-    if kind in ("revolute", "continuous", "prismatic"):
-        values["axis"] = _numbers(joint.first("axis"), "xyz", "1 0 0")
-        values["damping"] = _numbers(dynamics, "damping", "0")
-        values["friction"] = _numbers(dynamics, "friction", "0")
-        values["mimic"] = mimics[name]
-        for ours, theirs in (("velocity_limit", "velocity"), ("effort_limit", "effort")):
-            if limit is not None and theirs in limit.attributes:
-                values[ours] = unbounded(float(limit.attributes[theirs]))
-        if limit is not None and kind != "continuous":
-            values |= {x: unbounded(float(limit.attributes.get(x, 0))) for x in ("lower", "upper")}
-    b.add_joint(name, kind, parent=parent, child=child, translation=p, rotation=R, **values)
 
 
 def read_links(path: Path) -> Model:

@@ -9,7 +9,7 @@ import difflib
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Final, NoReturn
@@ -89,6 +89,11 @@ def read(path: Path) -> Element:
         # ValueError: a null character in the name.
         raise LoadError(f"{path!s}: cannot be read ({error})") from None
     return parse(content, str(path))
+
+
+def unknown_root(path: Path, root: Element) -> LoadError:
+    """Return the error for a file of neither format."""
+    return LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
 
 
 def _descriptions(folder: Path) -> str:
@@ -229,11 +234,8 @@ class Reader:
         if not value.strip():
             self.fault(f"{item}: <{element.tag}> has no {attribute}; give it one", element)
         if len(value) > _LONGEST_NAME:
-            self.fault(
-                f"{item}: {element.tag} {attribute}: expected a name of up to {_LONGEST_NAME} characters, "
-                f"got {len(value)}: {_short(value)}",
-                element,
-            )
+            expected = f"expected a name of up to {_LONGEST_NAME} characters, got {len(value)}: {_short(value)}"
+            self.fault(f"{item}: {element.tag} {attribute}: {expected}", element)
         return value[:_LONGEST_NAME]
 
     def numbers(
@@ -251,27 +253,28 @@ class Reader:
 
         An absent attribute is a fault without a `default`, and sizes that would overflow are one where `bounded`.
         """
-        where = f"{item}: {element.tag} {attribute}"
-        neutral = default if default is not None else (0.0,) * count
         raw = element.attributes.get(attribute)
-        if raw is None:
-            if default is None:
-                self.fault(f"{where}: missing; expected {_amount(count, least)}", element)
-            return neutral
-        values = []
-        for word in raw.split():
-            value = float(word) if _NUMBER.fullmatch(word) else math.nan
+        if raw is None and default is not None:
+            return default
+        least = count if least is None else least
+        expected = f"expected {count} numbers" if least == count else f"expected {least} to {count} numbers"
+        expected = "expected a number" if count == least == 1 else expected
+        words = [] if raw is None else raw.split()
+        values = tuple(float(word) if _NUMBER.fullmatch(word) else math.nan for word in words)
+        why = f"missing; {expected}" if raw is None else ""
+        if raw is not None and not least <= len(words) <= count:
+            why = f"{expected}, got {_short(raw)}"
+        for word, value in zip(words, values, strict=True):
             if not math.isfinite(value):
-                self.fault(f"{where}: {_short(word)} is not a finite number{_hint(word)}", element)
-                return neutral
+                why = f"{_short(word)} is not a finite number{_hint(word)}"
+                break
             if bounded and abs(value) > LARGEST:
-                self.fault(f"{where}: {_short(word)} is too large to compute with", element)
-                return neutral
-            values.append(value)
-        if not (count if least is None else least) <= len(values) <= count:
-            self.fault(f"{where}: expected {_amount(count, least)}, got {_short(raw)}", element)
-            return neutral
-        return tuple(values)
+                why = f"{_short(word)} is too large to compute with"
+                break
+        if not why:
+            return values
+        self.fault(f"{item}: {element.tag} {attribute}: {why}", element)
+        return (0.0,) * count if default is None else default
 
     def number(
         self, element: Element, attribute: str, item: str, default: float | None = None, *, bounded: bool = True
@@ -296,12 +299,6 @@ class Reader:
         elif len(children) > 1:
             self.fault(f"{item}: {len(children)} <{tag}> elements; keep one", children[1])
         return children[0] if children else None
-
-
-def _amount(count: int, least: int | None) -> str:
-    if count == 1 and least in (None, 1):
-        return "a number"
-    return f"{count} numbers" if least in (None, count) else f"{least} to {count} numbers"
 
 
 def _short(text: str) -> str:
@@ -335,6 +332,13 @@ def _plain(name: str) -> str:
     return re.sub(r"[-_.\s]", "", name.lower())
 
 
+def unused(name: str, names: Container[object]) -> str:
+    """Return this name, or a longer one that is not among `names`."""
+    while name in names:
+        name += "_"
+    return name
+
+
 # MJCF in several files
 #
 # As in MuJoCo, the content of a file's root element replaces an <include>, a name is relative to the folder of the
@@ -365,44 +369,37 @@ class _Includes:
             self._refuse(element, f"elements are nested more than {MOST_LEVELS} deep, included files counted")
         out: list[Element] = []
         for child in element.children:
-            if child.tag == _TAG:
-                out += self._included(child, folder, level)
-            else:
+            if child.tag != _TAG:
                 out.append(replace(child, children=self.inside(child, folder, level + 1)))
+                continue
+            path = self._path(child, folder)
+            # A file counts as a level, so that a chain of them ends too.
+            out += self.inside(self._read(child, path), path.parent, level + 1)
         return out
 
-    def _included(self, include: Element, folder: Path, level: int) -> list[Element]:
+    def _path(self, include: Element, folder: Path) -> Path:
+        """Return the path of an included file."""
         name = include.attributes.get("file", "")
         if not name.strip():
             self._refuse(include, 'no file; write <include file="..."/>')
         if include.children:
             self._refuse(include, "has elements of its own; move them into the file, or beside the <include>")
-        path = self._resolve(include, name, folder)
+        # MuJoCo reads Windows' separators everywhere.
+        relative = PurePosixPath(name.replace("\\", "/"))
+        main = self.path.parent
+        if relative.is_absolute() or PureWindowsPath(name).drive:
+            self._refuse(include, f"an absolute path is not followed; write it as seen from {main}, or move it there")
+        folders = list(dict.fromkeys((main, folder)))
+        try:
+            path = next((x / relative for x in folders if (x / relative).exists()), None)
+        except OSError as error:
+            self._refuse(include, f"cannot be read ({error.strerror})")
+        if path is None:
+            self._refuse(include, f"no such file in {' or '.join(str(f) for f in folders)}")
         if path.resolve() in self.seen:
             self._refuse(include, "was included before, or includes itself; include a file once at most")
         self.seen.add(path.resolve())
-        root = self._read(include, path)
-        if not root.children:
-            self._refuse(include, f"<{root.tag[:60]}> in it is empty; expected elements inside")
-        # A file counts as a level, so that a chain of them ends too.
-        return self.inside(root, path.parent, level + 1)
-
-    def _resolve(self, include: Element, name: str, folder: Path) -> Path:
-        """Return the path of an included file."""
-        # MuJoCo reads Windows' separators everywhere.
-        relative = PurePosixPath(name.replace("\\", "/"))
-        if relative.is_absolute() or PureWindowsPath(name).drive:
-            self._refuse(
-                include, f"an absolute path is not followed; write it as seen from {self.path.parent}, or move it there"
-            )
-        folders = list(dict.fromkeys((self.path.parent, folder)))
-        for place in folders:
-            try:
-                if (place / relative).exists():
-                    return place / relative
-            except OSError as error:
-                self._refuse(include, f"cannot be read ({error.strerror})")
-        return self._refuse(include, f"no such file in {' or '.join(str(f) for f in folders)}")
+        return path
 
     def _read(self, include: Element, path: Path) -> Element:
         try:
@@ -412,6 +409,8 @@ class _Includes:
             self._refuse(include, str(error))
         if self.bytes > MOST_BYTES:
             self._refuse(include, f"expected up to {MOST_BYTES} bytes of included files")
+        if not root.children:
+            self._refuse(include, f"<{root.tag[:60]}> in it is empty; expected elements inside")
         folder = self.path.parent
         file = str(path.relative_to(folder) if path.is_relative_to(folder) else path)
         for element in root.walk():

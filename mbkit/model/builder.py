@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 from mbkit import spatial
 from mbkit._check import Array, _as_float, finite_array, real, shown
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
-from mbkit.model.joint_types import FIXED, KINDS, kind_of
+from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
@@ -22,6 +23,9 @@ from mbkit.model.validation import body_faults, grouped, static_bodies, structur
 # The squares of sums of such lengths still fit a double.
 _LONGEST: Final = 1e150
 _LONGEST_NAME: Final = 1000
+#: What the builder takes for a vector, and for one number or several.
+_Vector = ArrayLike | Sequence[Number]
+_Numbers = ArrayLike | Sequence[Number] | Number
 
 
 class ArgumentReader:
@@ -42,32 +46,20 @@ class ArgumentReader:
             self.faults.append(f"{what}: expected up to {longest} characters, got {len(text)}")
         return text[:longest]
 
-    def names(self, item: str, **values: Any) -> dict[str, Any]:
-        """Return the names of other parts, by argument."""
-        return {argument: self.name(f"{item}: {argument}", x) for argument, x in values.items()}
-
-    def vector(self, name: str, value: ArrayLike, n: int) -> Array:
-        """Return n finite numbers; a single one is repeated."""
+    def array(self, name: str, value: Any, shape: tuple[int, ...]) -> Array:
+        """Return finite numbers; a single one in place of a vector is repeated."""
         try:
-            if shape_of(value) == ():
-                value = np.full(n, real(name, value))
-            return finite_array(name, value, (n,))
+            if len(shape) == 1 and shape_of(value) == ():
+                value = np.full(shape, real(name, value))
+            return finite_array(name, value, shape)
         except InputError as error:
             self._refuse(error, value)
-            return np.zeros(n)
+            return np.eye(3) if shape == (3, 3) else np.zeros(shape)
 
-    def matrix(self, name: str, value: ArrayLike) -> Array:
-        """Return a finite 3 by 3 matrix."""
-        try:
-            return finite_array(name, value, (3, 3))
-        except InputError as error:
-            self._refuse(error, value)
-            return np.eye(3)
-
-    def real(self, name: str, value: Any, *, nonnegative: bool = False) -> float:
+    def real(self, name: str, value: Any) -> float:
         """Return a finite number."""
         try:
-            return real(name, value, nonnegative=nonnegative)
+            return real(name, value)
         except InputError as error:
             self._refuse(error, value)
             return 0.0
@@ -76,10 +68,10 @@ class ArgumentReader:
         hint = "; no parameter can stand here, give a number" if _has_expressions(value) else ""
         self.faults.append(f"{error}{hint}")
 
-    def quantity(self, name: str, value: Any, *, nonnegative: bool = False) -> Number:
+    def quantity(self, name: str, value: Any) -> Number:
         """Return a finite number, or an expression of parameters."""
         if not isinstance(value, Expression):
-            return self.real(name, value, nonnegative=nonnegative)
+            return self.real(name, value)
         try:
             nominal(value)
         except InputError as error:
@@ -90,7 +82,7 @@ class ArgumentReader:
     def quantities(self, name: str, value: Any, n: int) -> Array:
         """Return n finite numbers or expressions, of dtype object where there are any; a single one is repeated."""
         if not _has_expressions(value):
-            return self.vector(name, value, n)
+            return self.array(name, value, (n,))
         array = np.array(value, dtype=object)
         if array.ndim == 0:
             array = np.full(n, value, dtype=object)
@@ -98,14 +90,6 @@ class ArgumentReader:
             self.faults.append(f"{name}: expected shape ({n},), got {array.shape}")
             return np.zeros(n)
         return np.array([self.quantity(f"{name}[{i}]", x) for i, x in enumerate(array)], dtype=object)
-
-    def nonnegatives(self, item: str, **values: Any) -> dict[str, Number]:
-        """Return numbers or expressions, by argument; no number may be negative."""
-        return {n: self.quantity(f"{item}: {n}", x, nonnegative=True) for n, x in values.items()}
-
-    def places(self, item: str, **values: Any) -> dict[str, Array]:
-        """Return positions by argument; see `place`."""
-        return {argument: self.place(f"{item}: {argument}", x) for argument, x in values.items()}
 
     def place(self, name: str, value: Any) -> Array:
         """Return three lengths, or expressions, whose squares do not overflow."""
@@ -123,7 +107,7 @@ class ArgumentReader:
         if shape_of(value) == (3,):
             return np.diag(self.quantities(name, value, 3))
         if not _has_expressions(value):
-            matrix = self.matrix(name, value)
+            matrix = self.array(name, value, (3, 3))
             if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
                 self.faults.append(f"{name} is not symmetric; expected I = Iᵀ")
             return np.asarray((matrix + matrix.T) / 2)
@@ -150,31 +134,35 @@ class ArgumentReader:
             return np.full(n, default)
         return array
 
-    def rotation(self, item: str, rotation: ArrayLike | None, rpy: ArrayLike | None, name: str = "rotation") -> Array:
+    def rotation(self, name: str, value: ArrayLike | None) -> Array:
+        """Return a rotation matrix; the identity for None."""
+        if value is None:
+            return np.eye(3)
+        R = self.array(name, value, (3, 3))
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0:
+            self.faults.append(f"{name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
+            return np.eye(3)
+        return R
+
+    def orientation(self, item: str, rotation: ArrayLike | None, rpy: ArrayLike | None) -> Array:
         """Return the matrix of a rotation matrix or of roll, pitch, yaw."""
         if rotation is not None and rpy is not None:
             self.faults.append(f"{item}: expected rotation or rpy, got both; give one")
         if rpy is not None:
-            return spatial.matrix_from_rpy(*self.vector(f"{item}: rpy", rpy, 3))
-        if rotation is None:
-            return np.eye(3)
-        R = self.matrix(f"{item}: {name}", rotation)
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0:
-            self.faults.append(f"{item}: {name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
-            return np.eye(3)
-        return R
+            return spatial.matrix_from_rpy(*self.array(f"{item}: rpy", rpy, (3,)))
+        return self.rotation(f"{item}: rotation", rotation)
 
-    def axes(self, item: str, kind: str, axis: ArrayLike | None, axis2: ArrayLike | None) -> Array:
-        """Return the unit axes of a joint of this kind."""
-        n = kind_of(kind).n_axes
-        axes: list[ArrayLike] = [a for a in (axis, axis2) if a is not None]
+    def axes(self, item: str, type_: JointType, *given: ArrayLike | None) -> Array:
+        """Return the unit axes of a joint of this type."""
+        n = type_.n_axes
+        axes: list[ArrayLike] = [a for a in given if a is not None]
         if len(axes) != n:
             names = ("no axis", "axis", "axis and axis2")[n]
-            self.faults.append(f"{item}: a {kind} joint takes {names}; {len(axes)} given")
+            self.faults.append(f"{item}: a {type_.name} joint takes {names}; {len(axes)} given")
             axes = list(np.eye(3)[:n])
         out = np.zeros((n, 3))
         for i, a in enumerate(axes):
-            vector = self.vector(f"{item}: axis", a, 3)
+            vector = self.array(f"{item}: axis", a, (3,))
             # The square of a component may overflow, or vanish.
             largest = float(np.abs(vector).max())
             if largest and not 1e-100 < largest < 1e100:
@@ -187,8 +175,8 @@ class ArgumentReader:
             out[i] = vector if abs(length - 1) < 1e-15 else vector / length
         return out
 
-    def mimic(self, item: str, value: Mimic | Iterable[Any]) -> tuple[str, Number, Number] | None:
-        """Return the leader of a mimic joint with ratio and offset, or None after a fault."""
+    def mimic(self, item: str, value: Mimic | Iterable[Any]) -> tuple[str, dict[str, Number]] | None:
+        """Return the leader of a mimic joint, and ratio and offset; None after a fault."""
         if isinstance(value, Mimic):
             value = (value.joint, value.ratio, value.offset)
         try:
@@ -197,11 +185,23 @@ class ArgumentReader:
             # Any: iterating over an object may raise what it likes.
             self.faults.append(f"{item}: mimic: expected (joint, ratio, offset), got {shown(value)}")
             return None
-        return (
-            self.name(f"{item}: mimic joint", joint),
-            self.quantity(f"{item}: mimic ratio", ratio),
-            self.quantity(f"{item}: mimic offset", offset),
-        )
+        numbers = {n: self.quantity(f"{item}: mimic {n}", x) for n, x in (("ratio", ratio), ("offset", offset))}
+        return self.name(f"{item}: mimic joint", joint), numbers
+
+
+#: How the fields of parts are read.
+_READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
+    **dict.fromkeys(("parent", "child", "body", "body_a", "body_b"), ArgumentReader.name),
+    **dict.fromkeys(
+        ("com", "translation", "point_a", "point_b", "translation_a", "translation_b"), ArgumentReader.place
+    ),
+    **dict.fromkeys(("rotation_a", "rotation_b"), ArgumentReader.rotation),
+    **dict.fromkeys(("mass", "pitch", "stiffness", "rest_length", "damping", "armature"), ArgumentReader.quantity),
+    **dict.fromkeys(("offset", "rate", "amplitude", "frequency", "phase"), ArgumentReader.quantity),
+    "inertia": ArgumentReader.inertia,
+    "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
+    "factors": lambda read, name, value: read.quantities(name, value, len(value)),
+}
 
 
 def _has_expressions(value: Any, depth: int = 3) -> bool:
@@ -225,10 +225,9 @@ def shape_of(value: Any) -> tuple[int, ...] | None:
 class ModelBuilder:
     """Collects bodies, joints and forces, and builds a frozen `Model` of them.
 
-    A faulty call is remembered and not raised: `build` reports all faults in one
-    `ModelError`. Parts may be declared in any order; coordinates follow the
-    order in which the joints are declared. Masses, lengths, inertias, constants of
-    springs and dampers, of prescribed motions, and gravity may be a `Parameter` or an expression of some.
+    A faulty call is remembered and not raised: `build` reports all faults in one `ModelError`. Parts may be declared
+    in any order; coordinates follow the order of the joints. Masses, lengths, inertias, constants of springs and
+    dampers, of prescribed motions, and gravity may be a `Parameter` or an expression of some.
 
     Parameters
     ----------
@@ -247,18 +246,14 @@ class ModelBuilder:
     1
     """
 
-    def __init__(self, name: str, gravity: ArrayLike | Sequence[Number] = (0.0, 0.0, -9.81)) -> None:
+    def __init__(self, name: str, gravity: _Vector = (0.0, 0.0, -9.81)) -> None:
         self._read = ArgumentReader()
         self._name = self._read.name("name", name)
         self._bindings: list[Binding] = []
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
-        self._bodies: list[Body] = []
-        self._joints: list[Joint] = []
-        self._frames: list[Frame] = []
-        self._springs: list[PointSpring] = []
-        self._couplings: list[JointCoupling] = []
-        self._loops: list[Loop] = []
-        self._prescribed: list[Prescribed] = []
+        self._parts: dict[str, list[Any]] = {
+            kind: [] for kind in ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed")
+        }
         self._notes: list[str] = []
 
     def add_body(
@@ -266,7 +261,7 @@ class ModelBuilder:
         name: str,
         *,
         mass: Number = 0.0,
-        com: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        com: _Vector = (0.0, 0.0, 0.0),
         inertia: ArrayLike | Sequence[Any] | None = None,
     ) -> None:
         """Add a rigid body.
@@ -279,19 +274,9 @@ class ModelBuilder:
         com : (3,) array_like
             Centre of mass in body axes, m.
         inertia : (3, 3) or (3,) array_like, optional
-            About the centre of mass, in body axes (or its diagonal), kg m².
-            Without it the body is a point mass.
+            About the centre of mass, in body axes (or its diagonal), kg m². Without it the body is a point mass.
         """
-        name = self._read.name("body name", name)
-        item = f"body {name!r}"
-        numbers = self._numbers(
-            "bodies",
-            name,
-            mass=self._read.quantity(f"{item}: mass", mass),
-            com=self._read.place(f"{item}: com", com),
-            inertia=self._read.inertia(f"{item}: inertia", inertia),
-        )
-        self._bodies.append(Body(name, **numbers))
+        self._add(Body, "bodies", "body", name, {"mass": mass, "com": com, "inertia": inertia})
 
     def add_joint(
         self,
@@ -300,7 +285,7 @@ class ModelBuilder:
         *,
         parent: str,
         child: str,
-        translation: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        translation: _Vector = (0.0, 0.0, 0.0),
         rotation: ArrayLike | None = None,
         rpy: ArrayLike | None = None,
         axis: ArrayLike | None = None,
@@ -310,11 +295,11 @@ class ModelBuilder:
         upper: ArrayLike | None = None,
         velocity_limit: ArrayLike | None = None,
         effort_limit: ArrayLike | None = None,
-        armature: ArrayLike | Sequence[Number] | Number = 0.0,
-        damping: ArrayLike | Sequence[Number] | Number = 0.0,
+        armature: _Numbers = 0.0,
+        damping: _Numbers = 0.0,
         friction: ArrayLike = 0.0,
-        stiffness: ArrayLike | Sequence[Number] | Number = 0.0,
-        rest: ArrayLike | Sequence[Number] | Number = 0.0,
+        stiffness: _Numbers = 0.0,
+        rest: _Numbers = 0.0,
         mimic: Mimic | tuple[str, Number, Number] | None = None,
     ) -> None:
         """Add the joint that carries `child`.
@@ -322,18 +307,17 @@ class ModelBuilder:
         Parameters
         ----------
         name, kind : str
-            `kind` is one of fixed, revolute, continuous, prismatic, helical,
-            universal, spherical_zyx, ball, planar, free.
+            `kind` is one of fixed, revolute, continuous, prismatic, helical, universal, spherical_zyx, ball, planar,
+            free.
         parent, child : str
             Names of bodies; `parent` may be ``"world"``.
         translation : (3,) array_like
             Origin of the joint's frame in the parent's axes, m.
         rotation, rpy : (3, 3) or (3,) array_like, optional
-            Orientation of the joint's frame in the parent: a matrix, or URDF's
-            roll, pitch, yaw in rad. At most one of the two.
+            Orientation of the joint's frame in the parent: a matrix, or URDF's roll, pitch, yaw in rad. At most one.
         axis, axis2 : (3,) array_like, optional
-            Axes in the joint's frame; normalized here. A universal joint takes
-            two; ball, planar, spherical_zyx and free take none.
+            Axes in the joint's frame; normalized here. A universal joint takes two; ball, planar, spherical_zyx and
+            free take none.
         pitch : float
             Helical: metres per radian.
         lower, upper : float or (nq,) array_like, optional
@@ -341,8 +325,7 @@ class ModelBuilder:
         velocity_limit, effort_limit, friction : float or (nv,) array_like
             Data, not dynamics.
         armature : float
-            Added to M's diagonal, kg m² (kg for a prismatic joint); joints of one
-            velocity only.
+            Added to M's diagonal, kg m² (kg for a prismatic joint); joints of one velocity only.
         damping : float or (nv,) array_like
             N m s/rad (N s/m).
         stiffness, rest : float or (nv,) array_like
@@ -350,65 +333,46 @@ class ModelBuilder:
         mimic : Mimic or (joint, ratio, offset), optional
             The joint that this one follows.
         """
-        name = self._read.name("joint name", name)
+        read = self._read
+        name = read.name("joint name", name)
         item = f"joint {name!r}"
         if not isinstance(kind, str) or kind not in KINDS:
             near = nearest(kind, KINDS) if isinstance(kind, str) else []
-            near = near or list(KINDS)
-            self._read.faults.append(f"{item}: unknown kind {shown(kind)}; use one of {', '.join(near)}")
+            read.faults.append(f"{item}: unknown kind {shown(kind)}; use one of {', '.join(near or KINDS)}")
             # The other faults of this call would follow from this one.
             kind, axis, axis2, pitch, mimic = FIXED.name, None, None, 0.0, None
             lower = upper = velocity_limit = effort_limit = None
             armature = damping = friction = stiffness = rest = 0.0
         type_ = kind_of(kind)
-        follows = None if mimic is None else self._read.mimic(item, mimic)
-        leader = None
-        if follows:
-            leader = Mimic(follows[0], **self._numbers("joints", name, ratio=follows[1], offset=follows[2]))
-        numbers = self._numbers(
-            "joints",
-            name,
-            translation=self._read.place(f"{item}: translation", translation),
-            pitch=self._read.quantity(f"{item}: pitch", pitch),
-            armature=self._read.quantities(f"{item}: armature", armature, type_.nv),
-            damping=self._read.quantities(f"{item}: damping", damping, type_.nv),
-            stiffness=self._read.quantities(f"{item}: stiffness", stiffness, type_.nv),
-            rest=self._read.quantities(f"{item}: rest", rest, type_.nv),
-        )
-        self._joints.append(
-            Joint(
-                name=name,
-                kind=kind,
-                **self._read.names(item, parent=parent, child=child),
-                rotation=self._read.rotation(item, rotation, rpy),
-                axes=self._read.axes(item, kind, axis, axis2),
-                lower=self._read.limits(f"{item}: lower", lower, type_.nq, -np.inf),
-                upper=self._read.limits(f"{item}: upper", upper, type_.nq, np.inf),
-                velocity_limit=self._read.limits(f"{item}: velocity_limit", velocity_limit, type_.nv, np.inf),
-                effort_limit=self._read.limits(f"{item}: effort_limit", effort_limit, type_.nv, np.inf),
-                friction=self._read.vector(f"{item}: friction", friction, type_.nv),
-                mimic=leader,
-                **numbers,
-            )
-        )
+        follows = None if mimic is None else read.mimic(item, mimic)
+        per_velocity = {"armature": armature, "damping": damping, "stiffness": stiffness, "rest": rest}
+        ready = {
+            "kind": kind,
+            "rotation": read.orientation(item, rotation, rpy),
+            "axes": read.axes(item, type_, axis, axis2),
+            "lower": read.limits(f"{item}: lower", lower, type_.nq, -np.inf),
+            "upper": read.limits(f"{item}: upper", upper, type_.nq, np.inf),
+            "velocity_limit": read.limits(f"{item}: velocity_limit", velocity_limit, type_.nv, np.inf),
+            "effort_limit": read.limits(f"{item}: effort_limit", effort_limit, type_.nv, np.inf),
+            "friction": read.array(f"{item}: friction", friction, (type_.nv,)),
+            "mimic": follows and Mimic(follows[0], **self._numbers("joints", name, **follows[1])),
+            **{n: read.quantities(f"{item}: {n}", x, type_.nv) for n, x in per_velocity.items()},
+        }
+        values = {"parent": parent, "child": child, "translation": translation, "pitch": pitch}
+        self._add(Joint, "joints", "joint", name, values, ready)
 
     def add_frame(
         self,
         name: str,
         *,
         body: str,
-        translation: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        translation: _Vector = (0.0, 0.0, 0.0),
         rotation: ArrayLike | None = None,
         rpy: ArrayLike | None = None,
     ) -> None:
         """Name a frame that is fixed to a body, for poses and Jacobians."""
-        name = self._read.name("frame name", name)
-        item = f"frame {name!r}"
-        place = self._read.place(f"{item}: translation", translation)
-        R = self._read.rotation(item, rotation, rpy)
-        self._frames.append(
-            Frame(name, self._read.name(f"{item}: body", body), R, **self._numbers("frames", name, translation=place))
-        )
+        R = self._read.orientation(f"frame {shown(name)}", rotation, rpy)
+        self._add(Frame, "frames", "frame", name, {"body": body, "translation": translation}, {"rotation": R})
 
     def add_spring(
         self,
@@ -416,17 +380,16 @@ class ModelBuilder:
         *,
         body_a: str,
         body_b: str,
-        point_a: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
-        point_b: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        point_a: _Vector = (0.0, 0.0, 0.0),
+        point_b: _Vector = (0.0, 0.0, 0.0),
         stiffness: Number = 0.0,
         rest_length: Number = 0.0,
         damping: Number = 0.0,
     ) -> None:
         """Add a spring and damper along the line between two points.
 
-        Where the points meet, a damper or a rest length has no direction to act in: there
-        every engine raises `NumericalError`, because the limit depends on the way there.
-        A joint's own spring and damper have no such pose.
+        Where the points meet, a damper or a rest length has no direction to act in, and every engine raises
+        `NumericalError`. A joint's own spring and damper have no such pose.
 
         Parameters
         ----------
@@ -442,15 +405,9 @@ class ModelBuilder:
         damping : float
             N s/m, on the rate of the distance.
         """
-        name = self._read.name("spring name", name)
-        item = f"spring {name!r}"
-        numbers = self._numbers(
-            "springs",
-            name,
-            **self._read.places(item, point_a=point_a, point_b=point_b),
-            **self._read.nonnegatives(item, stiffness=stiffness, rest_length=rest_length, damping=damping),
-        )
-        self._springs.append(PointSpring(name, **self._read.names(item, body_a=body_a, body_b=body_b), **numbers))
+        ends = {"body_a": body_a, "point_a": point_a, "body_b": body_b, "point_b": point_b}
+        numbers = {"stiffness": stiffness, "rest_length": rest_length, "damping": damping}
+        self._add(PointSpring, "springs", "spring", name, ends | numbers)
 
     def add_coupling(
         self,
@@ -476,23 +433,14 @@ class ModelBuilder:
         armature : float
             The kinetic energy is ½ armature (dl/dt)².
         """
-        name = self._read.name("coupling name", name)
-        item = f"coupling {name!r}"
         value: Any = factors
         if not isinstance(value, Mapping):
-            got = shown(value)
-            self._read.faults.append(f"{item}: factors: expected a mapping from joint names to numbers, got {got}")
+            expected = f"expected a mapping from joint names to numbers, got {shown(value)}"
+            self._read.faults.append(f"coupling {shown(name)}: factors: {expected}")
             return
-        numbers = self._numbers(
-            "couplings",
-            name,
-            factors=self._read.quantities(f"{item}: factors", list(factors.values()), len(factors)),
-            rest_length=self._read.quantity(f"{item}: rest_length", rest_length),
-            **self._read.nonnegatives(item, stiffness=stiffness, damping=damping, armature=armature),
-        )
-        self._couplings.append(
-            JointCoupling(name, tuple(self._read.name(f"{item}: factors", j) for j in factors), **numbers)
-        )
+        numbers = {"rest_length": rest_length, "stiffness": stiffness, "damping": damping, "armature": armature}
+        values = {"joints": [*factors], "factors": [*factors.values()], **numbers}
+        self._add(JointCoupling, "couplings", "coupling", name, values)
 
     def add_loop(
         self,
@@ -501,9 +449,9 @@ class ModelBuilder:
         *,
         body_a: str,
         body_b: str,
-        translation_a: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        translation_a: _Vector = (0.0, 0.0, 0.0),
         rotation_a: ArrayLike | None = None,
-        translation_b: ArrayLike | Sequence[Number] = (0.0, 0.0, 0.0),
+        translation_b: _Vector = (0.0, 0.0, 0.0),
         rotation_b: ArrayLike | None = None,
     ) -> None:
         """Close a loop: two points, or two frames, of two bodies stay together.
@@ -522,22 +470,12 @@ class ModelBuilder:
         rotation_a, rotation_b : (3, 3) array_like, optional
             The frames' orientations in their bodies.
         """
-        name = self._read.name("loop name", name)
-        item = f"loop {name!r}"
         if not isinstance(kind, str) or kind not in ("point", "frame"):
-            self._read.faults.append(f"{item}: unknown kind {shown(kind)}; use 'point' or 'frame'")
+            self._read.faults.append(f"loop {shown(name)}: unknown kind {shown(kind)}; use 'point' or 'frame'")
             kind = "point"
-        places = self._read.places(item, translation_a=translation_a, translation_b=translation_b)
-        self._loops.append(
-            Loop(
-                name=name,
-                kind=kind,
-                **self._read.names(item, body_a=body_a, body_b=body_b),
-                rotation_a=self._read.rotation(item, rotation_a, None, "rotation_a"),
-                rotation_b=self._read.rotation(item, rotation_b, None, "rotation_b"),
-                **self._numbers("loops", name, **places),
-            )
-        )
+        a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
+        b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
+        self._add(Loop, "loops", "loop", name, a | b, {"kind": kind})
 
     def prescribe(
         self,
@@ -553,10 +491,8 @@ class ModelBuilder:
 
         `mbkit.lagrangian.from_model` puts it into the energies; the engines by themselves refuse it.
         """
-        joint = self._read.name("prescribed joint", joint)
         values = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
-        values = {n: self._read.quantity(f"prescribed {joint!r}: {n}", x) for n, x in values.items()}
-        self._prescribed.append(Prescribed(joint, **self._numbers("prescribed", joint, **values)))
+        self._add(Prescribed, "prescribed", "prescribed", joint, values)
 
     def note(self, text: str) -> None:
         """Add a sentence to the model's notes."""
@@ -574,10 +510,9 @@ class ModelBuilder:
         Parameters
         ----------
         nonphysical : {"error", "warn"}
-            What to do about bodies with an inconsistent inertia (an inertia that is
-            not positive or violates the triangle inequality, joints that move no
-            inertia): raise, or keep them as written and warn. Of a body that is fixed
-            to the world only a negative mass counts; the rest is noted.
+            What to do about bodies with an inconsistent inertia (not positive, against the triangle inequality, or
+            joints that move no inertia): raise, or keep them as written and warn. Of a body that is fixed to the
+            world only a negative mass counts; the rest is noted.
         point_masses : bool
             Whether a mass without inertia is meant that way.
         parts : mapping of str to sequence of (str, str), optional
@@ -595,33 +530,46 @@ class ModelBuilder:
             raise InputError(f"point_masses: expected True or False, got {shown(point_masses)}")
         if parts is not None and not isinstance(parts, Mapping):
             raise InputError(f"parts: expected a mapping from bodies to links, got {shown(parts)}")
-        faults = list(self._read.faults)
-        faults += structure_faults(self._assemble(self._joints, self._bindings))
-        faults += self._two_valued()
         parts = parts or {}
-        # Joints that move nothing can be found in a connected tree only.
-        inconsistent = body_faults(self._bodies, point_masses=point_masses)
+        bodies, joints = self._parts["bodies"], self._parts["joints"]
+        model = self._assemble(joints, self._bindings)
+        faults = [*self._read.faults, *structure_faults(model), *self._two_valued()]
+        inconsistent = body_faults(bodies, point_masses=point_masses)
         if not faults:
-            model = self._assemble(*_resolved(self._joints, self._bindings))
+            # Mimic joints without leaders, and joints that move nothing, are for a connected tree only.
+            model = self._assemble(*_resolved(joints, self._bindings))
             inconsistent = suspects(model, point_masses=point_masses)
-        negative = {b.name for b in self._bodies if b.mass < 0}
-        static = static_bodies(self._joints) - negative
+        negative = {b.name for b in bodies if b.mass < 0}
+        static = static_bodies(joints) - negative
         idle = grouped([(n, why) for n, why in inconsistent if n in static], parts)
-        notes = [f"never moves, so this cannot act: {text}" for text in idle]
         inconsistent = tuple((n, why) for n, why in inconsistent if n not in static)
-        refused = [(n, why) for n, why in inconsistent if n not in negative]
-        if nonphysical == "error" and refused:
+        if nonphysical == "error" and (refused := [(n, why) for n, why in inconsistent if n not in negative]):
             faults += grouped(refused, parts)
             faults[-1] += '; correct it, or take it as written with nonphysical="warn"'
         faults += grouped([(n, why) for n, why in inconsistent if n in negative], parts)
         if faults:
             raise ModelError(self._name, faults)
-        model = self._assemble(*_resolved(self._joints, self._bindings), inconsistent, notes)
         if inconsistent:
-            listing = "; ".join(grouped(inconsistent, parts))
-            message = f"{self._name}: physically impossible, used as written: {listing}"
+            impossible = "; ".join(grouped(inconsistent, parts))
+            message = f"{self._name}: physically impossible, used as written: {impossible}"
             warnings.warn(message, NonPhysicalWarning, stacklevel=2)
-        return model
+        notes = (*model.notes, *(f"never moves, so this cannot act: {text}" for text in idle))
+        return replace(model, notes=notes, nonphysical=inconsistent)
+
+    def _add(
+        self,
+        part: Callable[..., Any],
+        where: str,
+        what: str,
+        name: Any,
+        values: Mapping[str, Any],
+        ready: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        """Read a part's fields by `_READERS`, keep the bindings of its expressions, and add it."""
+        name = self._read.name(f"{what} name", name)
+        fields = {n: _READERS[n](self._read, f"{what} {name!r}: {n}", x) for n, x in values.items()}
+        numbers = self._numbers(where, name, **fields, **ready)
+        self._parts[where].append(part(name, **numbers))
 
     def _numbers(self, where: str, part: str, **fields: Any) -> dict[str, Any]:
         """Return a part's fields as floats, and remember which of them stand for expressions."""
@@ -637,26 +585,10 @@ class ModelBuilder:
             if values.setdefault(p.name, p.value) != p.value
         ]
 
-    def _assemble(
-        self,
-        joints: Iterable[Joint],
-        bindings: Iterable[Binding],
-        nonphysical: tuple[tuple[str, str], ...] = (),
-        notes: Iterable[str] = (),
-    ) -> Model:
+    def _assemble(self, joints: Iterable[Joint], bindings: Iterable[Binding]) -> Model:
+        parts = {kind: tuple(parts) for kind, parts in self._parts.items()} | {"joints": tuple(joints)}
         return Model(
-            name=self._name,
-            gravity=self._gravity,
-            bodies=tuple(self._bodies),
-            joints=tuple(joints),
-            frames=tuple(self._frames),
-            springs=tuple(self._springs),
-            couplings=tuple(self._couplings),
-            loops=tuple(self._loops),
-            prescribed=tuple(self._prescribed),
-            notes=(*self._notes, *notes),
-            nonphysical=nonphysical,
-            bindings=tuple(bindings),
+            name=self._name, gravity=self._gravity, notes=tuple(self._notes), bindings=tuple(bindings), **parts
         )
 
 

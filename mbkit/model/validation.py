@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from typing import Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from mbkit._check import Array
 from mbkit.errors import InputError, ModelError, Suggestions, nearest
 from mbkit.model import manifold
 from mbkit.model.description import Description
-from mbkit.model.parts import Body, Joint, JointCoupling, Loop, PointSpring
+from mbkit.model.parts import Body, Joint, JointCoupling, Loop
 from mbkit.spatial import skew
 
 # Names in a message.
@@ -22,90 +22,96 @@ _MAX_NAMES: Final = 40
 _MAX_VELOCITIES: Final = 5000
 
 
+def repeated_names(what: str, names: Iterable[str]) -> list[str]:
+    """Return one sentence for each name that stands more than once."""
+    return [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
+
+
+def listed(texts: Sequence[str], most: int = 20) -> str:
+    """Return the first texts, and how many more there are."""
+    return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
+
+
 def structure_faults(description: Description) -> list[str]:
     """Return one sentence per fault: names, the tree, mimics, and the values of joints."""
-    bodies, joints, loops = description.bodies, description.joints, description.loops
-    frames, springs, couplings = description.frames, description.springs, description.couplings
-    known = {b.name for b in bodies} | {"world"}
-    faults: list[str] = []
+    return list(_structure_faults(description))
+
+
+def _structure_faults(description: Description) -> Iterator[str]:
+    bodies, joints = description.bodies, description.joints
     if not bodies:
-        faults.append("no bodies; add at least one")
+        yield "no bodies; add at least one"
     velocities = sum(j.type.nv for j in joints)
     if velocities > _MAX_VELOCITIES:
-        faults.append(f"{velocities} velocities; expected up to {_MAX_VELOCITIES}, because M has their square")
-    kinds = ("body", bodies), ("joint", joints), ("frame", frames), ("spring", springs)
-    for what, parts in (*kinds, ("coupling", couplings), ("loop", loops)):
-        names = Counter(p.name for p in parts)
-        faults += [f"{what} {n!r}: declared {k} times; names must differ" for n, k in names.items() if k > 1]
-        if what in ("body", "frame") and "world" in names:
-            faults.append(f"{what} 'world': that name is the ground's; choose another")
-    suggestions = Suggestions()
+        yield f"{velocities} velocities; expected up to {_MAX_VELOCITIES}, because M has their square"
+    for what in ("bodies", "joints", "frames", "springs", "couplings", "loops"):
+        names = [p.name for p in getattr(description, what)]
+        one = "body" if what == "bodies" else what[:-1]
+        yield from repeated_names(one, names)
+        if one in ("body", "frame") and "world" in names:
+            yield f"{one} 'world': that name is the ground's; choose another"
+    known, suggestions = {b.name for b in bodies} | {"world"}, Suggestions()
+
+    def unknown(item: str, names: Iterable[str], known: Set[str] = known) -> Iterator[str]:
+        for name in names:
+            if name not in known:
+                near = suggestions.near(name, known)
+                few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _MAX_NAMES else "; declare it"
+                yield f"{item}: unknown body {name!r}" + (f"; did you mean {near!r}?" if near else few)
+
     for joint in joints:
-        faults += _unknown(f"joint {joint.name!r}", (joint.parent, joint.child), known, suggestions)
-        faults += _joint_faults(joint)
-    for frame in frames:
-        faults += _unknown(f"frame {frame.name!r}", (frame.body,), known - {"world"}, suggestions)
-    for spring in springs:
-        faults += _unknown(f"spring {spring.name!r}", (spring.body_a, spring.body_b), known, suggestions)
-        faults += _negative(f"spring {spring.name!r}", spring, ("stiffness", "rest_length", "damping"))
+        yield from unknown(f"joint {joint.name!r}", (joint.parent, joint.child))
+        yield from _joint_faults(joint)
+    for frame in description.frames:
+        yield from unknown(f"frame {frame.name!r}", (frame.body,), known - {"world"})
+    for spring in description.springs:
+        item = f"spring {spring.name!r}"
+        yield from unknown(item, (spring.body_a, spring.body_b))
+        yield from _negative(item, spring, "stiffness", "rest_length", "damping")
         if spring.body_a == spring.body_b:
-            faults.append(f"spring {spring.name!r}: both ends on {spring.body_a!r}; it would never act")
-    for coupling in couplings:
-        faults += _coupling_faults(coupling, joints)
-    for loop in loops:
-        faults += _unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b), known, suggestions)
+            yield f"{item}: both ends on {spring.body_a!r}; it would never act"
+    for coupling in description.couplings:
+        yield from _coupling_faults(coupling, joints)
+    for loop in description.loops:
+        yield from unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b))
         if loop.body_a == loop.body_b:
-            faults.append(f"loop {loop.name!r}: both ends on {loop.body_a!r}; it would close nothing")
-    faults += _tree_faults(bodies, joints)
-    faults += _mimic_faults(joints)
-    one = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
-    there = ", ".join(sorted(one)) or "none"
-    faults += [
-        f"prescribed {p.joint!r}: expected a joint of one velocity that mimics none; there are: {there}"
-        for p in description.prescribed
-        if p.joint not in one
-    ]
-    moved = Counter(p.joint for p in description.prescribed)
-    faults += [f"prescribed {n!r}: moved {k} times; give one motion" for n, k in moved.items() if k > 1]
-    return faults
+            yield f"loop {loop.name!r}: both ends on {loop.body_a!r}; it would close nothing"
+    yield from _tree_faults(bodies, joints)
+    yield from _mimic_faults(joints)
+    single = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
+    for name, count in Counter(p.joint for p in description.prescribed).items():
+        if name not in single:
+            there = ", ".join(sorted(single)) or "none"
+            yield f"prescribed {name!r}: expected a joint of one velocity that mimics none; there are: {there}"
+        if count > 1:
+            yield f"prescribed {name!r}: moved {count} times; give one motion"
 
 
-def _negative(item: str, part: PointSpring | JointCoupling, names: Iterable[str]) -> list[str]:
-    return [f"{item}: {n} {getattr(part, n):g} is negative" for n in names if getattr(part, n) < 0]
-
-
-def _unknown(item: str, names: Iterable[str], known: Set[str], suggestions: Suggestions) -> list[str]:
-    out = []
+def _negative(item: str, part: Any, *names: str) -> Iterator[str]:
     for name in names:
-        if name not in known:
-            near = suggestions.near(name, known)
-            few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _MAX_NAMES else "; declare it"
-            out.append(f"{item}: unknown body {name!r}" + (f"; did you mean {near!r}?" if near else few))
-    return out
+        value = getattr(part, name)
+        if np.any(value < 0):
+            yield f"{item}: {name} {value if np.ndim(value) else format(value, 'g')} is negative"
 
 
-def _joint_faults(joint: Joint) -> list[str]:
-    item, out = f"joint {joint.name!r}", []
+def _joint_faults(joint: Joint) -> Iterator[str]:
+    item, type_ = f"joint {joint.name!r}", joint.type
     if joint.child == "world":
-        out.append(f"{item}: the world cannot be a child; swap parent and child")
+        yield f"{item}: the world cannot be a child; swap parent and child"
     if np.any(joint.lower > joint.upper):
-        out.append(f"{item}: lower limit {joint.lower} above upper limit {joint.upper}")
-    signed = ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
-    out += [f"{item}: {n} {getattr(joint, n)} is negative" for n in signed if np.any(getattr(joint, n) < 0)]
-    if joint.type.quaternion is not None:
-        turning = slice(joint.type.quaternion, None)
-        if np.isfinite([joint.lower[turning], joint.upper[turning]]).any():
-            out.append(f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite")
-    if np.any(joint.armature) and joint.type.nv != 1:
-        out.append(
+        yield f"{item}: lower limit {joint.lower} above upper limit {joint.upper}"
+    yield from _negative(item, joint, "armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
+    if type_.quaternion is not None and np.isfinite([x[type_.quaternion :] for x in (joint.lower, joint.upper)]).any():
+        yield f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite"
+    if np.any(joint.armature) and type_.nv != 1:
+        yield (
             f"{item}: armature on a {joint.kind} joint; expected a joint of one velocity "
             "(engines leave out the gyroscopic term otherwise): add a rotor as a body"
         )
-    if np.any(joint.stiffness) and not joint.type.coordinate_velocities:
-        out.append(f"{item}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring")
-    if joint.pitch and not joint.type.pitched:
-        out.append(f"{item}: pitch {joint.pitch} on a {joint.kind} joint; only types such as helical have one")
-    return out
+    if np.any(joint.stiffness) and not type_.coordinate_velocities:
+        yield f"{item}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring"
+    if joint.pitch and not type_.pitched:
+        yield f"{item}: pitch {joint.pitch} on a {joint.kind} joint; only types such as helical have one"
 
 
 def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterator[str]:
@@ -116,13 +122,12 @@ def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterat
             yield f"{item}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
         elif sizes[name] != 1:
             yield f"{item}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
-    yield from _negative(item, coupling, ("stiffness", "damping", "armature"))
+    yield from _negative(item, coupling, "stiffness", "damping", "armature")
     if not np.any(coupling.factors):
         yield f"{item}: no joint has a factor other than zero; it would never act"
 
 
-def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
-    out = []
+def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> Iterator[str]:
     carriers: dict[str, list[Joint]] = {}
     carried: dict[str, list[Joint]] = {}
     for joint in joints:
@@ -131,28 +136,37 @@ def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> list[str]:
     for name, several in carriers.items():
         if len(several) > 1 and name != "world":
             names = ", ".join(repr(j.name) for j in several)
-            out.append(
+            yield (
                 f"body {name!r}: carried by {len(several)} joints ({names}); keep one and close the loop with add_loop"
             )
-    reached = {"world"}
-    stack = ["world"]
-    while stack:
-        for joint in carried.get(stack.pop(), ()):
-            if joint.child not in reached:
-                reached.add(joint.child)
-                stack.append(joint.child)
+    reached = _reached(carried)
     for body in bodies:
-        if body.name in reached:
-            continue
-        if body.name in carriers:
-            out.append(f"body {body.name!r}: not connected to the world; its joints form a cycle or hang in the air")
-        else:
-            out.append(f"body {body.name!r}: no joint carries it; add a joint with child={body.name!r}")
+        if body.name not in reached and body.name in carriers:
+            yield f"body {body.name!r}: not connected to the world; its joints form a cycle or hang in the air"
+        elif body.name not in reached:
+            yield f"body {body.name!r}: no joint carries it; add a joint with child={body.name!r}"
+
+
+def _reached(carried: Mapping[str, Sequence[Joint]]) -> set[str]:
+    """Return the world and all bodies that joints connect to it, by the joints of each parent."""
+    out, stack = {"world"}, ["world"]
+    while stack:
+        new = {j.child for j in carried.get(stack.pop(), ())} - out
+        out |= new
+        stack += new
     return out
 
 
-def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
-    out = []
+def static_bodies(joints: Iterable[Joint]) -> set[str]:
+    """Return the bodies that are fixed to the world, whose inertia cannot act."""
+    carried: dict[str, list[Joint]] = {}
+    for joint in joints:
+        if not joint.type.nv:
+            carried.setdefault(joint.parent, []).append(joint)
+    return _reached(carried) - {"world"}
+
+
+def _mimic_faults(joints: Sequence[Joint]) -> Iterator[str]:
     by_name = {j.name: j for j in joints}
     suggestions = Suggestions()
     # Joints from which following the leaders ends.
@@ -164,25 +178,22 @@ def _mimic_faults(joints: Sequence[Joint]) -> list[str]:
         leader = by_name.get(joint.mimic.joint)
         if leader is None:
             near = suggestions.near(joint.mimic.joint, by_name)
-            out.append(f"{item}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near!r}" if near else ""))
+            yield f"{item}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near!r}" if near else "")
             continue
         if joint.type.nv != 1 or leader.type.nv != 1:
-            out.append(f"{item}: mimics {leader.name!r}, but both must have one velocity")
+            yield f"{item}: mimics {leader.name!r}, but both must have one velocity"
         seen, at = {joint.name}, leader
         while at.name not in ends and at.mimic is not None and at.mimic.joint in by_name:
             if at.name in seen:
-                out.append(f"{item}: mimics in a circle through {at.name!r}")
+                yield f"{item}: mimics in a circle through {at.name!r}"
                 break
             seen.add(at.name)
             at = by_name[at.mimic.joint]
         ends |= seen
-    return out
 
 
 # A thin plate written with six digits may miss A + B >= C by its last digit.
 _TRIANGLE = 1e-6
-# Bodies in one sentence.
-_MAX_LISTED = 20
 _JOINT = re.compile(r"joint '.*?'(?=, so)")
 # Ten times mjMINVAL is left of MuJoCo's smallest numbers, in kg and kg m².
 _LEAST = 1e-14
@@ -211,21 +222,6 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
         return f"inertia violates A + B >= C: {moments}"
     return None
-
-
-def static_bodies(joints: Iterable[Joint]) -> set[str]:
-    """Return the bodies that are fixed to the world, whose inertia cannot act."""
-    below: dict[str, list[str]] = {}
-    for joint in joints:
-        if not joint.type.nv:
-            below.setdefault(joint.parent, []).append(joint.child)
-    out: set[str] = set()
-    waiting = ["world"]
-    while waiting:
-        new = [child for child in below.get(waiting.pop(), ()) if child not in out]
-        out.update(new)
-        waiting += new
-    return out
 
 
 def body_faults(bodies: Iterable[Body], *, point_masses: bool) -> tuple[tuple[str, str], ...]:
@@ -287,9 +283,8 @@ def grouped(reasons: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tup
             out.append(f"{what} {name!r}: {reason}")
             continue
         plural = "links" if all(what == "link" for what, *_ in members) else "bodies"
-        listing = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members[:_MAX_LISTED]]
-        more = f" and {len(members) - _MAX_LISTED} more" if len(members) > _MAX_LISTED else ""
-        out.append(f"{len(members)} {plural}: {sentence}: {', '.join(listing)}{more}")
+        names = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members]
+        out.append(f"{len(members)} {plural}: {sentence}: {listed(names)}")
     return out
 
 
@@ -300,13 +295,12 @@ def idle_joints(model: Description) -> tuple[list[str], bool]:
     """
     if not model.nv:
         return [], True
-    with np.errstate(over="ignore", invalid="ignore"):
-        sample = _sample(model)
+    sample = _sample(model)
     M, diagonal = sample.M, np.diag(sample.M)
     if not np.isfinite(M).all():
         wild = [j.name for j in model.independent_joints if not np.isfinite(diagonal[model.layout.v[j.name]]).all()]
-        listing = ", ".join(repr(n) for n in wild[:_MAX_LISTED]) or "all joints together"
-        raise InputError(f"{model.name}: the mass matrix overflows at {listing}; give smaller masses and lengths")
+        where = ", ".join(map(repr, wild[:20])) or "all joints together"
+        raise InputError(f"{model.name}: the mass matrix overflows at {where}; give smaller masses and lengths")
     rows = [sample.held(loop) @ model.layout.G for loop in model.loops]
     if rows and (size := float(np.trace(M))):
         held = np.concatenate(rows)
@@ -335,13 +329,11 @@ def scale_doubts(model: Description) -> list[str]:
     """
     if not model.nv or any(x is None for x in model.parameters.values()):
         return []
-    with np.errstate(over="ignore", invalid="ignore"):
-        sample = _sample(model)
-    M, places = sample.M, sample.places
-    diagonal = np.diag(M)
+    sample = _sample(model)
+    M, diagonal = sample.M, np.diag(sample.M)
     if not (diagonal > 0).all() or not np.isfinite(M).all():
         return []
-    extent = float(np.max(np.ptp(np.array([*places.values()]), axis=0)))
+    extent = float(np.max(np.ptp(np.array([*sample.places.values()]), axis=0)))
     carried: dict[str, float] = {b.name: b.mass for b in model.bodies}
     small, far = [], []
     for joint in reversed(model.tree):
@@ -358,17 +350,12 @@ def scale_doubts(model: Description) -> list[str]:
     values = np.linalg.eigvalsh(M / root[:, None] / root)
     out = []
     if small:
-        out.append(f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero: {_listed(small)}")
+        out.append(f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero: {listed(small)}")
     if far:
-        out.append(f"joints whose inertia is lost beside m L² of the whole mechanism: {_listed(far)}")
+        out.append(f"joints whose inertia is lost beside m L² of the whole mechanism: {listed(far)}")
     if values[0] * _APART * 10 < values[-1]:
         out.append(f"M is nearly singular (eigenvalues {values[0]:.1e} to {values[-1]:.1e}, scaled to a unit diagonal)")
     return out
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
-    return f"{', '.join(names[:_MAX_LISTED])}{more}"
 
 
 def sample_mass_matrix(model: Description, q: Array | None = None) -> Array:
@@ -404,6 +391,7 @@ class _Sample(NamedTuple):
         return np.asarray(ends[0] - ends[1])
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _sample(model: Description, q: Array | None = None) -> _Sample:
     """Return M and the places of bodies at a pose or the random state."""
     places = {"": np.zeros(3)}

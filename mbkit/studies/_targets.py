@@ -17,7 +17,7 @@ from mbkit import catalog
 from mbkit.engines.registry import ENGINES, REFERENCE, compared
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
-from mbkit.load.robot_data import find
+from mbkit.load.loader import find
 from mbkit.model import Model
 
 _FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")

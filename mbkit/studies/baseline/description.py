@@ -17,7 +17,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load import load
-from mbkit.load.robot_data import find
+from mbkit.load.loader import find
 from mbkit.load.urdf_links import read_links
 from mbkit.model import Model
 from mbkit.studies._targets import resolved

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 from mbkit.engines.registry import STANDARD
 from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError
 from mbkit.load import load, robots
-from mbkit.load.robot_data import find
+from mbkit.load.loader import find
 from mbkit.studies import results
 from mbkit.studies.compare.result import Comparison
 from mbkit.studies.compare.study import compare

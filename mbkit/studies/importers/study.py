@@ -18,7 +18,7 @@ from mbkit._check import Array, count, real
 from mbkit.engines.imported import IMPORTERS, Imported, check_installed
 from mbkit.engines.registry import MUJOCO
 from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
-from mbkit.load import robot_data
+from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_links import urdf_links
@@ -413,11 +413,11 @@ def written(source: str | os.PathLike[str]) -> Model:
 
 def _path(source: str | os.PathLike[str]) -> Path:
     if isinstance(source, str) and not source.lower().endswith((".urdf", ".xml", ".mjcf")):
-        robot = robot_data.find(source)
+        robot = loader.find(source)
         if robot is not None:
             return robot.path
         if not os.path.exists(source) and os.sep not in source:
-            raise robot_data.unknown(source)
+            raise loader.unknown(source)
     if not isinstance(source, (str, os.PathLike)):
         raise InputError(f"source: expected a path or a robot's name, got {source!r}")
     return Path(os.fspath(source))
