@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.lagrangian import from_model, systems
-from mbkit.lagrangian.constraints.manifold import manifold_of
-from mbkit.lagrangian.constraints.redundancy import refuse_unreachable
+from mbkit.lagrangian.constraints import manifold_of, refuse_unreachable
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import off, random_tree
 from validation.closed_forms import published

@@ -17,8 +17,7 @@ from mbkit._check import Array, batch_of, count, generator, real
 from mbkit._escape import html, one_line
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian.constraints.manifold import Manifold, manifold_of
-from mbkit.lagrangian.constraints.redundancy import is_judged, refuse_unreachable, require_independent
+from mbkit.lagrangian.constraints import Manifold, is_judged, manifold_of, refuse_unreachable, require_independent
 from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
 from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.quasi_velocities import VelocityMap

@@ -12,8 +12,7 @@ A chart serves while its dependent block of J is not much nearer to singular tha
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,7 @@ from mbkit._escape import one_line
 from mbkit.engines.base import QUANTITIES, Dynamics, per_sample
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
-from mbkit.lagrangian.constraints.manifold import Manifold
-from mbkit.lagrangian.constraints.redundancy import require_few
+from mbkit.lagrangian.constraints import Manifold, require_few
 from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
 
@@ -36,6 +34,13 @@ _PLACES: Final = 32
 _BENT: Final = 0.5
 # Of a last step of Newton's, relative to the coordinates.
 _SOLVED: Final = 1e-9
+_TINY: Final = float(np.finfo(float).tiny)
+
+#: A pose is near a singular one where the smallest singular value of J, or of the
+#: dependent block, is below this part of the largest of J.
+SINGULAR: Final = 1e-3
+# Of the best that any choice can give: below, another one is due.
+_WORN: Final = 0.25
 
 Indices = NDArray[np.intp]
 
@@ -56,24 +61,11 @@ class ReducedModel(Model):
         return self._time
 
 
-@dataclass(frozen=True)
-class Chart:
+class Chart(NamedTuple):
     """Which coordinates are independent, by index."""
 
     independent: Indices
     dependent: Indices
-
-
-@dataclass
-class _Memory:
-    """Where Newton's iteration last ended: pairs of q and J, and the sign of the dependent block's determinant."""
-
-    places: deque[tuple[Array, Array]]
-    sign: float
-
-    def nearest(self, independent: Indices, u: Array) -> tuple[Array, Array]:
-        """Return the place whose independent coordinates are the nearest; of equal ones the last."""
-        return min(reversed(self.places), key=lambda place: float(np.abs(place[0][independent] - u).max()))
 
 
 class EmbeddedDynamics(Dynamics):
@@ -92,7 +84,8 @@ class EmbeddedDynamics(Dynamics):
         super().__init__(model)
         self._whole, self._chart, self._begin = whole, chart, begin
         self._manifold = Manifold(whole).at(begin)
-        self._memory = _Memory(deque(maxlen=_PLACES), 0.0)
+        # Where Newton's iteration last ended: q, J, and the sign of the dependent block's determinant.
+        self._places: deque[tuple[Array, Array, float]] = deque(maxlen=_PLACES)
 
     def at(self, /, **values: float) -> EmbeddedDynamics:
         """Return the same dynamics at a time of the run."""
@@ -112,9 +105,8 @@ class EmbeddedDynamics(Dynamics):
                 f"{self.model.name}: {', '.join(self.model.coordinate_names)} do not determine the other coordinates "
                 f"at {self._at(q[self._chart.independent])}, a singular pose; choose others, or leave the choice open"
             )
-        self._memory.places.clear()
-        self._memory.places.append((q.copy(), J))
-        self._memory.sign = sign
+        self._places.clear()
+        self._places.append((q.copy(), J, sign))
 
     def _sign(self, J: Array) -> float:
         return float(np.linalg.slogdet(J[:, self._chart.dependent])[0])
@@ -123,8 +115,10 @@ class EmbeddedDynamics(Dynamics):
 
     def configuration(self, u: Array) -> Array:
         """Return q, (n,)."""
-        chart, memory = self._chart, self._memory
-        q, J = memory.nearest(chart.independent, u)
+        chart, name = self._chart, self.model.name
+        # The place whose independent coordinates are the nearest; of equal ones the last.
+        distance = lambda place: float(np.abs(place[0][chart.independent] - u).max())  # noqa: E731
+        q, J, sign = min(reversed(self._places), key=distance)
         q, before = q.copy(), J
         q[chart.dependent] -= self._solved(J, J[:, chart.independent] @ (u - q[chart.independent]), q)
         q[chart.independent] = u
@@ -137,18 +131,16 @@ class EmbeddedDynamics(Dynamics):
                 break
             # The iteration squares the error.
             if size <= _SOLVED * (1 + float(np.abs(q).max())):
-                if self._sign(J) != memory.sign:
+                if self._sign(J) != sign:
                     # On the other side of a singular pose another branch begins.
-                    raise NumericalError(f"{self.model.name}: beyond a singular pose at {self._at(u)}")
+                    raise NumericalError(f"{name}: beyond a singular pose at {self._at(u)}")
                 if np.linalg.norm(J - before) > _BENT * np.linalg.norm(before):
-                    raise NumericalError(
-                        f"{self.model.name}: too long a step to {self._at(u)} to tell the dependent coordinates"
-                    )
-                memory.places.append((q.copy(), J))
+                    raise NumericalError(f"{name}: too long a step to {self._at(u)} to tell the dependent coordinates")
+                self._places.append((q.copy(), J, sign))
                 return q
         raise NumericalError(
-            f"{self.model.name}: Newton's iteration finds no dependent coordinates at {self._at(u)}; "
-            "perhaps beyond a singular pose"
+            f"{name}: Newton's iteration finds no dependent coordinates at {self._at(u)}; perhaps beyond a singular "
+            "pose"
         )
 
     def _at(self, u: Array) -> str:
@@ -204,7 +196,7 @@ class EmbeddedDynamics(Dynamics):
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         def one(u: Array, w: Array, rate: Array) -> Array:
-            _, M, applied = self._reduced(u, w)
+            M, applied = self._reduced(u, w)[1:]
             return np.asarray(M @ rate - applied)
 
         return per_sample(one, q, v, a)
@@ -219,13 +211,6 @@ class EmbeddedDynamics(Dynamics):
         raise NotImplementedError
 
     _gravity = _nle = _passive = _pose = _jacobian = _refused
-
-
-#: A pose is near a singular one where the smallest singular value of J, or of the
-#: dependent block, is below this part of the largest of J.
-SINGULAR: Final = 1e-3
-# Of the best that any choice can give: below, another one is due.
-_WORN: Final = 0.25
 
 
 class Embedded:
@@ -257,18 +242,13 @@ class Embedded:
             raise InputError(f"{self.model.name}: {rows} constraints leave none of {self.model.nv} coordinates free")
         # However chosen, the best block of a matrix is no worse than this (Gu and Eisenstat 1996).
         self.least = _WORN / float(np.sqrt(1 + rows * self.degrees))
-        if independent is not None:
-            self._check(independent)
-
-    def _check(self, names: tuple[str, ...]) -> None:
         known = self.model.coordinate_names
-        for name in names:
+        for name in independent or ():
             if name not in known:
                 raise UnknownNameError("coordinate", name, known)
-        if len(set(names)) != self.degrees:
-            raise InputError(
-                f"independent: expected {self.degrees} of {', '.join(known)}, got {', '.join(names) or 'none'}"
-            )
+        if independent is not None and len(set(independent)) != self.degrees:
+            choice = ", ".join(independent) or "none"
+            raise InputError(f"independent: expected {self.degrees} of {', '.join(known)}, got {choice}")
 
     def __repr__(self) -> str:
         chosen = "chosen as it runs" if self.independent is None else ", ".join(self.independent)
@@ -279,12 +259,12 @@ class Embedded:
         from scipy.linalg import qr
 
         names = self.model.coordinate_names
-        if self.independent is not None:
+        if self.independent is None:
+            J = self.manifold.at(t).jacobian(q)
+            independent = np.sort(qr(J, mode="economic", pivoting=True)[2][len(J) :])
+        else:
             independent = np.array([names.index(n) for n in self.independent], dtype=np.intp)
-            return Chart(independent, np.setdiff1d(np.arange(len(names)), independent))
-        J = self.manifold.at(t).jacobian(q)
-        _, _, order = qr(J, mode="economic", pivoting=True)
-        return Chart(np.sort(order[len(J) :]), np.sort(order[: len(J)]))
+        return Chart(independent, np.setdiff1d(np.arange(len(names)), independent))
 
     def names(self, chart: Chart) -> str:
         """Return the independent coordinates of a chart to read."""
@@ -293,15 +273,13 @@ class Embedded:
     def quality(self, chart: Chart, q: Array, t: float) -> float:
         """Return the smallest singular value of the dependent block over that of J: small where it is a bad choice."""
         J = self.manifold.at(t).jacobian(q)
-        least = np.linalg.svd(J, compute_uv=False)[-1]
-        return float(np.linalg.svd(J[:, chart.dependent], compute_uv=False)[-1] / max(least, np.finfo(float).tiny))
+        return _smallest(J[:, chart.dependent]) / max(_smallest(J), _TINY)
 
     def nearness(self, chart: Chart, q: Array, t: float) -> float:
         """Return the smallest singular value over the largest: of J, or of a dependent block that is to stay."""
         J = self.manifold.at(t).jacobian(q)
         block = J if self.independent is None else J[:, chart.dependent]
-        largest = np.linalg.norm(J, 2)
-        return float(np.linalg.svd(block, compute_uv=False)[-1] / max(largest, np.finfo(float).tiny))
+        return _smallest(block) / max(float(np.linalg.norm(J, 2)), _TINY)
 
     def on(self, chart: Chart, q: Array, t: float) -> EmbeddedDynamics:
         """Return the dynamics on a chart's independent coordinates, from a consistent configuration on."""
@@ -309,3 +287,7 @@ class Embedded:
         out = EmbeddedDynamics(ReducedModel(self.model, names), self.dynamics, chart, t)
         out.remember(q)
         return out
+
+
+def _smallest(J: Array) -> float:
+    return float(np.linalg.svd(J, compute_uv=False)[-1])

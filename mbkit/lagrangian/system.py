@@ -14,8 +14,7 @@ from mbkit._check import Array, real, rows
 from mbkit._escape import one_line
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.lagrangian.constraints.manifold import Manifold, manifold_of
-from mbkit.lagrangian.constraints.redundancy import refuse_unreachable, require_independent
+from mbkit.lagrangian.constraints import Manifold, manifold_of, refuse_unreachable, require_independent
 from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
 from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities

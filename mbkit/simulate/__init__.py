@@ -3,7 +3,7 @@
 from mbkit._callable import make_callable
 from mbkit.methods.registry import METHODS, Method, register_method
 from mbkit.methods.tableaus import RK4, ImplicitTableau, Tableau
-from mbkit.simulate.diagnostics.eigenvalues import Stiffness, stiffness
+from mbkit.simulate.diagnostics.linearization import Stiffness, stiffness
 from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run import simulate

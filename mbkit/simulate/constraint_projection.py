@@ -37,8 +37,7 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
     if not dyn.model.constrained:
         return q, v
     # These imports load CasADi.
-    from mbkit.lagrangian.constraints.manifold import manifold_of
-    from mbkit.lagrangian.constraints.redundancy import refuse_unreachable, require_independent
+    from mbkit.lagrangian.constraints import manifold_of, refuse_unreachable, require_independent
 
     manifold = manifold_of(dyn).at(t)
     try:
@@ -53,14 +52,14 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
 
 def settled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Return the consistent states near the ends of a step."""
-    from mbkit.lagrangian.constraints.manifold import manifold_of
+    from mbkit.lagrangian.constraints import manifold_of
 
     return manifold_of(dyn).at(t).pulled(q, v)
 
 
 def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Return the state after one step of Newton's iteration onto the constraints."""
-    from mbkit.lagrangian.constraints.manifold import manifold_of
+    from mbkit.lagrangian.constraints import manifold_of
 
     q, v, *_ = manifold_of(dyn).at(t).call("constraint_step", q, v)
     return q[..., 0], v[..., 0]
@@ -78,7 +77,7 @@ class Approach:
 
     def saw(self, dyn: Dynamics, t: float, q: Array) -> None:
         """Take in the end of a step."""
-        from mbkit.lagrangian.constraints.manifold import manifold_of
+        from mbkit.lagrangian.constraints import manifold_of
 
         J = manifold_of(dyn).at(t).jacobian(q)
         size = float(np.linalg.svd(J, compute_uv=False)[..., -1].min()) if np.isfinite(J).all() else np.inf
@@ -100,7 +99,7 @@ class SingularPoses:
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step."""
-        from mbkit.lagrangian.constraints.manifold import manifold_of
+        from mbkit.lagrangian.constraints import manifold_of
 
         J = manifold_of(self._dyn).at(t).jacobian(q)
         J = J.reshape(-1, J.shape[-1])
@@ -141,7 +140,7 @@ def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
     """Return a run with its kept states projected onto the constraints."""
     if not dyn.model.constrained or not outcome.q.size:
         return outcome
-    from mbkit.lagrangian.constraints.manifold import manifold_of
+    from mbkit.lagrangian.constraints import manifold_of
 
     q, v = outcome.q.copy(), outcome.v.copy()
     shape = q.shape

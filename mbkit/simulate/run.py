@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
@@ -139,14 +139,23 @@ def simulate(
     >>> bool(abs(run.energy() - run.energy()[0]).max() < 1e-12)
     True
     """
-    arguments = (q0, v0, duration, method, dt, rtol, atol, torque, save, progress, events)
+    options: dict[str, Any] = {
+        "method": method,
+        "dt": dt,
+        "rtol": rtol,
+        "atol": atol,
+        "torque": torque,
+        "save": save,
+        "t0": t0,
+    }
+    options |= {"progress": progress, "events": events}
     if isinstance(dyn, Dynamics):
-        data, error = integrate(dyn, *arguments, doubt, t0)
+        data, error = integrate(dyn, q0, v0, duration, doubt=doubt, **options)
     elif hasattr(dyn, "chart"):
         # Only where SymPy and CasADi are loaded already.
         from mbkit.simulate.independent_coordinates import integrate_on_charts
 
-        data, error = integrate_on_charts(dyn, *arguments, t0)
+        data, error = integrate_on_charts(dyn, q0, v0, duration, **options)
     else:
         raise no_dynamics(dyn)
     run = Trajectory(**vars(data))

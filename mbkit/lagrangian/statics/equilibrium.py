@@ -9,92 +9,37 @@ with the forces F at frames, and λ where constraints act.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array
 from mbkit._escape import html, terminal
-from mbkit.engines.base import Dynamics
-from mbkit.errors import InputError, NumericalError
-from mbkit.lagrangian.statics.force_balance import BALANCED, Balance, SmallMotion
+from mbkit.engines.base import Dynamics, at_time
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import InputError, NumericalError, UnknownNameError
+from mbkit.lagrangian.constraints import manifold_of, refuse_unreachable, require_independent
 from mbkit.lagrangian.system import Lagrangian
 
-# The search for a configuration at rest: Newton's iteration, damped after Levenberg and Marquardt far from the end.
-
-_MOST: Final = 200
-
-
-def find_equilibrium(balance: Balance, starts: list[Array], tau: Array) -> tuple[Array, Array]:
-    """Return the first configuration at rest that is found, and λ there; NumericalError names the least force left."""
-    least: tuple[float, Array, Array] | None = None
-    for start in starts:
-        q, multipliers, left = _solved(balance, start, tau)
-        if left <= 1.0:
-            return q, multipliers
-        size = balance.size(q, multipliers, tau)
-        if least is None or size < least[0]:
-            least = size, q, balance.residual(q, multipliers, tau)
-    assert least is not None
-    size, q, residual = least
-    names = balance.model.velocity_names
-    worst = int(np.abs(residual[: len(names)]).argmax())
-    raise NumericalError(
-        f"{balance.model.name}: no equilibrium found from {len(starts)} start{'s' * (len(starts) > 1)}; the least "
-        f"force left over is {size:.3g}, most of it along {names[worst]}, at q = {np.array2string(q, precision=4)}; "
-        "give tau= that balances it, or another q0"
-    )
-
-
-def _solved(balance: Balance, q: Array, tau: Array) -> tuple[Array, Array, float]:
-    """Return q, λ and the residual, relative to its rounding."""
-    multipliers = balance.multipliers(q, tau)
-    r = balance.residual(q, multipliers, tau)
-    damping, size = 0.0, float(np.linalg.norm(r))
-    for _ in range(_MOST):
-        if _left(balance, r, q, tau) <= 1e-3 or size == 0.0:
-            break
-        K = balance.matrix(q, multipliers)
-        step = _damped(K, r, damping)
-        moved = balance.model.integrate(q, step[: balance.model.nv])
-        tried = multipliers + step[balance.model.nv :]
-        new = balance.residual(moved, tried, tau)
-        new_size = float(np.linalg.norm(new))
-        if new_size < size and np.abs(step[: balance.model.nv]).max() < 3.0:
-            q, multipliers, r, size = moved, tried, new, new_size
-            damping = 0.0 if damping < 1e-9 else damping / 10
-        elif _left(balance, r, q, tau) <= 1.0:
-            break
-        else:
-            damping = max(10 * damping, 1e-6)
-            if damping > 1e9:
-                break
-    return q, multipliers, _left(balance, r, q, tau)
-
-
-def _left(balance: Balance, r: Array, q: Array, tau: Array) -> float:
-    return float(np.abs(r).max(initial=0.0)) / (BALANCED * balance.scale(q, tau))
-
-
-def _damped(K: Array, r: Array, damping: float) -> Array:
-    """Return Levenberg's and Marquardt's step; Newton's without damping."""
-    if not damping:
-        try:
-            step = np.linalg.solve(K, -r)
-            if np.isfinite(step).all():
-                return np.asarray(step)
-        except np.linalg.LinAlgError:
-            pass
-        return np.asarray(np.linalg.lstsq(K, -r, rcond=1e-10)[0])
-    square = K.T @ K
-    scale = max(float(np.trace(square)) / len(K), np.finfo(float).tiny)
-    return np.asarray(np.linalg.solve(square + damping * scale * np.eye(len(K)), -K.T @ r))
-
-
+#: Of the forces that balance: what rounding leaves of them.
+_BALANCED: Final = 1e-11
+# Random starts, and steps from each.
 _STARTS: Final = 30
+_MOST: Final = 200
+# rad or m: a neighbourhood, in which stiffness that vanishes at a threshold does not.
+_ASIDE: Final = 0.1
+#: Step of differences of fourth order, whose error is far below half of the digits.
+_STEP: Final = float(np.finfo(float).eps) ** 0.2
+#: s: when a system that depends on the time is looked at again, and what may differ then.
+_LATER: Final = (0.7310585786300049, 2.0178)
+_SAME: Final = 1e-9
+# Of the largest: what rounding and differences leave of a part that is zero.
+_ZERO: Final = 1e-8
+# Eigenvalues are roots where they meet: half of the digits.
+_ROOT: Final = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,26 +85,28 @@ class Equilibrium:
 
     @property
     def _verdict(self) -> str:
-        return {True: "stable", False: "unstable", None: "stability not decided by small motions"}[self.stable]
+        stability = {True: "stable", False: "unstable", None: "stability not decided by small motions"}[self.stable]
+        return f": equilibrium, {stability}; residual {self.residual:.2g}"
+
+    def _rows(self, tau: str, multiplier: str) -> list[tuple[str, str]]:
+        rows = [*zip(self.coordinates, self.q, strict=True)]
+        rows += [(f"{tau} of {n}", x) for n, x in zip(self.velocities, self.tau, strict=True) if x]
+        rows += [(f"{multiplier}{k + 1}", x) for k, x in enumerate(self.multipliers)]
+        return [(n, f"{x:.9g}") for n, x in rows]
+
+    def _shown_frequencies(self) -> str:
+        return ", ".join(f"{w:.6g}" for w in self.frequencies)
 
     def __str__(self) -> str:
-        lines = [f"{self.name}: equilibrium, {self._verdict}; residual {self.residual:.2g}"]
-        lines += [f"  {n} = {x:.9g}" for n, x in zip(self.coordinates, self.q, strict=True)]
-        lines += [f"  tau of {n} = {x:.9g}" for n, x in zip(self.velocities, self.tau, strict=True) if x]
-        lines += [f"  lambda{k + 1} = {x:.9g}" for k, x in enumerate(self.multipliers)]
+        lines = [self.name + self._verdict, *(f"  {n} = {x}" for n, x in self._rows("tau", "lambda"))]
         if len(self.frequencies):
-            lines.append("  oscillates at " + ", ".join(f"{w:.6g}" for w in self.frequencies) + " rad/s")
+            lines.append(f"  oscillates at {self._shown_frequencies()} rad/s")
         return terminal("\n".join(lines))
 
     def _repr_html_(self) -> str:
-        head = f"<p><b>{html(self.name)}</b>: equilibrium, {self._verdict}; residual {self.residual:.2g}</p>"
-        rows = [(n, f"{x:.9g}") for n, x in zip(self.coordinates, self.q, strict=True)]
-        rows += [(f"τ of {n}", f"{x:.9g}") for n, x in zip(self.velocities, self.tau, strict=True) if x]
-        rows += [(f"λ{k + 1}", f"{x:.9g}") for k, x in enumerate(self.multipliers)]
-        if len(self.frequencies):
-            rows.append(("ω, rad/s", ", ".join(f"{w:.6g}" for w in self.frequencies)))
+        rows = self._rows("τ", "λ") + ([("ω, rad/s", self._shown_frequencies())] if len(self.frequencies) else [])
         cells = "".join(f"<tr><td>{html(n)}</td><td>{x}</td></tr>" for n, x in rows)
-        return f"{head}<table>{cells}</table>"
+        return f"<p><b>{html(self.name)}</b>{self._verdict}</p><table>{cells}</table>"
 
 
 def equilibrium(
@@ -221,43 +168,24 @@ def equilibrium(
         raise InputError("dynamics: its parameters have a value per sample; expected one value of each")
     if holding is not None and not (tau is None and q0 is None):
         raise InputError("holding: expected without q0 and tau, which are for finding a configuration")
-    balance = Balance(dyn, {name: _wrench(name, x) for name, x in (forces or {}).items()})
+    model, balance = dyn.model, _Balance(dyn, {name: _wrench(name, x) for name, x in (forces or {}).items()})
     if holding is not None:
-        q = dyn.model.check_q(finite_array("holding", holding, (dyn.model.nq,)), "holding")
-        balance.check_constraints(q)
-        return _equilibrium_at(balance, q, *balance.held(q))
-    tau = np.zeros(dyn.model.nv) if tau is None else finite_array("tau", tau, (dyn.model.nv,))
-    if q0 is not None:
-        starts = [balance.allowed(dyn.model.check_q(finite_array("q0", q0, (dyn.model.nq,)), "q0"))]
+        q = model.check_q(finite_array("holding", holding, (model.nq,)), "holding")
+        acting, multipliers = balance.held(q)
     else:
-        rng = np.random.default_rng(seed)
-        starts = [dyn.model.random_state(rng)[0] for _ in range(_STARTS)]
-        # From the neutral configuration there need be no way to the constraints.
-        starts[:0] = [] if dyn.model.constrained else [dyn.model.neutral()]
-    q, multipliers = find_equilibrium(balance, starts, tau)
-    return _equilibrium_at(balance, q, tau, multipliers)
-
-
-def _equilibrium_at(balance: Balance, q: Array, tau: Array, multipliers: Array) -> Equilibrium:
-    """Return the equilibrium with the small motions about it."""
-    balance.require_independent(q)
-    if balance.changes(q, tau, multipliers):
-        # Mathieu's equation and its kind: no instant says whether the whole motion stays small.
-        motion = SmallMotion(None, np.empty(0), np.empty(0, dtype=complex))
-    else:
-        motion = balance.small_motion(q, multipliers)
-    return Equilibrium(
-        q=q,
-        tau=tau,
-        residual=balance.size(q, multipliers, tau),
-        multipliers=multipliers,
-        stable=motion.stable,
-        frequencies=motion.frequencies,
-        eigenvalues=motion.eigenvalues,
-        name=balance.model.name,
-        coordinates=balance.model.coordinate_names,
-        velocities=balance.model.velocity_names,
-    )
+        acting = np.zeros(model.nv) if tau is None else finite_array("tau", tau, (model.nv,))
+        if q0 is not None:
+            starts = [balance.allowed(model.check_q(finite_array("q0", q0, (model.nq,)), "q0"))]
+        else:
+            rng = np.random.default_rng(seed)
+            starts = [model.random_state(rng)[0] for _ in range(_STARTS)]
+            # From the neutral configuration there need be no way to the constraints.
+            starts[:0] = [] if model.constrained else [model.neutral()]
+        q, multipliers = balance.at_rest(starts, acting)
+    motion = balance.small_motion(q, acting, multipliers)
+    size = balance.size(balance.residual(q, multipliers, acting))
+    names = model.name, model.coordinate_names, model.velocity_names
+    return Equilibrium(q, acting, size, multipliers, *motion, *names)
 
 
 def _wrench(name: str, value: ArrayLike) -> Array:
@@ -267,5 +195,285 @@ def _wrench(name: str, value: ArrayLike) -> Array:
         shape = ()
     if shape not in ((3,), (6,)):
         raise InputError(f"forces[{name!r}]: expected shape (3,) or (6,), got {shape}")
-    wrench = finite_array(f"forces[{name!r}]", value, shape)
-    return wrench if len(wrench) == 6 else np.concatenate([wrench, np.zeros(3)])
+    return np.append(finite_array(f"forces[{name!r}]", value, shape), np.zeros(6 - shape[0]))
+
+
+class _Balance:
+    """The forces that balance at rest at time t, s, with a wrench (6,) on each frame by name."""
+
+    def __init__(self, dyn: Dynamics, wrenches: Mapping[str, Array], t: float = 0.0) -> None:
+        self._whole, self._wrenches = dyn, wrenches
+        self.dyn, self.model = at_time(dyn, t), dyn.model
+        for name in wrenches:
+            self.model.frame(name)
+            if not self.model.has_bodies:
+                raise UnknownNameError("frame", name, (), hint="a system on paper takes tau=")
+        self._manifold: Any = manifold_of(dyn).at(t) if self.model.constrained else None
+        self._zero = np.zeros(self.model.nv)
+
+    # What balances
+
+    def load(self, q: Array) -> Array:
+        """Return nle - τ_passive - Σ J_Fᵀ F at rest: the force to be held, (nv,)."""
+        out = self.dyn.inverse_dynamics(q, self._zero, self._zero)
+        for name, wrench in self._wrenches.items():
+            out = out - self.dyn.jacobian(q, name).T @ wrench
+        return np.asarray(out)
+
+    def scale(self, q: Array, tau: Array) -> float:
+        """Return the size of the forces that balance, which scales the residual's rounding."""
+        # The stiffness gives a scale where all forces are zero.
+        parts = tau, self.load(q), self._stiffness(q)
+        return float(max(*(np.abs(x).max(initial=0.0) for x in parts), np.finfo(float).tiny))
+
+    def residual(self, q: Array, multipliers: Array, tau: Array) -> Array:
+        """Return the residual, (nv,) of forces and (m,) of constraints."""
+        left = self.load(q) - tau
+        if self._manifold is None:
+            return np.asarray(left)
+        return np.concatenate([left - self._manifold.jacobian(q).T @ multipliers, self._manifold.value(q)])
+
+    def size(self, residual: Array) -> float:
+        """Return the largest force left over."""
+        return float(np.abs(residual[: self.model.nv]).max(initial=0.0))
+
+    def multipliers(self, q: Array, tau: Array) -> Array:
+        """Return the λ that balance best, (m,)."""
+        if self._manifold is None:
+            return np.empty(0)
+        return np.asarray(np.linalg.lstsq(self._manifold.jacobian(q).T, self.load(q) - tau, rcond=None)[0])
+
+    def allowed(self, q: Array) -> Array:
+        """Return a configuration on the constraints."""
+        if self._manifold is None:
+            return q
+        try:
+            return np.asarray(self._manifold.restored(q, self._zero))
+        except InputError:
+            refuse_unreachable(self._manifold.dyn, q)
+            raise
+
+    def held(self, q: Array) -> tuple[Array, Array]:
+        """Return the least τ that holds a configuration, which constraints must allow, and the multipliers with it."""
+        load = self.load(q)
+        if self._manifold is None:
+            return load, np.empty(0)
+        self._manifold.check(q, self._zero)
+        multipliers = self.multipliers(q, self._zero)
+        return load - self._manifold.jacobian(q).T @ multipliers, multipliers
+
+    # Stiffness and damping
+
+    def _slopes(self, function: Callable[[Array], Array], h: float) -> Array:
+        """Return the derivative of a function of a step (nv,) at zero, by differences of fourth order."""
+        columns = []
+        for e in h * np.eye(self.model.nv):
+            ahead, behind, far, back = (function(s * e) for s in (1.0, -1.0, 2.0, -2.0))
+            columns.append((8 * (ahead - behind) - (far - back)) / (12 * h))
+        return np.array(columns).T.reshape(self.model.nv, self.model.nv)
+
+    def _stiffness(self, q: Array) -> Array:
+        """Return ∂load/∂q along the manifold, (nv, nv)."""
+        if not isinstance(self.dyn, LagrangianDynamics):
+            return self._slopes(lambda u: self.load(self.model.integrate(q, u)), _STEP)
+        K = np.asarray(self.dyn.inverse_dynamics_derivatives(q, self._zero, self._zero).q)
+        if self._wrenches:
+
+            def loads(u: Array) -> Array:
+                there = self.model.integrate(q, u)
+                return np.asarray(-sum(self.dyn.jacobian(there, n).T @ w for n, w in self._wrenches.items()))
+
+            K = K + self._slopes(loads, _STEP)
+        return K
+
+    def _damping(self, q: Array) -> Array:
+        """Return ∂(inverse dynamics)/∂v at rest."""
+        if isinstance(self.dyn, LagrangianDynamics):
+            return np.asarray(self.dyn.inverse_dynamics_derivatives(q, self._zero, self._zero).v)
+        # Differences of a quadratic are exact.
+        return self._slopes(lambda v: self.dyn.inverse_dynamics(q, v, self._zero), 1.0)
+
+    def _whole_stiffness(self, q: Array, multipliers: Array) -> Array:
+        """Return ∂(load - Jᵀ λ)/∂q at these multipliers."""
+        K = self._stiffness(q)
+        if self._manifold is None:
+            return K
+        padded = np.append(multipliers, np.zeros(self.model.nv - len(multipliers)))
+        return np.asarray(K - self._manifold.call("curvature", q, padded)[0])
+
+    # The search: Newton's iteration, damped after Levenberg and Marquardt far from the end
+
+    def at_rest(self, starts: list[Array], tau: Array) -> tuple[Array, Array]:
+        """Return the first configuration at rest that is found, and λ there; NumericalError names the least force."""
+        ends: list[tuple[float, Array, Array]] = []
+        for start in starts:
+            q, multipliers, residual, left = self._solved(start, tau)
+            if left <= 1.0:
+                return q, multipliers
+            ends.append((self.size(residual), q, residual))
+        size, q, residual = min(ends, key=lambda end: end[0])
+        names = self.model.velocity_names
+        worst = int(np.abs(residual[: len(names)]).argmax())
+        raise NumericalError(
+            f"{self.model.name}: no equilibrium found from {len(starts)} start{'s' * (len(starts) > 1)}; the least "
+            f"force left over is {size:.3g}, most of it along {names[worst]}, at q = "
+            f"{np.array2string(q, precision=4)}; give tau= that balances it, or another q0"
+        )
+
+    def _solved(self, q: Array, tau: Array) -> tuple[Array, Array, Array, float]:
+        """Return q, λ, the residual, and its size relative to its rounding."""
+        nv, multipliers = self.model.nv, self.multipliers(q, tau)
+        r = self.residual(q, multipliers, tau)
+        damping, size = 0.0, float(np.linalg.norm(r))
+        for _ in range(_MOST):
+            if self._left(r, q, tau) <= 1e-3 or size == 0.0:
+                break
+            K = self._whole_stiffness(q, multipliers)
+            if self._manifold is not None:
+                J = self._manifold.jacobian(q)
+                K = np.block([[K, -J.T], [J, np.zeros((len(J), len(J)))]])
+            step = _damped(K, r, damping)
+            ahead = self.model.integrate(q, step[:nv]), multipliers + step[nv:]
+            new = self.residual(*ahead, tau)
+            new_size = float(np.linalg.norm(new))
+            if new_size < size and np.abs(step[:nv]).max() < 3.0:
+                (q, multipliers), r, size = ahead, new, new_size
+                damping = 0.0 if damping < 1e-9 else damping / 10
+            elif self._left(r, q, tau) <= 1.0:
+                break
+            else:
+                damping = max(10 * damping, 1e-6)
+                if damping > 1e9:
+                    break
+        return q, multipliers, r, self._left(r, q, tau)
+
+    def _left(self, r: Array, q: Array, tau: Array) -> float:
+        return float(np.abs(r).max(initial=0.0)) / (_BALANCED * self.scale(q, tau))
+
+    # Small motions
+
+    def small_motion(self, q: Array, tau: Array, multipliers: Array) -> SmallMotion:
+        """Return the small motions about a configuration, on what the constraints leave free."""
+        if self._manifold is not None:
+            require_independent(self._manifold.dyn, q)
+        if self._changes(q, tau, multipliers):
+            # Mathieu's equation and its kind: no instant says whether the whole motion stays small.
+            return SmallMotion(None, np.empty(0), np.empty(0, dtype=complex))
+        beside = (self.model.integrate(q, s * np.ones(self.model.nv)) for s in (-_ASIDE, _ASIDE))
+        scale = max(float(np.abs(self._whole_stiffness(p, multipliers)).max(initial=0.0)) for p in beside)
+        return small_motion(*self._linear(q, multipliers), scale)
+
+    def _linear(self, q: Array, multipliers: Array) -> tuple[Array, Array, Array]:
+        """Return M, D and K of what the constraints leave free."""
+        N = np.eye(self.model.nv)
+        if self._manifold is not None:
+            _, sizes, V = np.linalg.svd(self._manifold.jacobian(q))
+            N = V[int(np.count_nonzero(sizes > 1e-10 * sizes[0])) :].T
+        M, D, K = (
+            np.asarray(N.T @ A @ N)
+            for A in (self.dyn.mass_matrix(q), self._damping(q), self._whole_stiffness(q, multipliers))
+        )
+        return M, D, K
+
+    def _changes(self, q: Array, tau: Array, multipliers: Array) -> bool:
+        """Return whether the small motions change with the time; refuse forces or constraints that do (InputError)."""
+        if self.model.time_parameter is None:
+            return False
+        now, differs = self._linear(q, multipliers), False
+        for t in _LATER:
+            later = _Balance(self._whole, self._wrenches, t)
+            theirs = later.multipliers(q, tau)
+            left = np.abs(later.residual(q, theirs, tau)).max(initial=0.0)
+            if left > _SAME * (1 + later.scale(q, tau)):
+                raise InputError(
+                    f"dynamics: {self.model.name} depends on the time {self.model.time_parameter}, which moves it; "
+                    "there is no equilibrium of such a system"
+                )
+            pairs = zip(now, later._linear(q, theirs), strict=True)
+            differs = differs or any(np.abs(a - b).max(initial=0.0) > _SAME * (1 + np.abs(a).max()) for a, b in pairs)
+        return differs
+
+
+def _damped(K: Array, r: Array, damping: float) -> Array:
+    """Return Levenberg's and Marquardt's step; Newton's without damping."""
+    if damping:
+        square = K.T @ K
+        scale = max(float(np.trace(square)) / len(K), np.finfo(float).tiny)
+        return np.asarray(np.linalg.solve(square + damping * scale * np.eye(len(K)), -K.T @ r))
+    try:
+        step = np.linalg.solve(K, -r)
+    except np.linalg.LinAlgError:
+        step = np.full(len(K), np.nan)
+    return np.asarray(step if np.isfinite(step).all() else np.linalg.lstsq(K, -r, rcond=1e-10)[0])
+
+
+# Small motions about a state of rest: M δq̈ + D δq̇ + K δq = 0
+
+
+class SmallMotion(NamedTuple):
+    """Whether small motions stay small, their angular frequencies in rad/s and eigenvalues in 1/s."""
+
+    stable: bool | None
+    frequencies: Array
+    eigenvalues: Any
+
+
+def small_motion(M: Array, D: Array, K: Array, scale: float = 0.0) -> SmallMotion:
+    """Return the eigenvalues of M δq̈ + D δq̇ + K δq = 0 and its stability; massless coordinates have none.
+
+    Entries of K that are rounding beside `scale` count as zero. Merkin 1997, Introduction to the Theory of Stability,
+    ch. 3 (Lagrange and Dirichlet) and 6 (Kelvin and Tait).
+    """
+    if not len(M):
+        return SmallMotion(None, np.empty(0), np.empty(0, dtype=complex))
+    largest = float(np.abs(K).max())
+    if _symmetric(K) or largest <= _ZERO * max(scale, largest):
+        # Without the rounding of directions without stiffness.
+        values, vectors = np.linalg.eigh((K + K.T) / 2)
+        values[np.abs(values) <= _ZERO * max(scale, largest)] = 0.0
+        K = np.asarray(vectors * values @ vectors.T)
+    eigenvalues = _eigenvalues(M, D, K)
+    size = float(np.abs(eigenvalues).max(initial=0.0))
+    turning = eigenvalues[eigenvalues.imag > _ROOT * size] if size else eigenvalues[:0]
+    return SmallMotion(_stable(M, D, K, eigenvalues, size), np.sort(turning.imag), eigenvalues)
+
+
+def _eigenvalues(M: Array, D: Array, K: Array) -> Any:
+    from scipy.linalg import eig, eigh
+
+    unit, zero = np.eye(len(M)), np.zeros((len(M), len(M)))
+    if _undamped(D, M, K) and _symmetric(K):
+        try:
+            squares = eigh((K + K.T) / 2, (M + M.T) / 2, eigvals_only=True)
+        except np.linalg.LinAlgError:
+            pass
+        else:
+            # What rounding leaves of a free direction is no frequency.
+            squares[np.abs(squares) < _ZERO * np.abs(squares).max()] = 0.0
+            roots = np.sqrt(-squares.astype(complex))
+            return np.sort_complex(np.concatenate([roots, -roots]))
+    values = eig(np.block([[zero, unit], [-K, -D]]), np.block([[unit, zero], [zero, M]]), right=False)
+    return np.sort_complex(values[np.isfinite(values)])
+
+
+def _stable(M: Array, D: Array, K: Array, eigenvalues: Any, size: float) -> bool | None:
+    if _symmetric(K):
+        squares = np.linalg.eigvalsh((K + K.T) / 2)
+        scale = float(np.abs(squares).max())
+        friction = np.linalg.eigvalsh((D + D.T) / 2)
+        # Neither damping nor gyroscopic forces undo a minimum of the potential.
+        if scale and squares[0] > _ZERO * scale and friction[0] >= -_ZERO * max(float(np.abs(D).max()), 1e-300):
+            return True
+        if scale and squares[0] < -_ZERO * scale and _undamped(D, M, K):
+            return False
+    growth = float(eigenvalues.real.max(initial=-np.inf))
+    return False if growth > _ROOT * size else True if growth < -_ROOT * size else None
+
+
+def _symmetric(K: Array) -> bool:
+    return bool(np.abs(K - K.T).max() <= _ZERO * np.abs(K).max())
+
+
+def _undamped(D: Array, M: Array, K: Array) -> bool:
+    """Return whether D is negligible beside the geometric mean of M and K."""
+    return bool(np.abs(D).max() <= 1e-12 * np.sqrt(np.abs(M).max() * np.abs(K).max()))

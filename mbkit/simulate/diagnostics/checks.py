@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
-from typing import Final
+from contextlib import suppress
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,10 +18,10 @@ from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS, at_time
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances
+from mbkit.methods.stability import companion
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import magnitude, unit_quaternions
-from mbkit.simulate.diagnostics.eigenvalues import linearized
-from mbkit.simulate.diagnostics.stability import growth, lost
+from mbkit.simulate.diagnostics.linearization import linearized
 
 _EPS: Final = sys.float_info.epsilon
 #: Times and trajectories of a batch at which the mass matrix and the energy are evaluated, at most.
@@ -41,6 +42,8 @@ _FOLLOWED: Final = 1e-3
 #: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by 2 to 4 times that.
 _LOST: Final = 0.02
 _SUM: Final = 1e-3
+#: Of a run: what is gone after that is a transient.
+_BRIEF: Final = 0.01
 #: Smallest eigenvalue of the mass matrix beside its largest, where a random configuration has a unit diagonal.
 _IDLE: Final = 1e-7
 #: m or rad: the precision that a position must have.
@@ -82,14 +85,15 @@ def diagnostics(
     checks = [gimbal_lock(dyn, q)]
     if not isinstance(setting, Tolerances) and not quick and method.stability is not None:
         # The cause before its consequences.
-        checks.insert(0, step_size(dyn, method.name, setting, float(t[-1] - t[0]), q[0], v[0]))
+        checks.insert(0, step_size(dyn, method, setting, float(t[-1] - t[0]), q[0], v[0]))
     # The forces of a system on paper may drive it.
     if not (driven or model.time_parameter or (not model.has_bodies and model.needs.damping)):
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
         checks.append(energy_drift([samples[i] for i in whole], fast, model.needs.damping, limit))
-    if not _keeps_digits(dyn, method):
+    # Neither the engine nor the method may solve with the mass matrix.
+    if getattr(dyn, "elimination", "") != "least constraint" or method.mass_matrix:
         matrices = [one.M for member in samples for one in member]
         checks.append(condition(matrices[-1:] if quick else matrices))
     checks.append(coordinate_magnitude(at_q, None if method.scaled_by_start else tolerances))
@@ -97,21 +101,19 @@ def diagnostics(
         checks.append(scale_growth(at_q, at_v, tolerances))
     if tolerances and method.fills_tolerance:
         checks.append(accumulated_error(method.name, tolerances, 2 * model.nv, steps / len(q)))
-    found: list[str] = []
+    signs: list[str] = []
     for check in checks:
-        try:
-            found += check
-        except (MbkitError, np.linalg.LinAlgError):
-            # The engine lacks a term, or has none there.
-            continue
-    return found
+        # The engine may lack a term, or have none there.
+        with suppress(MbkitError, np.linalg.LinAlgError):
+            signs += check
+    return signs
 
 
 class _Sample:
     """A state of a run, and the terms of its dynamics there."""
 
     def __init__(self, dyn: Dynamics, q: Array, v: Array) -> None:
-        self._dyn, self.q, self.v = dyn, q, v
+        self._dyn, self._q, self._v = dyn, q, v
         self.M = self._term("mass_matrix", q)
 
     def _term(self, name: str, *state: Array) -> Array:
@@ -125,10 +127,10 @@ class _Sample:
 
     def energy(self) -> tuple[float, float]:
         """Return the kinetic and the potential energy; T2 - T0 of a system on paper, where T2 - T0 + V stays."""
-        kinetic = self.kinetic(self.v)
+        kinetic = self.kinetic(self._v)
         if not self._dyn.model.has_bodies:
-            kinetic -= float(self._term("kinetic_energy", self.q, np.zeros_like(self.v)))
-        return kinetic, float(self._term("potential_energy", self.q))
+            kinetic -= float(self._term("kinetic_energy", self._q, np.zeros_like(self._v)))
+        return kinetic, float(self._term("potential_energy", self._q))
 
 
 def _samples(dyn: Dynamics, member: int, t: Array, q: Array, v: Array) -> Iterator[_Sample]:
@@ -149,12 +151,12 @@ def energy_drift(samples: list[list[_Sample]], fast: list[Array], damped: bool, 
     """Find a change of the energy of a system without drive; `fast` has a velocity that sizes T of each trajectory."""
     worst, share = 0.0, most
     for member, velocity in zip(samples, fast, strict=True):
-        kinetic, potential = zip(*(one.energy() for one in member), strict=True)
-        change = [T + V - kinetic[0] - potential[0] for T, V in zip(kinetic, potential, strict=True)]
+        kinetic, potential = (np.array(x) for x in zip(*(one.energy() for one in member), strict=True))
+        change = (kinetic + potential - kinetic[0] - potential[0]).tolist()
         wrong = max(change) if damped else max(change, key=abs)
-        sizes = (*map(abs, kinetic), max(potential) - min(potential), *(one.kinetic(velocity) for one in member))
-        size = max(*sizes, sys.float_info.min)
-        if abs(wrong) > 1e4 * _EPS * max(map(abs, potential)) and abs(wrong) / size > share:
+        sizes = np.abs(kinetic).max(), np.ptp(potential), *(one.kinetic(velocity) for one in member)
+        size = float(max(*sizes, sys.float_info.min))
+        if abs(wrong) > 1e4 * _EPS * np.abs(potential).max() and abs(wrong) / size > share:
             worst, share = wrong, abs(wrong) / size
     if worst:
         yield (
@@ -193,10 +195,10 @@ def condition(matrices: list[Array]) -> Iterator[str]:
         )
 
 
-def step_size(dyn: Dynamics, method: str, h: float, duration: float, q: Array, v: Array) -> Iterator[str]:
+def step_size(dyn: Dynamics, method: Method, h: float, duration: float, q: Array, v: Array) -> Iterator[str]:
     """Compare the step with the modes of the linearized motion at a trajectory's first, fastest and last state."""
-    model = dyn.model
-    if dyn.samples is not None or model.time_parameter is not None or model.constrained:
+    model, name = dyn.model, method.name
+    if dyn.samples is not None or model.time_parameter is not None or model.constrained or method.stability is None:
         return
     space = Space(model)
 
@@ -204,7 +206,7 @@ def step_size(dyn: Dynamics, method: str, h: float, duration: float, q: Array, v
         v = space.leave(q, w)
         return np.asarray(space.acceleration(q, v, dyn.forward_dynamics(q, v, np.zeros_like(v))))
 
-    found: list[tuple[float, str]] = []
+    signs: list[tuple[float, str]] = []
     fastest_state = int(np.nan_to_num(np.abs(v).max(axis=-1), posinf=0.0).argmax())
     for k in sorted({0, fastest_state, len(q) - 1}):
         if not (np.isfinite(q[k]).all() and np.isfinite(v[k]).all()):
@@ -216,17 +218,18 @@ def step_size(dyn: Dynamics, method: str, h: float, duration: float, q: Array, v
         fastest = float(np.abs(rates).max())
         if h * fastest < _FOLLOWED:
             continue
+        steps = np.linalg.eigvals(method.stability.matrix(h, A, B))
         # Growth of the motion itself, as of a pendulum upside down or a chaotic one, is not the method's.
-        grows = float(np.log(max(growth(method, h, A, B), 1e-300))) - h * max(0.0, float(rates.real.max()))
+        grows = float(np.log(max(np.abs(steps).max(), 1e-300))) - h * max(0.0, float(rates.real.max()))
         if grows * duration / h > 1 and h * fastest > 1:
             text = (
                 f"a step of {h:g} s is too long for the fastest mode, {fastest:.2g} 1/s (h|λ| = {h * fastest:.2g}): "
-                f"{method} makes it grow by {np.expm1(min(grows, 700.0)):.1g} a step; take a step below "
+                f"{name} makes it grow by {np.expm1(min(grows, 700.0)):.1g} a step; take a step below "
                 f"{1 / fastest:.1g} s, or method={AUTOMATIC_METHOD!r}"
             )
-            found.append((np.inf, text))
+            signs.append((np.inf, text))
             continue
-        part, rate = lost(method, h, A, B, duration)
+        part, rate = lost(steps, h, np.linalg.eigvals(companion(A, B)), duration)
         if part > _LOST:
             kind = f"an oscillation of {abs(rate.imag):.2g} rad/s" if abs(rate.imag) > abs(rate.real) else "a motion"
             text = (
@@ -234,9 +237,31 @@ def step_size(dyn: Dynamics, method: str, h: float, duration: float, q: Array, v
                 f"excited, {min(1.0, part):.0%} of it is lost over the run; take a smaller step, "
                 f"or method={AUTOMATIC_METHOD!r}"
             )
-            found.append((part, text))
-    if found:
-        yield max(found)[1]
+            signs.append((part, text))
+    if signs:
+        yield max(signs)[1]
+
+
+def lost(steps: Any, h: float, rates: Any, duration: float) -> tuple[float, complex]:
+    """Return the largest loss of a mode's phase or amplitude over some time, and that mode's rate.
+
+    A step of h (s) multiplies a mode by μ of `steps`, the exact flow by exp(h λ) of `rates`; n steps are off by the
+    factor exp(n (ln μ - h λ)). It counts as long as the mode lasts; one that is soon gone is passed over (Hairer,
+    Wanner 1996, IV.2).
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    # Zero has no logarithm.
+    steps = np.log(np.where(np.abs(steps) > 1e-300, steps, 1e-300).astype(complex))
+    gap = steps[None, :] - h * rates[:, None]
+    gap.imag = (gap.imag + np.pi) % (2 * np.pi) - np.pi
+    modes, partners = linear_sum_assignment(np.abs(gap))
+    off = np.abs(gap[modes, partners])
+    dies = np.minimum(-rates.real[modes], -steps.real[partners] / h)
+    lasting = np.minimum(duration, 1 / np.maximum(dies, 1e-300))
+    part = np.where(lasting < _BRIEF * duration, 0.0, off * lasting / h)
+    worst = int(part.argmax())
+    return float(part[worst]), complex(rates[modes[worst]])
 
 
 def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[str]:
@@ -277,11 +302,6 @@ def accumulated_error(method: str, tolerances: Tolerances, numbers: int, steps: 
         )
 
 
-def _keeps_digits(dyn: Dynamics, method: Method) -> bool:
-    """Return whether neither the engine nor the method solves with the mass matrix."""
-    return getattr(dyn, "elimination", "") == "least constraint" and not method.mass_matrix
-
-
 def massless_joints(dyn: Dynamics, q: Array) -> str:
     """Return the end of a message that names the joints which move next to no mass at q, or nothing."""
     model = dyn.model
@@ -297,7 +317,7 @@ def massless_joints(dyn: Dynamics, q: Array) -> str:
     if not values[0] < _IDLE * values[-1]:
         return ""
     part = np.abs(vectors[:, 0])
-    found = [j for j in model.independent_joints if part[model.layout.v[j.name]].max(initial=0.0) > 0.5 * part.max()]
-    names = " and ".join(repr(j.name) for j in found)
-    lock = " (gimbal lock)" if any(len(j.type.angular) > 1 for j in found) else ""
+    light = [j for j in model.independent_joints if part[model.layout.v[j.name]].max(initial=0.0) > 0.5 * part.max()]
+    names = " and ".join(repr(j.name) for j in light)
+    lock = " (gimbal lock)" if any(len(j.type.angular) > 1 for j in light) else ""
     return f"; there joint {names} moves next to no mass{lock}, so that the mass matrix is nearly singular"

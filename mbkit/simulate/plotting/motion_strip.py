@@ -12,14 +12,13 @@ from mbkit._check import Array, count
 from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.simulate.along_trajectory import moved
-from mbkit.simulate.plotting.stick_figure import Plane, Skeleton, plane_of, skeleton
+from mbkit.simulate.plotting.stick_figure import Skeleton, direction_name, plane_of, skeleton
 from mbkit.simulate.plotting.time_series import ACCENT, BAD, FAINT, GHOST, INK, MUTED, drawing
 from mbkit.simulate.run_data import RunData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 
 # Inches, at most.
 _WIDTH: Final = 11.0
@@ -29,13 +28,18 @@ _SHAPE: Final = 3.0
 #: Edges of a box whose corners are counted with x slowest, and its side at -x.
 _EDGES: Final = [(i, i | b) for i in range(8) for b in (1, 2, 4) if not i & b]
 _SIDE: Final = [0, 1, 3, 2]
+_DOTS: Final[Any] = {"marker": "o", "linestyle": "none"}
+#: Steps of the path between two figures.
+_FINE: Final = 40
+#: A run that diverged is drawn up to so many times the size of its first figures.
+_FAR: Final = 6.0
 
 
-class Strip:
+class _Strip:
     """Windows of one size, side by side, each of which holds the points `seen`, (P, 2); `size` is in inches."""
 
-    def __init__(self, drawn: Skeleton, plane: Plane, seen: Array, figures: int) -> None:
-        self._drawn, self._plane, self._figures = drawn, plane, figures
+    def __init__(self, drawn: Skeleton, plane: Array, seen: Array, figures: int) -> None:
+        self._drawn, self._plane = drawn, plane
         low, high = seen.min(axis=0), seen.max(axis=0)
         largest = float((high - low).max()) or 1.0
         # Room around the figure, and never a window that is a line.
@@ -43,125 +47,84 @@ class Strip:
         self._low, self._window = low - room, high - low + 2 * room
         self._gap = 0.12 * largest
         self._cell = self._window + np.array([0.3, 1.2]) * self._gap
-        self._columns = self._best_columns()
+
+        def waste(columns: int) -> float:
+            rows = -(-figures // columns)
+            shape = columns * self._cell[0] / (rows * self._cell[1])
+            return abs(math.log(shape / _SHAPE)) + 2 * math.log(columns * rows / figures)
+
+        self._columns = min(range(1, figures + 1), key=waste)
         self._rows = -(-figures // self._columns)
         whole = self._cell * [self._columns, self._rows]
         scale = min(_WIDTH / whole[0], _HEIGHT / whole[1])
         self.size = (max(4.5, whole[0] * scale), whole[1] * scale + 0.6)
 
-    def _best_columns(self) -> int:
-        def waste(columns: int) -> float:
-            rows = -(-self._figures // columns)
-            shape = columns * self._cell[0] / (rows * self._cell[1])
-            return abs(math.log(shape / _SHAPE)) + 2 * math.log(columns * rows / self._figures)
-
-        return min(range(1, self._figures + 1), key=waste)
-
-    def draw(self, axis: Axes, k: int, t: float, since: tuple[int, int]) -> None:
-        """Draw figure k at t (s), the one before it and the path between; `since` are their indices of time."""
+    def draw(self, axis: Axes, k: int, t: float, before: int, now: int) -> None:
+        """Draw figure k at t (s), the one before it and the path between, by their indices of time."""
         from matplotlib.patches import Rectangle
 
+        drawn = self._drawn
         corner = self._cell * [k % self._columns, -(k // self._columns)]
         window = axis.add_patch(Rectangle(tuple(corner), *self._window, facecolor="none", edgecolor=FAINT, zorder=0))
-        pen = _Pen(axis, window, lambda points: self._plane.of(points) - self._low + corner)
-        before, now = since
-        self._ground(pen, corner, first=k == 0)
-        pen.line(self._drawn.path, color=GHOST, linewidth=0.8, zorder=1)
+
+        def line(points: Array, how: str = "plot", **style: Any) -> None:
+            # Not as an argument of plot: the axis would put its own bounds in its place.
+            for artist in getattr(axis, how)(*(points @ self._plane.T - self._low + corner).T, **style):
+                artist.set_clip_path(window)
+
+        # A rail is where a cart has been.
+        for cart in drawn.carts:
+            line(cart, color=FAINT, linewidth=5, zorder=0.5, solid_capstyle="round")
+        line(drawn.anchors[:, 0], **{**_DOTS, "marker": 6}, color=MUTED, markersize=9, zorder=2)
+        level = -self._low[1]
+        grounded = len(drawn.anchors) or len(drawn.carts)
+        if not grounded and direction_name(self._plane[1]) == "z" and 0 < level < self._window[1]:
+            ends = corner + np.array([[0, level], [self._window[0], level]])
+            axis.plot(*ends.T, color=MUTED, linewidth=0.8, linestyle=(0, (1, 2)), zorder=0.6)
+            if not k:
+                axis.text(ends[0, 0], ends[0, 1], " z = 0", color=MUTED, fontsize=7.5, va="bottom")
+        line(drawn.path, color=GHOST, linewidth=0.8, zorder=1)
         if k:
-            self._figure(pen, before, GHOST)
-        pen.line(self._drawn.path[before : now + 1], color=ACCENT, linewidth=1.8, zorder=5)
-        self._figure(pen, now, INK)
-        pen.dots(self._drawn.path[now : now + 1], color=ACCENT, markersize=5, zorder=8)
+            self._figure(line, before, GHOST, 3.0)
+        line(drawn.path[before : now + 1], color=ACCENT, linewidth=1.8, zorder=5)
+        self._figure(line, now, INK, 6.0)
+        line(drawn.path[now : now + 1], **_DOTS, color=ACCENT, markersize=5, zorder=8)
         x, y = corner[0] + self._window[0] / 2, corner[1] - 0.15 * self._gap
         axis.text(x, y, f"t = {t:.3g} s", ha="center", va="top", fontsize=8.5)
 
-    def _ground(self, pen: _Pen, corner: Array, *, first: bool) -> None:
+    def _figure(self, line: Any, i: int, colour: str, z: float) -> None:
         drawn = self._drawn
-        # A rail is where a cart has been.
-        for cart in drawn.carts:
-            pen.line(cart, color=FAINT, linewidth=5, zorder=0.5, solid_capstyle="round")
-        pen.dots(drawn.anchors[:, 0], marker=6, color=MUTED, markersize=9, zorder=2)
-        level = -self._low[1]
-        if (
-            not len(drawn.anchors)
-            and not len(drawn.carts)
-            and self._plane.names[1] == "z"
-            and 0 < level < self._window[1]
-        ):
-            ends = corner + np.array([[0, level], [self._window[0], level]])
-            pen.axis.plot(*ends.T, color=MUTED, linewidth=0.8, linestyle=(0, (1, 2)), zorder=0.6)
-            if first:
-                pen.axis.text(ends[0, 0], ends[0, 1], " z = 0", color=MUTED, fontsize=7.5, va="bottom")
-
-    def _figure(self, pen: _Pen, i: int, colour: str) -> None:
-        drawn, z = self._drawn, 3.0 if colour == GHOST else 6.0
         for stick in drawn.slides[:, :, i]:
-            pen.line(stick, color=colour, linewidth=1.0, zorder=z)
-            if colour != GHOST:
-                pen.dots(stick[1:], marker="s", color=colour, markersize=4, zorder=z + 0.1)
+            line(stick, color=colour, linewidth=1.0, zorder=z)
         for box in drawn.boxes[:, :, i]:
-            pen.area(box[_SIDE], facecolor=colour, alpha=0.35, zorder=z)
+            line(box[_SIDE], "fill", facecolor=colour, alpha=0.35, zorder=z)
             for edge in _EDGES:
-                pen.line(box[list(edge)], color=colour, linewidth=1.2, zorder=z)
+                line(box[list(edge)], color=colour, linewidth=1.2, zorder=z)
         for stick in drawn.links[:, :, i]:
-            pen.line(stick, color=colour, linewidth=2.4, zorder=z, solid_capstyle="round")
+            line(stick, color=colour, linewidth=2.4, zorder=z, solid_capstyle="round")
         if colour == GHOST:
             return
-        pen.dots(drawn.carts[:, i], marker="s", color=colour, markersize=9, zorder=z + 0.1)
-        pen.dots(drawn.joints[:, i], color=colour, markerfacecolor="white", markersize=4, zorder=z + 0.2)
-        pen.dots(drawn.masses[:, i], color=colour, markersize=8, zorder=z + 0.3)
+        square = {**_DOTS, "marker": "s", "color": colour, "zorder": z + 0.1}
+        line(drawn.slides[:, 1, i], markersize=4, **square)
+        line(drawn.carts[:, i], markersize=9, **square)
+        line(drawn.joints[:, i], **_DOTS, color=colour, markerfacecolor="white", markersize=4, zorder=z + 0.2)
+        line(drawn.masses[:, i], **_DOTS, color=colour, markersize=8, zorder=z + 0.3)
 
     def frame(self, axis: Axes) -> None:
         """Set the axis's bounds; draw the scale and the directions."""
-        x, y = self._plane.names
-        bar = _round(0.3 * self._window[0])
+        right, up = (direction_name(x) for x in self._plane)
+        room = 0.3 * self._window[0]
+        power = 10.0 ** math.floor(math.log10(room))
+        bar = next(k * power for k in (5, 2, 1) if k * power <= room)
         bottom = (1 - self._rows) * self._cell[1] - 0.95 * self._gap
         axis.plot([0, bar], [bottom, bottom], color=INK, linewidth=2, solid_capstyle="butt")
-        axis.annotate(
-            f"{bar:g} m; {x} to the right, {y} upwards",
-            (bar, bottom),
-            xytext=(5, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8.5,
-        )
+        text = f"{bar:g} m; {right} to the right, {up} upwards"
+        style: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8.5}
+        axis.annotate(text, (bar, bottom), xytext=(5, 0), **style)
         axis.set_xlim(-0.02 * self._cell[0], self._columns * self._cell[0])
         axis.set_ylim(bottom - 0.3 * self._gap, self._window[1] + 0.1 * self._gap)
         axis.set_aspect("equal")
         axis.set_axis_off()
-
-
-def _round(length: float) -> float:
-    """Return the largest of 1, 2 and 5 times a power of ten below a length."""
-    power = 10.0 ** math.floor(math.log10(length))
-    return next(k * power for k in (5, 2, 1) if k * power <= length)
-
-
-class _Pen:
-    """Draws points of space in a window."""
-
-    def __init__(self, axis: Axes, window: Any, place: Any) -> None:
-        self.axis, self._window, self._place = axis, window, place
-
-    def line(self, points: Array, **style: Any) -> None:
-        # Not as an argument of plot: the axis would put its own bounds in its place.
-        for line in self.axis.plot(*self._place(points).T, **style):
-            line.set_clip_path(self._window)
-
-    def dots(self, points: Array, **style: Any) -> None:
-        self.line(points, **{"marker": "o", "linestyle": "none", **style})
-
-    def area(self, points: Array, **style: Any) -> None:
-        from matplotlib.patches import Polygon
-
-        patch = self.axis.add_patch(Polygon(self._place(points), **style))
-        patch.set_clip_path(self._window)
-
-
-#: Steps of the path between two figures.
-_FINE: Final = 40
-#: A run that diverged is drawn up to so many times the size of its first figures.
-_FAR: Final = 6.0
 
 
 def picture(run: RunData, model: Model, figures: int, view: str | ArrayLike | None, member: int) -> Figure:
@@ -169,8 +132,12 @@ def picture(run: RunData, model: Model, figures: int, view: str | ArrayLike | No
     from matplotlib.figure import Figure
 
     figures = count("count", figures, least=1)
-    t, q, v = _states(run, member)
-    if len(t) < 2 or t[0] == t[-1]:
+    q, v = (run.q[member], run.v[member]) if run.q.ndim == 3 else (run.q, run.v)
+    good = np.isfinite(q).all(-1) & np.isfinite(v).all(-1)
+    if not good.any():
+        raise InputError("picture: the trajectory has no state")
+    t, q, v = run.t[good], q[good], v[good]
+    if t[0] == t[-1]:
         figures = 1
     at = np.linspace(t[0], t[-1], (figures - 1) * _FINE + 1)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -179,27 +146,18 @@ def picture(run: RunData, model: Model, figures: int, view: str | ArrayLike | No
     points = drawn.points()
     seen = points.transpose(1, 0, 2)[_near(points, run.stats.ended == "diverged")].reshape(-1, 3)
     plane = plane_of(view, seen, model.gravity)
-    strip = Strip(drawn, plane, plane.of(seen), figures)
+    strip = _Strip(drawn, plane, seen @ plane.T, figures)
     with drawing():
         figure = Figure(figsize=strip.size, layout="constrained")
         axis = figure.add_subplot()
         for k in range(figures):
-            strip.draw(axis, k, float(at[k * _FINE]), (max(k - 1, 0) * _FINE, k * _FINE))
+            strip.draw(axis, k, float(at[k * _FINE]), max(k - 1, 0) * _FINE, k * _FINE)
         strip.frame(axis)
         title = f"{model.name}: {run.method} on {run.engine}"
         axis.set_title(title + (f", trajectory {member}" if run.q.ndim == 3 else ""), loc="left")
-        if run.stats.ended not in ("finished", "event"):
+        if not run.stats.finished:
             axis.set_title(run.stats.ended.replace("_", " "), loc="right", color=BAD)
     return figure
-
-
-def _states(run: RunData, member: int) -> tuple[Array, Array, Array]:
-    """Return the good states of one trajectory."""
-    q, v = (run.q[member], run.v[member]) if run.q.ndim == 3 else (run.q, run.v)
-    good = np.isfinite(q).all(-1) & np.isfinite(v).all(-1)
-    if not good.any():
-        raise InputError("picture: the trajectory has no state")
-    return run.t[good], q[good], v[good]
 
 
 def _between(model: Model, t: Array, q: Array, v: Array, at: Array) -> Array:

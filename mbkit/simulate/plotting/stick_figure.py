@@ -5,9 +5,9 @@ Bodies that fixed joints hold together are one link. Places follow from the desc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from itertools import product
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,149 +36,115 @@ class Skeleton:
 
     def points(self) -> Array:
         """Return all points, (P, n, 3)."""
-        n = len(self.path)
         parts = (self.links, self.slides, self.joints, self.carts, self.anchors, self.boxes, self.path)
-        return np.concatenate([part.reshape(-1, n, 3) for part in parts])
-
-
-class _Pose:
-    """R_WF and p_WF at every configuration."""
-
-    def __init__(self, R: Array, p: Array) -> None:
-        self.R, self.p = R, p
-
-    def of(self, point: Array) -> Array:
-        """Return a point of the frame in world axes, (n, 3)."""
-        return np.asarray(self.p + self.R @ point)
-
-    def then(self, R: Array, p: Array) -> _Pose:
-        """Return a frame that stands in this one."""
-        return _Pose(self.R @ R, self.p + np.einsum("nij,nj->ni", self.R, np.broadcast_to(p, self.p.shape)))
+        return np.concatenate([part.reshape(-1, *self.path.shape) for part in parts])
 
 
 def skeleton(model: Model, q: Array) -> Skeleton:
     """Return the sticks at configurations (n, nq)."""
     n = len(q)
-    full = model.layout.expand_q(q)
-    poses = {"world": _Pose(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
-    bases: dict[str, _Pose] = {}
-    for joint in model.tree:
-        bases[joint.name] = poses[joint.parent].then(joint.rotation, joint.translation)
-        poses[joint.child] = bases[joint.name].then(*_placement(joint, full[:, model.layout.full_q[joint.name]]))
-    return _Drawn(model, poses, bases).whole(n)
+    tree = _Tree(model, q)
+    parts: dict[str, list[Any]] = {name: [] for name in Skeleton.__dataclass_fields__ if name != "path"}
+    for joint in tree.moving:
+        parent, base, place = tree.link[joint.parent], tree.bases[joint.name], tree.origin(joint.child)
+        flies, slides = joint.type.floating, _slides(joint)
+        if parent != "world":
+            parts["links"] += [] if flies else [[tree.origin(parent), base]]
+            parts["slides"] += [[base, place]] if slides else []
+        else:
+            foot = base if joint.parent == "world" else tree.origin(tree.ground[joint.parent])
+            parts["links"] += [] if joint.parent == "world" else [[foot, base]]
+            parts["anchors"] += [] if flies or slides else [foot]
+            parts["carts"] += [place] if slides else []
+        parts["joints"] += [] if flies or slides else [place]
+    path, deepest = np.zeros((n, 3)), 0
+    carrying = {tree.link[joint.parent] for joint in tree.moving}
+    for joint in tree.moving:
+        link = joint.child
+        if link in carrying:
+            continue
+        here = tree.origin(link)
+        tip, weighs = tree.tip(link)
+        if tip is not None:
+            parts["links"].append([here, tip])
+            parts["masses"] += [tip] if weighs else []
+        elif not _slides(joint):
+            parts["boxes"].append(tree.box(link))
+        if tree.depth[link] > deepest:
+            path, deepest = here if tip is None else tip, tree.depth[link]
+    if tree.moving and tree.moving[0].type.floating:
+        base_body = tree.moving[0].child
+        path = tree.at(base_body, model.body(base_body).com)
+    ends = {"links": (2,), "slides": (2,), "boxes": (8,)}
+    arrays = {k: np.array(x, dtype=np.float64).reshape(len(x), *ends.get(k, ()), n, 3) for k, x in parts.items()}
+    return Skeleton(**arrays, path=path)
 
 
-def _placement(joint: Joint, q: Array) -> tuple[Array, Array]:
-    # The formulas are for the components of all configurations at once.
-    R, p = joint.type.placement(np, joint, list(q.T))
-    n = len(q)
-    rows = [[np.broadcast_to(x, n) for x in row] for row in R]
-    return np.array(rows).transpose(2, 0, 1), np.array([np.broadcast_to(x, n) for x in p]).T
+def _slides(joint: Joint) -> bool:
+    return bool(joint.type.lengths) and not joint.type.floating
 
 
-class _Drawn:
-    """The parts of a drawn tree."""
+class _Tree:
+    """The poses of all bodies, and what link each belongs to: it goes by the name of its first body."""
 
-    def __init__(self, model: Model, poses: dict[str, _Pose], bases: dict[str, _Pose]) -> None:
-        self._model, self._poses, self._bases = model, poses, bases
-        self._root = {"world": "world"}
-        self._depth = {"world": 0}
-        self._members: dict[str, list[str]] = {"world": []}
+    def __init__(self, model: Model, q: Array) -> None:
+        n, full = len(q), model.layout.expand_q(q)
+        self._model = model
+        self._poses = {"world": (np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
+        #: Places of the joints on their parents.
+        self.bases: dict[str, Array] = {}
+        self.link, self.depth = {"world": "world"}, {"world": 0}
+        #: The body on the world that carries each body.
+        self.ground: dict[str, str] = {}
+        self.moving = [joint for joint in model.tree if joint.type.nv]
         for joint in model.tree:
-            fixed = not joint.type.nv
-            root = self._root[joint.parent] if fixed else joint.child
-            self._root[joint.child] = root
-            self._members.setdefault(root, []).append(joint.child)
-            if not fixed:
-                self._depth[root] = self._depth[self._root[joint.parent]] + 1
-        self._moving = [j for j in model.tree if j.type.nv]
+            parent, child = joint.parent, joint.child
+            R_WJ = self._poses[parent][0] @ joint.rotation
+            R, p = joint.type.placement(np, joint, list(full[:, model.layout.full_q[joint.name]].T))
+            R_JC = np.array([[np.broadcast_to(x, n) for x in row] for row in R]).transpose(2, 0, 1)
+            p_JC = np.array([np.broadcast_to(x, n) for x in p]).T
+            self.bases[joint.name] = self.at(parent, joint.translation)
+            self._poses[child] = R_WJ @ R_JC, self.bases[joint.name] + np.einsum("nij,nj->ni", R_WJ, p_JC)
+            self.link[child] = child if joint.type.nv else self.link[parent]
+            self.ground[child] = self.ground.get(parent, child)
+            if joint.type.nv:
+                self.depth[child] = self.depth[self.link[parent]] + 1
 
-    def whole(self, n: int) -> Skeleton:
-        links, slides, joints, carts, masses, anchors, boxes = ([] for _ in range(7))
-        path, deepest = np.zeros((n, 3)), 0
-        for joint in self._moving:
-            root, base, place = self._root[joint.parent], self._bases[joint.name].p, self._poses[joint.child].p
-            flies = joint.type.floating
-            slides_along = bool(joint.type.lengths) and not flies
-            if root == "world":
-                foot = base if joint.parent == "world" else self._foot(joint)
-                links += [] if foot is base else [[foot, base]]
-                anchors += [] if flies or slides_along else [foot]
-            elif not flies:
-                links.append([self._poses[root].p, base])
-            if slides_along and root == "world":
-                carts.append(place)
-            elif slides_along:
-                slides.append([base, place])
-            joints += [] if flies or slides_along else [place]
-        carrying = {self._root[j.parent] for j in self._moving}
-        for root, depth in self._depth.items():
-            if root == "world":
-                continue
-            tip, weighs = (None, False) if root in carrying else self._tip(root)
-            here = self._poses[root].p
-            if tip is not None:
-                links.append([here, tip])
-                masses += [tip] if weighs else []
-            elif root not in carrying and not self._slides(root):
-                boxes.append(self._box(root))
-            if depth > deepest and root not in carrying:
-                path, deepest = here if tip is None else tip, depth
-        first = self._moving[0] if self._moving else None
-        if first is not None and first.type.floating:
-            path = self._poses[first.child].of(self._model.body(first.child).com)
+    def at(self, body: str, point: Array) -> Array:
+        """Return a point of a body in world axes, (n, 3)."""
+        R, p = self._poses[body]
+        return np.asarray(p + R @ point)
 
-        def stacked(parts: Sequence[object], *shape: int) -> Array:
-            return np.array(parts, dtype=np.float64).reshape(len(parts), *shape, n, 3)
+    def origin(self, body: str) -> Array:
+        """Return the place of a body's frame, (n, 3)."""
+        return self._poses[body][1]
 
-        return Skeleton(
-            links=stacked(links, 2),
-            slides=stacked(slides, 2),
-            joints=stacked(joints),
-            carts=stacked(carts),
-            masses=stacked(masses),
-            anchors=stacked(anchors),
-            boxes=stacked(boxes, 8),
-            path=path,
-        )
-
-    def _foot(self, joint: Joint) -> Array:
-        """Return the origin of the body on the ground that a joint stands on."""
-        body = joint.parent
-        above = {j.child: j.parent for j in self._model.tree}
-        while above[body] != "world":
-            body = above[body]
-        return self._poses[body].p
-
-    def _slides(self, root: str) -> bool:
-        return any(j.child == root and j.type.lengths and not j.type.floating for j in self._moving)
-
-    def _tip(self, root: str) -> tuple[Array | None, bool]:
+    def tip(self, link: str) -> tuple[Array | None, bool]:
         """Return the end of a last link, and whether it is a centre of mass."""
-        here, members = self._poses[root].p, self._members[root]
-        found = [self._poses[body].p for body in members]
-        found += [self._poses[f.body].of(f.translation) for f in self._model.frames if f.body in members]
-        masses = [self._poses[b].of(self._model.body(b).com) for b in members if self._model.body(b).mass]
-        for points, weigh in ((found, False), (masses, True)):
+        here, model = self.origin(link), self._model
+        bodies = [model.body(name) for name, own in self.link.items() if own == link and name != "world"]
+        names = [body.name for body in bodies]
+        places = [self.origin(name) for name in names]
+        places += [self.at(f.body, f.translation) for f in model.frames if f.body in names]
+        masses = [self.at(body.name, body.com) for body in bodies if body.mass]
+        for points, weigh in ((places, False), (masses, True)):
             far = max(points, key=lambda p: float(np.linalg.norm(p[0] - here[0])), default=here)
             # Shorter lengths of robots are rounding.
             if np.linalg.norm(far[0] - here[0]) > 1e-6:
-                same = any(np.allclose(far[0], m[0], rtol=0, atol=1e-9) for m in masses)
-                return far, weigh or same
+                return far, weigh or any(np.allclose(far[0], m[0], rtol=0, atol=1e-9) for m in masses)
         return None, False
 
-    def _box(self, root: str) -> Array:
+    def box(self, name: str) -> Array:
         """Return the corners of the uniform box with a body's mass and inertia, (8, n, 3)."""
-        body = self._model.body(root)
+        body = self._model.body(name)
         moments, axes = np.linalg.eigh(body.inertia)
         # ∫ x² dm of each principal axis; of a box it is m/3 times the half length squared.
         squares = np.maximum(moments.sum() / 2 - moments, 0.0)
         half = np.sqrt(3 * squares / body.mass) if body.mass else np.zeros(3)
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        return np.array([self._poses[root].of(body.com + axes @ (half * s)) for s in signs])
+        return np.array([self.at(name, body.com + axes @ (half * s)) for s in product((-1, 1), repeat=3)])
 
 
-# The plane of a picture of a motion in space.
+# The plane of a picture of a motion in space: two orthonormal rows, to the right and upwards, in world axes.
 
 _AXES: Final = "xyz"
 # A world axis that shows this much of the widest spread reads better than a slanted one.
@@ -187,83 +153,66 @@ _NEARLY: Final = 0.9
 _FLAT: Final = 0.02
 
 
-@dataclass(frozen=True)
-class Plane:
-    """Two orthonormal directions, to the right and upwards, in world axes."""
-
-    right: Array
-    up: Array
-
-    def of(self, points: Array) -> Array:
-        """Return points (..., 3) in the plane, (..., 2)."""
-        return np.stack([points @ self.right, points @ self.up], axis=-1)
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """Names of the directions."""
-        return _name(self.right), _name(self.up)
-
-
-def _name(direction: Array) -> str:
+def direction_name(direction: Array) -> str:
+    """Return a world axis's name, or the components."""
     k = int(np.argmax(np.abs(direction)))
     if abs(direction[k]) > 1 - 1e-9:
         return ("-" if direction[k] < 0 else "") + _AXES[k]
     return "(" + ", ".join(f"{x:.2g}" for x in direction + 0.0) + ")"
 
 
-def plane_of(view: str | ArrayLike | None, points: Array, gravity: Array) -> Plane:
-    """Return the plane of the argument `view`, or the one that shows most of the points (P, 3)."""
+def plane_of(view: str | ArrayLike | None, points: Array, gravity: Array) -> Array:
+    """Return the plane (2, 3) of the argument `view`, or the one that shows most of the points (P, 3)."""
     if view is None:
-        return _widest(points - points.mean(axis=0), gravity)
+        return np.array(_widest(points - points.mean(axis=0), gravity))
     if isinstance(view, str):
         if len(view) != 2 or view[0] == view[1] or not set(view) <= set(_AXES):
             raise InputError(f"view: expected two of x, y and z such as 'xz', or two directions, got {view!r}")
-        right, up = np.eye(3)[[_AXES.index(a) for a in view]]
-        return Plane(right, up)
+        return np.eye(3)[[_AXES.index(a) for a in view]]
     right, up = finite_array("view", view, (2, 3))
     lengths = np.linalg.norm(right), np.linalg.norm(up)
     if not all(lengths) or np.linalg.norm(np.cross(right, up)) < 1e-9 * lengths[0] * lengths[1]:
         raise InputError("view: expected two directions that are not along one line")
     right = right / lengths[0]
-    up = up - (up @ right) * right
-    return Plane(right, up / np.linalg.norm(up))
+    return np.array([right, _across(up, right)])
 
 
-def _widest(points: Array, gravity: Array) -> Plane:
+def _across(x: Array, direction: Array) -> Array:
+    """Return the unit vector of the part of x that is normal to a direction."""
+    x = x - (x @ direction) * direction
+    return np.asarray(x / np.linalg.norm(x))
+
+
+def _positive(x: Array) -> Array:
+    return x if x[np.argmax(np.abs(x))] > 0 else -x
+
+
+def _widest(points: Array, gravity: Array) -> tuple[Array, Array]:
     g = float(np.linalg.norm(gravity))
     if g:
         up = -gravity / g
         right = _spread(points, up)
         ahead = np.cross(up, right)
         tall, wide, deep = (float(np.ptp(points @ x)) for x in (up, right, ahead))
-        if tall > _FLAT * max(wide, deep) or deep <= tall:
-            return Plane(right, up)
-        return Plane(right, ahead)
+        return right, up if tall > _FLAT * max(wide, deep) or deep <= tall else ahead
     # Nothing says where up is: the plane that shows most, z or else y upwards in it.
-    normal = np.linalg.eigh(points.T @ points)[1][:, 0]
+    squares, axes = np.linalg.eigh(points.T @ points)
+    normal = axes[:, 0]
     k = int(np.argmax(np.abs(normal)))
-    spread = np.linalg.eigvalsh(points.T @ points)
-    if points[:, k] @ points[:, k] <= spread[0] / _NEARLY**2 + 1e-12 * spread[2]:
+    if points[:, k] @ points[:, k] <= squares[0] / _NEARLY**2 + 1e-12 * squares[2]:
         normal = np.eye(3)[k]
-    up = np.eye(3)[1 if abs(normal[2]) > _NEARLY else 2]
-    up = up - (up @ normal) * normal
-    up /= np.linalg.norm(up)
-    right = np.cross(up, normal)
-    return Plane(right if right[np.argmax(np.abs(right))] > 0 else -right, up)
+    up = _across(np.eye(3)[1 if abs(normal[2]) > _NEARLY else 2], normal)
+    return _positive(np.cross(up, normal)), up
 
 
 def _spread(points: Array, up: Array) -> Array:
     """Return the direction across `up` in which the points are widest, a world axis if one nearly is."""
     across = points - np.outer(points @ up, up)
     squares, axes = np.linalg.eigh(across.T @ across)
-    best = axes[:, 2]
     for axis in np.eye(3):
-        level = abs(axis @ up) < 1e-9
-        if level and np.sum((across @ axis) ** 2) >= _NEARLY**2 * squares[2]:
+        if abs(axis @ up) < 1e-9 and np.sum((across @ axis) ** 2) >= _NEARLY**2 * squares[2]:
             return np.asarray(axis)
-    best = best - (best @ up) * up
-    if not squares[2] or not best.any():
+    if not squares[2]:
         # Only up and down: any level direction.
-        best = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    best /= np.linalg.norm(best)
-    return np.asarray(best if best[np.argmax(np.abs(best))] > 0 else -best)
+        return _positive(_across(np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))]), up))
+    return _positive(_across(axes[:, 2], up))

@@ -1,1 +1,0 @@
-"""Constraints: manifold, multipliers, redundancy, independent coordinates."""
