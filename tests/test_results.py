@@ -12,8 +12,7 @@ import pytest
 
 from mbkit.errors import InputError, OutputError
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.baseline.result import BaselineResult
-from mbkit.studies.baseline.tolerance import Moved, VersionChange
+from mbkit.studies.baseline.result import BaselineResult, Moved, VersionChange
 from mbkit.studies.compare.result import Comparison
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.result import Cause, Explanation

@@ -239,6 +239,7 @@ _MEANINGS: Final = {
     "inertia axes": "The same principal moments, about other axes.",
     "inverse rotation": "A rotation from child to parent was taken for the one from parent to child.",
     "inverse placement": "A frame's place in another was taken for the other's place in it.",
+    "joint coupling": "A gear or transmission couples joints: its rotor's inertia adds to M between them.",
     "joint held still": "What moves on one side is fixed on the other, so q and v are not the same there.",
     "joint kind": "The joint moves in another way.",
     "joint order": "q and v name the same joints in another order; read them by name.",

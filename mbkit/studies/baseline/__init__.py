@@ -3,11 +3,9 @@
 `record` writes, `check` holds a model and the installed engines against it, `diff` reads two.
 """
 
-from mbkit.studies.baseline.check import check, diff
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.file import Baseline, read
-from mbkit.studies.baseline.record import record
-from mbkit.studies.baseline.result import BaselineResult
-from mbkit.studies.baseline.tolerance import Moved, VersionChange
+from mbkit.studies.baseline.result import BaselineResult, Moved, VersionChange
+from mbkit.studies.baseline.study import check, diff, record
 
 __all__ = ["Baseline", "BaselineResult", "Change", "Moved", "VersionChange", "check", "diff", "read", "record"]

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load import load
@@ -49,11 +50,12 @@ _TRIANGLE: Final = np.triu_indices(3)
 
 def described(model: Model) -> Description:
     """Return every number and name of a model, in its own order."""
+    parameters: Part = {name: float(x) for name, x in model.parameters.items() if x is not None}
     if not model.has_bodies:
-        return _written(model, model.form)  # type: ignore[attr-defined]  # energies have their system
+        return _written(model, parameters)
     out: Description = {
         "system": {"": {"name": model.name, "gravity": _plain(model.gravity)}},
-        "parameters": {"": _parameters(model)},
+        "parameters": {"": parameters},
         "expressions": {
             "": {f"{b.field}{_at(b.index)} of {b.part}".strip(): str(b.expression) for b in model.bindings}
         },
@@ -68,26 +70,19 @@ def described(model: Model) -> Description:
     return {section: parts for section, parts in out.items() if any(parts.values())}
 
 
-def _written(model: Model, s: Any) -> Description:
+def _written(model: Model, parameters: Part) -> Description:
+    s: Any = model.form  # type: ignore[attr-defined]  # energies have their system
     named = {"T": s.T, "V": s.V, "dissipation": s.dissipation, "forces": list(s.forces)}
     named |= {f"constraint {k + 1}": x for k, x in enumerate(s.constraints)}
     if hasattr(s, "D"):
         # Of a system in quasi-velocities: what makes them the coordinates' rates.
         named["D"] = s.D.tolist()
-    names = {
-        "name": model.name,
-        "coordinates": ", ".join(model.coordinate_names),
-        "velocities": ", ".join(model.velocity_names),
-    }
+    names = {"coordinates": ", ".join(model.coordinate_names), "velocities": ", ".join(model.velocity_names)}
     return {
-        "system": {"": names},
-        "parameters": {"": _parameters(model)},
+        "system": {"": {"name": model.name} | names},
+        "parameters": {"": parameters},
         "energies": {"": {name: str(x) for name, x in named.items()}},
     }
-
-
-def _parameters(model: Model) -> Part:
-    return {name: float(x) for name, x in model.parameters.items() if x is not None}
 
 
 def _at(index: tuple[int, ...]) -> str:
@@ -117,8 +112,11 @@ def _part(part: Any, name: str) -> Part:
         if f.name == "mimic":
             if value is not None:
                 out |= {"mimic": value.joint, "ratio": value.ratio, "offset": value.offset}
-        elif f.name != name and (isinstance(value, (str, tuple)) or not _is_default(f.name, value) or f.name == "mass"):
-            out[f.name] = _plain(value[_TRIANGLE] if f.name == "inertia" else value)
+        elif f.name != name:
+            plain = _plain(value[_TRIANGLE] if f.name == "inertia" else value)
+            kept = f.name == "mass" or isinstance(value, (str, tuple))
+            if kept or not np.array_equal(plain, default(f.name, plain)):
+                out[f.name] = plain
     return out
 
 
@@ -126,11 +124,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return ", ".join(value)
     return [float(x) for x in value.ravel()] if isinstance(value, np.ndarray) else value
-
-
-def _is_default(field: str, value: Any) -> bool:
-    plain = _plain(value)
-    return bool(np.array_equal(plain, default(field, plain)))
 
 
 def default(field: str, like: Any) -> Any:
@@ -179,19 +172,10 @@ _TURNED: Final = 1e-7
 class Change:
     """One parameter that differs.
 
-    Attributes
-    ----------
-    section : str
-        Such as ``"bodies"``.
-    part : str
-        Name of the body, joint or other part; empty where the section has but one.
-    field : str
-        Such as ``"mass"``; empty where the whole part is new or gone.
-    old, new : number, text, list of numbers or None
-    text : str
-        In words: ``"mass of body link5: 2.3 → 2.31"``.
-    rounding : bool
-        Whether it is no more than rounding.
+    `section` is such as ``"bodies"``; `part` is the name of the body, joint or other part, empty where the section has
+    but one; `field` is such as ``"mass"``, empty where the whole part is new or gone; `old` and `new` are a number, a
+    text, a list of numbers or None; `text` says it in words: ``"mass of body link5: 2.3 → 2.31"``. `rounding` says
+    whether it is no more than rounding.
     """
 
     section: str
@@ -210,17 +194,15 @@ def changes(old: Description, new: Description) -> tuple[Change, ...]:
 
 def _section(section: str, old: Description, new: Description) -> Iterator[Change]:
     before, after = old.get(section, {}), new.get(section, {})
-    gone = [n for n in before if n not in after and n]
-    added = [n for n in after if n not in before and n]
     noun = SECTIONS[section]
-    for name in list(gone):
-        same = [n for n in added if after[n] == before[name]]
-        if same:
-            gone.remove(name)
-            added.remove(same[0])
-            yield Change(section, name, "", name, same[0], f"{noun} {name} is called {same[0]} now")
-    for name in gone:
-        yield Change(section, name, "", before[name], None, f"{noun} {name} is gone")
+    added = [n for n in after if n not in before and n]
+    for name in [n for n in before if n not in after and n]:
+        same = next((n for n in added if after[n] == before[name]), None)
+        if same is None:
+            yield Change(section, name, "", before[name], None, f"{noun} {name} is gone")
+        else:
+            added.remove(same)
+            yield Change(section, name, "", name, same, f"{noun} {name} is called {same} now")
     for name in added:
         yield Change(section, name, "", None, after[name], f"{noun} {name} is new")
     kept = [n for n in before if n in after] if section not in FLAT else [""]
@@ -238,33 +220,28 @@ def _more(section: str, name: str, description: Description) -> str:
     if section == "frames":
         names = [n for n, frame in frames.items() if frame.get("same_as") == name]
         return f" ({', '.join(names)})" if names else ""
-    names = [n for n, frame in frames.items() if section == "bodies" and frame.get("body") == name]
-    return f" (with {', '.join(names)} fixed to it)" if names else ""
+    names = [n for n, frame in frames.items() if frame.get("body") == name]
+    return f" (with {', '.join(names)} fixed to it)" if names and section == "bodies" else ""
 
 
 def _fields(section: str, name: str, owner: str, before: Part, after: Part) -> Iterator[Change]:
-    for field in [*before, *(f for f in after if f not in before)]:
-        if section in FLAT and section != "system":
-            # What is left out of these does not exist, rather than being zero.
-            old, new = before.get(field), after.get(field)
-        else:
-            old = before.get(field, default(field, after.get(field)))
-            new = after.get(field, default(field, before.get(field)))
+    for field in dict.fromkeys([*before, *after]):
+        # What is left out of a flat section does not exist, rather than being zero.
+        absent = section in FLAT and section != "system"
+        old = before.get(field, None if absent else default(field, after.get(field)))
+        new = after.get(field, None if absent else default(field, before.get(field)))
         if old == new:
             continue
-        what = _what(section, field, owner)
+        what = field.replace("_", " ")
+        if section == "parameters":
+            what = f"parameter {field}"
+        elif section not in FLAT:
+            what = f"{what} of {owner}"
         x, y = _numbers(old), _numbers(new)
-        if x is None or y is None or x.shape != y.shape:
-            yield Change(section, name, field, old, new, f"{what}: {_plain_text(old)} → {_plain_text(new)}")
-            continue
-        yield Change(section, name, field, old, new, f"{what}: {_difference(field, x, y)}", _only_rounding(field, x, y))
-
-
-def _what(section: str, field: str, owner: str) -> str:
-    if section == "parameters":
-        return f"parameter {field}"
-    words = field.replace("_", " ")
-    return words if section in FLAT else f"{words} of {owner}"
+        text, rounding = f"{_plain_text(old)} → {_plain_text(new)}", False
+        if x is not None and y is not None and x.shape == y.shape:
+            text, rounding = _difference(field, x, y), _only_rounding(field, x, y)
+        yield Change(section, name, field, old, new, f"{what}: {text}", rounding)
 
 
 def _numbers(x: Any) -> Array | None:
@@ -276,10 +253,8 @@ def _plain_text(x: Any) -> str:
 
 
 def _difference(field: str, old: Array, new: Array) -> str:
-    if field.startswith("rotation"):
-        turned = _turn(old, new)
-        if turned:
-            return turned
+    if field.startswith("rotation") and (turned := _turn(old, new)):
+        return turned
     names = _ENTRIES.get(field, [str(k) for k in range(len(old))] if len(old) > 1 else [""])
     # Equal infinities are no difference, though they have none.
     moved = [k for k in range(len(old)) if old[k] != new[k]]
@@ -296,15 +271,11 @@ def _pair(old: float, new: float) -> str:
 
 def _turn(old: Array, new: Array) -> str:
     """Return by how much and about which of the old axes a frame has turned; empty for a turn within rounding."""
-    R = old.reshape(3, 3).T @ new.reshape(3, 3)
-    twice = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    size = float(np.linalg.norm(twice))
-    angle = float(np.arctan2(0.5 * size, 0.5 * (np.trace(R) - 1)))
+    turned = spatial.log_quaternion(spatial.quaternion_from_matrix(old.reshape(3, 3).T @ new.reshape(3, 3)))
+    angle = float(np.linalg.norm(turned))
     if angle < _TURNED:
         return ""
-    if size < _TURNED:
-        return f"turned by {angle:.6g} rad"
-    axis = ", ".join(f"{x:g}" for x in np.round(twice / size, 4) + 0.0)
+    axis = ", ".join(f"{x:g}" for x in np.round(turned / angle, 4) + 0.0)
     return f"turned by {angle:.6g} rad about ({axis})"
 
 

@@ -29,6 +29,23 @@ from mbkit.studies.results import Refusal, write_whole
 
 #: The name of a rollout's end among the terms: q, then v, (nq + nv,).
 ROLLOUT: Final = "rollout"
+VECTORS: Final = ("q", "v", "a", "tau")
+#: Of the file. Another number is another layout, which this one does not read.
+FORMAT: Final = 1
+#: Of a rollout that a file asks for; `record` writes far fewer.
+_MAX_STEPS: Final = 10_000
+_HEAD: Final = "# mbkit baseline: "
+_NOTE: Final = (
+    f"{_HEAD}what engines said of one robot. Written by mbkit and guarded by the checksum in its last line:\n"
+    "# do not edit it, record it anew. A line below [section] is the whole name of a number or row; a row has a\n"
+    "# number for each of the states; a row of M is what stands before the diagonal, from its first that is not zero,\n"
+    "# and the diagonal.\n"
+)
+_SUM: Final = "# sha256 "
+_FORMAT: Final = re.compile(r"^format = (\d+)$", re.MULTILINE)
+_MODEL: Final = re.compile(r"^model = (\".*\")$", re.MULTILINE)
+_CONFLICT: Final = re.compile(r"^(<<<<<<<|>>>>>>>)", re.MULTILINE)
+_REMEDY: Final = "restore it from version control, or record it anew"
 
 
 @dataclass(frozen=True)
@@ -43,33 +60,13 @@ class Rollout:
 class Baseline:
     """What was recorded of one model, as `record` returns and `read` reads it.
 
-    Attributes
-    ----------
-    model : str
-        Name of the model.
-    digest : str
-        Its fingerprint, `Model.digest`.
-    target, options
-        What `mbkit baseline check` loads, and how; empty for a model without a source.
-    seed : int
-    processor : str
-    versions : dict
-        Of what computes, by package.
-    description : dict
-        The model's parameters, as `mbkit.studies.baseline.description` has them.
-    coordinates, velocities : tuple of str
-    states : States
-    rollout : Rollout
-    terms : dict
-        Term -> values at the states by the oracle, rounded to double. ``"rollout"`` is the end
-        of a rollout.
-    errors : dict
-        Engine -> term -> worst error against these, as `mbkit.studies.compare.errors` defines it; zero for
-        one of less than 8 eps, which any engine may have.
-    own : dict
-        Engine -> term -> the engine's own values, where it differed by more than rounding.
-    left_out : tuple of Refusal
-        What an engine could not do when this was recorded.
+    `digest` is the model's fingerprint, `Model.digest`. `target` and `options` are what `mbkit baseline check` loads,
+    and how; empty for a model without a source. `versions` are those of what computes, by package. `description` has
+    the model's parameters, as `mbkit.studies.baseline.description` says. `terms` has for each term the values at the
+    states by the oracle, rounded to double, and as ``"rollout"`` the end of a rollout. `errors` has for each engine
+    and term the worst error against these, as `mbkit.studies.compare.errors` defines it; zero for one of less than
+    8 eps, which any engine may have. `own` has the engine's own values where it differed by more than rounding.
+    `left_out` is what an engine could not do when this was recorded.
     """
 
     model: str
@@ -108,11 +105,7 @@ class Baseline:
         return f"<Baseline of {self.model!r}: {', '.join(self.engines)}; {content}>"
 
 
-#: Of the file. Another number is another layout, which this one does not read.
-FORMAT: Final = 1
-#: Of a rollout that a file asks for; `record` writes far fewer.
-_MAX_STEPS: Final = 10_000
-_VECTORS: Final = ("q", "v", "a", "tau")
+# The content of a file as nested tables.
 
 
 def _to_table(b: Baseline) -> dict[str, Any]:
@@ -121,19 +114,16 @@ def _to_table(b: Baseline) -> dict[str, Any]:
     refused: dict[str, dict[str, str]] = {}
     for r in b.left_out:
         refused.setdefault(r.engine, {})[r.term or "everything"] = r.reason
+    plain = ("model", "digest", "target", "seed", "processor")
     return {
         "format": FORMAT,
-        "model": b.model,
-        "digest": b.digest,
-        "target": b.target,
-        "seed": b.seed,
-        "processor": b.processor,
+        **{name: getattr(b, name) for name in plain},
         "engines": list(b.errors),
-        "options": dict(b.options),
-        "versions": dict(b.versions),
+        "options": b.options,
+        "versions": b.versions,
         **{s: b.description[s][""] if s in FLAT else b.description[s] for s in SECTIONS if s in b.description},
-        "states": {"kinds": list(b.states.kinds)} | {x: _columns(names[x], getattr(b.states, x)) for x in _VECTORS},
-        "rollout": {"dt": b.rollout.dt, "steps": b.rollout.steps},
+        "states": {"kinds": list(b.states.kinds)} | {x: _columns(names[x], getattr(b.states, x)) for x in VECTORS},
+        "rollout": vars(b.rollout),
         "terms": {term: _values(b, term, x, half=True) for term, x in b.terms.items()},
         "errors": {e: {t: float(f"{x:.1e}") for t, x in terms.items() if x} for e, terms in b.errors.items()},
         "own": {e: {t: _values(b, t, x, half=False) for t, x in terms.items()} for e, terms in b.own.items()},
@@ -141,37 +131,78 @@ def _to_table(b: Baseline) -> dict[str, Any]:
     }
 
 
+def _columns(names: Sequence[str], x: Array) -> dict[str, list[float]]:
+    """Return (N, n) numbers as n rows, each with a joint's numbers at all states; (n,) as n numbers."""
+    return dict(zip(names, x.T.tolist(), strict=True))
+
+
+def _values(b: Baseline, term: str, x: Array, *, half: bool) -> Any:
+    """Return a term's values: what is zero in every state as one zero, and of a symmetric matrix the lower half."""
+    if term == ROLLOUT:
+        n = len(b.coordinates)
+        return {"q": _columns(b.coordinates, x[:n]), "v": _columns(b.velocities, x[n:])}
+    if not x.any():
+        return 0.0
+    if x.ndim == 1:
+        return x.tolist()
+    if x.ndim == 2:
+        return _columns(b.velocities, x)
+    rows = [_half(M) if half else M.tolist() for M in x]
+    return {str(k + 1): dict(zip(b.velocities, row, strict=True)) for k, row in enumerate(rows)}
+
+
+def _half(M: Array) -> list[list[float]]:
+    """Return of each row what is left of the diagonal, from its first entry that is not zero, and the diagonal."""
+    first = [int(np.flatnonzero(np.append(M[i, :i], 1.0))[0]) for i in range(len(M))]
+    return [M[i, first[i] : i + 1].tolist() for i in range(len(M))]
+
+
 def _from_table(t: Mapping[str, Any]) -> Baseline:
-    """Return what was written; a part that is missing or of another kind raises some built-in error."""
-    if t["format"] != FORMAT:
-        raise ValueError(f"expected format {FORMAT}, got {t['format']!r}")
-    states = t["states"]
+    """Return what was written; a missing part, or what no recording holds, raises some built-in error."""
+    _expect(t["format"] == FORMAT, f"expected format {FORMAT}, got {t['format']!r}")
+    states, kinds = t["states"], tuple(t["states"]["kinds"])
     coordinates, velocities = tuple(states["q"]), tuple(states["v"])
-    q, v, a, tau = (_unfolded(states[x]) for x in _VECTORS)
-    at = States(q, v, a, tau, tuple(states["kinds"]))
-    sizes = len(at.kinds), len(velocities)
+    n, nv = len(kinds), len(velocities)
+
+    def array(name: str, x: Any, shape: tuple[int, ...]) -> Array:
+        out = np.ascontiguousarray(np.array(x, dtype=np.float64))
+        _expect(out.shape == shape, f"{name}: expected numbers of shape {shape}, got {out.shape}")
+        _expect(bool(np.isfinite(out).all()), f"{name}: a number is not finite")
+        return out
+
+    def values(term: str, x: Any, half: bool) -> Array:
+        if term == ROLLOUT:
+            return array(term, [*x["q"].values(), *x["v"].values()], (len(coordinates) + nv,))
+        shape = (n,) if term.endswith("energy") else (n, nv, nv) if term == "M" else (n, nv)
+        if isinstance(x, float):
+            _expect(x == 0, f"{term}: expected rows of numbers or 0.0, got {x!r}")
+            return np.zeros(shape)
+        if isinstance(x, list):
+            return array(term, x, shape)
+        if term == "M":
+            matrices = (list(rows.values()) for rows in x.values())
+            return array(term, [_whole(rows) if half else rows for rows in matrices], shape)
+        return array(term, np.array(list(x.values())).T, shape)
+
+    refused, errors = t.get("left_out", {}), t.get("errors", {})
+    computed = {e: [term for term in t["terms"] if term not in refused.get(e, {})] for e in t["engines"]}
+    sizes = {"q": len(coordinates), "v": nv, "a": nv, "tau": nv}
+    q, v, a, tau = (array(x, np.array(list(states[x].values())).T, (n, sizes[x])) for x in VECTORS)
     baseline = Baseline(
-        model=t["model"],
-        digest=t["digest"],
-        target=t["target"],
+        **{name: t[name] for name in ("model", "digest", "target", "seed", "processor")},
         options=dict(t.get("options", {})),
-        seed=t["seed"],
-        processor=t["processor"],
         versions=dict(t["versions"]),
         description={s: {"": dict(t[s])} if s in FLAT else dict(t[s]) for s in SECTIONS if s in t},
         coordinates=coordinates,
         velocities=velocities,
-        states=at,
+        states=States(q, v, a, tau, kinds),
         rollout=Rollout(t["rollout"]["dt"], t["rollout"]["steps"]),
-        terms={term: _read(term, x, sizes, half=True) for term, x in t["terms"].items()},
-        errors={e: _errors(t, e) for e in t["engines"]},
-        own={
-            e: {term: _read(term, x, sizes, half=False) for term, x in terms.items()}
-            for e, terms in t.get("own", {}).items()
-        },
+        terms={term: values(term, x, True) for term, x in t["terms"].items()},
+        errors={e: {term: errors.get(e, {}).get(term, 0.0) for term in terms} for e, terms in computed.items()},
+        own={e: {term: values(term, x, False) for term, x in terms.items()} for e, terms in t.get("own", {}).items()},
         left_out=tuple(
             Refusal(engine, "" if term == "everything" else term, reason)
-            for engine, terms in t.get("left_out", {}).items()
+            for engine, terms in refused.items()
             for term, reason in terms.items()
         ),
     )
@@ -179,134 +210,42 @@ def _from_table(t: Mapping[str, Any]) -> Baseline:
     return baseline
 
 
-def _check(b: Baseline) -> None:
-    """Raise `ValueError` for what no recording holds."""
-    texts = [b.model, b.digest, b.target, b.processor, *b.states.kinds, *b.versions, *b.versions.values(), *b.errors]
-    if not all(isinstance(x, str) for x in texts):
-        raise ValueError("a name, a target or a version is no text")
-    if type(b.seed) is not int or type(b.rollout.steps) is not int or not 0 < b.rollout.steps <= _MAX_STEPS:
-        raise ValueError(f"expected a whole number as seed, and 1 to {_MAX_STEPS} steps of the rollout")
-    if not b.terms or not b.errors or "M" not in b.terms:
-        raise ValueError("no terms, no mass matrix or no engines")
-    n, nv = len(b.states.kinds), len(b.velocities)
-    arrays: list[tuple[str, Array, tuple[int, ...]]] = [("q", b.states.q, (n, len(b.coordinates)))]
-    arrays += [(x, getattr(b.states, x), (n, nv)) for x in ("v", "a", "tau")]
-    for terms in (b.terms, *b.own.values()):
-        arrays += [
-            (term, x, (len(b.coordinates) + nv,) if term == ROLLOUT else _shape(term, (n, nv)))
-            for term, x in terms.items()
-        ]
-    for name, x, shape in arrays:
-        if x.shape != shape:
-            raise ValueError(f"{name}: expected numbers of shape {shape}, got {x.shape}")
-        if not np.isfinite(x).all():
-            raise ValueError(f"{name}: a number is not finite")
-    for section, parts in b.description.items():
-        for part in parts.values():
-            for name, x in part.items():
-                if not (_is_number(x) if name == "mass" else isinstance(x, str) or _are_numbers(x)):
-                    raise ValueError(f"{section}: {name}: expected numbers or text, got {x!r}")
-    if np.shape(moving_mass(b.description)[1]) != (3,):
-        raise ValueError("gravity: expected three numbers")
-    errors = [x for terms in b.errors.values() for x in terms.values()]
-    if not np.isfinite([*errors, b.rollout.dt]).all() or min([*errors, b.rollout.dt]) < 0:
-        raise ValueError("an error or the rollout's step is negative or not finite")
-
-
-def _are_numbers(x: object) -> bool:
-    return all(map(_is_number, x)) if isinstance(x, list) else _is_number(x)
-
-
-def _is_number(x: object) -> bool:
-    return isinstance(x, float) or (type(x) is int and abs(x) < 2**53)
-
-
-def _errors(t: Mapping[str, Any], engine: str) -> dict[str, float]:
-    """Return the errors of every term that an engine gave."""
-    errors, without = t.get("errors", {}).get(engine, {}), t.get("left_out", {}).get(engine, {})
-    return {term: errors.get(term, 0.0) for term in t["terms"] if term not in without}
-
-
-# Arrays as rows by name.
-
-
-def _rows(names: Sequence[str], x: Array) -> dict[str, float]:
-    return dict(zip(names, x.tolist(), strict=True))
-
-
-def _columns(names: Sequence[str], x: Array) -> dict[str, list[float]]:
-    """Return (N, n) numbers as n rows, each with a joint's numbers at all states."""
-    return dict(zip(names, x.T.tolist(), strict=True))
-
-
-def _vector(rows: Mapping[str, float]) -> Array:
-    return np.array(list(rows.values()), dtype=np.float64)
-
-
-def _unfolded(rows: Mapping[str, Sequence[float]]) -> Array:
-    return np.ascontiguousarray(np.array(list(rows.values()), dtype=np.float64).T)
-
-
-def _values(b: Baseline, term: str, x: Array, *, half: bool) -> Any:
-    """Return a term's values: what is zero in every state as one zero, and of a symmetric matrix the lower half."""
-    if term == ROLLOUT:
-        n = len(b.coordinates)
-        return {"q": _rows(b.coordinates, x[:n]), "v": _rows(b.velocities, x[n:])}
-    if not x.any():
-        return 0.0
-    if x.ndim == 1:
-        return x.tolist()
-    if x.ndim == 2:
-        return _columns(b.velocities, x)
-    return {str(k + 1): _half(b.velocities, M) if half else _columns(b.velocities, M.T) for k, M in enumerate(x)}
-
-
-def _half(names: Sequence[str], M: Array) -> dict[str, list[float]]:
-    """Return of each row what is left of the diagonal, from its first entry that is not zero, and the diagonal."""
-    first = [int(np.flatnonzero(np.append(M[i, :i], 1.0))[0]) for i in range(len(M))]
-    return {name: M[i, first[i] : i + 1].tolist() for i, name in enumerate(names)}
-
-
-def _read(term: str, value: Any, sizes: tuple[int, int], *, half: bool) -> Array:
-    if term == ROLLOUT:
-        return np.concatenate([_vector(value["q"]), _vector(value["v"])])
-    if isinstance(value, list):
-        return np.array(value, dtype=np.float64)
-    if isinstance(value, float):
-        if value:
-            raise ValueError(f"{term}: expected rows of numbers or 0.0, got {value!r}")
-        return np.zeros(_shape(term, sizes))
-    if term == "M":
-        return np.array([_matrix(list(rows.values()), half) for rows in value.values()])
-    return _unfolded(value)
-
-
-def _shape(term: str, sizes: tuple[int, int]) -> tuple[int, ...]:
-    if term.endswith("energy"):
-        return sizes[:1]
-    return (*sizes, sizes[1]) if term == "M" else sizes
-
-
-def _matrix(rows: Sequence[Sequence[float]], half: bool) -> Array:
-    if not half:
-        return np.array(rows, dtype=np.float64)
+def _whole(rows: Sequence[Sequence[float]]) -> Array:
+    """Return a symmetric matrix from the rows of `_half`."""
     M = np.zeros((len(rows), len(rows)))
     for i, row in enumerate(rows):
         M[i, i + 1 - len(row) : i + 1] = M[i + 1 - len(row) : i + 1, i] = row
     return M
 
 
-_HEAD: Final = "# mbkit baseline: "
-_NOTE: Final = (
-    f"{_HEAD}what engines said of one robot. Written by mbkit and guarded by the checksum in its last line:\n"
-    "# do not edit it, record it anew. A line below [section] is the whole name of a number or row; a row has a\n"
-    "# number for each of the states; a row of M is what stands before the diagonal, from its first that is not zero,\n"
-    "# and the diagonal.\n"
-)
-_SUM: Final = "# sha256 "
-_FORMAT: Final = re.compile(r"^format = (\d+)$", re.MULTILINE)
-_MODEL: Final = re.compile(r"^model = (\".*\")$", re.MULTILINE)
-_CONFLICT: Final = re.compile(r"^(<<<<<<<|>>>>>>>)", re.MULTILINE)
+def _expect(holds: bool, message: str) -> None:
+    if not holds:
+        raise ValueError(message)
+
+
+def _check(b: Baseline) -> None:
+    """Raise `ValueError` for texts and numbers that no recording holds."""
+    texts = [b.model, b.digest, b.target, b.processor, *b.states.kinds, *b.versions, *b.versions.values(), *b.errors]
+    _expect(all(isinstance(x, str) for x in texts), "a name, a target or a version is no text")
+    whole = type(b.seed) is int and type(b.rollout.steps) is int and 0 < b.rollout.steps <= _MAX_STEPS
+    _expect(whole, f"expected a whole number as seed, and 1 to {_MAX_STEPS} steps of the rollout")
+    _expect(bool(b.errors) and "M" in b.terms, "no terms, no mass matrix or no engines")
+    for section, parts in b.description.items():
+        for name, x in ((name, x) for part in parts.values() for name, x in part.items()):
+            numbers = all(map(_is_number, x)) if isinstance(x, list) and name != "mass" else _is_number(x)
+            text = isinstance(x, str) and name != "mass"
+            _expect(numbers or text, f"{section}: {name}: expected numbers or text, got {x!r}")
+    _expect(np.shape(moving_mass(b.description)[1]) == (3,), "gravity: expected three numbers")
+    sizes = [b.rollout.dt, *(x for terms in b.errors.values() for x in terms.values())]
+    sound = bool(np.isfinite(sizes).all()) and min(sizes) >= 0
+    _expect(sound, "an error or the rollout's step is negative or not finite")
+
+
+def _is_number(x: object) -> bool:
+    return isinstance(x, float) or (type(x) is int and abs(x) < 2**53)
+
+
+# Reading.
 
 
 def path_of(path: object) -> Path:
@@ -328,12 +267,6 @@ def is_baseline(path: Path) -> bool:
         return False
 
 
-def text_of(baseline: Baseline) -> str:
-    """Return a baseline as the text of its file; the same baseline is the same text."""
-    body = f"{_NOTE}\n{_dumps(_to_table(baseline))}\n"
-    return f"{body}{_SUM}{_checksum(body)}\n"
-
-
 def read(path: str | os.PathLike[str]) -> Baseline:
     """Read a baseline.
 
@@ -352,26 +285,25 @@ def read(path: str | os.PathLike[str]) -> Baseline:
     """
     where = path_of(path)
     try:
-        raw = where.read_bytes()
+        # Version control may have changed the ends of lines.
+        text = where.read_bytes().decode("utf-8").replace("\r\n", "\n")
     except FileNotFoundError:
         raise BaselineError(f"{where}: there is no baseline; record one, and keep it with the robot's files") from None
     except OSError as error:
         raise BaselineError(f"{where}: cannot be read: {error.strerror or error}") from None
-    return parsed(raw, where)
-
-
-def parsed(raw: bytes, where: Path) -> Baseline:
-    """Return the baseline in a file's bytes; `where` is for messages."""
-    try:
-        # Version control may have changed the ends of lines.
-        text = raw.decode("utf-8").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise BaselineError(f"{where}: no text from byte {error.start} on; {_REMEDY}") from None
     if not text.startswith(_HEAD):
         raise BaselineError(f"{where}: no baseline of mbkit's; its first line would begin with {_HEAD.strip()!r}")
     if _CONFLICT.search(text):
         raise BaselineError(f"{where}: a merge has left conflict marks in it; take either side, or record it anew")
-    _check_format(text, where)
+    number = _format(text)
+    if number != FORMAT:
+        by, advice = (
+            ("a newer", "update mbkit, or record it anew") if number > FORMAT else ("an older", "record it anew")
+        )
+        reads = f"this one reads format {FORMAT}"
+        raise BaselineError(f"{where}: of format {number}, by {by} mbkit; {reads}: {advice}")
     body, mark, checksum = text.rpartition(_SUM)
     if not mark or len(checksum.strip()) != 64 or not body.endswith("\n"):
         lines = text.count("\n")
@@ -384,27 +316,10 @@ def parsed(raw: bytes, where: Path) -> Baseline:
         raise BaselineError(f"{where}: sound by its checksum, yet not readable ({error}); {_REMEDY}") from None
 
 
-_REMEDY: Final = "restore it from version control, or record it anew"
-
-
-def _check_format(text: str, where: Path) -> None:
-    number = _format(text)
-    if number is None or number == FORMAT:
-        # Without the line it is damaged, which the checksum tells.
-        return
-    if number > FORMAT:
-        message = (
-            f"of format {number}, by a newer mbkit; this one reads format {FORMAT}: update mbkit, or record it anew"
-        )
-    else:
-        message = f"of format {number}, by an older mbkit; this one reads format {FORMAT}: record it anew"
-    raise BaselineError(f"{where}: {message}")
-
-
-def _format(text: str) -> int | None:
-    """Return the number of the format; of a number that no format has, its first nine digits."""
-    found = _FORMAT.search(text)
-    return int(found[1][:9]) if found else None
+def _format(text: str) -> int:
+    """Return the number of the format: of a longer one than any, nine digits; ours where the line is damaged."""
+    line = _FORMAT.search(text)
+    return int(line[1][:9]) if line else FORMAT
 
 
 def _checksum(body: str) -> str:
@@ -414,6 +329,12 @@ def _checksum(body: str) -> str:
 # Writing.
 
 
+def text_of(baseline: Baseline) -> str:
+    """Return a baseline as the text of its file; the same baseline is the same text."""
+    body = f"{_NOTE}\n{_dumps(_to_table(baseline))}\n"
+    return f"{body}{_SUM}{_checksum(body)}\n"
+
+
 def check_replaceable(path: Path, model: str) -> None:
     """Raise `OutputError` unless a file is absent or a baseline of the same model, whole or damaged."""
     if not os.path.lexists(path):
@@ -421,12 +342,11 @@ def check_replaceable(path: Path, model: str) -> None:
     if not is_baseline(path):
         raise OutputError(f"{path}: there is a file that is no baseline; name another, or replace it with force")
     text = path.read_bytes().decode("utf-8", "replace").replace("\r\n", "\n")
-    number = _format(text)
-    if number is not None and number > FORMAT:
+    number, named = _format(text), _MODEL.search(text)
+    if number > FORMAT:
         raise OutputError(
             f"{path}: a newer mbkit's baseline, of format {number}; update mbkit, or replace it with force"
         )
-    named = _MODEL.search(text)
     if named and named[1] != _value(model):
         raise OutputError(
             f"{path}: the baseline of {named[1]}, not of {model!r}; name another file, or replace it with force"
@@ -437,35 +357,31 @@ def store(path: Path, text: str, model: str, *, force: bool) -> None:
     """Write a baseline as a whole or not at all; unless `force` is set, never over another robot's baseline."""
     # Where a link leads, so that it stays one.
     path = Path(os.path.realpath(path))
+
+    def claim(temporary: str) -> None:
+        """Claim a free name in one atomic step; else check that its file may be replaced."""
+        try:
+            os.link(temporary, path)
+        except OSError:
+            # There is such a file, or the file system has no links.
+            check_replaceable(path, model)
+
     try:
         with _interrupt.uninterrupted:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, text.encode("utf-8"), None if force else lambda temporary: _claim(temporary, path, model))
+            write_whole(path, text.encode("utf-8"), None if force else claim)
     except UnicodeEncodeError as error:
         name = error.object[error.start : error.end]
         raise InputError(f"{model}: the name {name!r} is no text that a file holds") from None
+    except OutputError:
+        raise
     except OSError as error:
-        if isinstance(error, OutputError):
-            raise
         raise OutputError(f"cannot write {path}: {error.strerror or error}; what was there is unchanged") from error
-
-
-def _claim(temporary: str, path: Path, model: str) -> None:
-    """Claim a free name in one atomic step; else check that its file may be replaced."""
-    try:
-        os.link(temporary, path)
-    except OSError:
-        # There is such a file, or the file system has no links.
-        check_replaceable(path, model)
-
-
-_BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def _dumps(table: Mapping[str, Any]) -> str:
     """Return a table as TOML: first what is no table itself, then a section for each that is."""
-    head = [f"{_key(k)} = {_value(x)}" for k, x in table.items() if not isinstance(x, Mapping)]
-    sections = ["\n".join(head)]
+    sections = ["\n".join(f"{_key(k)} = {_value(x)}" for k, x in table.items() if not isinstance(x, Mapping))]
     for name, part in table.items():
         if isinstance(part, Mapping) and part:
             sections.append("\n".join([f"[{_key(name)}]", *_lines(part)]))
@@ -482,23 +398,17 @@ def _lines(part: Mapping[str, Any], before: str = "") -> Iterator[str]:
 
 
 def _key(name: str) -> str:
-    return name if _BARE.fullmatch(name) else _text(name)
-
-
-def _text(x: str) -> str:
-    # What JSON escapes, TOML reads alike, but for characters of two units, which TOML writes as one.
-    return "".join(
-        f"\\U{ord(c):08x}" if ord(c) > 0xFFFF and not c.isprintable() else json_text(c)
-        for c in json.dumps(x, ensure_ascii=False)
-    )
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _value(name)
 
 
 def _value(x: Any) -> str:
     """Return a number, text or list as TOML."""
-    if isinstance(x, bool):
-        return "true" if x else "false"
-    if isinstance(x, str):
-        return _text(x)
     if isinstance(x, (list, tuple)):
-        return f"[{', '.join(_value(y) for y in x)}]"
-    return repr(x)
+        return f"[{', '.join(map(_value, x))}]"
+    if isinstance(x, str):
+        # What JSON escapes, TOML reads alike, but for characters of two units, which TOML writes as one.
+        return "".join(
+            f"\\U{ord(c):08x}" if ord(c) > 0xFFFF and not c.isprintable() else json_text(c)
+            for c in json.dumps(x, ensure_ascii=False)
+        )
+    return repr(x).lower() if isinstance(x, bool) else repr(x)

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+import numpy as np
+
 from mbkit._escape import one_line
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.baseline.tolerance import Moved, VersionChange
 from mbkit.studies.results import Block, Items, Refusal, ResultTable, Title, columns_of
 
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
@@ -18,35 +19,58 @@ _MOST_CHANGES: Final = 20
 
 
 @dataclass(frozen=True)
+class Moved:
+    """A term that is not what was recorded, at its worst state and joint.
+
+    `joint` is the name of the velocity, or of the two of an entry of M, and empty for energies; `state` is one of the
+    recorded states; `recorded` and `now` are the entry that differs most for that joint; `error` and `allowed` are as
+    `mbkit.studies.compare.errors` has them; `cause` names the version that moved, and `reason` what else there is to
+    say, alone where the engine gave no number.
+    """
+
+    term: str
+    engine: str
+    joint: str
+    state: str
+    recorded: float
+    now: float
+    error: float
+    allowed: float
+    cause: str = ""
+    reason: str = ""
+
+    def __str__(self) -> str:
+        if np.isnan(self.now):
+            return f"{self.term}: {self.reason}"
+        at = f" at {self.joint}" if self.joint else ""
+        where = f" ({self.state})" if self.state else ""
+        change = f"{self.term}{at}{where}: {self.recorded:.12g} → {self.now:.12g}"
+        more = f"; {self.reason}" if self.reason else ""
+        return f"{change}, off by {self.error:.1e} where {self.allowed:.1e} is rounding{more}"
+
+
+@dataclass(frozen=True)
+class VersionChange:
+    """A package whose version differs."""
+
+    package: str
+    old: str
+    new: str
+
+    def __str__(self) -> str:
+        return f"{self.package} {self.old} → {self.new}"
+
+
+@dataclass(frozen=True)
 class BaselineResult(ResultTable):
     """A model held against a baseline, or one baseline against another.
 
-    Attributes
-    ----------
-    question : {"check", "diff"}
-    model, path : str
-    against : str
-        The second file of a `diff`.
-    status : {"same", "versions", "numbers", "description", "skipped"}
-        The gravest difference; ``"skipped"`` where no engine was installed.
-    engines : tuple of str
-        Those that were checked.
-    changes : tuple of Change
-        Parameters of the description, causes before effects.
-    moved : tuple of Moved
-        Numbers that are not as recorded, by more than rounding.
-    versions : tuple of VersionChange
-    processors : (str, str)
-        Then and now.
-    skipped : tuple of Refusal
-        Engines that are not there, with the reason.
-    strict : bool
-        Whether these fail.
-    notes : tuple of str
-    effect : str
-        What a changed description does to the terms.
-    worst : float
-        The largest error of what is as recorded.
+    `question` is "check" or "diff", and `against` the second file of a `diff`. `status` is the gravest difference, and
+    "skipped" where no engine was there. `engines` are those that were checked. `changes` are parameters of the
+    description, causes before effects; `moved` are numbers that are not as recorded, by more than rounding;
+    `processors` are those of then and now. `skipped` are engines that are not there, with the reason, which fails if
+    `strict`. `effect` says what a changed description does to the terms, and `worst` is the largest error of what is
+    as recorded.
     """
 
     question: Literal["check", "diff"]

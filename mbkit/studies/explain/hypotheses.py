@@ -7,10 +7,10 @@ them can be put into the first description or taken out of the second without th
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import permutations, product
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -30,10 +30,16 @@ _MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 #: Numbers per velocity, and what they are called.
 _NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "friction", "stiffness": "spring"}
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
+#: Parts of the whole: section, key, kind of the difference, noun.
+_SECTIONS: Final = (
+    ("springs", "name", "point spring", "spring"),
+    ("couplings", "name", "joint coupling", "coupling"),
+    ("loops", "name", "loop", "loop"),
+    ("prescribed", "joint", "prescribed motion", "motion of"),
+)
 
 
-@dataclass(frozen=True)
-class Mistake:
+class Mistake(NamedTuple):
     """A named difference of one part: its kind, a sentence that begins with a verb, and the changed fields."""
 
     kind: str
@@ -41,7 +47,7 @@ class Mistake:
     fields: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A difference between two descriptions: fields of one part in either, with a name, and their numbers."""
 
@@ -49,23 +55,23 @@ class Hypothesis:
     subject: str
     says: str
     #: (description, fields) -> the description with these fields in the part.
-    put: Callable[[MergedModel, Mapping[str, Any]], MergedModel] = field(default=lambda x, _: x, compare=False)
-    ours: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    theirs: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    put: Callable[[MergedModel, Mapping[str, Any]], MergedModel] = lambda x, _: x
+    ours: Mapping[str, Any] | None = None
+    theirs: Mapping[str, Any] | None = None
     a: Any = None
     b: Any = None
 
     def apply(self, x: MergedModel) -> MergedModel:
         """Put the difference into a description."""
-        return self.put(x, self.theirs)
+        return self.put(x, self.theirs or {})
 
     def revert(self, x: MergedModel) -> MergedModel:
         """Take the difference out of a description that has it."""
-        return self.put(x, self.ours)
+        return self.put(x, self.ours or {})
 
-    def without(self, fields: Container[str]) -> Hypothesis:
+    def without(self, names: Container[str]) -> Hypothesis:
         """Return the hypothesis with fewer fields."""
-        ours, theirs = ({k: x for k, x in side.items() if k not in fields} for side in (self.ours, self.theirs))
+        ours, theirs = ({k: x for k, x in (s or {}).items() if k not in names} for s in (self.ours, self.theirs))
         return replace(self, ours=ours, theirs=theirs)
 
 
@@ -80,23 +86,15 @@ def _axis_times_sine(R: Array) -> Array:
 
 def number_text(value: Any) -> str:
     """Return a number, vector or matrix of a description as text."""
-    if isinstance(value, np.ndarray):
-        if value.shape == (3, 3):
-            if np.array_equal(value, value.T):
-                return f"[{', '.join(map(number_text, value[np.triu_indices(3)]))}]"
-            return f"[{'; '.join(map(number_text, value))}]"
-        if value.size == 1:
-            return number_text(float(value.ravel()[0]))
+    if not isinstance(value, np.ndarray) or value.size == 1:
+        x = float(value.ravel()[0]) if isinstance(value, np.ndarray) else value
+        # Below this it is rounding.
+        return f"{0.0 if abs(x) < 1e-15 else x:.6g}"
+    if value.shape != (3, 3):
         return f"({', '.join(map(number_text, value.ravel().tolist()))})"
-    # Below this it is rounding.
-    return f"{0.0 if abs(value) < 1e-15 else value:.6g}"
-
-
-def _is_identity(R: Array) -> bool:
-    return np.array_equal(R, np.eye(3))
-
-
-# Rotations.
+    if np.array_equal(value, value.T):
+        return f"[{', '.join(map(number_text, value[np.triu_indices(3)]))}]"
+    return f"[{'; '.join(map(number_text, value))}]"
 
 
 def _reordered(R: Array) -> list[Array]:
@@ -105,22 +103,11 @@ def _reordered(R: Array) -> list[Array]:
     return [spatial.matrix_from_quaternion(np.array(q)) for q in ([w, x, y, z], [y, z, w, x])]
 
 
-def rotation_mistakes(R: Array) -> Iterator[Mistake]:
-    """Yield the usual mistakes with a joint's rotation."""
-    says = "reads the joint's quaternion in the wrong order"
-    rows: list[tuple[str, str, Array]] = [("quaternion order", says, x) for x in _reordered(R)]
-    if angle_of(R) >= 1e-12:
-        angles = np.array(spatial.rpy_from_matrix(R))
-        about = [spatial.matrix_from_rpy(*x) for x in np.diag(angles)]
-        rows += [
-            ("inverse rotation", "has the joint's rotation the wrong way round", R.T),
-            ("rotation left out", "has no rotation at the joint", np.eye(3)),
-            ("order of angles", "turns by roll, pitch, yaw in the other order", about[0] @ about[1] @ about[2]),
-        ]
-        for factor, says in ((180 / np.pi, "degrees for radians"), (np.pi / 180, "radians for degrees")):
-            turned = spatial.matrix_from_rpy(*(factor * angles))
-            rows.append(("unit of angle", f"takes {says} in the joint's rotation", turned))
-    return (Mistake(kind, says, {"rotation": x}) for kind, says, x in rows)
+def _effective(part: Any, rows: Sequence[tuple[str, str, Mapping[str, Any]]]) -> list[Mistake]:
+    """Return the mistakes that change a part."""
+    return [
+        Mistake(*row) for row in rows if not all(np.array_equal(getattr(part, name), x) for name, x in row[2].items())
+    ]
 
 
 # Bodies.
@@ -133,26 +120,21 @@ def body_mistakes(links: Sequence[LinkInBody], R_PJ: Array, *, base: bool = Fals
     """
     at = composite(links)
     m, c, I = at.mass, at.com, at.inertia
+    steiner = -m * spatial.skew(c) @ spatial.skew(c)
+    from_origin = "has the inertia about the body's origin for that about the centre of mass"
+    to_com = "takes the inertia to be about the body's origin, and moves it to the centre of mass"
     rows: list[tuple[str, str, dict[str, Any]]] = [
         ("base mass" if base else "lost body", "has no matter in it", vars(NOTHING)),
         *_merge_mistakes(links),
+        ("inertia about the wrong point", from_origin, {"inertia": I + steiner}),
+        ("inertia about the wrong point", to_com, {"inertia": I - steiner}),
+        ("inertia axes", "has the inertia in the parent's axes", {"inertia": R_PJ @ I @ R_PJ.T}),
+        ("inertia axes", "has the inertia in axes turned against its own", {"inertia": R_PJ.T @ I @ R_PJ}),
+        *_product_mistakes(I),
+        ("centre of mass", "has the centre of mass at the origin", {"com": np.zeros(3)}),
+        ("centre of mass", "has the centre of mass on the other side of the origin", {"com": -c}),
+        *(("centre of mass", "has the centre of mass in other axes", {"com": R @ c}) for R in (R_PJ, R_PJ.T)),
     ]
-    if m and c.any():
-        d = spatial.skew(c)
-        steiner, kind = -m * d @ d, "inertia about the wrong point"
-        says = "has the inertia about the body's origin for that about the centre of mass"
-        rows.append((kind, says, {"inertia": I + steiner}))
-        says = "takes the inertia to be about the body's origin, and moves it to the centre of mass"
-        rows.append((kind, says, {"inertia": I - steiner}))
-    for R, whose in ((R_PJ, "the parent's axes"), (R_PJ.T, "axes turned against its own")):
-        if not _is_identity(R):
-            rows.append(("inertia axes", f"has the inertia in {whose}", {"inertia": R @ I @ R.T}))
-    rows += [(kind, says, {"inertia": x}) for kind, says, x in _product_mistakes(I)]
-    kind = "centre of mass"
-    rows.append((kind, "has the centre of mass at the origin", {"com": np.zeros(3)}))
-    rows.append((kind, "has the centre of mass on the other side of the origin", {"com": -c}))
-    if not _is_identity(R_PJ) and c.any():
-        rows += [(kind, "has the centre of mass in other axes", {"com": R @ c}) for R in (R_PJ, R_PJ.T)]
     for mass, says in (
         (m, "has the inertia of a ball of water of its mass"),
         (1.0, "has a ball of water of 1 kg in its place"),
@@ -170,7 +152,7 @@ def body_mistakes(links: Sequence[LinkInBody], R_PJ: Array, *, base: bool = Fals
     for factor in (1e6, 1e-6):
         says = f"has an inertia {factor:g} times as large, as of millimetres"
         rows.append(("unit of inertia", says, {"inertia": factor * I}))
-    return [Mistake(*row) for row in rows]
+    return _effective(at, rows)
 
 
 def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -180,22 +162,19 @@ def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dic
     for one in heavy:
         rest = composite([x for x in links if x is not one])
         yield "lost body", f"leaves out link {one.name!r}, which is fixed to it", vars(rest)
+    groups = [(f"link {x.name!r}", [x]) for x in heavy]
     if len(heavy) > 1:
         yield "lost body", "leaves out every link that is fixed to it", vars(composite([own]))
-    groups = [(f"link {x.name!r}", [x]) for x in heavy] + ([("its links", heavy)] if len(heavy) > 1 else [])
+        groups.append(("its links", heavy))
+    ways: tuple[tuple[str, str, Callable[[LinkInBody], LinkInBody]], ...] = (
+        ("fused with a rotated frame", "without turning it", lambda x: replace(x, R=np.eye(3))),
+        ("fused with a rotated frame", "turned the wrong way", lambda x: replace(x, R=x.R.T)),
+        ("fused with a rotated frame", "without turning its inertia", _with_unturned_inertia),
+        ("fused at the wrong place", "at the origin", lambda x: replace(x, p=np.zeros(3))),
+    )
     for which, some in groups:
-        turned = [x for x in some if not _is_identity(x.R)]
-        if turned:
-            for how, change in (
-                ("without turning it", lambda x: replace(x, R=np.eye(3))),
-                ("turned the wrong way", lambda x: replace(x, R=x.R.T)),
-                ("without turning its inertia", _with_unturned_inertia),
-            ):
-                changed = composite([change(x) if x in turned else x for x in links])
-                yield "fused with a rotated frame", f"fuses {which} {how}", vars(changed)
-        if any(x.p.any() for x in some):
-            changed = composite([replace(x, p=np.zeros(3)) if x in some else x for x in links])
-            yield "fused at the wrong place", f"fuses {which} at the origin", vars(changed)
+        for kind, how, change in ways:
+            yield kind, f"fuses {which} {how}", vars(composite([change(x) if x in some else x for x in links]))
     if heavy:
         total = sum((x.lump.inertia for x in links), np.zeros((3, 3)))
         says = "adds the inertias of its links, each about its own centre of mass"
@@ -206,25 +185,22 @@ def _with_unturned_inertia(x: LinkInBody) -> LinkInBody:
     return replace(x, matter=replace(x.matter, inertia=x.R.T @ x.matter.inertia @ x.R))
 
 
-def _product_mistakes(I: Array) -> Iterator[tuple[str, str, Array]]:
+def _product_mistakes(I: Array) -> Iterator[tuple[str, str, dict[str, Any]]]:
     diagonal = np.diag(np.diag(I))
-    if np.array_equal(I, diagonal):
-        return
-    kind = "products of inertia"
-    yield kind, "has the products of inertia with the other sign", 2 * diagonal - I
-    yield kind, "has no products of inertia", diagonal
+    yield "products of inertia", "has the products of inertia with the other sign", {"inertia": 2 * diagonal - I}
+    yield "products of inertia", "has no products of inertia", {"inertia": diagonal}
     for i, j in ((0, 1), (0, 2), (1, 2)):
         flipped = I.copy()
         flipped[i, j] = flipped[j, i] = -I[i, j]
-        yield kind, f"has I{'xyz'[i]}{'xyz'[j]} with the other sign", flipped
-    for written, read, says in (
+        yield "products of inertia", f"has I{'xyz'[i]}{'xyz'[j]} with the other sign", {"inertia": flipped}
+    for order, other, says in (
         (_URDF, _MJCF, "URDF's order read in MJCF's"),
         (_MJCF, _URDF, "MJCF's order read in URDF's"),
     ):
-        other = np.zeros((3, 3))
-        for (i, j), (k, l) in zip(written, read, strict=True):
-            other[k, l] = other[l, k] = I[i, j]
-        yield "order of the inertia's numbers", f"has the inertia's six numbers in {says}", other
+        misread = np.zeros((3, 3))
+        for (i, j), (k, l) in zip(order, other, strict=True):
+            misread[k, l] = misread[l, k] = I[i, j]
+        yield "order of the inertia's numbers", f"has the inertia's six numbers in {says}", {"inertia": misread}
 
 
 def _body_differences(
@@ -235,32 +211,28 @@ def _body_differences(
     First one mistake for all of it, then one each for mass, centre of mass and inertia, with the other side's values.
     """
     a = composite(links)
-    everything = vars(b)
     mistakes = body_mistakes(links, R_PJ, base=base)
     for mistake in mistakes:
         if near.lump(replace(a, **mistake.fields), b):
-            return [replace(mistake, fields=everything)]
+            return [mistake._replace(fields=vars(b))]
     if a.mass and b.mass and b.mass != a.mass and near.lump(a.scaled(b.mass / a.mass), b):
         says = f"has {number_text(b.mass / a.mass)} times the mass, and the inertia with it"
-        return [Mistake("mass", says, everything)]
+        return [Mistake("mass", says, vars(b))]
     if not a.mass and not a.inertia.any():
-        return [Mistake("added body", "has matter in it", everything)]
+        return [Mistake("added body", "has matter in it", vars(b))]
     out = []
-    same = {
-        "mass": near.number(a.mass, b.mass),
-        "com": near.point(a.com, b.com),
-        "inertia": near.inertia(a.inertia, b.inertia, a.mass),
-    }
-    for name, what, unit in (("mass", "mass", "kg"), ("com", "centre of mass", "m")):
-        if not same[name]:
+    for name, what, unit, same in (
+        ("mass", "mass", "kg", near.number(a.mass, b.mass)),
+        ("com", "centre of mass", "m", near.point(a.com, b.com)),
+    ):
+        if not same:
             ours, theirs = getattr(a, name), getattr(b, name)
             wanted = replace(a, **{name: theirs})
             says = f"has the {what} {number_text(theirs)} {unit} for {number_text(ours)}"
             fitting = (x for x in mistakes if near.lump(replace(a, **x.fields), wanted))
-            out.append(replace(next(fitting, Mistake(what, says, {})), fields={name: theirs}))
-    if not same["inertia"]:
-        kind, says = _inertia_difference(a, b, mistakes, near)
-        out.append(Mistake(kind, says, {"inertia": b.inertia}))
+            out.append(next(fitting, Mistake(what, says, {}))._replace(fields={name: theirs}))
+    if not near.inertia(a.inertia, b.inertia, a.mass):
+        out.append(Mistake(*_inertia_difference(a, b, mistakes, near), {"inertia": b.inertia}))
     return out
 
 
@@ -287,12 +259,11 @@ def _has_reordered_axes(a: Array, b: Array, mass: float, near: Tolerances) -> bo
     moments, axes = np.linalg.eigh(a)
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         Q = axes[:, order] * signs
-        if np.linalg.det(Q) < 0:
-            continue
-        for R in _reordered(Q):
-            turned = R @ np.diag(moments[list(order)]) @ R.T
-            if angle_of(R.T @ Q) > near.relative and near.inertia(turned, b, mass):
-                return True
+        if np.linalg.det(Q) > 0:
+            for R in _reordered(Q):
+                same = near.inertia(R @ np.diag(moments[list(order)]) @ R.T, b, mass)
+                if same and angle_of(R.T @ Q) > near.relative:
+                    return True
     return False
 
 
@@ -300,15 +271,14 @@ def link_differences(
     ours: Sequence[LinkInBody], theirs: Sequence[LinkInBody], near: Tolerances
 ) -> list[tuple[str, Mistake]] | None:
     """Return (link, mistake) where both sides know the same links of a body, in common axes; else None."""
-    there = {x.name: x for x in theirs}
+    there = {x.name: x.matter for x in theirs}
     if len(ours) < 2 or there.keys() != {x.name for x in ours}:
         return None
     out = []
     for x in ours:
-        wanted = there[x.name].matter
-        if not near.lump(x.matter, wanted):
+        if not near.lump(x.matter, there[x.name]):
             alone = replace(x, R=np.eye(3), p=np.zeros(3))
-            out += [(x.name, mistake) for mistake in _body_differences([alone], np.eye(3), wanted, near)]
+            out += [(x.name, mistake) for mistake in _body_differences([alone], np.eye(3), there[x.name], near)]
     return out
 
 
@@ -317,14 +287,11 @@ def links_in_common_axes(one: MergedModel, other: MergedModel, near: Tolerances)
 
     A link whose frame differs between the two has its body's axes in both.
     """
-    sides: tuple[dict[str, tuple[LinkInBody, ...]], ...] = (dict(one.links), dict(other.links))
+    sides = dict(one.links), dict(other.links)
     for name in sides[0].keys() & sides[1].keys():
         there = {x.name: x for x in sides[1][name]}
-        apart = {
-            x.name
-            for x in sides[0][name]
-            if x.name in there and not (near.vector(x.R, there[x.name].R) and near.point(x.p, there[x.name].p))
-        }
+        pairs = [(x, there[x.name]) for x in sides[0][name] if x.name in there]
+        apart = {x.name for x, y in pairs if not (near.vector(x.R, y.R) and near.point(x.p, y.p))}
         for side in sides:
             side[name] = tuple(
                 LinkInBody(x.name, np.eye(3), np.zeros(3), x.lump) if x.name in apart else x for x in side[name]
@@ -337,46 +304,44 @@ def links_in_common_axes(one: MergedModel, other: MergedModel, near: Tolerances)
 
 def joint_mistakes(joint: Joint) -> list[Mistake]:
     """Return the usual mistakes with a joint, whatever the other side has."""
-    R, p = joint.rotation, joint.translation
-    rows: list[tuple[str, str, dict[str, Any]]] = []
-    for name, kind in _NUMBERS.items():
-        if np.any(getattr(joint, name)):
-            rows.append((kind, f"has no {kind}", {name: np.zeros(joint.type.nv)}))
+    R, p, axes, pitch = joint.rotation, joint.translation, joint.axes, joint.pitch
+    angles = np.array(spatial.rpy_from_matrix(R))
+    roll, pitching, yaw = (spatial.matrix_from_rpy(*x) for x in np.diag(angles))
+    too_large, too_small = (spatial.matrix_from_rpy(*(factor * angles)) for factor in (1 / _DEGREE, _DEGREE))
+    rows: list[tuple[str, str, dict[str, Any]]] = [
+        (kind, f"has no {kind}", {name: np.zeros(joint.type.nv)}) for name, kind in _NUMBERS.items()
+    ]
     if joint.mimic is not None:
         rows.append(("mimic", f"leaves it free, which follows {joint.mimic.joint!r}", {"mimic": None}))
         if joint.mimic.offset:
             mimic = Mimic(joint.mimic.joint, joint.mimic.ratio)
             rows.append(("mimic", "leaves out the offset at which it follows", {"mimic": mimic}))
-    if joint.type.pitched:
-        turn = 2 * np.pi
-        rows += [
-            ("unit of pitch", "takes a pitch per radian for one per turn", {"pitch": turn * joint.pitch}),
-            ("unit of pitch", "takes a pitch per turn for one per radian", {"pitch": 1 / turn * joint.pitch}),
-            ("pitch", "has the pitch with the other sign", {"pitch": -joint.pitch}),
-            ("pitch", "has no pitch", {"pitch": 0.0}),
-        ]
-    if joint.axes.size:
-        rows.append(("axis sign", "has the axis the other way round", {"axes": -joint.axes}))
-        if not _is_identity(R):
-            rows.append(("axis", "has the axis in the parent's axes", {"axes": joint.axes @ R}))
-            rows.append(("axis", "has the axis in other axes", {"axes": joint.axes @ R.T}))
-    rows += [(x.kind, x.says, dict(x.fields)) for x in rotation_mistakes(R)]
-    if p.any():
-        far = "has the joint's origin 1000 times too far, as of millimetres"
-        rows += [
-            ("joint origin", "has the joint's origin on the other side", {"translation": -p}),
-            ("joint origin", "has the joint at the parent's origin", {"translation": 0.0 * p}),
-            ("unit of length", far, {"translation": 1e3 * p}),
-            ("unit of length", "has the joint's origin 1000 times too near", {"translation": 1e-3 * p}),
-        ]
-        if not _is_identity(R):
-            inverse = {"rotation": R.T, "translation": -R.T @ p}
-            rows += [
-                ("joint origin", "has the joint's origin in the joint's axes", {"translation": R @ p}),
-                ("joint origin", "has the joint's origin in other axes", {"translation": R.T @ p}),
-                ("inverse placement", "has the joint's placement the wrong way round", inverse),
-            ]
-    return [Mistake(*row) for row in rows]
+    misread = "reads the joint's quaternion in the wrong order"
+    far = "has the joint's origin 1000 times too far, as of millimetres"
+    inverse = {"rotation": R.T, "translation": -R.T @ p}
+    rows += [
+        ("unit of pitch", "takes a pitch per radian for one per turn", {"pitch": 2 * np.pi * pitch}),
+        ("unit of pitch", "takes a pitch per turn for one per radian", {"pitch": 1 / (2 * np.pi) * pitch}),
+        ("pitch", "has the pitch with the other sign", {"pitch": -pitch}),
+        ("pitch", "has no pitch", {"pitch": 0.0}),
+        ("axis sign", "has the axis the other way round", {"axes": -axes}),
+        ("axis", "has the axis in the parent's axes", {"axes": axes @ R}),
+        ("axis", "has the axis in other axes", {"axes": axes @ R.T}),
+        *(("quaternion order", misread, {"rotation": x}) for x in _reordered(R)),
+        ("inverse rotation", "has the joint's rotation the wrong way round", {"rotation": R.T}),
+        ("rotation left out", "has no rotation at the joint", {"rotation": np.eye(3)}),
+        ("order of angles", "turns by roll, pitch, yaw in the other order", {"rotation": roll @ pitching @ yaw}),
+        ("unit of angle", "takes degrees for radians in the joint's rotation", {"rotation": too_large}),
+        ("unit of angle", "takes radians for degrees in the joint's rotation", {"rotation": too_small}),
+        ("joint origin", "has the joint's origin on the other side", {"translation": -p}),
+        ("joint origin", "has the joint at the parent's origin", {"translation": 0.0 * p}),
+        ("unit of length", far, {"translation": 1e3 * p}),
+        ("unit of length", "has the joint's origin 1000 times too near", {"translation": 1e-3 * p}),
+        ("joint origin", "has the joint's origin in the joint's axes", {"translation": R @ p}),
+        ("joint origin", "has the joint's origin in other axes", {"translation": R.T @ p}),
+        ("inverse placement", "has the joint's placement the wrong way round", inverse),
+    ]
+    return _effective(joint, rows)
 
 
 def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
@@ -390,26 +355,30 @@ def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
         return [*out, Mistake("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)]
     mistakes = joint_mistakes(a)
 
-    def named(wanted: dict[str, Any], otherwise: Mistake | None = None) -> Mistake | None:
-        for x in mistakes:
-            if x.fields.keys() == wanted.keys() and all(_same(near, n, x.fields[n], y) for n, y in wanted.items()):
-                return replace(x, fields=wanted)
-        return otherwise
+    def same(name: str, x: Any, y: Any) -> bool:
+        if name == "translation":
+            return near.point(x, y)
+        return near.number(x, y) if name == "pitch" else near.vector(x, y)
 
-    placement = {
-        n: getattr(b, n) for n in ("rotation", "translation") if not _same(near, n, getattr(a, n), getattr(b, n))
-    }
-    each: list[Mistake | None] = [named(placement) if placement else None]
-    if each == [None]:
-        each = [named({n: x}, _moved(n, a, b, near)) for n, x in placement.items()]
-    if not near.vector(a.axes, b.axes):
-        says = f"has the axis {number_text(b.axes)}, not {number_text(a.axes)}"
-        each.append(named({"axes": b.axes}, Mistake("axis", says, {"axes": b.axes})))
-    if not near.number(a.pitch, b.pitch):
-        says = f"has the pitch {number_text(b.pitch)} m/rad for {number_text(a.pitch)}"
-        each.append(named({"pitch": b.pitch}, Mistake("pitch", says, {"pitch": b.pitch})))
-    each.append(_mimic_difference(a.mimic, b.mimic, near))
-    out += [x for x in each if x is not None]
+    def differing(*names: str) -> dict[str, Any]:
+        return {n: getattr(b, n) for n in names if not same(n, getattr(a, n), getattr(b, n))}
+
+    def known(wanted: dict[str, Any]) -> list[Mistake]:
+        """Return the first usual mistake in just these fields."""
+        for x in mistakes:
+            if x.fields.keys() == wanted.keys() and all(same(n, x.fields[n], y) for n, y in wanted.items()):
+                return [x._replace(fields=wanted)]
+        return []
+
+    placement = differing("rotation", "translation")
+    if placement:
+        each = ((known({n: x}) or [_moved(n, a, b, near)])[0] for n, x in placement.items())
+        out += known(placement) or each
+    for name, kind, says in (("axes", "axis", "{}, not {}"), ("pitch", "pitch", "{} m/rad for {}")):
+        if wanted := differing(name):
+            numbers = says.format(number_text(getattr(b, name)), number_text(getattr(a, name)))
+            out += known(wanted) or [Mistake(kind, f"has the {kind} {numbers}", wanted)]
+    out += _mimic_difference(a.mimic, b.mimic, near)
     for name, kind in _NUMBERS.items():
         ours, theirs = getattr(a, name), getattr(b, name)
         if not near.numbers(ours, theirs):
@@ -422,14 +391,6 @@ def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
     if limits:
         out.append(Mistake("limits", _other_limits(a, limits), limits))
     return out
-
-
-def _same(near: Tolerances, name: str, a: Any, b: Any) -> bool:
-    if name == "translation":
-        return near.point(a, b)
-    if name in ("rotation", "axes"):
-        return near.vector(a, b)
-    return near.number(float(a), float(b))
 
 
 def _moved(name: str, a: Joint, b: Joint, near: Tolerances) -> Mistake:
@@ -452,16 +413,16 @@ def _moved(name: str, a: Joint, b: Joint, near: Tolerances) -> Mistake:
     return Mistake("joint origin", says, value)
 
 
-def _mimic_difference(a: Mimic | None, b: Mimic | None, near: Tolerances) -> Mistake | None:
+def _mimic_difference(a: Mimic | None, b: Mimic | None, near: Tolerances) -> list[Mistake]:
     if a is None and b is None:
-        return None
+        return []
     if a is None or b is None:
         says = f"lets it follow {b.joint!r}, which is free" if b else f"leaves it free, which follows {a.joint!r}"  # type: ignore[union-attr]
-        return Mistake("mimic", says, {"mimic": b})
+        return [Mistake("mimic", says, {"mimic": b})]
     if a.joint == b.joint and near.number(a.ratio, b.ratio) and abs(a.offset - b.offset) <= near.relative:
-        return None
+        return []
     one, other = (f"{number_text(m.ratio)} {m.joint} + {number_text(m.offset)}" for m in (b, a))
-    return Mistake("mimic", f"lets it follow {one}, not {other}", {"mimic": b})
+    return [Mistake("mimic", f"lets it follow {one}, not {other}", {"mimic": b})]
 
 
 def _other_number(name: str, a: Array, b: Array) -> str:
@@ -491,34 +452,18 @@ def differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[
     out = _global_differences(one.model, other.model, near)
     theirs = {j.name: j for j in other.model.joints}
     for a in one.model.joints:
-        b = theirs.get(a.name)
-        if b is None:
-            continue
-        put = partial(_put, MergedModel.with_joint, a.name)
-        out += [_hypothesis(x, f"joint {a.name!r}", put, a, b) for x in _joint_differences(a, b, near)]
-        out += _matter_differences(one, a, other, near)
+        if b := theirs.get(a.name):
+            put = partial(MergedModel.with_joint, name=a.name)
+            out += [_hypothesis(x, f"joint {a.name!r}", put, a, b) for x in _joint_differences(a, b, near)]
+            out += _matter_differences(one, a, other, near)
     return out
-
-
-def _put(change: Callable[..., MergedModel], *arguments: Any) -> MergedModel:
-    """Call a method of a description with the names of a part, which come first here, and its fields."""
-    *names, x, values = arguments
-    return change(x, *names, values)
-
-
-def _put_parts(section: str, key: str, x: MergedModel, parts: Mapping[str, Any]) -> MergedModel:
-    """Exchange springs, couplings, loops or prescribed motions by name; None takes one away."""
-    kept = [p for p in getattr(x.model, section) if getattr(p, key) not in parts]
-    return x.with_fields(**{section: (*kept, *(p for p in parts.values() if p is not None))})
 
 
 def _hypothesis(x: Mistake, subject: str, put: Callable[..., MergedModel], a: object, b: object) -> Hypothesis:
     ours, theirs = ({name: getattr(side, name) for name in x.fields} for side in (a, b))
-    numbers: tuple[Any, Any] = (None, None)
-    if len(ours) == 1:
-        values = next(iter(ours.values())), next(iter(theirs.values()))
-        if all(isinstance(v, (float, np.ndarray)) for v in values):
-            numbers = values
+    numbers = [*ours.values(), *theirs.values()]
+    if len(numbers) != 2 or not all(isinstance(v, (float, np.ndarray)) for v in numbers):
+        numbers = [None, None]
     return Hypothesis(x.kind, subject, x.says, put, ours, theirs, *numbers)
 
 
@@ -527,26 +472,19 @@ def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near
     a, b = one.lump(body), other.lump(body)
     if near.lump(a, b):
         return []
-    ours, theirs = ({x.name: x.matter for x in side.links[body]} for side in (one, other))
     links = link_differences(one.links[body], other.links[body], near)
-    if links:
-        return [
-            _hypothesis(
-                x,
-                f"link {name!r}, fixed to {body!r}" if name != body else f"link {name!r}",
-                partial(_put, MergedModel.with_link, body, name),
-                ours[name],
-                theirs[name],
-            )
-            for name, x in links
-        ]
-    base = joint.type.floating and joint.parent == "world"
-    mistakes = _body_differences(one.links[body], joint.rotation, b, near, base=base)
-    return [_hypothesis(x, f"body {body!r}", partial(_put, MergedModel.with_body, body), a, b) for x in mistakes]
-
-
-def _put_gravity(x: MergedModel, values: Mapping[str, Any]) -> MergedModel:
-    return x.with_fields(**values)
+    if not links:
+        base = joint.type.floating and joint.parent == "world"
+        mistakes = _body_differences(one.links[body], joint.rotation, b, near, base=base)
+        return [_hypothesis(x, f"body {body!r}", partial(MergedModel.with_body, name=body), a, b) for x in mistakes]
+    out = []
+    ours, theirs = ({x.name: x.matter for x in side.links[body]} for side in (one, other))
+    for name, x in links:
+        subject = f"link {name!r}" + (f", fixed to {body!r}" if name != body else "")
+        out.append(
+            _hypothesis(x, subject, partial(MergedModel.with_link, body=body, link=name), ours[name], theirs[name])
+        )
+    return out
 
 
 def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis]:
@@ -558,30 +496,27 @@ def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis
             says = "has no gravity"
         elif a.gravity.any() and near.vector(-a.gravity, b.gravity):
             says = "has gravity with the other sign"
-        out.append(_hypothesis(Mistake("gravity", says, {"gravity": b.gravity}), "", _put_gravity, a, b))
-    for section, kind, what in (
-        ("springs", "point spring", "spring"),
-        ("couplings", "joint coupling", "coupling"),
-        ("loops", "loop", "loop"),
-        ("prescribed", "prescribed motion", "motion of"),
-    ):
-        key = "joint" if section == "prescribed" else "name"
+        mistake = Mistake("gravity", says, {"gravity": b.gravity})
+        out.append(_hypothesis(mistake, "", lambda x, values: x.with_fields(**values), a, b))
+    for section, key, kind, what in _SECTIONS:
         ours, theirs = ({getattr(x, key): x for x in getattr(m, section)} for m in (a, b))
         for name in dict.fromkeys([*ours, *theirs]):
             one, other = ours.get(name), theirs.get(name)
-            if one is not None and other is not None and _alike(one, other, near):
-                continue
-            says = "lacks it" if other is None else "has it besides" if one is None else "has other numbers for it"
-            put = partial(_put_parts, section, key)
-            out.append(Hypothesis(kind, f"{what} {name!r}", says, put, {name: one}, {name: other}))
+            if one is None or other is None or not _alike(one, other, near):
+                says = "lacks it" if other is None else "has it besides" if one is None else "has other numbers for it"
+                put = partial(_with_parts, section=section, key=key)
+                out.append(Hypothesis(kind, f"{what} {name!r}", says, put, {name: one}, {name: other}))
     return out
 
 
+def _with_parts(x: MergedModel, parts: Mapping[str, Any], section: str, key: str) -> MergedModel:
+    """Exchange springs, couplings, loops or prescribed motions by name; None takes one away."""
+    kept = [p for p in getattr(x.model, section) if getattr(p, key) not in parts]
+    return x.with_fields(**{section: (*kept, *(p for p in parts.values() if p is not None))})
+
+
 def _alike(a: Any, b: Any, near: Tolerances) -> bool:
-    for x, y in zip(a._values(), b._values(), strict=True):
-        if isinstance(x, np.ndarray):
-            if not near.point(x, y):
-                return False
-        elif not (near.number(x, y) if isinstance(x, float) else x == y):
-            return False
-    return True
+    return all(
+        near.point(x, y) if isinstance(x, np.ndarray) else near.number(x, y) if isinstance(x, float) else x == y
+        for x, y in zip(a._values(), b._values(), strict=True)
+    )

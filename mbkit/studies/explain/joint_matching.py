@@ -9,21 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model import Body, Joint, Mimic, Model
+from mbkit.engines.imported import joint_of, unused
+from mbkit.model import Body, Joint, Model
 from mbkit.model.joint_types import FIXED
 from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.merged_model import FrameChange, MergedModel, Tolerances, merge, reattached
 from mbkit.studies.explain.terms import restricted, trimmed_couplings
 
-#: Deeper chains are compared by name, because the assignment is recursive.
-_MAX_DEPTH: Final = 150
 _NAME, _FRAME, _NUMBER, _KIND, _ALONE = 0.1, 0.25, 1.0, 3.0, 2.0
-_Pairs = list[tuple[Joint, Joint]]
+#: Cost of an assignment that is not possible.
+_NEVER: Final = 1e12
 
 
 @dataclass(frozen=True)
@@ -51,44 +51,44 @@ class Matching:
 
 def match(a: Model, b: Model, near: Tolerances) -> Matching:
     """Match the joints of two merged descriptions."""
-    assignment = _Assignment(a, b, near)
     names = {j.name for j in b.joints}
     to_b = {j.name: j.name for j in a.joints if j.name in names}
-    if max(_depth(a), _depth(b)) <= _MAX_DEPTH:
-        by_structure = assignment.solve()
-        for name in to_b:
-            if name not in by_structure and name not in by_structure.values():
-                by_structure[name] = name
-        if assignment.cost(by_structure) < assignment.cost(to_b):
-            to_b = by_structure
-    matched = [j.name for j in a.joints if j.name in to_b]
+    assignment = _Assignment(a, b, near)
+    by_structure = assignment.solve()
+    for name in to_b:
+        if name not in by_structure and name not in by_structure.values():
+            by_structure[name] = name
+    if assignment.cost(by_structure) < assignment.cost(to_b):
+        to_b = by_structure
     return Matching(
-        tuple(Match(n, to_b[n], "name" if to_b[n] == n else "structure") for n in matched),
+        tuple(
+            Match(j.name, to_b[j.name], "name" if to_b[j.name] == j.name else "structure")
+            for j in a.joints
+            if j.name in to_b
+        ),
         tuple(j.name for j in a.joints if j.name not in to_b),
         tuple(j.name for j in b.joints if j.name not in set(to_b.values())),
     )
 
 
-def _depth(model: Model) -> int:
-    depth = {"world": 0}
-    for joint in model.tree:
-        depth[joint.child] = depth[joint.parent] + 1
-    return max(depth.values())
-
-
 class _Tree:
-    """A description by name: joints, bodies, the joints on each body, and the size of each joint's subtree."""
+    """The bodies of a description by depth, what each joint carries, and the joints on each body."""
 
     def __init__(self, model: Model) -> None:
         self.joints = {j.name: j for j in model.joints}
         self.bodies = {x.name: x for x in model.bodies}
-        self.children: dict[str, list[Joint]] = {}
-        for joint in model.joints:
-            self.children.setdefault(joint.parent, []).append(joint)
+        self.moments: dict[str, Array] = {x.name: np.linalg.eigvalsh(x.inertia) for x in model.bodies}
         self.carrier = {j.child: j.name for j in model.joints}
+        self.children: dict[str, list[Joint]] = {name: [] for name in ("world", *self.bodies)}
+        for joint in model.joints:
+            self.children[joint.parent].append(joint)
+        #: Number of joints on a body and beyond, and the joint that carries it.
         self.sizes: dict[str, int] = {}
         for joint in reversed(model.tree):
-            self.sizes[joint.name] = 1 + sum(self.sizes[c.name] for c in self.children.get(joint.child, ()))
+            self.sizes[joint.child] = 1 + sum(self.sizes[c.child] for c in self.children[joint.child])
+        self.levels = [["world"]]
+        while self.levels[-1]:
+            self.levels.append([j.child for name in self.levels[-1] for j in self.children[name]])
 
 
 class _Assignment:
@@ -96,16 +96,43 @@ class _Assignment:
 
     def __init__(self, a: Model, b: Model, near: Tolerances) -> None:
         self.near, self.a, self.b = near, _Tree(a), _Tree(b)
-        self._known: dict[tuple[str, str], tuple[float, _Pairs]] = {}
 
     def solve(self) -> dict[str, str]:
+        #: Two bodies -> the cost of all that they carry, and the pairs of joints on them.
+        below: dict[tuple[str, str], tuple[float, list[tuple[Joint, Joint]]]] = {}
+        for ours, theirs in reversed(list(zip(self.a.levels, self.b.levels, strict=False))):
+            for x in ours:
+                for y in theirs:
+                    below[x, y] = self._siblings(self.a.children[x], self.b.children[y], below)
         out: dict[str, str] = {}
-        waiting = self._children("world", "world")[1]
+        waiting = below["world", "world"][1]
         while waiting:
-            a, b = waiting.pop()
-            out[a.name] = b.name
-            waiting += self._pair(a, b)[1]
+            joint, other = waiting.pop()
+            out[joint.name] = other.name
+            waiting += below[joint.child, other.child][1]
         return out
+
+    def _siblings(
+        self,
+        ours: list[Joint],
+        theirs: list[Joint],
+        below: Mapping[tuple[str, str], tuple[float, list[tuple[Joint, Joint]]]],
+    ) -> tuple[float, list[tuple[Joint, Joint]]]:
+        from scipy.optimize import linear_sum_assignment
+
+        n, k = len(ours), len(theirs)
+        alone = [self.a.sizes[j.child] for j in ours], [self.b.sizes[j.child] for j in theirs]
+        if not n or not k:
+            return _ALONE * (sum(alone[0]) + sum(alone[1])), []
+        # Beside the pairs, each joint may stay alone.
+        cost = np.full((n + k, n + k), _NEVER)
+        cost[n:, k:] = 0.0
+        cost[range(n), range(k, n + k)] = _ALONE * np.array(alone[0])
+        cost[range(n, n + k), range(k)] = _ALONE * np.array(alone[1])
+        cost[:n, :k] = [[self._own(x, y) + below[x.child, y.child][0] for y in theirs] for x in ours]
+        rows, columns = linear_sum_assignment(cost)
+        pairs = [(ours[i], theirs[j]) for i, j in zip(rows, columns, strict=True) if i < n and j < k]
+        return float(cost[rows, columns].sum()), pairs
 
     def cost(self, to_b: Mapping[str, str]) -> float:
         """Return the cost of any assignment."""
@@ -116,32 +143,6 @@ class _Assignment:
             total += self._own(a, b) + (0.0 if to_b.get(above) == below else _NUMBER)
         return total
 
-    def _pair(self, a: Joint, b: Joint) -> tuple[float, _Pairs]:
-        """Return the cost of a and its subtree as b and its subtree, and the pairs of their children."""
-        key = a.name, b.name
-        if key not in self._known:
-            below, pairs = self._children(a.child, b.child)
-            self._known[key] = self._own(a, b) + below, pairs
-        return self._known[key]
-
-    def _children(self, a: str, b: str) -> tuple[float, _Pairs]:
-        from scipy.optimize import linear_sum_assignment
-
-        ours, theirs = self.a.children.get(a, []), self.b.children.get(b, [])
-        n, k = len(ours), len(theirs)
-        alone = [self.a.sizes[j.name] for j in ours], [self.b.sizes[j.name] for j in theirs]
-        if not n or not k:
-            return _ALONE * (sum(alone[0]) + sum(alone[1])), []
-        # Beside the pairs, each joint may stay alone.
-        cost = np.full((n + k, n + k), 1e12)
-        cost[n:, k:] = 0.0
-        cost[range(n), range(k, n + k)] = _ALONE * np.array(alone[0])
-        cost[range(n, n + k), range(k)] = _ALONE * np.array(alone[1])
-        cost[:n, :k] = [[self._pair(x, y)[0] for y in theirs] for x in ours]
-        rows, columns = linear_sum_assignment(cost)
-        pairs = [(ours[i], theirs[j]) for i, j in zip(rows, columns, strict=True) if i < n and j < k]
-        return float(cost[rows, columns].sum()), pairs
-
     def _own(self, a: Joint, b: Joint) -> float:
         x, y, near = self.a.bodies[a.child], self.b.bodies[b.child], self.near
         far = np.array([[np.linalg.norm(a.translation)], [np.linalg.norm(b.translation)]])
@@ -151,17 +152,13 @@ class _Assignment:
             (a.kind != b.kind, _FRAME if same_motion else _KIND),
             (not near.point(*far), _NUMBER),
             (not near.number(x.mass, y.mass), _NUMBER),
-            (not near.inertia(_moments(x), _moments(y), x.mass), _NUMBER),
+            (not near.inertia(self.a.moments[x.name], self.b.moments[y.name], x.mass), _NUMBER),
             (not near.vector(a.axes, b.axes), _FRAME),
             (not near.vector(a.rotation, b.rotation), _FRAME),
             (not near.point(a.translation, b.translation), _FRAME),
             (not near.point(x.com, y.com), _FRAME),
         )
         return sum(cost for differs, cost in differing if differs)
-
-
-def _moments(body: Body) -> Array:
-    return np.asarray(np.linalg.eigvalsh(body.inertia), dtype=np.float64)
 
 
 # The second description with names, order and frames of the first.
@@ -172,13 +169,13 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
     own = {j.name: j for j in b.model.joints}
     theirs = {j.name: j.child for j in a.joints}
     joints = {m.b: m.a for m in matching.pairs}
-    bodies = {own[m.b].child: theirs[m.a] for m in matching.pairs}
+    bodies = {"world": "world"} | {own[m.b].child: theirs[m.a] for m in matching.pairs}
     used = set(theirs), {x.name for x in a.bodies} | {"world"}
     # Joints that were held still or removed are in the matching, but not in the description.
-    for name in (n for n in matching.only_b if n in own):
-        joints[name] = _unused(name, used[0])
-        bodies[own[name].child] = _unused(own[name].child, used[1])
-    bodies["world"] = "world"
+    for joint in (own[n] for n in matching.only_b if n in own):
+        for names, name, others in ((joints, joint.name, used[0]), (bodies, joint.child, used[1])):
+            names[name] = unused(name, others)
+            others.add(names[name])
     order = {m.a: k for k, m in enumerate(matching.pairs)}
     renamed = [
         replace(
@@ -186,7 +183,7 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
             name=joints[j.name],
             parent=bodies[j.parent],
             child=bodies[j.child],
-            mimic=None if j.mimic is None else Mimic(joints[j.mimic.joint], j.mimic.ratio, j.mimic.offset),
+            mimic=None if j.mimic is None else replace(j.mimic, joint=joints[j.mimic.joint]),
         )
         for j in b.model.joints
     ]
@@ -204,13 +201,6 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
     return MergedModel(model, {bodies[name]: some for name, some in b.links.items()})
 
 
-def _unused(name: str, used: set[str]) -> str:
-    while name in used:
-        name += "_"
-    used.add(name)
-    return name
-
-
 def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedModel, tuple[str, ...]]:
     """Return `b`, in the names of `a`, with its frames where `a` has them, and the joints of moved frames.
 
@@ -221,13 +211,13 @@ def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedMode
     joints = {j.name: j for j in a.joints}
     matter = {x.name: x for x in a.bodies}
     own = {x.name: x for x in b.model.bodies}
-    changes = {"world": FrameChange.none("world")}
+    changes = {"world": FrameChange("world")}
     out: dict[str, tuple[Joint, Body]] = {}
     moved = []
     for joint in b.model.tree:
         there = changes[joint.parent].joint(joint)
         body = own[joint.child]
-        changes[joint.child] = FrameChange.none(joint.child)
+        changes[joint.child] = FrameChange(joint.child)
         out[joint.name] = there, body
         like = joints.get(joint.name)
         if like is None or not joint.type.axial or like.type.motion != joint.type.motion:
@@ -237,11 +227,10 @@ def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedMode
         turn = np.eye(3) if near.vector(turn, np.eye(3)) else turn
         shift = np.zeros(3) if near.point(shift, np.zeros(3)) else shift
         if joint.type.rotates:
-            axis = joint.axes[0]
-            shift = axis * (axis @ shift)
+            shift = joint.axes[0] * (joint.axes[0] @ shift)
         if not shift.any() and np.array_equal(turn, np.eye(3)):
             continue
-        change = FrameChange(joint.child, turn.T, shift, np.zeros(3))
+        change = FrameChange(joint.child, turn.T, shift)
         other = _moved(there, body, turn, shift)
         after = _differing(*other, like, matter[like.child], near)
         gain = _differing(there, body, like, matter[like.child], near) - after
@@ -276,12 +265,11 @@ def _moved(joint: Joint, body: Body, R: Array, p: Array) -> tuple[Joint, Body]:
 
 
 def _differing(joint: Joint, body: Body, like: Joint, matter: Body, near: Tolerances) -> int:
-    return _misplaced(joint, like, near) + sum(
-        (
-            not near.vector(joint.axes, like.axes),
-            not near.point(body.com, matter.com),
-            not near.inertia(body.inertia, matter.inertia, matter.mass),
-        )
+    return (
+        _misplaced(joint, like, near)
+        + (not near.vector(joint.axes, like.axes))
+        + (not near.point(body.com, matter.com))
+        + (not near.inertia(body.inertia, matter.inertia, matter.mass))
     )
 
 
@@ -302,38 +290,38 @@ def reconcile_joint_sets(
     """
     causes: list[Hypothesis] = []
     alone: tuple[list[str], list[str]] = ([], [])
+    sides = [a, b]
     while True:
-        one, other = merge(a), merge(b)
+        one, other = (merge(x) for x in sides)
         matching = match(one.model, other.model, near)
         if not matching.only_a and not matching.only_b:
             return one, other, Matching(matching.pairs, tuple(alone[0]), tuple(alone[1])), causes
         side = 0 if matching.only_a else 1
-        model, names = ((a, matching.only_a), (b, matching.only_b))[side]
+        model, names = sides[side], matching.only_a or matching.only_b
         name = next(j.name for j in model.tree if j.name in names)
-        options = {"still": _held(model, name)}
         below = _subtree(model, name)
+        options = {True: _held(model, name)}
         if len(below) < len(model.joints):
-            options["lost"] = restricted(model, {j.name for j in model.joints} - below)
-        costs = {how: _count_differences(*((x, b) if side == 0 else (a, x)), near) for how, x in options.items()}
-        how = min(options, key=costs.__getitem__)
-        causes.append(_structural_cause(how, name, model, below, side))
+            options[False] = restricted(model, {j.name for j in model.joints} - below)
+        costs = {
+            still: _count_differences(*((x, sides[1]) if side == 0 else (sides[0], x)), near)
+            for still, x in options.items()
+        }
+        still = min(options, key=costs.__getitem__)
+        causes.append(_structural_cause(still, name, model, below, side))
         alone[side].append(name)
-        a, b = (options[how], b) if side == 0 else (a, options[how])
+        sides[side] = options[still]
 
 
 def _held(model: Model, name: str) -> Model:
     """Return the description with a joint fixed at zero, and those that follow it."""
     held = {name} | {j.name for j in model.joints if j.mimic is not None and j.mimic.joint == name}
+    joints = tuple(
+        joint_of(j.name, FIXED.name, j.parent, j.child, j.rotation, j.translation) if j.name in held else j
+        for j in model.joints
+    )
     kept = {j.name for j in model.joints} - held
-    joints = tuple(_fixed(j) if j.name in held else j for j in model.joints)
     return replace(model, joints=joints, couplings=tuple(trimmed_couplings(model, kept)))
-
-
-def _fixed(joint: Joint) -> Joint:
-    none = joint.axes[:0].ravel()
-    numbers = ("lower", "upper", "velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness")
-    empty: dict[str, Any] = dict.fromkeys((*numbers, "rest"), none)
-    return replace(joint, kind=FIXED.name, axes=joint.axes[:0], pitch=0.0, mimic=None, **empty)
 
 
 def _subtree(model: Model, name: str) -> set[str]:
@@ -361,13 +349,11 @@ def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
     return count
 
 
-def _structural_cause(how: str, name: str, model: Model, below: Collection[str], side: int) -> Hypothesis:
-    subject = f"joint {name!r}"
-    if how == "still":
-        says = "holds it still" if side == 0 else "lets it move, which stands still on the other side"
-        return Hypothesis("joint held still", subject, says)
+def _structural_cause(still: bool, name: str, model: Model, below: Collection[str], side: int) -> Hypothesis:
+    if still:
+        says = "lets it move, which stands still on the other side" if side else "holds it still"
+        return Hypothesis("joint held still", f"joint {name!r}", says)
     count = sum(1 for j in model.joints if j.name in below and j.type.nv)
     more = f" and the {count - 1} joints below it" if count > 1 else ""
-    if side == 0:
-        return Hypothesis("lost joint", subject, f"lacks it{more}")
-    return Hypothesis("added joint", subject, f"has it{more} besides")
+    kind, says = ("added joint", f"has it{more} besides") if side else ("lost joint", f"lacks it{more}")
+    return Hypothesis(kind, f"joint {name!r}", says)

@@ -7,7 +7,7 @@ and each body knows its links.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -103,15 +103,15 @@ class MergedModel:
         """Return the description with other fields of the model."""
         return replace(self, model=replace(self.model, **fields))
 
-    def with_joint(self, name: str, fields: Mapping[str, Any]) -> MergedModel:
+    def with_joint(self, fields: Mapping[str, Any], name: str) -> MergedModel:
         """Return the description with other fields in one joint."""
         return self.with_fields(joints=tuple(replace(j, **fields) if j.name == name else j for j in self.model.joints))
 
-    def with_body(self, name: str, fields: Mapping[str, Any]) -> MergedModel:
+    def with_body(self, fields: Mapping[str, Any], name: str) -> MergedModel:
         """Return the description with another mass, centre of mass or inertia in one body."""
         return replace(self, model=with_lump(self.model, name, replace(self.lump(name), **fields)))
 
-    def with_link(self, body: str, link: str, fields: Mapping[str, Any]) -> MergedModel:
+    def with_link(self, fields: Mapping[str, Any], body: str, link: str) -> MergedModel:
         """Return the description with other matter in one link of a body, in the link's axes."""
         links = tuple(replace(x, matter=replace(x.matter, **fields)) if x.name == link else x for x in self.links[body])
         return MergedModel(with_lump(self.model, body, composite(links)), {**self.links, body: links})
@@ -122,14 +122,9 @@ class FrameChange:
     """Coordinates in another frame: x becomes A (x - o) + t on `body`."""
 
     body: str
-    A: Array
-    o: Array
-    t: Array
-
-    @classmethod
-    def none(cls, body: str) -> FrameChange:
-        """Return the change that changes nothing."""
-        return cls(body, np.eye(3), np.zeros(3), np.zeros(3))
+    A: Array = field(default_factory=lambda: np.eye(3))
+    o: Array = field(default_factory=lambda: np.zeros(3))
+    t: Array = field(default_factory=lambda: np.zeros(3))
 
     def point(self, x: Array) -> Array:
         """Return a point in the other frame."""
@@ -137,9 +132,8 @@ class FrameChange:
 
     def joint(self, joint: Joint) -> Joint:
         """Return a joint on this body as it stands in the other frame."""
-        return replace(
-            joint, parent=self.body, rotation=self.A @ joint.rotation, translation=self.point(joint.translation)
-        )
+        rotation, translation = self.A @ joint.rotation, self.point(joint.translation)
+        return replace(joint, parent=self.body, rotation=rotation, translation=translation)
 
 
 def merge(model: Model) -> MergedModel:
@@ -151,44 +145,41 @@ def merge(model: Model) -> MergedModel:
         model.require_values("explain")
         model = with_values(model)
     bodies = {b.name: b for b in model.bodies}
-    at = {"world": FrameChange.none("world")}
+    at = {"world": FrameChange("world")}
     links: dict[str, list[LinkInBody]] = {"world": []}
     moving: dict[str, Joint] = {}
     for joint in model.tree:
         placed, own = at[joint.parent].joint(joint), bodies[joint.child]
         if joint.type.nv:
             moving[joint.name] = placed
-            at[joint.child] = FrameChange.none(joint.child)
+            at[joint.child] = FrameChange(joint.child)
             links[joint.child] = []
         else:
-            at[joint.child] = FrameChange(placed.parent, placed.rotation, np.zeros(3), placed.translation)
+            at[joint.child] = FrameChange(placed.parent, placed.rotation, t=placed.translation)
         here = at[joint.child]
         links[here.body].append(LinkInBody(own.name, here.A, here.t, Lump(own.mass, own.com, own.inertia)))
     joints = tuple(moving[j.name] for j in model.joints if j.name in moving)
-    merged = replace(
-        reattached(model, at),
-        bodies=tuple(_body(j.child, composite(links[j.child])) for j in joints),
-        joints=joints,
-        frames=(),
-    )
+    matter = tuple(_body(j.child, composite(links[j.child])) for j in joints)
+    merged = replace(reattached(model, at), bodies=matter, joints=joints, frames=())
     return MergedModel(merged, {name: tuple(some) for name, some in links.items()})
 
 
 def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
     """Return the description with the ends of springs and loops in other frames."""
-    springs = []
-    for s in model.springs:
-        a, b = changes[s.body_a], changes[s.body_b]
-        ends: dict[str, Any] = {"body_a": a.body, "point_a": a.point(s.point_a)}
-        ends |= {"body_b": b.body, "point_b": b.point(s.point_b)}
-        springs.append(replace(s, **ends))
-    loops = []
-    for x in model.loops:
-        a, b = changes[x.body_a], changes[x.body_b]
-        ends = {"body_a": a.body, "rotation_a": a.A @ x.rotation_a, "translation_a": a.point(x.translation_a)}
-        ends |= {"body_b": b.body, "rotation_b": b.A @ x.rotation_b, "translation_b": b.point(x.translation_b)}
-        loops.append(replace(x, **ends))
-    return replace(model, springs=tuple(springs), loops=tuple(loops))
+
+    def moved(part: Any) -> Any:
+        ends: dict[str, Any] = {}
+        for side in "ab":
+            change = changes[getattr(part, f"body_{side}")]
+            ends[f"body_{side}"] = change.body
+            for name in (f"point_{side}", f"translation_{side}"):
+                if hasattr(part, name):
+                    ends[name] = change.point(getattr(part, name))
+            if hasattr(part, f"rotation_{side}"):
+                ends[f"rotation_{side}"] = change.A @ getattr(part, f"rotation_{side}")
+        return replace(part, **ends)
+
+    return replace(model, springs=tuple(map(moved, model.springs)), loops=tuple(map(moved, model.loops)))
 
 
 def composite(links: Iterable[LinkInBody]) -> Lump:

@@ -21,22 +21,12 @@ _MAX_LINES: Final = 3
 class Cause:
     """A difference between two sides.
 
-    Attributes
-    ----------
-    kind : str
-        Name of the usual mistake, such as ``"armature"`` or ``"inertia about the wrong point"``.
-    subject : str
-        The body or joint; empty for the whole.
-    says : str
-        A sentence about the second side.
-    a, b : float, list or None
-        The numbers of the two sides, where they are numbers.
-    effects : dict
-        Term -> relative difference of this cause alone: the larger of two, where it is put into the
-        first side, and where it is taken out of the second. Infinite where the coordinates then differ.
-        Empty where no term can show it: other names, matter that stands still, a constraint.
-    acts : bool
-        Whether an effect is above the tolerance, or the cause is a constraint.
+    Its `kind` names the usual mistake, such as ``"armature"`` or ``"inertia about the wrong point"``; `subject` is the
+    body or joint, empty for the whole; `says` is a sentence about the second side; `a` and `b` are the numbers of the
+    two sides, where they are numbers. `effects` has for each term the relative difference of this cause alone: the
+    larger of two, where it is put into the first side, and where it is taken out of the second. It is infinite where
+    the coordinates then differ, and empty where no term can show it: other names, matter that stands still, a
+    constraint. `acts` says whether an effect is above the tolerance, or the cause is a constraint.
     """
 
     kind: str
@@ -55,34 +45,14 @@ class Cause:
 class Explanation(ResultTable):
     """Why two descriptions or engines differ, or that they do not.
 
-    Attributes
-    ----------
-    a, b : str
-        Names of the two sides.
-    agree : bool
-        Whether all terms agree by joint name, and all joints and constraints are there.
-    gaps : tuple of Gap
-        Difference of each term, joints matched by name where they have the same names.
-    comparable : bool
-        Whether both have the same coordinates, so that terms can be compared.
-    matches : tuple of Match
-        Matched joints, by name or by structure.
-    only_a, only_b : tuple of str
-        Joints without a counterpart.
-    causes : tuple of Cause
-    notes : tuple of str
-        Differences without effect, such as frames drawn elsewhere.
-    explained : bool
-        Whether the difference vanishes with all causes applied to one side.
-    left : tuple of Gap
-        The remaining difference of each term; empty where the coordinates differ.
-    subtree : tuple of str
-        If a difference remains, the joints of the smallest part that still differs.
-    samples, seed : int
-    tolerance : float
-        Relative difference of a term above which two sides differ.
-    massless : bool
-        Whether M is zero on both sides at every state, so that equal terms are no agreement.
+    `a` and `b` are the names of the two sides. `agree` says whether all terms agree by joint name, and all joints and
+    constraints are there. `gaps` has the difference of each term, joints matched by name where they have the same
+    names; `comparable` says whether both have the same coordinates, so that terms can be compared. `matches` are the
+    matched joints, `only_a` and `only_b` those without a counterpart. `notes` are differences without effect, such as
+    frames drawn elsewhere. `explained` says whether the difference vanishes with all `causes` applied to one side, and
+    `left` has the remaining difference of each term, empty where the coordinates differ; then `subtree` has the joints
+    of the smallest part that still differs. Two sides differ where a term differs by more than `tolerance`. `massless`
+    says whether M is zero on both sides at every state, so that equal terms are no agreement.
     """
 
     a: str

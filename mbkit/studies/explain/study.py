@@ -186,7 +186,7 @@ class _Descriptions:
 
     def _gaps(self, a: Model, b: Model) -> Gaps:
         if a.velocity_names != b.velocity_names or not a.nv:
-            return Gaps((), comparable=False)
+            return Gaps(comparable=False)
         at = states_of(b, self.samples, self.seed)
         return gaps(model_terms(a, at), model_terms(b, at), at.v, velocity_joints(a))
 
@@ -209,7 +209,7 @@ class _Descriptions:
             return self._cause(h, {})
         effects: dict[str, float] = {}
         for model, changed in ((one.model, h.apply(one).model), (target.model, h.revert(target).model)):
-            for term, relative in _effects(self._gaps(model, changed)).items():
+            for term, relative in self._gaps(model, changed).effects.items():
                 effects[term] = max(relative, effects.get(term, 0.0))
         return self._cause(h, effects)
 
@@ -222,7 +222,7 @@ class _Descriptions:
         exchanged = ", ".join(f"{m.a!r} is {m.b!r}" for m in by_structure if m.b in ours)
         if exchanged:
             h = Hypothesis("names exchanged", "", f"calls joints by each other's names: {exchanged}")
-            yield self._cause(h, _effects(by_name) if by_name else {"M": np.inf})
+            yield self._cause(h, by_name.effects if by_name else {"M": np.inf})
         others = ", ".join(f"{m.a!r} is {m.b!r}" for m in by_structure if m.b not in ours)
         if others:
             yield self._cause(Hypothesis("renamed", "", f"calls joints otherwise: {others}"), {})
@@ -258,10 +258,6 @@ class _Descriptions:
         return minimal_differing_subtree(a, differs)
 
 
-def _effects(measured: Gaps) -> dict[str, float]:
-    return {g.term: g.relative for g in measured.terms} if measured.comparable else {"M": np.inf}
-
-
 def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) -> Iterator[str]:
     if moved_frames:
         frames = ", ".join(moved_frames)
@@ -281,16 +277,14 @@ def _summarized_differences(one: MergedModel, other: MergedModel, near: Toleranc
     coarse = differences(one, other, replace(near, relative=max(_ROUNDED, near.relative)))
     if len(coarse) > len(fine) // 2:
         return fine
-    large = {(h.subject, field) for h in coarse for field in h.theirs}
+    large = {(h.subject, field) for h in coarse for field in h.theirs or ()}
     less = [h.without({field for subject, field in large if subject == h.subject}) for h in fine]
     small = [h for h in less if h.theirs]
+
+    def put(x: MergedModel, side: Mapping[str, str]) -> MergedModel:
+        for h in small:
+            x = h.put(x, getattr(h, side["of"]))
+        return x
+
     says = f"has rounded numbers: {len(small)} of them differ, by less than {_ROUNDED:.0e} of their size"
-    return [*coarse, Hypothesis("rounding", "", says, _put_all, {"revert": small}, {"apply": small})]
-
-
-def _put_all(x: MergedModel, sides: Mapping[str, Sequence[Hypothesis]]) -> MergedModel:
-    for h in sides.get("apply", ()):
-        x = h.apply(x)
-    for h in sides.get("revert", ()):
-        x = h.revert(x)
-    return x
+    return [*coarse, Hypothesis("rounding", "", says, put, {"of": "ours"}, {"of": "theirs"})]

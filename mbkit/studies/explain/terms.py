@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class Gap:
 class Gaps:
     """The largest difference of each term; `comparable` is False where the coordinates differ."""
 
-    terms: tuple[Gap, ...]
+    terms: tuple[Gap, ...] = ()
     comparable: bool = True
 
     @property
@@ -61,6 +61,11 @@ class Gaps:
     def joint(self) -> str:
         """The joint of the largest."""
         return max(self.terms, key=lambda g: g.relative).joint if self.terms else ""
+
+    @property
+    def effects(self) -> dict[str, float]:
+        """Term -> difference; an infinite one of M where nothing can be compared."""
+        return {g.term: g.relative for g in self.terms} if self.comparable else {"M": np.inf}
 
 
 def states_of(model: Model, samples: int, seed: int) -> States:
@@ -100,28 +105,20 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
     """Return the differences of values at states with velocities v of these joints, scaled by those of `a`."""
     # An engine may refuse the state, or have another number of velocities.
     if "M" not in a or "M" not in b or a["M"].shape != b["M"].shape:
-        return Gaps((), comparable=False)
-    scales = _scales(a, v)
+        return Gaps(comparable=False)
+    M = a["M"]
+    diagonal, nothing = np.einsum("nii->ni", M).copy(), np.zeros(len(M))
+    inertial = np.linalg.norm(M, axis=(1, 2)) * np.sum(v * v, axis=1)
+    scales = Scales(M, diagonal, inertial, nothing, np.zeros_like(diagonal), nothing, nothing)
     out = []
-    for term in a:
-        if term not in b:
-            continue
-        errors: Any = matrix_errors if term == "M" else force_errors
-        measured = errors(b[term] - a[term], a[term], scales)
+    for term in [t for t in a if t in b]:
+        measured = (matrix_errors if term == "M" else force_errors)(b[term] - a[term], a[term], scales)
         per = measured.per_velocity
         joint = joints[int(np.argmax(per))] if per.size and per.max() > 0 else ""
         largest = float(measured.relative.max(initial=0.0))
         # A NaN would be lost in a maximum.
         out.append(Gap(term, np.inf if np.isnan(largest) else largest, joint))
     return Gaps(tuple(out))
-
-
-def _scales(a: Values, v: Array) -> Scales:
-    M = a["M"]
-    diagonal = np.einsum("nii->ni", M).copy()
-    inertial = np.linalg.norm(M, axis=(1, 2)) * np.sum(v * v, axis=1)
-    nothing = np.zeros(len(M))
-    return Scales(M, diagonal, inertial, nothing, np.zeros_like(diagonal), nothing, nothing)
 
 
 # Parts of a description.
@@ -134,9 +131,7 @@ def restricted(model: Model, joints: Collection[str]) -> Model:
     here = bodies | {"world"}
     return replace(
         model,
-        joints=tuple(
-            replace(j, mimic=None) if j.mimic is not None and j.mimic.joint not in joints else j for j in kept
-        ),
+        joints=tuple(j if j.mimic is None or j.mimic.joint in joints else replace(j, mimic=None) for j in kept),
         bodies=tuple(b for b in model.bodies if b.name in bodies),
         frames=(),
         springs=tuple(s for s in model.springs if {s.body_a, s.body_b} <= here),

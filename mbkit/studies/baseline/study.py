@@ -1,0 +1,584 @@
+"""`record`, `check` and `diff`: engines' numbers into a file, and what moved since.
+
+Errors are those of `mbkit.studies.compare.errors`, on the recorded values' own scales, so nothing but the file and an
+engine is needed. An engine's own error against 34 digits, found when it was recorded, says what its rounding is: 16
+times that is allowed, because the error is the worst of a handful of states and another processor rounds elsewhere;
+and of an error below 8 eps (`FINE`) 16 times 8 eps, because a handful of states can by chance show almost none. What
+differed by more than `ROUNDING` when it was recorded is no rounding; it is held against the engine's own values, to
+`OWN`.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array, count
+from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.engines.registry import ENGINES, REFERENCE, compared, find_engine
+from mbkit.errors import (
+    BaselineError,
+    KnownDefectWarning,
+    MbkitError,
+    NumericalError,
+    UnknownNameError,
+    UnsupportedError,
+)
+from mbkit.methods.registry import DEFAULT_METHOD
+from mbkit.model import Model
+from mbkit.studies import results
+from mbkit.studies._checkpoint import Progress, silent
+from mbkit.studies._targets import checked_target, engine_names, with_values
+from mbkit.studies.baseline.description import (
+    LINK_SECTIONS,
+    Change,
+    changes,
+    described,
+    links_of,
+    moving_mass,
+    without_consequences,
+)
+from mbkit.studies.baseline.file import (
+    ROLLOUT,
+    VECTORS,
+    Baseline,
+    Rollout,
+    check_replaceable,
+    path_of,
+    read,
+    store,
+    text_of,
+)
+from mbkit.studies.baseline.result import BaselineResult, Moved, Status, VersionChange
+from mbkit.studies.compare.errors import Errors, Scales
+from mbkit.studies.compare.terms import TERMS, States, states
+from mbkit.studies.results import Refusal
+from mbkit.studies.study_runs import quiet_simulate, require_motion
+
+FINE: Final = 8.0 * float(np.finfo(float).eps)
+ROUNDING: Final = 1e-9
+OWN: Final = 1e-12
+_FACTOR: Final = 16.0
+#: Of the motion of a robot an excerpt, in which rounding does not grow.
+_ROLLOUT: Final = Rollout(dt=2e-3, steps=25)
+# States are written in a file for people: of these decimals every double is its own shortest text.
+_DECIMALS: Final = 6
+#: The description and the states come from these, whatever the engine.
+_SHARED: Final = ("mbkit", "pin", "numpy")
+_ABSENT: Final = "not installed"
+_OTHER_COORDINATES: Final = "the coordinates are others, so no number can be compared"
+
+
+def record(
+    model: Model,
+    path: str | os.PathLike[str],
+    engines: Sequence[str] | None = None,
+    *,
+    samples: int = 2,
+    seed: int = 0,
+    target: str = "",
+    options: Mapping[str, Any] | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Baseline:
+    """Record what engines say of a model, for `check` to hold them against later.
+
+    The file has the model's parameters, every term at a few seeded states and the end of a short rollout, by the
+    oracle; how far each engine was from these; and versions. The same model, versions and processor give the same
+    bytes.
+
+    Parameters
+    ----------
+    model : Model
+        Whose named parameters have values.
+    path : path
+        A TOML file, of which folders are made. The baseline of the same model is replaced.
+    engines : sequence of str, optional
+        By default all that are installed and hold the model.
+    samples : int
+        Random states, beside which stands one near singular.
+    seed : int
+    target, options : str and mapping, optional
+        What `mbkit baseline check` loads, as `mbkit check` takes it, and how: keyword arguments of `mbkit.load`. A
+        function, ``package.module:function``, is loaded only where ``--target`` names it. A file's path is relative to
+        the baseline's folder, and begins with a dot. Of a URDF, links that are fixed to each other are recorded each
+        by itself then, beside the body that they make.
+    force : bool
+        Whether to replace whatever file is there.
+    progress : callable, optional
+        Called as ``progress(fraction, text)``.
+
+    Returns
+    -------
+    Baseline
+        Of which `disagreements` tells where an engine was not right even now.
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        For unusable arguments.
+    UnsupportedError
+        An engine that was asked for is not installed, or none holds the model.
+    OutputError
+        The file cannot be written, or is not this model's to replace; it stays as it was.
+    """
+    model, where = _checked_model(model), path_of(path)
+    names = compared() if engines is None else engine_names(engines)
+    count("samples", samples, least=1)
+    count("seed", seed)
+    checked_target(target, options)
+    if not force:
+        check_replaceable(where, model.name)
+    tell = progress or silent
+    tell(0.0, "building")
+    plain = with_values(model)
+    built, refused, missing = _build_engines(plain, names)
+    if engines is not None and missing:
+        raise UnsupportedError("; ".join(f"{m.engine}: {m.reason}" for m in missing))
+    if not built:
+        why = "; ".join(f"{r.engine}: {r.reason}" for r in refused)
+        raise UnsupportedError(f"no engine holds {model.name}, so there is nothing to record: {why}")
+    at = _states(plain, samples, seed)
+    tell(0.1, "34 digits")
+    terms, absent = _evaluate(OracleDynamics(plain), at, _ROLLOUT)
+    recorded = Baseline(
+        model=model.name,
+        digest=model.digest,
+        target=target,
+        options=dict(options or {}),
+        seed=seed,
+        processor=results.processor(),
+        versions=_versions_of(built),
+        description=described(model) | links_of(model, target, options or {}, where),
+        coordinates=tuple(model.coordinate_names),
+        velocities=tuple(model.velocity_names),
+        states=at,
+        rollout=_ROLLOUT,
+        terms=terms,
+        errors={name: {} for name in built},
+    )
+    comparator = _Comparator(recorded)
+    left_out = [*refused, *absent]
+    for k, (name, dyn) in enumerate(built.items()):
+        tell(0.6 + 0.4 * k / len(built), name)
+        values, without = _evaluate(dyn, at, _ROLLOUT)
+        left_out += [r for r in without if r.term in terms]
+        for term in [t for t in values if t in terms]:
+            error = comparator.error(term, values[term], terms[term])
+            recorded.errors[name][term] = error if error > FINE else 0.0
+            if error > ROUNDING:
+                recorded.own.setdefault(name, {})[term] = values[term]
+    tell(1.0, "done")
+    recorded = replace(recorded, left_out=tuple(left_out))
+    store(where, text_of(recorded), model.name, force=force)
+    return recorded
+
+
+def check(
+    model: Model,
+    path: str | os.PathLike[str],
+    *,
+    strict: bool = False,
+    target: str | None = None,
+    progress: Progress | None = None,
+) -> BaselineResult:
+    """Hold a model and the engines against what was recorded of them.
+
+    First the description: a parameter that changed is named, with its old and new value, and what it does to the
+    terms. Where there is none, the numbers of every recorded engine, to its own rounding
+    (`mbkit.studies.baseline.study` says how much that is). Where these stand, the versions: new ones alone ask whether
+    to record again.
+
+    Parameters
+    ----------
+    model : Model
+    path : path
+        What `record` wrote.
+    strict : bool
+        Whether an engine that was recorded and is not installed or registered fails, instead of being skipped.
+    target : str, optional
+        What the model was loaded from, where that is not what was recorded.
+    progress : callable, optional
+        Called as ``progress(fraction, text)``.
+
+    Returns
+    -------
+    BaselineResult
+        With ``passed``, ``verdict``, ``changes``, ``moved``, ``versions`` and ``skipped``.
+
+    Raises
+    ------
+    BaselineError
+        The file is damaged or of another format, or the baseline is another robot's.
+    InputError
+        For unusable arguments.
+
+    Examples
+    --------
+    >>> import tempfile, mbkit as mb
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> path = folder.name + "/pendulum.toml"
+    >>> _ = mb.baseline.record(mb.catalog.pendulum(), path, engines=["lagrangian"])
+    >>> mb.baseline.check(mb.catalog.pendulum(), path).passed
+    True
+    >>> print(mb.baseline.check(mb.catalog.pendulum(mass=1.1), path).changes[0].text)
+    mass of body bob (with tip fixed to it): 1 → 1.1
+    """
+    model, where = _checked_model(model), path_of(path)
+    checked_target("" if target is None else target)
+    recorded = read(where)
+    if recorded.model != model.name and not {*model.coordinate_names} & {*recorded.coordinates}:
+        raise BaselineError(
+            f"{where}: the baseline of another robot: {recorded.model!r} with {_shown(recorded.coordinates)}; "
+            f"this is {model.name!r} with {_shown(model.coordinate_names)}"
+        )
+    tell = progress or silent
+    moved = _version_changes(recorded.versions, _versions_of(recorded.engines))
+    processor = results.processor()
+    changed = _changes(recorded, model, recorded.target if target is None else target, where)
+    meant = tuple(c for c in changed if not c.rounding)
+    if not meant and not moved and processor == recorded.processor:
+        # Another parser or processor may round otherwise; neither is another, so somebody wrote another number.
+        meant = changed
+    result = BaselineResult(
+        question="check",
+        model=model.name,
+        path=os.fspath(path),
+        status="description",
+        changes=meant,
+        versions=moved,
+        processors=(recorded.processor, processor),
+        strict=strict,
+    )
+    plain = with_values(model)
+    if meant:
+        return replace(result, effect=_effect(recorded, plain, meant))
+    notes = [f"only rounding: {c.text}" for c in changed]
+    if not changed and model.digest != recorded.digest:
+        notes = ["the digest is another, though no parameter is"]
+    tell(0.0, "building")
+    built, refused, missing = _build_engines(plain, recorded.engines)
+    rows = [_unavailable(recorded, r, moved) for r in refused]
+    worst = 0.0
+    for k, (name, dyn) in enumerate(built.items()):
+        tell(0.1 + 0.9 * k / len(built), name)
+        some, error = _differences(recorded, name, dyn, moved)
+        rows += some
+        worst = max(worst, error)
+    tell(1.0, "done")
+    if len(built) > 1 and {r.engine for r in rows} == set(built):
+        shared = "look at what they share, mbkit itself, before any engine"
+        notes.append(f"every engine moved while the description stands: {shared}")
+    return replace(
+        result,
+        status="numbers" if rows else "skipped" if not (built or refused) else "versions" if moved else "same",
+        engines=tuple(built),
+        moved=tuple(rows),
+        skipped=tuple(missing),
+        notes=tuple(notes),
+        worst=worst,
+    )
+
+
+def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> BaselineResult:
+    """Say what the second of two baselines has that the first has not.
+
+    Nothing is computed: it reads what was recorded. Numbers are the oracle's, so they tell what became of the robot;
+    engines' own are compared where they were recorded.
+
+    Parameters
+    ----------
+    path_a, path_b : path
+
+    Returns
+    -------
+    BaselineResult
+        With all that differs: parameters, numbers and versions.
+
+    Raises
+    ------
+    BaselineError
+        A file cannot be read, or the two are of different robots.
+    """
+    a, b = read(path_a), read(path_b)
+    if a.model != b.model and not set(a.coordinates) & set(b.coordinates):
+        raise BaselineError(
+            f"{path_a} is a baseline of {a.model!r}, {path_b} of {b.model!r}; they have no joint in common"
+        )
+    notes: tuple[str, ...] = ()
+    same_states = all(np.array_equal(getattr(a.states, x), getattr(b.states, x)) for x in VECTORS)
+    if a.coordinates != b.coordinates or a.velocities != b.velocities:
+        notes = (_OTHER_COORDINATES,)
+    elif not same_states or a.rollout != b.rollout:
+        states_text = f"seed {a.seed} and {b.seed}, {len(a.states.q)} and {len(b.states.q)} of them"
+        notes = (f"the states are others ({states_text}), so no number can be compared",)
+    moved = _version_changes(a.versions, b.versions)
+    rows = () if notes else _moved_numbers(a, b, moved)
+    changed = without_consequences(changes(a.description, b.description), a.description)
+    status: Status = "description" if changed else "numbers" if rows or notes else "versions" if moved else "same"
+    return BaselineResult(
+        question="diff",
+        model=a.model,
+        path=os.fspath(path_a),
+        against=os.fspath(path_b),
+        status=status,
+        engines=tuple(e for e in a.engines if e in b.engines),
+        changes=changed,
+        moved=rows,
+        versions=moved,
+        processors=(a.processor, b.processor),
+        skipped=tuple(
+            Refusal(e, "", f"in {path_a if e in a.engines else path_b} alone")
+            for e in dict.fromkeys([*a.engines, *b.engines])
+            if (e in a.engines) != (e in b.engines)
+        ),
+        notes=notes,
+    )
+
+
+def _moved_numbers(a: Baseline, b: Baseline, moved: tuple[VersionChange, ...]) -> tuple[Moved, ...]:
+    comparator = _Comparator(a)
+    rows = [comparator.moved(REFERENCE, t, b.terms[t], x, FINE) for t, x in a.terms.items() if t in b.terms]
+    for engine, terms in a.own.items():
+        for term, x in terms.items():
+            y = b.own.get(engine, {}).get(term)
+            if y is None and term in b.errors.get(engine, {}):
+                y = b.terms[term]
+            if y is not None:
+                rows.append(comparator.moved(engine, term, y, x, OWN, _cause(engine, a.versions, moved)))
+    return tuple(row for row in rows if row is not None)
+
+
+# The model, its states, and engines on them.
+
+
+def _checked_model(model: object) -> Model:
+    """Return a model that has something to record."""
+    checked = require_motion(model, "record")
+    checked.require_values("a baseline")
+    return checked
+
+
+def _shown(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def _states(model: Model, samples: int, seed: int) -> States:
+    """Return `samples` random states, and one that is near singular, of few decimals."""
+    drawn = states(model, samples, seed)
+    # Limits act on no term, and at zero axes are aligned as they are near singular: a file is read by people.
+    which = [*range(samples), *[k for k, kind in enumerate(drawn.kinds) if kind == "near singular"][:1]]
+    q, v, a, tau = (x[which] for x in (drawn.q, drawn.v, drawn.a, drawn.tau))
+    a, tau = (np.round(x, _DECIMALS // 2) + 0.0 for x in (a, tau))
+    if not model.constrained:
+        # Rounded, a state would be off the constraints, and a quaternion off its unit length.
+        exact = np.zeros(model.nq, dtype=bool)
+        for start, _ in model.quaternions:
+            exact[start : start + 4] = True
+        q = np.where(exact, q, np.round(q, _DECIMALS)) + 0.0
+        v = np.round(v, _DECIMALS // 2) + 0.0
+    return States(q, v, a, tau, tuple(drawn.kinds[k] for k in which))
+
+
+def _build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynamics], list[Refusal], list[Refusal]]:
+    """Return the engines that hold a model, those that refuse it, and those that are not there."""
+    engines: dict[str, Dynamics] = {}
+    refused: list[Refusal] = []
+    missing: list[Refusal] = []
+    for name in names:
+        try:
+            engines[name] = dynamics(model, name, **find_engine(name).brief)
+        except UnknownNameError:
+            missing.append(Refusal(name, "", "not registered; import the module that registers it"))
+        except MbkitError as error:
+            if isinstance(error.__cause__, ModuleNotFoundError):
+                missing.append(Refusal(name, "", f"not installed; pip install {find_engine(name).package}"))
+            else:
+                refused.append(Refusal.of(name, error))
+    return engines, refused, missing
+
+
+def _evaluate(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Array], list[Refusal]]:
+    """Return every term that an engine gives, and why it does not give the others."""
+    values: dict[str, Array] = {}
+    refusals = []
+    calls = {term.name: partial(term.call, dyn, at) for term in TERMS}
+    with warnings.catch_warnings():
+        # A defect that was there before is recorded, and no news.
+        warnings.simplefilter("ignore", KnownDefectWarning)
+        for name, call in {**calls, ROLLOUT: partial(_rollout_end, dyn, at, rollout)}.items():
+            try:
+                values[name] = call()
+            except MbkitError as error:
+                refusals.append(Refusal.of(dyn.engine, error, name))
+    return values, refusals
+
+
+def _rollout_end(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
+    """Return q and v at the end of a rollout from the first state, one after the other."""
+    # MuJoCo's own steps make a mimic joint a soft equality, which is another system.
+    # The same formula everywhere, by an engine's own steps where it has them.
+    method = DEFAULT_METHOD if dyn.model.layout.reduced else find_engine(dyn.engine).rk4
+    run = quiet_simulate(dyn, at.q[0], at.v[0], rollout.dt * rollout.steps, method, rollout.dt)
+    if run.stats.ended != "finished":
+        raise NumericalError(f"{dyn.engine}: {method}: {run.stats.message}")
+    return np.concatenate([run.q[-1], run.v[-1]])
+
+
+# Numbers against recorded ones.
+
+
+class _Comparator:
+    """Measures values of any term against others, on the scales of a baseline's values."""
+
+    def __init__(self, b: Baseline) -> None:
+        mass, gravity = moving_mass(b.description)
+        acting = np.abs(b.states.tau) + sum(np.abs(b.terms[name]) for name in ("nle", "passive") if name in b.terms)
+        weight = float(np.linalg.norm(gravity)) * float(np.sqrt(mass))
+        self._scales = Scales.of(b.terms["M"], b.states.v, acting, weight)
+        self._measures = {t.name: t.errors for t in TERMS}
+        self._velocities, self._split = b.velocities, len(b.coordinates)
+        self._ends = [f"q of {n}" for n in b.coordinates] + [f"v of {n}" for n in b.velocities]
+        self._states = [f"{kind} state {k + 1}" for k, kind in enumerate(b.states.kinds)]
+
+    def errors(self, term: str, value: Array, reference: Array) -> Errors:
+        """Measure a term's values; of a rollout's end q and v each relative to their size, rad, m and s or more."""
+        if term != ROLLOUT:
+            return self._measures[term](value - reference, reference, self._scales)
+        e, ends = np.abs(value - reference), np.split(reference, [self._split])
+        size = np.concatenate([np.full(len(x), max(1.0, float(np.abs(x).max()))) for x in ends])
+        return Errors(e.max(keepdims=True), (e / size).max(keepdims=True), e / size)
+
+    def error(self, term: str, value: Array, reference: Array) -> float:
+        """Return a term's largest error."""
+        return float(np.max(self.errors(term, value, reference).relative))
+
+    def moved(
+        self, engine: str, term: str, value: Array, reference: Array, allowed: float, cause: str = "", reason: str = ""
+    ) -> Moved | None:
+        """Return where a term is off by more than allowed, or None."""
+        errors = self.errors(term, value, reference)
+        error = float(errors.relative[errors.worst])
+        if error <= allowed:
+            return None
+        off, per = np.abs(value - reference), errors.per_velocity
+        joint, state = "", self._states[errors.worst] if term != ROLLOUT else ""
+        index: tuple[int, ...] = (errors.worst,)
+        if per.size:
+            j = int(np.argmax(per))
+            joint, index = (self._ends if term == ROLLOUT else self._velocities)[j], (j,)
+            if off.ndim > 1:
+                n, *more = (int(x) for x in np.unravel_index(np.argmax(off[:, j]), off[:, j].shape))
+                state, index = self._states[n], (n, j, *more)
+                joint += "".join(f", {self._velocities[i]}" for i in more if i != j)
+        numbers = float(reference[index]), float(value[index])
+        return Moved(term, engine, joint, state, *numbers, error, allowed, cause, reason)
+
+
+def _allowed(baseline: Baseline, engine: str, term: str) -> float:
+    """Return the error that is still rounding."""
+    if term in baseline.own.get(engine, {}):
+        return OWN
+    recorded = baseline.errors[engine][term]
+    if term == ROLLOUT:
+        # Rounding grows along a motion, by what only the motion tells: the worst of all engines.
+        recorded = max(e[term] for e in baseline.errors.values() if e.get(term, np.inf) <= ROUNDING)
+    return _FACTOR * max(recorded, FINE)
+
+
+def _differences(
+    recorded: Baseline, name: str, dyn: Dynamics, moved: tuple[VersionChange, ...]
+) -> tuple[list[Moved], float]:
+    """Return what is not as recorded of one engine, and the worst error of what is."""
+    comparator = _Comparator(recorded)
+    values, refusals = _evaluate(dyn, recorded.states, recorded.rollout)
+    before, own = recorded.errors[name], recorded.own.get(name, {})
+    rows = [_unavailable(recorded, r, moved) for r in refusals if r.term in before]
+    worst = 0.0
+    cause = _cause(name, recorded.versions, moved)
+    for term in [t for t in values if t in before]:
+        value, oracle = values[term], recorded.terms[term]
+        reference = own.get(term, oracle)
+        reason = ""
+        if term in own:
+            # It was wrong when recorded, and may be right now.
+            error = comparator.error(term, value, oracle)
+            reason = f"it differed from the oracle by {before[term]:.1e} when recorded, and by {error:.1e} now"
+            if error <= ROUNDING:
+                differed = f"which it differed from by {before[term]:.1e} when recorded"
+                reason = f"right now: {error:.1e} from the oracle, {differed}"
+        row = comparator.moved(name, term, value, reference, _allowed(recorded, name, term), cause, reason)
+        if row is None:
+            worst = max(worst, comparator.error(term, value, reference))
+        else:
+            rows.append(row)
+    return rows, worst
+
+
+def _unavailable(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChange, ...]) -> Moved:
+    """Return the failure of an engine that gives no number any more."""
+    cause = _cause(refusal.engine, recorded.versions, moved)
+    numbers = np.nan, np.nan, np.inf, 0.0
+    return Moved(refusal.term or "everything", refusal.engine, "", "", *numbers, cause, f"no longer: {refusal.reason}")
+
+
+# The description and the versions against recorded ones.
+
+
+def _changes(recorded: Baseline, model: Model, target: str, path: Path) -> tuple[Change, ...]:
+    """Return what differs in the descriptions, by the links' own names where a file tells them."""
+    old, new = recorded.description, described(model)
+    changed = changes({k: x for k, x in old.items() if k not in LINK_SECTIONS}, new)
+    if not changed or "links" not in old:
+        return changed
+    links = links_of(model, target, recorded.options, path)
+    return without_consequences(changes(old, new | links), old) if links else changed
+
+
+def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> str:
+    """Return what a changed description does to the terms, by the first engine at hand."""
+    if tuple(model.coordinate_names) != recorded.coordinates or tuple(model.velocity_names) != recorded.velocities:
+        return _OTHER_COORDINATES
+    if all(c.section == "expressions" for c in changed):
+        return ""
+    for name in recorded.engines:
+        for dyn in _build_engines(model, [name])[0].values():
+            rows = [r for r in _differences(recorded, name, dyn, ())[0] if np.isfinite(r.error)]
+            if not rows:
+                return f"no term moves ({name})"
+            worst = max(rows, key=lambda r: r.error)
+            at = f" at {worst.joint}" if worst.joint else ""
+            most = f"{worst.term}{at} most, by {worst.error:.1e} ({name})"
+            return f"moves {len(rows)} of {len(recorded.errors[name])} terms, {most}"
+    return ""
+
+
+def _package(engine: str) -> str:
+    return (ENGINES[engine].distribution if engine in ENGINES else "") or "mbkit"
+
+
+def _versions_of(engines: Iterable[str]) -> dict[str, str]:
+    """Return the versions that can move numbers of these engines."""
+    now = results.versions()
+    return {p: now[p] for p in dict.fromkeys([*_SHARED, *map(_package, engines)])}
+
+
+def _version_changes(old: Mapping[str, str], new: Mapping[str, str]) -> tuple[VersionChange, ...]:
+    """Return what differs among the packages of both; what is not installed has no version."""
+    return tuple(VersionChange(p, x, new[p]) for p, x in old.items() if new.get(p, _ABSENT) not in (x, _ABSENT))
+
+
+def _cause(engine: str, old: Mapping[str, str], changed: Iterable[VersionChange]) -> str:
+    """Return which version of an engine moved, or that none did, for a failure."""
+    package = _package(engine)
+    own = [str(m) for m in changed if m.package == package]
+    others = [str(m) for m in changed if m.package in _SHARED and m.package != package]
+    return "; ".join([*(own or [f"{package} {old.get(package, '?')}, as recorded"]), *others])
