@@ -592,6 +592,24 @@ def test_an_engine_without_a_mass_matrix_is_refused_by_name() -> None:
             mb.explain(*pair)
 
 
+def test_an_engine_that_refuses_bodies_without_mass_is_explained_as_far_as_it_goes() -> None:
+    class Picky(PinocchioDynamics):
+        """Wrong in one entry of M, and without an answer where nothing has mass."""
+
+        engine = "picky"
+
+        def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
+            if not all(b.mass for b in self.model.bodies):
+                raise UnsupportedError("picky: a body has no mass")
+            M = super()._mass_matrix(q).copy()
+            M[..., 0, 0] *= 1.1
+            return M
+
+    found = mb.explain(Picky(arm()), mb.dynamics(arm()))
+    assert not found.agree
+    assert [g.term for g in found.gaps if g.relative > found.tolerance] == ["M"]
+
+
 def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="expected a Model"):
         mb.explain("panda", arm())  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ import pytest
 import mbkit as mb
 from mbkit.engines import imported
 from mbkit.errors import InputError
-from mbkit.studies.importers import process
+from mbkit.studies.importers import study
 
 ROBOT = (
     '<robot name="{0}"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.1"/><mass value="2"/>'
@@ -64,7 +64,7 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         return mb.compare_parsers(path, importers, samples=1, **options)
 
     yield run
-    worker = process._workers.pop(key, None)
+    worker = study._workers.pop(key, None)
     if worker is not None:
         worker.end()
 
@@ -95,7 +95,7 @@ def test_one_that_hangs_is_stopped_and_the_next_file_read(told) -> None:
     assert first.agrees
     assert first.notes == second.notes != (str(os.getpid()),)
     # One that was interrupted owes an answer that nobody wants.
-    process._workers[imported.IMPORTERS["drake"]].begin(os.getpid)
+    study._workers[imported.IMPORTERS["drake"]].begin(os.getpid)
     assert told("sound").importers[0].notes != first.notes
     with pytest.raises(InputError, match="seconds"):
         told("sound", seconds=-1.0)
@@ -109,18 +109,18 @@ def test_in_a_script_without_a_guard_in_its_forks_and_after_its_end(tmp_path: Pa
             """
             import os
             import mbkit as mb
-            from mbkit.studies.importers import process
+            from mbkit.studies.importers import study
 
             def pid():
                 assert mb.compare_parsers("r.urdf", ("mujoco",)).importers[0].agrees
-                (worker,) = process._workers.values()
+                (worker,) = study._workers.values()
                 return worker.call(os.getpid)
 
             first = pid()
             forked = os.fork()
             if not forked:
                 # A fork has no part in its parent's processes.
-                (worker,) = process._workers.values()
+                (worker,) = study._workers.values()
                 own = worker.call(os.getpid)
                 worker.end()
                 raise SystemExit(own == first)

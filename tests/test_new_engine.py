@@ -46,6 +46,16 @@ def test_it_is_compared_and_shown(engine):
     assert assert_engines_agree(PENDULUM, ("pinocchio", engine), samples=2).passed
 
 
+def test_a_baseline_of_an_engine_that_nobody_registered_is_skipped(engine, tmp_path):
+    path = tmp_path / "pendulum.toml"
+    mb.baseline.record(PENDULUM, path, [engine])
+    assert mb.baseline.check(PENDULUM, path).status == "same"
+    del ENGINES[engine]
+    result = mb.baseline.check(PENDULUM, path)
+    assert result.status == "skipped"
+    assert "not registered" in result.skipped[0].reason
+
+
 def test_a_wrong_value_is_seen(engine, monkeypatch):
     monkeypatch.setattr(ClosedForm, "_mass_matrix", lambda self, q: np.full((*q.shape[:-1], 1, 1), 2 * self._inertia))
     with pytest.raises(AssertionError, match=rf"{engine}, M: differs"):

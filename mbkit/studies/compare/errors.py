@@ -66,7 +66,8 @@ class Errors:
         return int(np.argmax(self.relative))
 
 
-def _ratio(e: Array, scale: Array) -> Array:
+def ratio(e: Array, scale: Array) -> Array:
+    """Return e / scale, and 0 where e is 0."""
     # 0/0 is no error: both sides say zero.
     return np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
 
@@ -75,12 +76,12 @@ def force_errors(error: Array, reference: Array, scales: Scales, *, heavy: bool 
     """Measure errors of generalized forces; `heavy` where gravity is among them."""
     e = np.abs(error)
     floor = np.maximum(scales.inertial, scales.weight) if heavy else scales.inertial
-    relative = _ratio(np.linalg.norm(e, axis=1), np.maximum(np.linalg.norm(reference, axis=1), floor))
+    relative = ratio(np.linalg.norm(e, axis=1), np.maximum(np.linalg.norm(reference, axis=1), floor))
     # A joint's own scale: its force, or its share of what is at play.
     trace = scales.diagonal.sum(axis=1, keepdims=True)
     share = np.sqrt(scales.diagonal / np.where(trace > 0, trace, 1.0))
     own = np.maximum(np.abs(reference), floor[:, None] * share)
-    return Errors(e.max(axis=1, initial=0.0), relative, _ratio(e, own).max(axis=0))
+    return Errors(e.max(axis=1, initial=0.0), relative, ratio(e, own).max(axis=0))
 
 
 def acceleration_errors(error: Array, reference: Array, scales: Scales) -> Errors:
@@ -90,12 +91,12 @@ def acceleration_errors(error: Array, reference: Array, scales: Scales) -> Error
     size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
     own = np.maximum(np.abs(reference), scales.acting / np.where(scales.diagonal > 0, scales.diagonal, np.inf))
     force = np.einsum("nij,nj->ni", scales.M, error) / np.where(root > 0, root, np.inf)
-    backward = _ratio(np.linalg.norm(force, axis=1), scales.size * size)
-    forward = _ratio(np.linalg.norm(root * e, axis=1), size * scales.condition)
+    backward = ratio(np.linalg.norm(force, axis=1), scales.size * size)
+    forward = ratio(np.linalg.norm(root * e, axis=1), size * scales.condition)
     return Errors(
         e.max(axis=1, initial=0.0),
         np.maximum(forward, backward),
-        _ratio(e, own * scales.condition[:, None]).max(axis=0),
+        ratio(e, own * scales.condition[:, None]).max(axis=0),
     )
 
 
@@ -103,15 +104,15 @@ def matrix_errors(error: Array, reference: Array, scales: Scales) -> Errors:  # 
     """Measure errors of mass matrices entry by entry, each by its two diagonal entries."""
     e = np.abs(error)
     root = np.sqrt(np.abs(scales.diagonal))
-    ratio = _ratio(e, root[:, :, None] * root[:, None, :])
-    return Errors(e.max(axis=(1, 2), initial=0.0), ratio.max(axis=(1, 2), initial=0.0), ratio.max(axis=(0, 1)))
+    each = ratio(e, root[:, :, None] * root[:, None, :])
+    return Errors(e.max(axis=(1, 2), initial=0.0), each.max(axis=(1, 2), initial=0.0), each.max(axis=(0, 1)))
 
 
 def energy_errors(error: Array, reference: Array, scales: Scales) -> Errors:
     """Measure errors of energies, by the largest of all samples."""
     e = np.abs(error)
     scale = np.maximum(np.abs(reference).max(initial=0.0), scales.inertial)
-    return Errors(e, _ratio(e, scale), np.empty(0))
+    return Errors(e, ratio(e, scale), np.empty(0))
 
 
 # Timings of small calls: interleaved between engines, repeated, median and spread.
@@ -128,20 +129,21 @@ def interleaved(
     repetitions: dict[str, int] = {}
     for name, call in calls.items():
         call()
-        start = time.perf_counter()
-        call()
-        once = max(time.perf_counter() - start, 1e-7)
+        once = max(_seconds(call, 1), 1e-7)
         repetitions[name] = int(np.clip(budget / once, 1, 1000))
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
-            n = repetitions[name]
-            start = time.perf_counter()
-            for _ in range(n):
-                call()
-            times[name].append((time.perf_counter() - start) / n * 1e9)
+            times[name].append(_seconds(call, repetitions[name]) / repetitions[name] * 1e9)
     out = {}
     for name, samples in times.items():
         low, median, high = np.percentile(samples, [25, 50, 75])
         out[name] = float(median), float(high - low) / 2
     return out
+
+
+def _seconds(call: Callable[[], Any], times: int) -> float:
+    start = time.perf_counter()
+    for _ in range(times):
+        call()
+    return time.perf_counter() - start

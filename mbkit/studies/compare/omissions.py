@@ -21,8 +21,10 @@ from mbkit.studies.study_runs import state_within_limits
 # order of a few sums, amplified by the conditioning that both share.
 _UNCHANGED: Final = 1e-9
 
-#: need -> (field of Needs, MuJoCo's bit, what was off)
-_FLAGS: Final = (
+#: Need, field of Needs, MuJoCo's bits, what was off.
+_NEEDS: Final = (
+    ("contacts", "", ("CONTACT", "CONSTRAINT"), "collision detection and contact forces (measured on those spheres)"),
+    ("geometry", "", (), "meshes and shapes never opened (measured with one small sphere per body)"),
     ("limits", "limits", ("LIMIT", "CONSTRAINT"), "joint limits kept as data; no limit rows, no constraint solver"),
     ("dry friction", "friction", ("FRICTIONLOSS", "CONSTRAINT"), "dry friction kept as data; no constraint solver"),
     ("damping", "damping", ("DAMPER",), "dampers"),
@@ -30,65 +32,50 @@ _FLAGS: Final = (
     ("gravity", "gravity", ("GRAVITY",), "gravity"),
     ("loops", "loops", ("EQUALITY", "CONSTRAINT"), "loop closures and equality rows"),
 )
+#: What is on where the description has it.
+_KEPT: Final = ("damping", "springs", "gravity")
 
 
 def omissions(model: Model, engines: Mapping[str, Dynamics], seed: int) -> tuple[Omission, ...]:
     """Return one row per need, measured on the engines at hand."""
     # Well within the limits, where none of them acts.
     q, v = state_within_limits(model, np.random.default_rng([seed, 2]))
-    rows: list[Omission] = []
-    mujoco = engines.get(MUJOCO)
-    if mujoco is not None:
-        rows += _in_mujoco(model, mujoco, q, v)
-    if DERIVED in engines:
-        rows.append(_coriolis(model, q, v))
-    return tuple(rows)
+    rows = _in_mujoco(model, engines[MUJOCO], q, v) if MUJOCO in engines else []
+    return (*rows, *([_coriolis(model, q, v)] if DERIVED in engines else []))
 
 
 def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
     from mbkit.engines.mujoco.variants import Variant
 
-    lean = Variant(dyn)
-    variants: dict[str, Variant] = {
-        "geometry": Variant(dyn, spheres=True),
-        "contacts": Variant(dyn, ("CONTACT", "CONSTRAINT"), spheres=True),
-    }
-    words = {
-        "geometry": "meshes and shapes never opened (measured with one small sphere per body)",
-        "contacts": "collision detection and contact forces (measured on those spheres)",
-    }
-    kept: dict[str, str] = {}
     needs = model.needs.as_dict()
-    for need, flag, bits, what in _FLAGS:
-        words[need] = what
-        if need in ("damping", "springs", "gravity") and needs[flag]:
-            kept[need] = "needed, so it is on"
-            continue
-        variants[need] = Variant(dyn, bits)
-    calls: dict[str, Any] = {"lean": lean.forward}
+    variants = {
+        need: Variant(dyn, bits, spheres=not field)
+        for need, field, bits, _ in _NEEDS
+        if not (need in _KEPT and needs[field])
+    }
+    lean = Variant(dyn)
     reference = lean.accelerations(q, v)
     # Where nothing accelerates, what turning at v would ask for is the measure.
     scale = max(float(np.abs(reference).max(initial=0.0)), float(v @ v))
-    changes: dict[str, float] = {}
-    for need, variant in variants.items():
-        a = variant.accelerations(q, v)
-        changes[need] = float(np.abs(a - reference).max(initial=0.0)) / scale
-        calls[need] = variant.forward
-    times = interleaved(calls, rounds=15)
+    changes = {
+        need: float(np.abs(variant.accelerations(q, v) - reference).max(initial=0.0)) / scale
+        for need, variant in variants.items()
+    }
+    times = interleaved({"lean": lean.forward} | {n: x.forward for n, x in variants.items()}, rounds=15)
     rows = []
-    for need in ("contacts", "geometry", "limits", "dry friction", "damping", "springs", "gravity", "loops"):
-        flag = next((f for n, f, _, _ in _FLAGS if n == need), "")
-        present = bool(flag) and needs[flag]
-        if need in kept:
-            rows.append(Omission(need, True, kept[need], math.nan, math.nan, math.nan, math.nan, True))
+    for need, field, _, what in _NEEDS:
+        if need not in variants:
+            unmeasured = (math.nan,) * 4
+            rows.append(Omission(need, True, "needed, so it is on", *unmeasured, unchanged=True))
             continue
+        present = bool(field) and needs[field]
         saved = times[need][0] - times["lean"][0]
         spread = math.hypot(times[need][1], times["lean"][1])
         # Dry friction that is there would act: leaving it out is a choice, said aloud.
         chosen = need == "dry friction" and present
         note = "it is off in every engine, so that the smooth terms compare" if chosen else ""
         unchanged = chosen or changes[need] <= _UNCHANGED
-        rows.append(Omission(need, present, words[need], saved, spread, math.nan, changes[need], unchanged, note))
+        rows.append(Omission(need, present, what, saved, spread, math.nan, changes[need], unchanged, note))
     return rows
 
 

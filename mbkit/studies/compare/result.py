@@ -17,41 +17,16 @@ from mbkit.studies.work_precision.result import WorkPrecision
 class Row:
     """One term of one engine against the reference, worst over all samples.
 
-    Attributes
-    ----------
-    term, engine : str
-    reference : str
-        ``"oracle"``, or an engine where the oracle has no value.
-    joint : str
-        The joint with the largest per-joint error; empty for energies.
-    max_abs : float
-        Largest absolute difference of any entry, in the term's own unit.
-    relative : float
-        Worst normwise error of a sample; see `mbkit.studies.compare.errors`.
-    per_joint : float
-        Worst error of a joint relative to its own scale.
-    median : float
-        Median normwise error of the samples.
-    samples : int
-    worst_kind : str
-        The kind of state (random, neutral, at limits, near singular) of the worst sample.
-    worst_q, worst_v : tuple of float
-        That state.
-    ns : float
-        Nanoseconds per evaluation of a single state, the engine's median.
-    ns_spread : float
-        Half the interquartile range of the timings, ns.
-    passed : bool
-    reason : str
-        Why it failed, naming joints and a known defect where there is one; or why
-        more than the comparison's tolerance was allowed.
-    allowed : float
-        The error that passes: the comparison's tolerance, or more where the
-        engine's own formula cannot do better.
-    defect : str
-        The engine's known defect, where the row failed with one announced.
-    zero : bool
-        Whether the reference is zero in every entry at every state, so that the row is no evidence.
+    `reference` is ``"oracle"``, or an engine where the oracle has no value. `max_abs` is the largest absolute
+    difference of any entry, in the term's own unit; `relative` the worst normwise error of a sample, and `median` the
+    median, see `mbkit.studies.compare.errors`; `per_joint` the worst error of a joint relative to its own scale, and
+    `joint` that joint, empty for energies. `worst_kind` (random, neutral, at limits, near singular), `worst_q` and
+    `worst_v` are the state of the worst sample. `ns` is the median of nanoseconds per evaluation of a single state,
+    `ns_spread` half their interquartile range. `reason` says why the row failed, naming joints and a known defect
+    where there is one; or why more than the comparison's tolerance was allowed. `allowed` is the error that passes:
+    that tolerance, or more where the engine's own formula cannot do better. `defect` is the engine's known defect,
+    where the row failed with one announced. `zero` says whether the reference is zero in every entry at every state,
+    so that the row is no evidence.
     """
 
     term: str
@@ -77,31 +52,13 @@ class Row:
 
 @dataclass(frozen=True)
 class RolloutRow:
-    """A trajectory of mbkit's integrator on one engine against MuJoCo's own.
+    """A trajectory of mbkit's integrator on one engine against MuJoCo's own, by the same formula.
 
-    Attributes
-    ----------
-    method : str
-        Integrator, the same formula on both sides.
-    engine, against : str
-    dt, duration : float
-        Step and compared horizon, s.
-    error : float
-        Largest difference of q over the horizon (on the manifold).
-    condition : float
-        The rollout's condition: how far q moves per relative disturbance of the
-        forces, see `mbkit.studies.compare.rollouts`.
-    tolerance : float
-        1e-12, or a multiple of eps times the condition where that is more.
-    steps : int
-    seconds, seconds_against : float
-        Run times of the two.
-    passed : bool
-    note : str
-    judged : bool
-        False where too few steps are well conditioned to say anything.
-    asked : float
-        The horizon to compare, s.
+    `dt` is the step, `duration` the compared horizon and `asked` the wanted one, s. `error` is the largest difference
+    of q over the horizon, on the manifold. `condition` says how far q moves per relative disturbance of the forces,
+    see `mbkit.studies.compare.rollouts`; `tolerance` is 1e-12, or a multiple of eps times the condition where that is
+    more. `seconds` and `seconds_against` are the run times of the two. `judged` is False where too few steps are well
+    conditioned to say anything.
     """
 
     method: str
@@ -130,24 +87,10 @@ class RolloutRow:
 class Omission:
     """One thing that was left out, need by need.
 
-    Attributes
-    ----------
-    need : str
-    present : bool
-        Whether the description has it.
-    what : str
-        What was off, in words.
-    saved_ns : float
-        Nanoseconds saved per evaluation, the difference of two medians; NaN where nothing was timed.
-    saved_spread : float
-        Half the interquartile range of that difference, ns.
-    saved_setup : float
-        Seconds of set-up saved; NaN where none.
-    change : float
-        Largest relative change of the accelerations with the thing on.
-    unchanged : bool
-        Whether the change is within rounding.
-    note : str
+    `present` says whether the description has it, and `what` what was off. `saved_ns` are the nanoseconds saved per
+    evaluation, the difference of two medians, NaN where nothing was timed; `saved_spread` is half the interquartile
+    range of that difference; `saved_setup` are the seconds of set-up saved, NaN where none. `change` is the largest
+    relative change of the accelerations with the thing on, and `unchanged` says whether it is within rounding.
     """
 
     need: str
@@ -186,30 +129,9 @@ _COLUMNS: Final = (
 class Comparison(ResultTable):
     """Several engines on one description: do they agree, to how many digits, at what cost.
 
-    Attributes
-    ----------
-    model : str
-        Name of the model.
-    facts : dict
-        nq, nv, mass, digest, needs and notes of the model.
-    engines : tuple of str
-        The engines compared.
-    reference : str
-        What their terms were measured by: the oracle.
-    samples, seed : int
-    tolerance : float
-    rows : tuple of Row
-    rollouts : tuple of RolloutRow
-    precision : WorkPrecision or None
-        Error against run time of a few methods on a short horizon.
-    omissions : tuple of Omission
-    refusals : tuple of Refusal
-    setup : dict
-        Seconds to build each engine; the derivation works when first called.
-    versions : dict
-    processor : str
-    seconds : float
-        Time of the whole study.
+    `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
+    measured by: the oracle. `precision` is the error against run time of a few methods on a short horizon. `setup` has
+    the seconds to build each engine; the derivation works when first called. `seconds` is the time of the whole study.
     """
 
     model: str

@@ -50,7 +50,8 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
         native = _NATIVE[method]
         theirs = quiet_simulate(engines[MUJOCO], q0, v0, DURATION, native, STEP)
         condition = _condition(engines[MUJOCO], engines[ours_on[0]], native, theirs)
-        last = _safe(condition)
+        # The last step before the condition says too little.
+        last = int(next(iter(np.flatnonzero(condition > _CHAOS)), len(condition))) - 1
         for name in ours_on:
             # One step first: compiling it is not run time.
             quiet_simulate(engines[name], q0, v0, STEP, method, STEP)
@@ -78,12 +79,6 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
     off = np.abs(model.difference(q, np.where(np.isfinite(bent), bent, q))).max(axis=1) / _DISTURBANCE
     off[~np.isfinite(bent).all(axis=1)] = np.inf
     return np.asarray(np.maximum.accumulate(off))
-
-
-def _safe(condition: Array) -> int:
-    """Return the last step before the condition says too little."""
-    beyond = np.flatnonzero(condition > _CHAOS)
-    return int(beyond[0]) - 1 if beyond.size else len(condition) - 1
 
 
 def _row(

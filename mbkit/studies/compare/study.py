@@ -6,6 +6,7 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -23,7 +24,7 @@ from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.omissions import omissions
 from mbkit.studies.compare.result import Comparison, Row
 from mbkit.studies.compare.rollouts import rollouts
-from mbkit.studies.compare.terms import TERMS, States, Term, power_rows, states
+from mbkit.studies.compare.terms import TERMS, States, Term, power_errors, states
 from mbkit.studies.results import Refusal, model_info
 from mbkit.studies.study_runs import free_of_mimic, require_motion
 from mbkit.studies.work_precision.study import work_precision
@@ -70,11 +71,13 @@ class Judge:
             rows += self._term(term)
         tell(len(TERMS) / (len(TERMS) + 1), "power balance")
 
-        def refuse(engine: str, error: MbkitError) -> None:
-            self._refuse(engine, "power balance", error)
-
-        for name, errors in power_rows(self.engines, self.oracle, self.at, self.scales, refuse):
-            rows.append(self._row("power balance", name, errors, (np.nan, np.nan), self.defects.get(name, "")))
+        for name, dyn in self.engines.items():
+            try:
+                errors = power_errors(dyn, self.oracle, self.at, self.scales)
+            except MbkitError as error:
+                self._refuse(name, "power balance", error)
+            else:
+                rows.append(self._row("power balance", name, errors, (np.nan, np.nan), self.defects.get(name, "")))
         return rows, self.refusals
 
     def _term(self, term: Term) -> list[Row]:
@@ -232,7 +235,11 @@ def compare(
         For unusable arguments. What an engine cannot do is a row of `refusals`.
     """
     begun = time.perf_counter()
-    names = _checked(model, engines, samples, seed, tolerance)
+    model = require_motion(model, "compare")
+    names = engine_names(engines, least=2)
+    count("samples", samples, least=1)
+    count("seed", seed)
+    real("tolerance", tolerance, positive=True)
     model = with_values(model)
     tell = progress or silent
     built, refusals, setup, defects = _build(model, names, tell, compile=not terms_only)
@@ -275,53 +282,29 @@ def _beyond_terms(
     model: Model, engines: dict[str, Dynamics], seed: int, tell: Progress
 ) -> tuple[dict[str, Any], list[Refusal]]:
     """Return rollouts, run times and omissions; what fails is a refusal, and loses nothing else."""
-    result: dict[str, Any] = {}
-    refusals: list[Refusal] = []
     moving, movers, note = model, engines, ""
     if model.layout.reduced:
         moving, note = free_of_mimic(model), "mimic joints free"
         movers, _, _, _ = _build(moving, tuple(engines), silent, compile=True)
-
-    def study(fraction: float, name: str, call: Callable[[], None]) -> None:
+    methods = {engine: shown for engine in movers if (shown := find_engine(engine).shown)}
+    settings: dict[str, Any] = {"duration": _HORIZON, "repeats": _REPEATS, "seconds": _SECONDS, "work": _WORK}
+    settings["progress"] = lambda fraction, text: tell(0.6 + 0.3 * fraction, text)
+    by_time = partial(work_precision, moving, tuple(movers), methods, seed=seed, **settings)
+    studies: list[tuple[float, str, str, Callable[[], Any]]] = [
+        (0.42, "rollouts", "rollouts", partial(rollouts, moving, movers, seed, note)),
+        (0.6, "precision", "error against run time", by_time),
+    ]
+    if model.has_bodies:
+        studies.append((0.9, "omissions", "what was left out", partial(omissions, model, engines, seed)))
+    result: dict[str, Any] = {}
+    refusals: list[Refusal] = []
+    for fraction, field, name, call in studies:
         tell(fraction, name)
         try:
-            call()
+            result[field] = call()
         except MbkitError as error:
             refusals.append(Refusal("", name, str(error)))
-
-    def run_rollouts() -> None:
-        result["rollouts"] = rollouts(moving, movers, seed, note)
-
-    def run_times() -> None:
-        result["precision"] = work_precision(
-            moving,
-            tuple(movers),
-            {engine: shown for engine in movers if (shown := find_engine(engine).shown)},
-            duration=_HORIZON,
-            seed=seed,
-            repeats=_REPEATS,
-            seconds=_SECONDS,
-            work=_WORK,
-            progress=lambda fraction, text: tell(0.6 + 0.3 * fraction, text),
-        )
-
-    def run_omissions() -> None:
-        result["omissions"] = omissions(model, engines, seed)
-
-    study(0.42, "rollouts", run_rollouts)
-    study(0.6, "error against run time", run_times)
-    if model.has_bodies:
-        study(0.9, "what was left out", run_omissions)
     return result, refusals
-
-
-def _checked(model: Model, engines: Sequence[str], samples: int, seed: int, tolerance: float) -> tuple[str, ...]:
-    require_motion(model, "compare")
-    names = engine_names(engines, least=2)
-    count("samples", samples, least=1)
-    count("seed", seed)
-    real("tolerance", tolerance, positive=True)
-    return names
 
 
 def _build(

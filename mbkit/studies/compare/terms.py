@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -12,7 +12,6 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.errors import MbkitError
 from mbkit.model import Model
 from mbkit.model.manifold import limits_box
 from mbkit.studies.compare.errors import (
@@ -22,6 +21,7 @@ from mbkit.studies.compare.errors import (
     energy_errors,
     force_errors,
     matrix_errors,
+    ratio,
 )
 
 # An angle this far from gimbal lock loses four digits in anything that divides
@@ -47,24 +47,16 @@ def states(model: Model, samples: int, seed: int) -> States:
     """
     rng = np.random.default_rng(seed)
     q, v = model.random_state(rng, samples)
-    parts, kinds = [q], ["random"] * samples
+    parts = [("random", q)]
     few = max(2, samples // 16)
-    special = (
-        []
-        if model.constrained
-        else [
-            ("neutral", np.tile(model.neutral(), (2, 1))),
-            ("at limits", _at_limits(model, rng, few)),
-            ("near singular", _near_singular(model, rng, few)),
-        ]
-    )
-    for kind, drawn in special:
-        parts.append(drawn)
-        kinds += [kind] * len(drawn)
-    q = np.concatenate(parts)
+    if not model.constrained:
+        parts.append(("neutral", np.tile(model.neutral(), (2, 1))))
+        parts.append(("at limits", _at_limits(model, rng, few)))
+        parts.append(("near singular", _near_singular(model, rng, few)))
+    q = np.concatenate([x for _, x in parts])
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
     a, tau = rng.standard_normal((2, len(q), model.nv))
-    return States(q, v, a, tau, tuple(kinds))
+    return States(q, v, a, tau, tuple(kind for kind, x in parts for _ in x))
 
 
 def _at_limits(model: Model, rng: np.random.Generator, n: int) -> Array:
@@ -127,34 +119,19 @@ TERMS: Final = (
 )
 
 
-# Power balance: dE/dt = (τ + τ_damping) · v, with each engine's own acceleration.
-#
-# The rate of energy is differentiated exactly from T and V by the oracle;
-# acceleration and damping are the engine's. So it fails if either the engine's
-# dynamics or the energies are wrong, whatever two engines agree on.
+def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scales) -> Errors:
+    """Return the errors of the power balance, dE/dt = (τ + τ_damping) · v, with the engine's own acceleration.
 
-
-def power_rows(
-    engines: Mapping[str, Dynamics],
-    oracle: OracleDynamics,
-    at: States,
-    scales: Scales,
-    refuse: Callable[[str, MbkitError], None],
-) -> Iterator[tuple[str, Errors]]:
-    """Yield (engine, errors) for every engine; an engine that raises is handed to `refuse`."""
-    for name, dyn in engines.items():
-        try:
-            a = dyn.forward_dynamics(at.q, at.v, at.tau)
-            damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
-            inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
-        except MbkitError as error:
-            refuse(name, error)
-            continue
-        e = np.abs(rate - np.sum((at.tau + damping) * at.v, axis=1))
-        # M a is as large as M's norm lets it be, and that is where it is rounded.
-        root = np.sqrt(scales.diagonal)
-        speed, size = np.linalg.norm(root * at.v, axis=1), np.linalg.norm(root * a, axis=1)
-        pushes = np.linalg.norm(inertial, axis=1) + np.linalg.norm(at.tau, axis=1) + np.linalg.norm(damping, axis=1)
-        scale = speed * size + np.linalg.norm(at.v, axis=1) * pushes + scales.inertial
-        relative = np.where(e == 0, 0.0, e / np.where(scale == 0, np.finfo(float).tiny, scale))
-        yield name, Errors(e, relative, np.empty(0))
+    The rate of energy is differentiated exactly from T and V by the oracle; acceleration and damping are the engine's.
+    So it fails if either the engine's dynamics or the energies are wrong, whatever two engines agree on.
+    """
+    a = dyn.forward_dynamics(at.q, at.v, at.tau)
+    damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
+    inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
+    e = np.abs(rate - np.sum((at.tau + damping) * at.v, axis=1))
+    # M a is as large as M's norm lets it be, and that is where it is rounded.
+    root = np.sqrt(scales.diagonal)
+    speed, size = np.linalg.norm(root * at.v, axis=1), np.linalg.norm(root * a, axis=1)
+    pushes = sum(np.linalg.norm(x, axis=1) for x in (inertial, at.tau, damping))
+    scale = speed * size + np.linalg.norm(at.v, axis=1) * pushes + scales.inertial
+    return Errors(e, ratio(e, scale), np.empty(0))

@@ -24,17 +24,9 @@ _MARK: Final = {True: "same", False: "differs", None: "not comparable"}
 class Stage:
     """One kind of number of one importer against the reference.
 
-    Attributes
-    ----------
-    name : str
-    same : bool or None
-        None where it cannot be compared.
-    worst : float
-        The largest difference: relative for masses, inertias and terms, else in m or its unit; NaN without one.
-    where : str
-        The joint or body where it is largest.
-    says : str
-        The difference in words.
+    `same` is None where it cannot be compared. `worst` is the largest difference, relative for masses, inertias and
+    terms, else in m or its unit, and NaN without one; `where` is the joint or body where it is largest; `says` tells
+    the difference in words.
     """
 
     name: str
@@ -48,17 +40,9 @@ class Stage:
 class Parsed:
     """One importer's reading.
 
-    Attributes
-    ----------
-    engine, version : str
-    refused : str
-        Why it does not read the file; empty where it does.
-    stages : tuple of Stage
-        Empty for the reference itself, and where there is no reference.
-    explanation : Explanation or None
-        Why it differs from the reference.
-    notes : tuple of str
-        What it said, and what it holds beside bodies and joints.
+    `refused` says why it does not read the file, and is empty where it does. `stages` is empty for the reference
+    itself, and where there is no reference; `explanation` says why it differs from the reference; `notes` are what it
+    said, and what it holds beside bodies and joints.
     """
 
     engine: str
@@ -78,27 +62,10 @@ class Parsed:
 class ParserComparison(ResultTable):
     """A file through several importers.
 
-    Attributes
-    ----------
-    source : str
-        The file.
-    format : str
-        ``"urdf"`` or ``"mjcf"``.
-    floating_base : bool
-    reference : str
-        What the importers are compared with: ``"file"``, the file as written, link by link. Where mbkit
-        does not read it: ``"mujoco"`` for an MJCF that MuJoCo reads, else empty, and nothing is compared.
-    faults : str
-        Why mbkit does not read it; empty where it does.
-    importers : tuple of Parsed
-    notes : tuple of str
-        What was taken out of the file before.
-    samples, seed : int
-    tolerance : float
-    versions : dict
-        Package -> version, of everything that took part.
-    processor : str
-    seconds : float
+    `source` is the file, and `format` is ``"urdf"`` or ``"mjcf"``. `reference` is what the importers are compared with:
+    ``"file"``, the file as written, link by link. Where mbkit does not read it, for the reason in `faults`, it is
+    ``"mujoco"`` for an MJCF that MuJoCo reads, else empty, and nothing is compared. `notes` say what was taken out of
+    the file before. `versions` are those of every package that took part, and `seconds` is the time of the whole.
     """
 
     source: str

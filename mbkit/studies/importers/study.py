@@ -4,44 +4,132 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
+from operator import itemgetter
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array, count, real
-from mbkit.engines.imported import IMPORTERS, Imported, check_installed
+from mbkit.engines.imported import IMPORTERS, Beside, Imported, Importer, check_installed, reader
 from mbkit.engines.registry import MUJOCO
 from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_links import urdf_links
-from mbkit.model import Joint, Model
+from mbkit.model import Model
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import angle_of, number_text
-from mbkit.studies.explain.joint_matching import Matching, align_frames, reconcile_joint_sets, rename_joints
+from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of, velocity_joints
-from mbkit.studies.importers.process import ImporterError, Reading, one_at_a_time
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
+from mbkit.studies.worker import WALL_PER_CPU, Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
 
-_LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
+#: Fields of joints with numbers per velocity, and the stage in which they are compared.
+_NUMBERS: Final = {
+    **{name: name for name in ("armature", "damping", "friction")},
+    **dict.fromkeys(("lower", "upper", "velocity_limit", "effort_limit"), "limits"),
+}
 
 
-@dataclass(frozen=True)
-class _Difference:
-    where: str
-    size: float
-    says: str
+# Importers run in worker processes, so that none of them can end, hang or fill the user's process. The processes are
+# kept from one comparison to the next: libraries take longer to load than files.
+
+#: Seconds more than all importers may take, after which a process ends that nobody waits for any more.
+_GRACE: Final = 30.0
+#: The most seconds that a reading may have; the system's calls take no more.
+_MAX_SECONDS: Final = 1e6
+
+_workers: Final[dict[Importer, Worker]] = {}
+#: Held by a comparison: each importer's process holds one file.
+_lock = threading.Lock()
+#: In a worker process: the file that it holds.
+_held: Imported | None = None
+
+
+def _renew_lock() -> None:
+    global _lock
+    _lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_lock)
+
+
+class ImporterError(Exception):
+    """An importer refuses a text, ended its process over it, or took too long; never leaves `mbkit.studies`."""
+
+
+class Reading:
+    """A file that an engine's importer reads, in at most `seconds` of processor time; so is each call of its terms."""
+
+    def __init__(self, engine: str, file: Stripped, floating_base: bool, seconds: float) -> None:
+        self._engine, self._seconds = engine, min(seconds, _MAX_SECONDS)
+        importer = IMPORTERS[engine]
+        self._worker = _workers.setdefault(importer, Worker(outlives_thread=True))
+        self._begin(_read, importer.module, file.text, file.format, floating_base, file.meshes)
+
+    def result(self) -> Imported:
+        """Return the reading that was begun; raises `ImporterError`."""
+        model, notes, beside = self._finish()
+        return Imported(model, self._terms, notes, beside)
+
+    def _terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> Values:
+        self._begin(_terms_of_held, q, v, without)
+        terms: Values = self._finish()
+        return terms
+
+    def _begin(self, function: Callable[..., Any], *args: Any) -> None:
+        # It may be waited for after all others.
+        alarm = len(IMPORTERS) * WALL_PER_CPU * self._seconds + _GRACE
+        try:
+            self._worker.begin(function, *args, alarm=alarm)
+        except (WorkerDiedError, WorkerStartError) as error:
+            raise ImporterError(self._failure(error)) from None
+
+    def _finish(self) -> Any:
+        try:
+            return self._worker.finish(self._seconds)
+        except Exception as error:  # importers raise errors of all kinds
+            raise ImporterError(self._failure(error)) from None
+
+    def _failure(self, error: Exception) -> str:
+        if isinstance(error, WorkerTimeoutError):
+            return f"its importer was {error}, without an answer"
+        if isinstance(error, WorkerDiedError):
+            if not error.signal:
+                return f"its importer: {error}"
+            return f"its importer ended the process with {error.signal}" + (f" ({error.last})" if error.last else "")
+        return describe(error).removeprefix(f"{self._engine}: ")
+
+
+def _read(
+    module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]
+) -> tuple[Model, tuple[str, ...], tuple[Beside, ...]]:
+    global _held
+    # The file before can be as large.
+    _held = None
+    _held = reader(module)(text, format_, floating_base, files)
+    return _held.model, _held.notes, _held.beside
+
+
+def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
+    assert _held is not None
+    return _held.terms(q, v, without)
+
+
+# Stages.
 
 
 def stages(
@@ -54,146 +142,92 @@ def stages(
     near = Tolerances.of(free, tolerance)
     one, other, matching, structural = reconcile_joint_sets(free, imported.model, near)
     there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
-    pairs = [(a, b) for a, b in zip(one.model.joints, there.model.joints, strict=False) if a.name == b.name]
-    alone = [h.subject for h in structural]
-    out = [
-        Stage(
-            "joints",
-            not alone,
-            float(len(alone)),
-            alone[0] if alone else "",
-            f"{len(alone)} without a counterpart: {', '.join(alone)}" if alone else "",
-        ),
-        *_tree(pairs, near),
-        _mimics(described, imported.model, matching),
-        *_matter(one, there, near),
-        *_numbers(pairs, near),
-    ]
-    if structural:
-        return (*out, *_uncompared())
-    at = states_of(one.model, samples, seed)
-    ours = model_terms(one.model, at)
-    if isinstance(reference, Imported):
-        ours = _own_terms_of(one.model, reference, {j.name: j.name for j in one.model.joints}, at)
-    theirs = _own_terms_of(one.model, imported, matching.to_b, at)
-    return (*out, *_terms(one.model, ours, theirs, at, tolerance))
+    theirs = {j.name: j.mimic for j in imported.model.joints}
+    mimics = [j.name for j in described.joints if j.mimic and not theirs.get(matching.to_b.get(j.name, ""))]
+    out = [_missing("joints", [h.subject for h in structural], "without a counterpart")]
+    for name, some in _differences(one, there, near).items():
+        if name == "total mass":
+            out.append(_missing("mimic", mimics, "left free"))
+        size, where, says = max(some, key=itemgetter(0), default=(0.0, "", ""))
+        more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
+        out.append(Stage(name, not some, size, where, f"{where}: {says}{more}" if some else ""))
+    found = Gaps(comparable=False)
+    if not structural:
+        at = states_of(one.model, samples, seed)
+        ours = model_terms(one.model, at)
+        if isinstance(reference, Imported):
+            ours = _own_terms_of(one.model, reference, {j.name: j.name for j in one.model.joints}, at)
+        theirs_ = _own_terms_of(one.model, imported, matching.to_b, at)
+        found = gaps(ours, theirs_, at.v, velocity_joints(one.model))
+    measured = {g.term: g for g in found.terms}
+    for name in TERMS:
+        if g := measured.get(name):
+            says = f"{g.relative:.1e} at {g.joint}"
+            out.append(Stage(name, g.relative <= tolerance, g.relative, g.joint, says))
+        else:
+            out.append(Stage(name, None, math.nan, "", "not computed" if found.comparable else "other coordinates"))
+    return tuple(out)
 
 
-def _stage(name: str, some: list[_Difference]) -> Stage:
-    if not some:
-        return Stage(name, True, 0.0, "", "")
-    worst = max(some, key=lambda d: d.size)
-    more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
-    return Stage(name, False, worst.size, worst.where, f"{worst.where}: {worst.says}{more}")
+def _missing(name: str, missing: list[str], what: str) -> Stage:
+    says = f"{len(missing)} {what}: {', '.join(missing)}" if missing else ""
+    return Stage(name, not missing, float(len(missing)), missing[0] if missing else "", says)
 
 
-def _tree(pairs: list[tuple[Joint, Joint]], near: Tolerances) -> list[Stage]:
-    found: dict[str, list[_Difference]] = {name: [] for name in ("kinds", "parents", "places", "axes")}
-    for a, b in pairs:
+def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict[str, list[tuple[float, str, str]]]:
+    """Return for each stage what differs: by how much, where, and in words."""
+    names = ("kinds", "parents", "places", "axes", "total mass", "masses", "centres of mass", "inertias")
+    found: dict[str, list[tuple[float, str, str]]] = {name: [] for name in (*names, *_NUMBERS.values())}
+    for a, b in zip(one.model.joints, other.model.joints, strict=False):
+        if a.name != b.name:
+            continue
         if a.type.motion != b.type.motion:
-            found["kinds"].append(_Difference(a.name, 1.0, f"{b.kind} for {a.kind}"))
+            found["kinds"].append((1.0, a.name, f"{b.kind} for {a.kind}"))
         if a.parent != b.parent:
-            found["parents"].append(_Difference(a.name, 1.0, f"on {b.parent} for {a.parent}"))
+            found["parents"].append((1.0, a.name, f"on {b.parent} for {a.parent}"))
         if not (near.vector(a.rotation, b.rotation) and near.point(a.translation, b.translation)):
             far = float(np.linalg.norm(a.translation - b.translation))
             turn = angle_of(a.rotation.T @ b.rotation)
-            found["places"].append(_Difference(a.name, max(far, turn), f"{far:.3g} m and {turn:.3g} rad off"))
+            found["places"].append((max(far, turn), a.name, f"{far:.3g} m and {turn:.3g} rad off"))
         if a.axes.shape == b.axes.shape and not near.vector(a.axes, b.axes):
-            size, says = float(np.abs(a.axes - b.axes).max()), f"{number_text(b.axes)} for {number_text(a.axes)}"
-            found["axes"].append(_Difference(a.name, size, says))
-    return [_stage(name, some) for name, some in found.items()]
-
-
-def _mimics(reference: Model, imported: Model, matching: Matching) -> Stage:
-    theirs = {j.name: j.mimic for j in imported.joints}
-    lost = [
-        j.name for j in reference.joints if j.mimic is not None and theirs.get(matching.to_b.get(j.name, "")) is None
-    ]
-    says = f"{len(lost)} left free: {', '.join(lost)}" if lost else ""
-    return Stage("mimic", not lost, float(len(lost)), lost[0] if lost else "", says)
-
-
-def _matter(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Stage]:
-    total = [sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other)]
-    whole = []
-    if not near.number(*total):
-        base = " (the base's)" if near.number(total[0] - total[1], one.ground.mass - other.ground.mass) else ""
-        whole = [
-            _Difference(
-                "all", abs(total[1] / total[0] - 1), f"{number_text(total[1])} kg for {number_text(total[0])} kg{base}"
-            )
-        ]
-    masses, coms, inertias = [], [], []
-    theirs = {b.name: b for b in other.model.bodies}
-    for a in one.model.bodies:
-        if a.name not in theirs:
-            continue
-        b = theirs[a.name]
+            size = float(np.abs(a.axes - b.axes).max())
+            found["axes"].append((size, a.name, f"{number_text(b.axes)} for {number_text(a.axes)}"))
+        for field, stage in _NUMBERS.items():
+            x, y = getattr(a, field), getattr(b, field)
+            if x.shape == y.shape and not near.numbers(x, y):
+                size = float(np.max(np.where(np.isfinite(x) & np.isfinite(y), np.abs(y - x), np.inf)))
+                label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
+                found[stage].append((size, a.name, f"{label}{number_text(y)} for {number_text(x)}"))
+    ours, theirs = (sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other))
+    if not near.number(ours, theirs):
+        base = " (the base's)" if near.number(ours - theirs, one.ground.mass - other.ground.mass) else ""
+        says = f"{number_text(theirs)} kg for {number_text(ours)} kg{base}"
+        found["total mass"].append((abs(theirs / ours - 1), "all", says))
+    bodies = {b.name: b for b in other.model.bodies}
+    for a, b in ((a, bodies[a.name]) for a in one.model.bodies if a.name in bodies):
         if not near.number(a.mass, b.mass):
-            size = abs(b.mass - a.mass) / max(a.mass, b.mass)
-            masses.append(_Difference(a.name, size, f"{number_text(b.mass)} kg for {number_text(a.mass)} kg"))
+            says = f"{number_text(b.mass)} kg for {number_text(a.mass)} kg"
+            found["masses"].append((abs(b.mass - a.mass) / max(a.mass, b.mass), a.name, says))
         if not near.point(a.com, b.com):
-            size = float(np.linalg.norm(a.com - b.com))
-            coms.append(_Difference(a.name, size, f"{number_text(b.com)} for {number_text(a.com)} m"))
+            says = f"{number_text(b.com)} for {number_text(a.com)} m"
+            found["centres of mass"].append((float(np.linalg.norm(a.com - b.com)), a.name, says))
         if not near.inertia(a.inertia, b.inertia, a.mass):
             size = float(np.abs(b.inertia - a.inertia).max() / max(np.abs(a.inertia).max(), np.abs(b.inertia).max()))
-            inertias.append(_Difference(a.name, size, f"{number_text(b.inertia)} for {number_text(a.inertia)} kg m²"))
-    return [
-        _stage("total mass", whole),
-        _stage("masses", masses),
-        _stage("centres of mass", coms),
-        _stage("inertias", inertias),
-    ]
-
-
-def _numbers(pairs: list[tuple[Joint, Joint]], near: Tolerances) -> list[Stage]:
-    out = []
-    for name in ("armature", "damping", "friction", "limits"):
-        found = []
-        for a, b in pairs:
-            for field in _LIMITS if name == "limits" else (name,):
-                x, y = getattr(a, field), getattr(b, field)
-                if x.shape == y.shape and not near.numbers(x, y):
-                    size = float(np.max(np.where(np.isfinite(x) & np.isfinite(y), np.abs(y - x), np.inf)))
-                    label = f"{field.replace('_', ' ')} " if name == "limits" else ""
-                    found.append(_Difference(a.name, size, f"{label}{number_text(y)} for {number_text(x)}"))
-        out.append(_stage(name, found))
-    return out
-
-
-def _uncompared() -> list[Stage]:
-    return [Stage(n, None, np.nan, "", "other coordinates") for n in TERMS]
-
-
-def _terms(reference: Model, ours: Values, theirs: Values, at: States, tolerance: float) -> list[Stage]:
-    found = gaps(ours, theirs, at.v, velocity_joints(reference))
-    if not found.comparable:
-        return _uncompared()
-    measured = {g.term: g for g in found.terms}
-    return [
-        Stage(n, g.relative <= tolerance, g.relative, g.joint, f"{g.relative:.1e} at {g.joint}")
-        if (g := measured.get(n)) is not None
-        else Stage(n, None, np.nan, "", "not computed")
-        for n in TERMS
-    ]
+            found["inertias"].append((size, a.name, f"{number_text(b.inertia)} for {number_text(a.inertia)} kg m²"))
+    return found
 
 
 def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
     """Return the engine's own terms in the reference's coordinates; `names` has its joint for each of these."""
     theirs = imported.model.layout
-    q_order, v_order = (
-        np.concatenate([np.arange(r[names[j.name]].start, r[names[j.name]].stop) for j in reference.independent_joints])
-        for r in (theirs.q, theirs.v)
-    )
+    joints = [names[j.name] for j in reference.independent_joints]
+    q_order, v_order = (np.concatenate([np.r_[rows[n]] for n in joints]) for rows in (theirs.q, theirs.v))
     q, v = np.empty((len(at.q), theirs.sizes[0])), np.empty((len(at.v), theirs.sizes[1]))
     if q.shape != at.q.shape or v.shape != at.v.shape:
         return {}
     q[:, q_order], v[:, v_order] = at.q, at.v
-    return {k: _ordered(x, v_order) for k, x in imported.terms(q, v, ()).items()}
-
-
-def _ordered(x: Array, order: np.ndarray) -> Array:
-    return x[:, order][:, :, order] if x.ndim == 3 else x[:, order]
+    terms = imported.terms(q, v, ())
+    return {k: x[:, v_order][:, :, v_order] if x.ndim == 3 else x[:, v_order] for k, x in terms.items()}
 
 
 @dataclass(frozen=True)
@@ -219,7 +253,8 @@ def own_terms(engine: str, imported: Imported, samples: int, seed: int, toleranc
     causes, idle = [], []
     for extra in imported.beside:
         without = imported.terms(at.q, at.v, (extra.key,))
-        part = {} if extra.without is None else _less(described, model_terms(extra.without, at))
+        rest = {} if extra.without is None else model_terms(extra.without, at)
+        part = {name: x - rest[name] for name, x in described.items() if name in rest}
         bare = _with(bare, part)
         if gaps(whole, without, at.v, owners).worst <= tolerance:
             idle.append(extra.says)
@@ -227,25 +262,17 @@ def own_terms(engine: str, imported: Imported, samples: int, seed: int, toleranc
         found = gaps(whole, _with(without, part), at.v, owners)
         if not found.worst <= tolerance:
             says = f"{engine}: {extra.says}{', and acts otherwise than described' if part else ''}"
-            causes.append(Cause(extra.kind, extra.says, says, None, None, _effects(found), acts=True))
+            causes.append(Cause(extra.kind, extra.says, says, None, None, found.effects, acts=True))
     found = gaps(bare, described, at.v, owners)
     held = found.worst <= tolerance
     if not held:
         says = f"{engine}: its own terms are not those of its bodies and joints, most at {found.joint or 'no joint'}"
-        causes.append(Cause("own terms", engine, says, None, None, _effects(found), acts=True))
+        causes.append(Cause("own terms", engine, says, None, None, found.effects, acts=True))
     return OwnTerms(tuple(causes), tuple(idle), held)
-
-
-def _less(a: Values, b: Values) -> Values:
-    return {name: x - b[name] for name, x in a.items() if name in b}
 
 
 def _with(a: Values, b: Values) -> Values:
     return {name: x + b[name] if name in b else x for name, x in a.items()}
-
-
-def _effects(found: Gaps) -> dict[str, float]:
-    return {g.term: g.relative for g in found.terms} if found.comparable else {"M": math.inf}
 
 
 def measured(found: Explanation, stages: tuple[Stage, ...], own: OwnTerms) -> Explanation:
@@ -335,8 +362,8 @@ def compare_parsers(
     stripped = strip(_path(source), floating_base=floating_base)
     engines = tuple(dict.fromkeys(importers))
     parsed: dict[str, Parsed] = {}
-    with one_at_a_time():
-        read, refused = _read(stripped, engines, floating_base, seconds)
+    with _lock:
+        read, refused = _readings(stripped, engines, floating_base, seconds)
         reference, label, faults = _reference(stripped, read, floating_base)
         for engine, imported in read.items():
             if reference is None or engine == label:
@@ -365,7 +392,7 @@ def compare_parsers(
     )
 
 
-def _read(
+def _readings(
     stripped: Stripped, engines: Sequence[str], floating_base: bool, seconds: float
 ) -> tuple[dict[str, Imported], dict[str, str]]:
     """Return each importer's reading of a file, and why the others refuse it; all read at the same time."""
@@ -375,17 +402,12 @@ def _read(
     for engine in engines:
         try:
             check_installed(engine)
-            begun[engine] = Reading(engine, stripped.text, stripped.format, floating_base, stripped.meshes, seconds)
-        except UnsupportedError as error:
+            begun[engine] = Reading(engine, stripped, floating_base, seconds)
+        except (UnsupportedError, ImporterError) as error:
             refused[engine] = str(error)
     for engine, reading in begun.items():
         try:
-            reading.begin()
-        except ImporterError as error:
-            refused[engine] = str(error)
-    for engine in [e for e in begun if e not in refused]:
-        try:
-            read[engine] = begun[engine].result()
+            read[engine] = reading.result()
         except ImporterError as error:
             refused[engine] = str(error)
     return read, refused
