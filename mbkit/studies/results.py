@@ -13,7 +13,7 @@ import tempfile
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, reduce
 from importlib import metadata
 from operator import attrgetter, getitem
@@ -47,6 +47,21 @@ class Refusal:
 
 
 # Plain data, and back.
+
+
+def _data(value: Any) -> Any:
+    """Return dataclasses as dictionaries of their fields and derived properties, and tuples as lists."""
+    if isinstance(value, ResultTable):
+        return value.to_dict()
+    if is_dataclass(value):
+        return {name: _data(getattr(value, name)) for name in _names(value)}
+    if isinstance(value, dict):
+        return {k: _data(x) for k, x in value.items()}
+    return [_data(x) for x in value] if isinstance(value, (list, tuple)) else value
+
+
+def _names(value: Any) -> list[str]:
+    return [*(f.name for f in fields(value)), *getattr(value, "_derived", ())]
 
 
 def to_plain(value: Any) -> Any:
@@ -173,6 +188,8 @@ Block = Title | Table | Items
 class ResultTable:
     """Base of the results of studies: `_blocks` for people, `_csv_columns` of `_csv_rows` for programs."""
 
+    #: Properties that stand in the plain data beside the fields.
+    _derived: ClassVar[Sequence[str]] = ()
     _csv_columns: ClassVar[Sequence[Column]] = ()
 
     def _blocks(self) -> Iterator[Block]:
@@ -184,7 +201,7 @@ class ResultTable:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        return asdict(typing.cast(Any, self))
+        return {name: _data(getattr(self, name)) for name in _names(self)}
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Return the result as JSON, and write it to `path` if given.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -165,10 +165,7 @@ class BaselineResult(ResultTable):
             out.append(f"  If this is meant: {remedy}")
         return "\n".join(out)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return super().to_dict() | {"passed": self.passed, "verdict": self.verdict}
-
+    _derived = ("passed", "verdict")
     _csv_columns = columns_of(Moved)
 
     def _csv_rows(self) -> tuple[Moved, ...]:

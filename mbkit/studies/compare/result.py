@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from mbkit._escape import one_line
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
@@ -102,6 +102,8 @@ class Omission:
     change: float
     unchanged: bool
     note: str = ""
+
+    _derived: ClassVar = ("measurable",)
 
     @property
     def measurable(self) -> bool:
@@ -233,17 +235,7 @@ class Comparison(ResultTable):
             return math.nan
         return -math.log10(max(*errors, 1e-16))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return super().to_dict() | {
-            "precision": self.precision.to_dict() if self.precision is not None else None,
-            "omissions": [asdict(o) | {"measurable": o.measurable} for o in self.omissions],
-            "passed": self.passed,
-            "verdict": self.verdict,
-            "digits": self.digits,
-            "shortened": list(self.shortened),
-        }
-
+    _derived = ("passed", "verdict", "digits", "shortened")
     _csv_columns = columns_of(Row)
 
     def _csv_rows(self) -> tuple[Row, ...]:

@@ -77,7 +77,7 @@ class _Tree:
     def __init__(self, model: Model) -> None:
         self.joints = {j.name: j for j in model.joints}
         self.bodies = {x.name: x for x in model.bodies}
-        self.moments: dict[str, Array] = {x.name: np.linalg.eigvalsh(x.inertia) for x in model.bodies}
+        self.moments = {x.name: np.asarray(np.linalg.eigvalsh(x.inertia), dtype=np.float64) for x in model.bodies}
         self.carrier = {j.child: j.name for j in model.joints}
         self.children: dict[str, list[Joint]] = {name: [] for name in ("world", *self.bodies)}
         for joint in model.joints:

@@ -112,10 +112,7 @@ class Explanation(ResultTable):
         left = f"; with {'it' if count == 1 else 'all of them'} applied the terms agree to {self.remainder:.1e}"
         return f"{head}, for {_counted(count, 'reason')}{left}{beside}"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return super().to_dict() | {"verdict": self.verdict}
-
+    _derived = ("verdict",)
     _csv_columns = (*columns_of(Cause), Column("effect", lambda cause: effect(cause)))
 
     def _csv_rows(self) -> tuple[Cause, ...]:

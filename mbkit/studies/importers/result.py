@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any, Final
+from typing import ClassVar, Final
 
 from mbkit._escape import one_line
 from mbkit.studies.explain.result import Explanation, grouped
@@ -51,6 +51,8 @@ class Parsed:
     stages: tuple[Stage, ...] = ()
     explanation: Explanation | None = None
     notes: tuple[str, ...] = ()
+
+    _derived: ClassVar = ("agrees",)
 
     @property
     def agrees(self) -> bool:
@@ -113,14 +115,7 @@ class ParserComparison(ResultTable):
             return f"file as written, {'link by link' if self.format == 'urdf' else 'body by body'}"
         return f"reading of {self.reference}" if self.reference else ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        importers = [
-            asdict(p) | {"agrees": p.agrees, "explanation": p.explanation.to_dict() if p.explanation else None}
-            for p in self.importers
-        ]
-        return super().to_dict() | {"importers": importers, "agree": self.agree, "verdict": self.verdict}
-
+    _derived = ("agree", "verdict")
     _csv_columns = (
         Column("engine", lambda row: row[0].engine),
         Column("version", lambda row: row[0].version),

@@ -193,27 +193,27 @@ def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict
             size = float(np.abs(a.axes - b.axes).max())
             found["axes"].append((size, a.name, f"{number_text(b.axes)} for {number_text(a.axes)}"))
         for field, stage in _NUMBERS.items():
-            x, y = getattr(a, field), getattr(b, field)
-            if x.shape == y.shape and not near.numbers(x, y):
-                size = float(np.max(np.where(np.isfinite(x) & np.isfinite(y), np.abs(y - x), np.inf)))
+            old, new = getattr(a, field), getattr(b, field)
+            if old.shape == new.shape and not near.numbers(old, new):
+                size = float(np.max(np.where(np.isfinite(old) & np.isfinite(new), np.abs(new - old), np.inf)))
                 label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
-                found[stage].append((size, a.name, f"{label}{number_text(y)} for {number_text(x)}"))
+                found[stage].append((size, a.name, f"{label}{number_text(new)} for {number_text(old)}"))
     ours, theirs = (sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other))
     if not near.number(ours, theirs):
         base = " (the base's)" if near.number(ours - theirs, one.ground.mass - other.ground.mass) else ""
         says = f"{number_text(theirs)} kg for {number_text(ours)} kg{base}"
         found["total mass"].append((abs(theirs / ours - 1), "all", says))
     bodies = {b.name: b for b in other.model.bodies}
-    for a, b in ((a, bodies[a.name]) for a in one.model.bodies if a.name in bodies):
-        if not near.number(a.mass, b.mass):
-            says = f"{number_text(b.mass)} kg for {number_text(a.mass)} kg"
-            found["masses"].append((abs(b.mass - a.mass) / max(a.mass, b.mass), a.name, says))
-        if not near.point(a.com, b.com):
-            says = f"{number_text(b.com)} for {number_text(a.com)} m"
-            found["centres of mass"].append((float(np.linalg.norm(a.com - b.com)), a.name, says))
-        if not near.inertia(a.inertia, b.inertia, a.mass):
-            size = float(np.abs(b.inertia - a.inertia).max() / max(np.abs(a.inertia).max(), np.abs(b.inertia).max()))
-            found["inertias"].append((size, a.name, f"{number_text(b.inertia)} for {number_text(a.inertia)} kg m²"))
+    for x, y in ((x, bodies[x.name]) for x in one.model.bodies if x.name in bodies):
+        if not near.number(x.mass, y.mass):
+            says = f"{number_text(y.mass)} kg for {number_text(x.mass)} kg"
+            found["masses"].append((abs(y.mass - x.mass) / max(x.mass, y.mass), x.name, says))
+        if not near.point(x.com, y.com):
+            says = f"{number_text(y.com)} for {number_text(x.com)} m"
+            found["centres of mass"].append((float(np.linalg.norm(x.com - y.com)), x.name, says))
+        if not near.inertia(x.inertia, y.inertia, x.mass):
+            size = float(np.abs(y.inertia - x.inertia).max() / max(np.abs(x.inertia).max(), np.abs(y.inertia).max()))
+            found["inertias"].append((size, x.name, f"{number_text(y.inertia)} for {number_text(x.inertia)} kg m²"))
     return found
 
 
