@@ -18,7 +18,7 @@ from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap
 from mbkit.studies.importers.result import Parsed, ParserComparison, Stage
-from mbkit.studies.results import Column, Refusal, Table, from_plain, to_plain
+from mbkit.studies.results import Column, Refusal, Table, block_html, block_markdown, from_plain, to_plain
 from tests.test_report import AGREEING, DIFFERING, EMPTY, STUDY
 from tests.test_stress_report import RESULT
 
@@ -138,8 +138,11 @@ def test_nothing_is_lost_where_a_file_cannot_be_written(tmp_path):
 
 def test_markdown_and_html_escape_texts_and_write_numbers_as_asked():
     table = Table((Column("a|b", lambda r: r[0]), Column("x", lambda r: r[1], ".1e", right=True)), [("<b>|", 0.5)])
-    assert table.markdown() == "| a\\|b | x |\n|---|---:|\n| &lt;b&gt;\\| | 5.0e-01 |"
-    assert table.html() == "<table><tr><th>a|b</th><th>x</th></tr><tr><td>&lt;b&gt;|</td><td>5.0e-01</td></tr></table>"
+    assert block_markdown(table) == "| a\\|b | x |\n|---|---:|\n| &lt;b&gt;\\| | 5.0e-01 |"
+    assert (
+        block_html(table)
+        == "<table><tr><th>a|b</th><th>x</th></tr><tr><td>&lt;b&gt;|</td><td>5.0e-01</td></tr></table>"
+    )
     for result in RESULTS.values():
         assert "<mesh>" not in result._repr_html_() + result.to_markdown()
 

@@ -98,16 +98,13 @@ def _blamed(what: str) -> Iterator[None]:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise LoadError(f"{what}: {type(error).__name__}: {error}{_place(error)}") from error
-
-
-def _place(error: BaseException) -> str:
-    """Return where a user's code failed, unless the message itself says it or the fault is not in code."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    ours = place.filename == __file__ or place.filename.startswith("<frozen")
-    if ours or isinstance(error, (SyntaxError, MbkitError)):
-        return ""
-    return f" ({place.filename}, line {place.lineno})"
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f" ({place.filename}, line {place.lineno})"
+        # The message itself may say where, or the fault is not in code.
+        ours = place.filename == __file__ or place.filename.startswith("<frozen")
+        if ours or isinstance(error, (SyntaxError, MbkitError)):
+            where = ""
+        raise LoadError(f"{what}: {type(error).__name__}: {error}{where}") from error
 
 
 # What a baseline was recorded of, as text: a robot's name, a function, or a file by its place beside the baseline.
@@ -119,12 +116,9 @@ def checked_target(target: object, options: object = None) -> None:
         raise InputError(f"target: expected a text such as 'panda' or './arm.urdf', got {type(target).__name__}")
     if options is None:
         return
-    kept_kinds = (bool, int, float, str)
-    if not isinstance(options, Mapping) or not all(
-        isinstance(k, str)
-        and (isinstance(x, kept_kinds) or (isinstance(x, (list, tuple)) and all(isinstance(y, kept_kinds) for y in x)))
-        for k, x in options.items()
-    ):
+    values = [*options, *options.values()] if isinstance(options, Mapping) else [None]
+    parts = [y for x in values for y in (x if isinstance(x, (list, tuple)) else [x])]
+    if not all(isinstance(x, (bool, int, float, str)) for x in parts) or not all(isinstance(k, str) for k in options):
         raise InputError(f"options: expected keyword arguments of mbkit.load, of numbers and texts, got {options!r}")
 
 

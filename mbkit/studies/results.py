@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import itertools
@@ -9,6 +10,7 @@ import json
 import math
 import os
 import platform
+import re
 import tempfile
 import types
 import typing
@@ -136,19 +138,6 @@ class Table:
     columns: Sequence[Column]
     rows: Iterable[Any]
 
-    def markdown(self) -> str:
-        """Return it in Markdown."""
-        head = "".join(f"| {markdown(c.head)} ".replace("  ", " ") for c in self.columns)
-        rule = "".join("|---:" if c.right else "|---" for c in self.columns)
-        rows = ("".join(f"| {c.text(row, markdown)} " for c in self.columns) for row in self.rows)
-        return "\n".join(f"{line}|" for line in (head, rule, *rows))
-
-    def html(self) -> str:
-        """Return it in HTML."""
-        head = "".join(f"<th>{html(c.head)}</th>" for c in self.columns)
-        rows = ("".join(f"<td>{c.text(row, html)}</td>" for c in self.columns) for row in self.rows)
-        return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
-
 
 @dataclass(frozen=True)
 class Title:
@@ -157,14 +146,6 @@ class Title:
     name: str
     text: str
 
-    def markdown(self) -> str:
-        """Return it in Markdown."""
-        return f"**{markdown(self.name)}**{markdown(self.text)}"
-
-    def html(self) -> str:
-        """Return it in HTML."""
-        return f"<p><b>{html(self.name)}</b>{html(self.text)}</p>"
-
 
 @dataclass(frozen=True)
 class Items:
@@ -172,17 +153,32 @@ class Items:
 
     texts: Iterable[str]
 
-    def markdown(self) -> str:
-        """Return it in Markdown."""
-        return "\n".join(f"- {markdown(text)}" for text in self.texts)
-
-    def html(self) -> str:
-        """Return it in HTML."""
-        items = "".join(f"<li>{html(text)}</li>" for text in self.texts)
-        return f"<ul>{items}</ul>" if items else ""
-
 
 Block = Title | Table | Items
+
+
+def block_markdown(block: Block) -> str:
+    """Return a block in Markdown."""
+    if isinstance(block, Title):
+        return f"**{markdown(block.name)}**{markdown(block.text)}"
+    if isinstance(block, Items):
+        return "\n".join(f"- {markdown(text)}" for text in block.texts)
+    head = "".join(f"| {markdown(c.head)} ".replace("  ", " ") for c in block.columns)
+    rule = "".join("|---:" if c.right else "|---" for c in block.columns)
+    rows = ("".join(f"| {c.text(row, markdown)} " for c in block.columns) for row in block.rows)
+    return "\n".join(f"{line}|" for line in (head, rule, *rows))
+
+
+def block_html(block: Block) -> str:
+    """Return a block in HTML."""
+    if isinstance(block, Title):
+        return f"<p><b>{html(block.name)}</b>{html(block.text)}</p>"
+    if isinstance(block, Items):
+        items = "".join(f"<li>{html(text)}</li>" for text in block.texts)
+        return f"<ul>{items}</ul>" if items else ""
+    head = "".join(f"<th>{html(c.head)}</th>" for c in block.columns)
+    rows = ("".join(f"<td>{c.text(row, html)}</td>" for c in block.columns) for row in block.rows)
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
 
 
 class ResultTable:
@@ -250,10 +246,10 @@ class ResultTable:
 
     def to_markdown(self) -> str:
         """Return the result for people, in Markdown."""
-        return "\n\n".join(text for block in self._blocks() if (text := block.markdown())) + "\n"
+        return "\n\n".join(text for block in self._blocks() if (text := block_markdown(block))) + "\n"
 
     def _repr_html_(self) -> str:
-        return "".join(block.html() for block in self._blocks())
+        return "".join(map(block_html, self._blocks()))
 
 
 def _csv_cell(value: Any) -> Any:
@@ -328,10 +324,8 @@ def _versions(packages: tuple[str, ...]) -> dict[str, str]:
     # Searching the installed packages takes some 10 ms.
     out = {"mbkit": __version__, "python": platform.python_version()}
     for package in packages:
-        if package in out:
-            continue
         try:
-            out[package] = metadata.version(package)
+            out.setdefault(package, metadata.version(package))
         except metadata.PackageNotFoundError:
             out[package] = "not installed"
     return out
@@ -340,11 +334,9 @@ def _versions(packages: tuple[str, ...]) -> dict[str, str]:
 def processor() -> str:
     """Return the processor's model name and the system."""
     name = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                name = line.split(":", 1)[1].strip()
-                break
-    except OSError:
-        pass
+    with contextlib.suppress(OSError):
+        found = re.search(
+            r"^model name\s*:\s*(.*?)\s*$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
+        )
+        name = found[1] if found else name
     return f"{name}, {platform.system()} {platform.machine()}"

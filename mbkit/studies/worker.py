@@ -256,20 +256,16 @@ class Worker:
     def _end_dead(self) -> RuntimeError:
         """Return the exception for a process that is gone."""
         assert self._process is not None
-        try:
-            code: int | None = self._process.wait(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            code = None
-        try:
-            output = (self._folder / "output").read_bytes()[self._output_before :][-_TAIL:].decode("utf-8", "replace")
-        except OSError:
-            output = ""
+        code, output = None, b""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            code = self._process.wait(timeout=5.0)
+        with contextlib.suppress(OSError):
+            output = (self._folder / "output").read_bytes()[self._output_before :][-_TAIL:]
         self.end()
-        return WorkerClosedError() if self._closed.is_set() else _death(code, output)
+        return WorkerClosedError() if self._closed.is_set() else _death(code, output.decode("utf-8", "replace"))
 
     def _kill(self) -> None:
-        process = self._process
-        if process is not None:
+        if (process := self._process) is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
 
@@ -303,19 +299,9 @@ class Worker:
 _workers: Final[WeakSet[Worker]] = WeakSet()
 
 
-@atexit.register
-def _end_all() -> None:
-    for worker in list(_workers):
-        worker.end()
-
-
-def _detach_all() -> None:
-    for worker in list(_workers):
-        worker._detach()
-
-
+atexit.register(lambda: [worker.end() for worker in list(_workers)])
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_detach_all)
+    os.register_at_fork(after_in_child=lambda: [worker._detach() for worker in list(_workers)])
 
 
 def _processor_seconds(pid: int) -> float:
@@ -415,14 +401,12 @@ def _answer(main: dict[str, Any], call: bytes) -> bytes:
     try:
         return pickle.dumps(("result", function(*args)))
     except BaseException as error:
-        try:
-            if not isinstance(error, Exception):
-                raise TypeError from None
-            answer = pickle.dumps(("error", error))
-            pickle.loads(answer)
-        except Exception:
-            answer = pickle.dumps(("error", RemoteError(describe(error))))
-        return answer
+        if isinstance(error, Exception):
+            with contextlib.suppress(Exception):
+                answer = pickle.dumps(("error", error))
+                pickle.loads(answer)
+                return answer
+        return pickle.dumps(("error", RemoteError(describe(error))))
 
 
 def _limit_memory(memory: int) -> None:

@@ -37,26 +37,9 @@ from mbkit.model import Model
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import checked_target, engine_names, with_values
-from mbkit.studies.baseline.description import (
-    LINK_SECTIONS,
-    Change,
-    changes,
-    described,
-    links_of,
-    moving_mass,
-    without_consequences,
-)
-from mbkit.studies.baseline.file import (
-    ROLLOUT,
-    VECTORS,
-    Baseline,
-    Rollout,
-    check_replaceable,
-    path_of,
-    read,
-    store,
-    text_of,
-)
+from mbkit.studies.baseline import description, file
+from mbkit.studies.baseline.description import Change, changes, described, links_of, moving_mass, without_consequences
+from mbkit.studies.baseline.file import ROLLOUT, Baseline, Rollout, path_of, read
 from mbkit.studies.baseline.result import BaselineResult, Moved, Status, VersionChange
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States, states
@@ -136,7 +119,7 @@ def record(
     count("seed", seed)
     checked_target(target, options)
     if not force:
-        check_replaceable(where, model.name)
+        file.check_replaceable(where, model.name)
     tell = progress or silent
     tell(0.0, "building")
     plain = with_values(model)
@@ -178,7 +161,7 @@ def record(
                 recorded.own.setdefault(name, {})[term] = values[term]
     tell(1.0, "done")
     recorded = replace(recorded, left_out=tuple(left_out))
-    store(where, text_of(recorded), model.name, force=force)
+    file.store(where, file.text_of(recorded), model.name, force=force)
     return recorded
 
 
@@ -314,7 +297,7 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
             f"{path_a} is a baseline of {a.model!r}, {path_b} of {b.model!r}; they have no joint in common"
         )
     notes: tuple[str, ...] = ()
-    same_states = all(np.array_equal(getattr(a.states, x), getattr(b.states, x)) for x in VECTORS)
+    same_states = all(np.array_equal(getattr(a.states, x), getattr(b.states, x)) for x in file.VECTORS)
     if a.coordinates != b.coordinates or a.velocities != b.velocities:
         notes = (_OTHER_COORDINATES,)
     elif not same_states or a.rollout != b.rollout:
@@ -536,7 +519,7 @@ def _unavailable(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChang
 def _changes(recorded: Baseline, model: Model, target: str, path: Path) -> tuple[Change, ...]:
     """Return what differs in the descriptions, by the links' own names where a file tells them."""
     old, new = recorded.description, described(model)
-    changed = changes({k: x for k, x in old.items() if k not in LINK_SECTIONS}, new)
+    changed = changes({k: x for k, x in old.items() if k not in description.LINK_SECTIONS}, new)
     if not changed or "links" not in old:
         return changed
     links = links_of(model, target, recorded.options, path)

@@ -21,22 +21,11 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, Lump
 from mbkit.model import Model
+from mbkit.studies.explain import terms
 from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes, number_text
 from mbkit.studies.explain.merged_model import MergedModel, merge, with_lump
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import (
-    Gap,
-    Gaps,
-    States,
-    Values,
-    evaluated,
-    gaps,
-    minimal_differing_subtree,
-    model_terms,
-    part,
-    states_of,
-    velocity_joints,
-)
+from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, model_terms, velocity_joints
 
 #: Pairs of joints tried in each other's place.
 _MAX_SWAPS: Final = 400
@@ -102,7 +91,7 @@ class _Engines:
     def __init__(self, a: Dynamics, b: Dynamics, out: Explanation) -> None:
         self.a, self.b, self.tolerance, self.name = a, b, out.tolerance, out.b
         self.model = b.model
-        self.at = states_of(self.model, out.samples, out.seed)
+        self.at = terms.states_of(self.model, out.samples, out.seed)
         self.owners = velocity_joints(self.model)
         self.values = {dyn: evaluated(dyn, self.at) for dyn in (a, b)}
         for dyn, values in self.values.items():
@@ -289,8 +278,7 @@ class _Engines:
             depth[joint.child] = depth[joint.parent] + 1
         level = {j.name: depth[j.child] for j in model.joints}
         orders = [
-            ("has the joints in the order of their names", sorted(names)),
-            ("has the joints in the order of their names", sorted(names, key=str.lower)),
+            *(("has the joints in the order of their names", sorted(names, key=key)) for key in (str, str.lower)),
             ("has the joints depth first", [j.name for j in model.tree if j.name in names]),
             ("has the joints generation by generation", sorted(names, key=level.__getitem__)),
             ("has the joints from last to first", names[::-1]),
@@ -298,12 +286,9 @@ class _Engines:
         for a, b in islice(combinations(names, 2), _MAX_SWAPS):
             swapped = [{a: b, b: a}.get(name, name) for name in names]
             orders.append((f"has joints {a!r} and {b!r} in each other's place", swapped))
-        tried = [names]
         for says, order in orders:
-            if order not in tried:
-                tried.append(order)
-                q, v = (np.concatenate([np.r_[rows[n]] for n in order]) for rows in (layout.q, layout.v))
-                yield _Trial("joint order", "", says, self._answers(q, self._permutation(v)))
+            q, v = (np.concatenate([np.r_[rows[n]] for n in order]) for rows in (layout.q, layout.v))
+            yield _Trial("joint order", "", says, self._answers(q, self._permutation(v)))
 
     # Quantities that enter the terms linearly.
 
@@ -400,12 +385,12 @@ class _Engines:
         whole = merge(self.model).model
 
         def differs(names: set[str]) -> bool:
-            some = part(whole, names)
-            at = states_of(some, len(self.at.q), 0)
+            some = terms.part(whole, names)
+            at = terms.states_of(some, len(self.at.q), 0)
             try:
                 one, other = (evaluated(type(x)(some), at) for x in (self.a, self.b))
             except MbkitError:
                 return False
             return gaps(one, other, at.v, velocity_joints(some)).worst > self.tolerance
 
-        return minimal_differing_subtree(whole, differs)
+        return terms.minimal_differing_subtree(whole, differs)

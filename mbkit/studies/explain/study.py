@@ -12,6 +12,7 @@ from mbkit._check import count, real
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
+from mbkit.studies.explain import terms
 from mbkit.studies.explain.engine_differences import engine_causes
 from mbkit.studies.explain.hypotheses import (
     CONSTRAINTS,
@@ -21,24 +22,10 @@ from mbkit.studies.explain.hypotheses import (
     links_in_common_axes,
     number_text,
 )
-from mbkit.studies.explain.joint_matching import (
-    Match,
-    Matching,
-    align_frames,
-    reconcile_joint_sets,
-    rename_joints,
-)
+from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import (
-    Gaps,
-    gaps,
-    minimal_differing_subtree,
-    model_terms,
-    part,
-    states_of,
-    velocity_joints,
-)
+from mbkit.studies.explain.terms import Gaps, model_terms, states_of
 from mbkit.studies.results import to_plain
 
 #: Relative difference of numbers written with five digits.
@@ -160,6 +147,11 @@ class _Descriptions:
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
         agree = not (structural or constrained or massless) and before.worst <= self.tolerance
         explained = after.worst <= self.tolerance and (agree or massless or any(c.acts for c in causes))
+
+        def differs(joints: set[str]) -> bool:
+            one, other = (terms.part(x.model, joints) for x in (changed, target))
+            return self._gaps(one, other).worst > self.tolerance
+
         return Explanation(
             a=self.names[0],
             b=self.names[1],
@@ -173,7 +165,7 @@ class _Descriptions:
             notes=tuple(_notes(one, moved_frames, matching)),
             explained=explained,
             left=after.terms,
-            subtree=() if explained else self._subtree(changed.model, target.model),
+            subtree=() if explained else terms.minimal_differing_subtree(changed.model, differs),
             samples=self.samples,
             seed=self.seed,
             tolerance=self.tolerance,
@@ -188,7 +180,7 @@ class _Descriptions:
         if a.velocity_names != b.velocity_names or not a.nv:
             return Gaps(comparable=False)
         at = states_of(b, self.samples, self.seed)
-        return gaps(model_terms(a, at), model_terms(b, at), at.v, velocity_joints(a))
+        return terms.gaps(model_terms(a, at), model_terms(b, at), at.v, terms.velocity_joints(a))
 
     def _gaps_by_name(self, one: MergedModel, other: MergedModel) -> Gaps | None:
         """Return the differences of terms with joints matched by name, where the names are the same."""
@@ -250,12 +242,6 @@ class _Descriptions:
         else:
             says = f"has {number_text(b.mass)} kg standing still for {number_text(a.mass)} kg"
         yield self._cause(Hypothesis("base mass", "the base", says, a=a.mass, b=b.mass), {})
-
-    def _subtree(self, a: Model, b: Model) -> tuple[str, ...]:
-        def differs(joints: set[str]) -> bool:
-            return self._gaps(part(a, joints), part(b, joints)).worst > self.tolerance
-
-        return minimal_differing_subtree(a, differs)
 
 
 def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) -> Iterator[str]:

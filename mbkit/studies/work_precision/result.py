@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title
+from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, block_html
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import figure
 
@@ -165,7 +165,7 @@ class WorkPrecision(ResultTable):
     def _repr_html_(self) -> str:
         error = Column("error", lambda row: row[1].error, ".1e", right=True)
         name, setting, *times = _run_columns("on the front", 0)
-        return self._title().html() + Table((name, setting, error, *times), self.front).html()
+        return block_html(self._title()) + block_html(Table((name, setting, error, *times), self.front))
 
 
 def _run_columns(head: str, at: int) -> tuple[Column, ...]:
