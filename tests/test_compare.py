@@ -21,8 +21,8 @@ from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.engines.registry import find_engine
 from mbkit.errors import InputError, NumericalError, OutputError, UnknownNameError
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
+from mbkit.studies.compare.beyond_terms import rollouts
 from mbkit.studies.compare.errors import Scales, acceleration_errors, force_errors, interleaved, matrix_errors
-from mbkit.studies.compare.rollouts import rollouts
 from mbkit.studies.compare.terms import TERMS
 from mbkit.studies.compare.terms import states as study_states
 from mbkit.testing import assert_engines_agree

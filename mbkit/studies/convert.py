@@ -118,11 +118,11 @@ def _check_names(model: Model, to: str) -> None:
         raise UnsupportedError(f"convert: {to} is XML, which cannot hold the characters of {names}; rename these parts")
 
 
-def _head(model: Model, to: str) -> str:
+def _head(model: Model, check: str) -> str:
     return (
         f"{model.name}, written by mbkit {__version__} from its own description (digest {model.digest[:12]}): the "
         "motion alone, without geometry, contacts, sensors or actuators. Read back when it was written: M, g, nle and "
-        f"passive forces {to}."
+        f"passive forces {check}."
     )
 
 

@@ -56,7 +56,7 @@ class RolloutRow:
 
     `dt` is the step, `duration` the compared horizon and `asked` the wanted one, s. `error` is the largest difference
     of q over the horizon, on the manifold. `condition` says how far q moves per relative disturbance of the forces,
-    see `mbkit.studies.compare.rollouts`; `tolerance` is 1e-12, or a multiple of eps times the condition where that is
+    see `mbkit.studies.compare.beyond_terms`; `tolerance` is 1e-12, or a multiple of eps times the condition if that is
     more. `seconds` and `seconds_against` are the run times of the two. `judged` is False where too few steps are well
     conditioned to say anything.
     """

@@ -20,10 +20,9 @@ from mbkit.model import Model
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
+from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
-from mbkit.studies.compare.omissions import omissions
 from mbkit.studies.compare.result import Comparison, Row
-from mbkit.studies.compare.rollouts import rollouts
 from mbkit.studies.compare.terms import TERMS, States, Term, power_errors, states
 from mbkit.studies.results import Refusal, model_info
 from mbkit.studies.study_runs import free_of_mimic, require_motion

@@ -309,19 +309,16 @@ def compare_parsers(
 ) -> ParserComparison:
     """Read a file with each engine's own importer, and compare what comes out with the file as written.
 
-    The importers read the file without meshes and textures, so that nothing else is opened but what
-    an MJCF includes and the meshes from which its bodies take their inertia; boxes, cylinders and spheres
-    stay. Each runs in a process of its own, kept until this one ends: a crash or an endless loop there is
-    reported like any other refusal.
+    The importers read the file without meshes and textures, so that nothing else is opened but what an MJCF includes
+    and the meshes from which its bodies take their inertia. Each runs in a process of its own, kept until this one
+    ends: a crash or an endless loop there is reported like any other refusal.
 
-    The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses,
-    centres of mass, inertias, armature, damping, friction, limits, and M, g, nle and passive by joint name,
-    by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons,
-    actuators at zero control, fluid, gravity compensation. Links that an importer fuses are fused on the
-    other side too. Why one differs is in its ``explanation``.
-
-    Where mbkit does not read the file, an MJCF is compared with MuJoCo's own reading, and any other file
-    with nothing: the importers that read it are only listed.
+    The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses, centres of
+    mass, inertias, armature, damping, friction, limits, and M, g, nle and passive by joint name, by the engine itself
+    on its own model, with all that it holds beside bodies and joints: flags, tendons, actuators at zero control, fluid,
+    gravity compensation. Links that an importer fuses are fused on the other side too. Why one differs is in its
+    ``explanation``. Where mbkit does not read the file, an MJCF is compared with MuJoCo's own reading, and any other
+    file with nothing: the importers that read it are only listed.
 
     Parameters
     ----------
@@ -331,12 +328,10 @@ def compare_parsers(
         Of pinocchio, mujoco and drake. One that is not installed is named as such.
     floating_base : bool
         Whether the base moves freely, in the file's reading and in every importer's.
-    samples, seed : int
-        Random states for the terms.
-    tolerance : float
-        Relative difference that counts.
+    samples, seed, tolerance : int, int, float
+        Random states for the terms, and the relative difference that counts.
     seconds : float
-        That an importer may take over the file, of the processor's time.
+        Processor time that an importer may take over the file.
 
     Returns
     -------
