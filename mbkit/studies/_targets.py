@@ -116,9 +116,9 @@ def checked_target(target: object, options: object = None) -> None:
         raise InputError(f"target: expected a text such as 'panda' or './arm.urdf', got {type(target).__name__}")
     if options is None:
         return
-    values = [*options, *options.values()] if isinstance(options, Mapping) else [None]
+    names, values = (list(options), [*options.values()]) if isinstance(options, Mapping) else ([None], [])
     parts = [y for x in values for y in (x if isinstance(x, (list, tuple)) else [x])]
-    if not all(isinstance(x, (bool, int, float, str)) for x in parts) or not all(isinstance(k, str) for k in options):
+    if not all(isinstance(k, str) for k in names) or not all(isinstance(x, (bool, int, float, str)) for x in parts):
         raise InputError(f"options: expected keyword arguments of mbkit.load, of numbers and texts, got {options!r}")
 
 

@@ -299,9 +299,14 @@ class Worker:
 _workers: Final[WeakSet[Worker]] = WeakSet()
 
 
-atexit.register(lambda: [worker.end() for worker in list(_workers)])
+def _each(do: Callable[[Worker], None]) -> None:
+    for worker in list(_workers):
+        do(worker)
+
+
+atexit.register(_each, Worker.end)
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=lambda: [worker._detach() for worker in list(_workers)])
+    os.register_at_fork(after_in_child=partial(_each, Worker._detach))
 
 
 def _processor_seconds(pid: int) -> float:
