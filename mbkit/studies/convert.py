@@ -142,13 +142,12 @@ def _to_mjcf(model: Model) -> Converted:
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
     at = states_of(model, _STATES, 0)
     values = evaluated(read_back(model, text), at)
-    found = gaps(model_terms(model, at), values, at.v, velocity_joints(model))
-    if not found.comparable or found.worst > _TOLERANCE:
+    difference = gaps(model_terms(model, at), values, at.v, velocity_joints(model))
+    if not difference.comparable or difference.worst > _TOLERANCE:
         why = f"MuJoCo wants inertias with A + B >= C of {', '.join(lifted)}" if lifted else "please report this model"
-        raise MbkitError(
-            f"convert: what was written of {model.name} reads back otherwise: {found.worst:.1e} at {found.joint}; {why}"
-        )
-    return Converted(model.name, "mjcf", text, found.terms, tuple(notes))
+        off = f"{difference.worst:.1e} at {difference.joint}"
+        raise MbkitError(f"convert: what was written of {model.name} reads back otherwise: {off}; {why}")
+    return Converted(model.name, "mjcf", text, difference.terms, tuple(notes))
 
 
 def _degenerate(model: Model) -> list[str]:
@@ -175,14 +174,14 @@ def _to_urdf(model: Model) -> Converted:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MbkitWarning)
             back = load(path, gravity=model.gravity, nonphysical="warn")
-    found = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
-    acting: tuple[Cause, ...] = found.acting
-    if acting or not (found.agree or found.massless):
-        reasons = "; ".join(str(c) for c in acting) or found.verdict
+    explanation = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
+    acting: tuple[Cause, ...] = explanation.acting
+    if acting or not (explanation.agree or explanation.massless):
+        reasons = "; ".join(str(c) for c in acting) or explanation.verdict
         raise MbkitError(
             f"convert: what was written of {model.name} reads back otherwise: {reasons}; please report this model"
         )
-    if found.massless:
+    if explanation.massless:
         notes.append("no body has mass, so that reading back compares no forces, but bodies and joints alone")
-    order = [c.says for c in found.causes if c.kind == "joint order"]
-    return Converted(model.name, "urdf", text, found.gaps, (*notes, *order))
+    order = [c.says for c in explanation.causes if c.kind == "joint order"]
+    return Converted(model.name, "urdf", text, explanation.gaps, (*notes, *order))

@@ -335,8 +335,6 @@ def processor() -> str:
     """Return the processor's model name and the system."""
     name = platform.processor() or platform.machine()
     with contextlib.suppress(OSError):
-        found = re.search(
-            r"^model name\s*:\s*(.*?)\s*$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
-        )
-        name = found[1] if found else name
+        line = re.search(r"^model name.*?:(.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+        name = line[1].strip() if line else name
     return f"{name}, {platform.system()} {platform.machine()}"

@@ -338,12 +338,12 @@ def _merged(whole: Model) -> Description:
     }
 
 
-def without_consequences(found: tuple[Change, ...], old: Description) -> tuple[Change, ...]:
+def without_consequences(changed: tuple[Change, ...], old: Description) -> tuple[Change, ...]:
     """Return the changes without those of merged bodies and frames that follow from a link's."""
-    if not any(c.section in LINK_SECTIONS for c in found):
-        return found
+    if not any(c.section in LINK_SECTIONS for c in changed):
+        return changed
     hosts = {frame["body"] for frame in old.get("frames", {}).values() if "body" in frame}
-    return tuple(c for c in found if not _follows(c, old, hosts))
+    return tuple(c for c in changed if not _follows(c, old, hosts))
 
 
 def _follows(change: Change, old: Description, hosts: set[str]) -> bool:

@@ -50,8 +50,8 @@ class Sweep:
     @property
     def counts(self) -> dict[str, int]:
         """How many ended in which status."""
-        found = Counter(o.status for o in self.outcomes)
-        return {status: found[status] for status in STATUSES}
+        number = Counter(o.status for o in self.outcomes)
+        return {status: number[status] for status in STATUSES}
 
     @property
     def passed(self) -> bool:

@@ -151,21 +151,21 @@ def stages(
         size, where, says = max(some, key=itemgetter(0), default=(0.0, "", ""))
         more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
         out.append(Stage(name, not some, size, where, f"{where}: {says}{more}" if some else ""))
-    found = Gaps(comparable=False)
+    apart = Gaps(comparable=False)
     if not structural:
         at = states_of(one.model, samples, seed)
         ours = model_terms(one.model, at)
         if isinstance(reference, Imported):
             ours = _own_terms_of(one.model, reference, {j.name: j.name for j in one.model.joints}, at)
         theirs_ = _own_terms_of(one.model, imported, matching.to_b, at)
-        found = gaps(ours, theirs_, at.v, velocity_joints(one.model))
-    measured = {g.term: g for g in found.terms}
+        apart = gaps(ours, theirs_, at.v, velocity_joints(one.model))
+    by_term = {g.term: g for g in apart.terms}
     for name in TERMS:
-        if g := measured.get(name):
+        if g := by_term.get(name):
             says = f"{g.relative:.1e} at {g.joint}"
             out.append(Stage(name, g.relative <= tolerance, g.relative, g.joint, says))
         else:
-            out.append(Stage(name, None, math.nan, "", "not computed" if found.comparable else "other coordinates"))
+            out.append(Stage(name, None, math.nan, "", "not computed" if apart.comparable else "other coordinates"))
     return tuple(out)
 
 
@@ -177,44 +177,44 @@ def _missing(name: str, missing: list[str], what: str) -> Stage:
 def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict[str, list[tuple[float, str, str]]]:
     """Return for each stage what differs: by how much, where, and in words."""
     names = ("kinds", "parents", "places", "axes", "total mass", "masses", "centres of mass", "inertias")
-    found: dict[str, list[tuple[float, str, str]]] = {name: [] for name in (*names, *_NUMBERS.values())}
+    out: dict[str, list[tuple[float, str, str]]] = {name: [] for name in (*names, *_NUMBERS.values())}
     for a, b in zip(one.model.joints, other.model.joints, strict=False):
         if a.name != b.name:
             continue
         if a.type.motion != b.type.motion:
-            found["kinds"].append((1.0, a.name, f"{b.kind} for {a.kind}"))
+            out["kinds"].append((1.0, a.name, f"{b.kind} for {a.kind}"))
         if a.parent != b.parent:
-            found["parents"].append((1.0, a.name, f"on {b.parent} for {a.parent}"))
+            out["parents"].append((1.0, a.name, f"on {b.parent} for {a.parent}"))
         if not (near.vector(a.rotation, b.rotation) and near.point(a.translation, b.translation)):
             far = float(np.linalg.norm(a.translation - b.translation))
             turn = angle_of(a.rotation.T @ b.rotation)
-            found["places"].append((max(far, turn), a.name, f"{far:.3g} m and {turn:.3g} rad off"))
+            out["places"].append((max(far, turn), a.name, f"{far:.3g} m and {turn:.3g} rad off"))
         if a.axes.shape == b.axes.shape and not near.vector(a.axes, b.axes):
             size = float(np.abs(a.axes - b.axes).max())
-            found["axes"].append((size, a.name, f"{number_text(b.axes)} for {number_text(a.axes)}"))
+            out["axes"].append((size, a.name, f"{number_text(b.axes)} for {number_text(a.axes)}"))
         for field, stage in _NUMBERS.items():
             old, new = getattr(a, field), getattr(b, field)
             if old.shape == new.shape and not near.numbers(old, new):
                 size = float(np.max(np.where(np.isfinite(old) & np.isfinite(new), np.abs(new - old), np.inf)))
                 label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
-                found[stage].append((size, a.name, f"{label}{number_text(new)} for {number_text(old)}"))
+                out[stage].append((size, a.name, f"{label}{number_text(new)} for {number_text(old)}"))
     ours, theirs = (sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other))
     if not near.number(ours, theirs):
         base = " (the base's)" if near.number(ours - theirs, one.ground.mass - other.ground.mass) else ""
         says = f"{number_text(theirs)} kg for {number_text(ours)} kg{base}"
-        found["total mass"].append((abs(theirs / ours - 1), "all", says))
+        out["total mass"].append((abs(theirs / ours - 1), "all", says))
     bodies = {b.name: b for b in other.model.bodies}
     for x, y in ((x, bodies[x.name]) for x in one.model.bodies if x.name in bodies):
         if not near.number(x.mass, y.mass):
             says = f"{number_text(y.mass)} kg for {number_text(x.mass)} kg"
-            found["masses"].append((abs(y.mass - x.mass) / max(x.mass, y.mass), x.name, says))
+            out["masses"].append((abs(y.mass - x.mass) / max(x.mass, y.mass), x.name, says))
         if not near.point(x.com, y.com):
             says = f"{number_text(y.com)} for {number_text(x.com)} m"
-            found["centres of mass"].append((float(np.linalg.norm(x.com - y.com)), x.name, says))
+            out["centres of mass"].append((float(np.linalg.norm(x.com - y.com)), x.name, says))
         if not near.inertia(x.inertia, y.inertia, x.mass):
             size = float(np.abs(y.inertia - x.inertia).max() / max(np.abs(x.inertia).max(), np.abs(y.inertia).max()))
-            found["inertias"].append((size, x.name, f"{number_text(y.inertia)} for {number_text(x.inertia)} kg m²"))
-    return found
+            out["inertias"].append((size, x.name, f"{number_text(y.inertia)} for {number_text(x.inertia)} kg m²"))
+    return out
 
 
 def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
@@ -259,15 +259,15 @@ def own_terms(engine: str, imported: Imported, samples: int, seed: int, toleranc
         if gaps(whole, without, at.v, owners).worst <= tolerance:
             idle.append(extra.says)
             continue
-        found = gaps(whole, _with(without, part), at.v, owners)
-        if not found.worst <= tolerance:
+        apart = gaps(whole, _with(without, part), at.v, owners)
+        if not apart.worst <= tolerance:
             says = f"{engine}: {extra.says}{', and acts otherwise than described' if part else ''}"
-            causes.append(Cause(extra.kind, extra.says, says, None, None, found.effects, acts=True))
-    found = gaps(bare, described, at.v, owners)
-    held = found.worst <= tolerance
+            causes.append(Cause(extra.kind, extra.says, says, None, None, apart.effects, acts=True))
+    apart = gaps(bare, described, at.v, owners)
+    held = apart.worst <= tolerance
     if not held:
-        says = f"{engine}: its own terms are not those of its bodies and joints, most at {found.joint or 'no joint'}"
-        causes.append(Cause("own terms", engine, says, None, None, found.effects, acts=True))
+        says = f"{engine}: its own terms are not those of its bodies and joints, most at {apart.joint or 'no joint'}"
+        causes.append(Cause("own terms", engine, says, None, None, apart.effects, acts=True))
     return OwnTerms(tuple(causes), tuple(idle), held)
 
 
@@ -275,25 +275,25 @@ def _with(a: Values, b: Values) -> Values:
     return {name: x + b[name] if name in b else x for name, x in a.items()}
 
 
-def measured(found: Explanation, stages: tuple[Stage, ...], own: OwnTerms) -> Explanation:
+def with_own_terms(explanation: Explanation, stages: tuple[Stage, ...], own: OwnTerms) -> Explanation:
     """Return an explanation of two descriptions, corrected by the terms that the engine itself computes."""
     terms = [s for s in stages if s.name in TERMS]
     gaps_ = tuple(Gap(s.name, s.worst, s.where) for s in terms)
     same = all(s.same is True for s in terms)
     if not own.causes:
         # The terms are those of the descriptions.
-        return replace(found, gaps=gaps_) if found.agree and same else replace(found, agree=False)
-    if same and not (found.only_a or found.only_b):
-        silent = tuple(c for c in found.causes if not c.acts)
-        return replace(found, agree=True, gaps=gaps_, causes=silent, explained=True, left=(), subtree=())
+        return replace(explanation, gaps=gaps_) if explanation.agree and same else replace(explanation, agree=False)
+    if same and not (explanation.only_a or explanation.only_b):
+        silent = tuple(c for c in explanation.causes if not c.acts)
+        return replace(explanation, agree=True, gaps=gaps_, causes=silent, explained=True, left=(), subtree=())
     known = all(math.isfinite(s.worst) for s in terms)
     return replace(
-        found,
+        explanation,
         agree=False,
-        comparable=found.comparable and known,
-        gaps=gaps_ if known else found.gaps,
-        causes=(*found.causes, *own.causes),
-        explained=found.explained and own.held,
+        comparable=explanation.comparable and known,
+        gaps=gaps_ if known else explanation.gaps,
+        causes=(*explanation.causes, *own.causes),
+        explained=explanation.explained and own.held,
     )
 
 
@@ -413,14 +413,16 @@ def _compared(
 ) -> Parsed:
     """Return an importer's reading, compared with the reference."""
     described = reference.model if isinstance(reference, Imported) else reference
-    found = explain(described, imported.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine))
+    explanation = explain(
+        described, imported.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine)
+    )
     compared = stages(reference, imported, samples, seed, tolerance)
     own = own_terms(engine, imported, samples, seed, tolerance)
     if isinstance(reference, Imported):
         theirs = own_terms(label, reference, samples, seed, tolerance)
         own = OwnTerms((*theirs.causes, *own.causes), own.idle, own.held and theirs.held)
-    notes = (*found.notes, *imported.notes, *own.notes)
-    return Parsed(engine, _version(engine), "", compared, measured(found, compared, own), notes)
+    notes = (*explanation.notes, *imported.notes, *own.notes)
+    return Parsed(engine, _version(engine), "", compared, with_own_terms(explanation, compared, own), notes)
 
 
 def written(source: str | os.PathLike[str]) -> Model:
