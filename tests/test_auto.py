@@ -19,7 +19,7 @@ from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Trajectory, at_section, simulate, stiffness
 from mbkit.simulate.solvers.auto import StepRateMonitor
 from mbkit.simulate.solvers.step_attempts import AcceptedSteps
-from mbkit.studies.stress.cases import stiffness as stiffness_cases
+from mbkit.studies.stress import cases
 from mbkit.studies.stress.cases.exact_motions import cart_pole as light_cart_pole
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms
@@ -115,7 +115,7 @@ def test_a_stiffness_without_damping_is_passed_over_where_it_does_not_ring() -> 
 
 def test_rodas5_is_tried_where_many_steps_are_to_come_though_stability_does_not_hold_them() -> None:
     """A conical pendulum on a stiff damped spring, whose h|λ| is 1.3: rk853 alone takes 700,000 evaluations."""
-    problem = next(case for case in stiffness_cases.CASES if case.name == "damped_point_spring").make(1e8)
+    problem = cases.get("damped_point_spring").make(1e8)
     times = problem.duration * np.linspace(0.0, 0.98, 11)
     dyn = dynamics(problem.model, "lagrangian", compile=True)
     run = simulate(dyn, problem.q, problem.v, times[-1], "auto", rtol=1e-8, save=times)

@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 
 from mbkit.cli import cli
 from mbkit.errors import OutputError
-from mbkit.studies.work_precision.result import InterruptedSweepError
+from mbkit.studies._checkpoint import InterruptedSweepError
 
 SHORT = ("--engines", "pinocchio,mujoco", "--methods", "rk4,mujoco_rk4", "--quick", "--seconds", "30", "--repeats", "1")
 

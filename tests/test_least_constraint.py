@@ -17,7 +17,7 @@ from mbkit.derivation.least_squares_solve import LeastConstraint, inertia_square
 from mbkit.derivation.mass_matrix_solve import elimination_order
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import NonPhysicalWarning, NumericalError
-from mbkit.studies.stress.cases.mass_ratio import CASES
+from mbkit.studies.stress import cases
 from tests.random_trees import SOUND, off, random_tree, rotation, states
 
 EPS = np.finfo(float).eps
@@ -134,7 +134,7 @@ def test_machine_code_and_derivatives_take_the_same_way():
 @pytest.mark.parametrize("name", ["heavy_tip", "loaded_arm"])
 def test_a_heavy_end_costs_no_digits(name):
     """Where the mass matrix costs seven: the chain's lengths, ones and halves, are known exactly."""
-    model = next(case for case in CASES if case.name == name).make(1e9).model
+    model = cases.get(name).make(1e9).model
     rng = np.random.default_rng(0)
     q, v = model.random_state(rng, 20)
     dyn = mb.dynamics(model, "lagrangian")

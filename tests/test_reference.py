@@ -26,6 +26,7 @@ from mbkit.studies.work_precision.reference import (
     Deadline,
     LateError,
     Reference,
+    checked_motion,
     gap,
     reference,
     taylor_pair,
@@ -126,7 +127,7 @@ def test_each_pair_knows_how_good_it_is() -> None:
     """Against quadruple precision, no pair is wrong by more than the safety that is put on top."""
     model = catalog.double_pendulum()
     q, v = [2.0, 1.0], [0.0, 0.5]
-    motion = module._checked(model, q, v, 3.0, TIMES, None)
+    motion = checked_motion(model, q, v, 3.0, TIMES)
     best = taylor_pair(motion, 113, ample())
     for known in (taylor_pair(motion, 64, ample()), two_engines(motion, ample())):
         error = np.abs((known.q[0] - best.q[0]) + (known.q[1] - best.q[1])).max(axis=1)

@@ -27,10 +27,10 @@ from mbkit.errors import InputError, UnknownNameError
 from mbkit.report.stress_view import headline
 from mbkit.studies import InterruptedSweepError, StressResult
 from mbkit.studies.stress import Case, CaseResult, Measurement, Row, stress
-from mbkit.studies.stress.measure import Prepared, condition_number, measure, prepare
-from mbkit.studies.stress.reference import ReferenceSearch, condition, cpu_limit
-from mbkit.studies.stress.sweep import CaseSweep, Limits
-from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
+from mbkit.studies.stress.measure import Limits, Prepared, condition_number, measure, prepare
+from mbkit.studies.stress.reference import condition, reference_motion
+from mbkit.studies.stress.sweep import CaseSweep
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, cpu_limit
 from mbkit.studies.worker import WorkerDiedError, WorkerTimeoutError
 from tests import stress_cases as own
 
@@ -233,7 +233,7 @@ class FakeWorker:
         self.answers, self.stage = dict(answers), ""
 
     def call(self, function, _case, value, *args, **_limits):
-        key = {prepare: "case", condition_number: "condition"}.get(function) or args[0].method
+        key = {prepare: "case", condition_number: "condition"}.get(function) or args[1]
         default = {"case": Prepared("known"), "condition": 1.0}.get(key, Measurement(value, "finished", 0.0))
         found = self.answers.get((key, value), default)
         self.stage = "run" if function is measure else ""
@@ -323,14 +323,14 @@ def test_a_bound_of_time_ends_what_does_not_ask():
 
 def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none():
     problem, times = own.sprung(100.0), np.linspace(0, 0.5, 11)
-    truth, told = ReferenceSearch().truth(problem, times, 1e-7, 5.0)
+    truth, told = reference_motion(problem, times, 1e-7, 5.0)
     assert truth.floor < 1e-10
     assert "rk853 on lagrangian" in told
     # At 50 µs its own error is 1e-13.
     other = mb.simulate(mb.dynamics(problem.model, "mujoco"), problem.q, problem.v, 0.5, "mujoco_rk4", 5e-5, save=times)
     assert np.abs(truth.q - other.q).max() < 1e-12
     # 1e5 swings cannot be followed in the time.
-    truth, told = ReferenceSearch().truth(own.sprung(1e12), times, 1e-7, 0.5)
+    truth, told = reference_motion(own.sprung(1e12), times, 1e-7, 0.5)
     assert truth is None
     assert told.startswith("no truth: ")
 

@@ -29,8 +29,7 @@ from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
 from mbkit.studies.work_precision.result import WorkPrecision
-from mbkit.studies.work_precision.settings import plans
-from mbkit.studies.work_precision.sweep import Problem, _without_heyoka_cache, first_run, repetitions
+from mbkit.studies.work_precision.sweep import Problem, _without_heyoka_cache, first_run, plans, repetitions
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]
 STEPS = [0.1 / 2**k for k in range(6)]

@@ -26,7 +26,7 @@ import mbkit as mb
 from mbkit.methods.registry import METHODS
 from mbkit.simulate.solvers.auto import EXPLICIT, IMPLICIT
 from mbkit.studies.results import processor, versions
-from mbkit.studies.stress.cases import mass_ratio, stiffness
+from mbkit.studies.stress.cases import CASES
 from mbkit.studies.study_runs import start_state
 
 GOAL, RTOL = 1e-6, 1e-8
@@ -242,10 +242,9 @@ def table(rows):
 def main():
     warnings.simplefilter("ignore")
     begun, rows = time.perf_counter(), []
-    cases = {case.name: case for case in (*stiffness.CASES, *mass_ratio.CASES)}
     for name, values in VALUES.items():
         for value in values:
-            problem = cases[name].make(value)
+            problem = CASES[name].make(value)
             reference = None
             for engine in WAYS:
                 task = Task(problem, engine)

@@ -71,8 +71,8 @@ def bench(
     from mbkit.report.output_folder import check_writable
     from mbkit.report.progress import Bar
     from mbkit.studies import work_precision
+    from mbkit.studies._checkpoint import InterruptedSweepError
     from mbkit.studies._targets import model_of
-    from mbkit.studies.work_precision.result import InterruptedSweepError
 
     check_engines(engines, least=1)
     for name in methods:

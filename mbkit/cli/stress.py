@@ -70,8 +70,8 @@ def stress(
     from mbkit.methods.registry import method_of
     from mbkit.report.progress import Bar
     from mbkit.report.stress_page import view
+    from mbkit.studies._checkpoint import InterruptedSweepError
     from mbkit.studies.stress.study import stress as study
-    from mbkit.studies.work_precision.result import InterruptedSweepError
 
     check_engines(engines, least=1)
     for name in methods:

@@ -1,13 +1,14 @@
 """Studies of several engines: compare, stress, work-precision, baselines, explain."""
 
 from mbkit.studies import stress
+from mbkit.studies._checkpoint import InterruptedSweepError
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 from mbkit.studies.compare.study import compare
 from mbkit.studies.results import Refusal
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.reference import Reference
-from mbkit.studies.work_precision.result import InterruptedSweepError, WorkPrecision
+from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.study import work_precision
 
 __all__ = [

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.studies.results import write_whole
@@ -19,12 +19,32 @@ class _Result(Protocol):
         ...
 
 
+R = TypeVar("R", bound=_Result)
 #: progress(fraction, text)
 Progress = Callable[[float, str], object]
 Checkpoint = str | os.PathLike[str] | Callable[[Any], object]
 
 #: Seconds between two results.
 _BETWEEN: Final = 5.0
+
+
+class InterruptedSweepError(KeyboardInterrupt):
+    """A study was interrupted by Ctrl-C; `result` holds the part that was finished.
+
+    A `KeyboardInterrupt`, so that a program that does not handle it ends as usual.
+
+    Attributes
+    ----------
+    result : WorkPrecision or StressResult
+        With ``complete=False``.
+    """
+
+    def __init__(self, result: Any) -> None:
+        super().__init__("interrupted; what was finished is in .result")
+        self.result = result
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.result,)
 
 
 def silent(_fraction: float, _text: str) -> None:
@@ -51,11 +71,32 @@ class Checkpointer:
         self._reported = max(self._reported, min(fraction, 1.0))
         self._progress(self._reported, text)
 
-    def save_if_due(self, result: Callable[[], _Result]) -> None:
-        """Save the result so far, unless that was done a moment ago."""
-        if self._checkpoint is not None and time.perf_counter() - self._saved > _BETWEEN:
-            self.save(result())
-            self._saved = time.perf_counter()
+    def run(self, steps: Iterable[tuple[float, str]], result: Callable[..., R]) -> R:
+        """Work through the steps of a study, and return its result; `result` takes ``complete``.
+
+        The result is saved on the way, at the end, and when an interruption or an error ends the study.
+        """
+        try:
+            for fraction, text in steps:
+                self.report(fraction, text)
+                if self._checkpoint is not None and time.perf_counter() - self._saved > _BETWEEN:
+                    self.save(result(complete=False))
+                    self._saved = time.perf_counter()
+            whole = result(complete=True)
+        except KeyboardInterrupt:
+            part = result(complete=False)
+            self.save(part)
+            raise InterruptedSweepError(part) from None
+        except Exception:
+            # Such as one of the progress function: the finished part is not lost.
+            self.save(result(complete=False))
+            raise
+        self.save(whole)
+        try:
+            self.report(1.0, "done")
+        except KeyboardInterrupt:
+            raise InterruptedSweepError(whole) from None
+        return whole
 
     def save(self, result: _Result) -> None:
         """Save a result; where that fails, a warning says so and the study goes on."""
@@ -71,4 +112,4 @@ class Checkpointer:
             except OSError as error:
                 message = f"cannot write {self._checkpoint}: {error.strerror or error}"
         if message:
-            warnings.warn(f"checkpoint: {message}; the study goes on", MbkitWarning, stacklevel=3)
+            warnings.warn(f"checkpoint: {message}; the study goes on", MbkitWarning, stacklevel=4)

@@ -9,15 +9,17 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from mbkit import catalog
+from mbkit._check import real
 from mbkit.engines.registry import ENGINES, REFERENCE, compared
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
 from mbkit.load.loader import find
+from mbkit.methods.registry import METHODS, method_of
 from mbkit.model import Model
 
 _FUNCTION: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
@@ -161,6 +163,16 @@ def names_of(what: str, names: object) -> tuple[str, ...]:
     return unique
 
 
+def numbers_of(what: str, values: object, **sign: bool) -> tuple[float, ...]:
+    """Return numbers as a tuple, at least one; `what` begins the message of an error, `sign` is as in `real`."""
+    if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
+        raise InputError(f"{what}: expected several numbers, got {values!r}")
+    numbers = tuple(real(f"{what}[{i}]", x, **sign) for i, x in enumerate(values))
+    if not numbers:
+        raise InputError(f"{what}: expected at least one number, got none; leave it out for the study's own")
+    return numbers
+
+
 def engine_names(engines: object, least: int = 1) -> tuple[str, ...]:
     """Return the names of engines that can be compared and measured, each once."""
     names, known = names_of("engines", engines), compared()
@@ -172,6 +184,36 @@ def engine_names(engines: object, least: int = 1) -> tuple[str, ...]:
     if len(names) < least:
         raise InputError(f"engines: expected at least {least} of {list(known)}, got {list(names)}")
     return names
+
+
+def methods_by_engine(
+    engines: Sequence[str], methods: Sequence[str] | Mapping[str, Sequence[str]] | None
+) -> dict[str, tuple[str, ...]]:
+    """Return the methods of each engine, checked: all, those named for all engines that have them, or for each."""
+    names = engine_names(engines)
+    if isinstance(methods, Mapping):
+        for engine in methods:
+            if engine not in names:
+                raise InputError(f"methods: {engine!r} is not among the engines {list(names)}")
+        wanted = {engine: names_of(f"methods[{engine!r}]", methods[engine]) for engine in names if engine in methods}
+        if not wanted:
+            raise InputError("methods: expected the methods of at least one engine, got none")
+        for engine, own in wanted.items():
+            for method in map(method_of, own):
+                if method.engines and engine not in method.engines:
+                    raise InputError(
+                        f"methods[{engine!r}]: {method.name} is not on {engine}; it is on {', '.join(method.engines)}"
+                    )
+    else:
+        wanted = dict.fromkeys(names, tuple(METHODS) if methods is None else names_of("methods", methods))
+    out = {e: tuple(m for m in ms if not method_of(m).engines or e in METHODS[m].engines) for e, ms in wanted.items()}
+    available = {name for ms in out.values() for name in ms}
+    for name in dict.fromkeys(m for ms in wanted.values() for m in ms):
+        if methods is not None and name not in available:
+            raise InputError(
+                f"methods: {name} is not on {' or '.join(wanted)}; it is on {', '.join(METHODS[name].engines)}"
+            )
+    return out
 
 
 def not_installed(engines: Iterable[str]) -> dict[str, str]:

@@ -11,6 +11,7 @@ import numpy as np
 from mbkit._check import Array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
+from mbkit.studies.study_runs import require_motion
 
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "long", "step"]
 #: The error of q along a run, of the energy along a run, or of terms at states.
@@ -51,12 +52,8 @@ class Problem:
         Generalized force of the terms' forward dynamics.
     duration : float
         Of a run, s; 0 for terms.
-    exact : callable or None
-        The closed form of the motion, from times (K,) to q (K, nq).
-    floor : float
-        Error of `exact`, rad or m.
-    source : str
-        Of the closed form.
+    exact, floor, source : callable or None, float, and str
+        The closed form of the motion, from times (K,) to q (K, nq), its error, rad or m, and where it is from.
     scale : float
         Size of the motion, by which an error of q is divided, rad or m.
     dt : float or None
@@ -84,11 +81,8 @@ class Case:
 
     Attributes
     ----------
-    name : str
-        Argument of `mbkit stress`.
-    about : str
-        One sentence on the system and its task.
-    family : str
+    name, about, family : str
+        The argument of `mbkit stress`, one sentence on the system and its task, and the kind of extreme.
     parameter, unit : str
         The number that is swept; the unit is empty for a pure number.
     values, quick : tuple of float
@@ -96,10 +90,8 @@ class Case:
     make : callable
         From a value to its `Problem`; a function of a module, because other processes call it.
     measure : {"motion", "energy", "terms"}
-    bar : float or None
-        The error up to which a value is held; None for the study's own.
-    why : str
-        Reason of that bar.
+    bar, why : float or None, and str
+        The error up to which a value is held, None for the study's own, and its reason.
     methods : tuple of str
         The only ones with a meaning here; all where empty.
     theory : callable or None
@@ -139,12 +131,8 @@ def problem_of(case: Case, value: float) -> Problem:
     what = f"{case.name} at {value:g}"
     if not isinstance(problem, Problem):
         raise InputError(f"{what}: expected make to return a Problem, got {type(problem).__name__}")
-    model: Any = problem.model
-    if not isinstance(model, Model):
-        raise InputError(f"{what}: model: expected a Model, got {type(model).__name__}")
+    model = require_motion(problem.model, "integrate")
     model.require_values("a study of stress")
-    if not model.nv:
-        raise InputError(f"{what}: nothing moves in {model.name} (nv = 0)")
     q, v = model.check_q(problem.q), model.check_v(problem.v)
     if case.measure == "terms":
         if problem.tau is not None:

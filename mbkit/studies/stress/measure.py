@@ -4,41 +4,41 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.errors import MbkitError, MbkitWarning
+from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, METHODS, STIFF_METHOD
 from mbkit.simulate import Trajectory, simulate
 from mbkit.studies.compare.errors import interleaved
 from mbkit.studies.stress.case import Case, Truth, problem_of, step_of, times_of
 from mbkit.studies.stress.measurements import Measurement
 from mbkit.studies.stress.reference import (
+    MAX_ERROR,
     TERMS,
-    ReferenceSearch,
     Terms,
     condition,
-    cpu_limit,
     error_of,
+    reference_motion,
     reference_terms,
 )
-from mbkit.studies.study_runs import TooLongError, patience, quiet_simulate
+from mbkit.studies.study_runs import TooLongError, cpu_limit, energy_drift, heard_warnings, patience, quiet_simulate
 from mbkit.studies.worker import report_stage
 
 #: Processor time: the wall's is also other processes'. A run has one thread, and Linux gives the time of the whole
 #: process to some milliseconds only, unless there is a timer on it.
 _clock = time.thread_time
 
+#: Times a run's seconds that making the problem and the engine, and compiling, may take; and at the least, s.
+_PREPARATION: Final = 15.0
+_MIN_PREPARATION: Final = 6.0
 #: A run shorter than this is timed so many times in all, s.
 _SHORT: Final = 5e-3
 _REPEATS: Final = 3
@@ -52,12 +52,9 @@ _UNTIMED: Final = 2.0
 _MOMENT: Final = 1e-15
 #: Steps of an engine's own integrator from which the time of all steps is estimated.
 _TRIAL: Final = 2000
-_EPS: Final = float(np.finfo(float).eps)
 #: Roundings of a double energy, and the part of the motion's from which on they can hide its error.
-_ROUNDINGS: Final = 16.0
+_ROUNDING: Final = 16.0 * float(np.finfo(float).eps)
 _HIDDEN: Final = 1e-9
-#: The largest error that a result holds, for JSON has no infinity.
-_MAX_ERROR: Final = 1e300
 
 
 @dataclass(frozen=True)
@@ -69,19 +66,22 @@ class Prepared:
     facts: Mapping[str, float] = field(default_factory=dict)
     #: Step that the problem prescribes, s.
     dt: float | None = None
+    #: The cell of every method, where there is no problem.
+    failure: Measurement | None = None
 
 
 @dataclass(frozen=True)
-class Setting:
-    """How a cell is computed; for terms, the method is the term."""
+class Limits:
+    """Processor time of a run, its step and tolerance."""
 
-    engine: str
-    method: str
+    seconds: float
     dt: float
     rtol: float
-    #: Processor time of the run, and of deriving and compiling for it.
-    seconds: float
-    compile_seconds: float
+
+    @property
+    def preparation(self) -> float:
+        """Processor time of making the problem and the engine, and compiling, s."""
+        return max(_MIN_PREPARATION, _PREPARATION * self.seconds)
 
 
 class _ValueCache:
@@ -90,7 +90,7 @@ class _ValueCache:
     def __init__(self, case: Case, value: float) -> None:
         self.case, self.value = case, value
         self.problem = problem_of(case, value)
-        #: Engine -> dynamics, and the warnings when it was made.
+        #: Engine -> dynamics, and the warnings of its construction.
         self.engines: dict[str, tuple[Dynamics, list[str]]] = {}
 
     @cached_property
@@ -105,79 +105,74 @@ class _ValueCache:
         return self.engines[engine]
 
 
-_cache: _ValueCache | None = None
-_searches: Final[dict[str, ReferenceSearch]] = {}
+_cache: Final[dict[tuple[str, float], _ValueCache]] = {}
 
 
-@contextmanager
-def _value_of(case: Case, value: float) -> Iterator[_ValueCache]:
-    """Give the cache of a value, and free that of the value before."""
-    global _cache
-    try:
-        if _cache is None or (_cache.case.name, _cache.value) != (case.name, value):
-            _cache = None
-            _cache = _ValueCache(case, value)
-        yield _cache
-    except MemoryError:
-        _cache = None
-        raise
+def _value_of(case: Case, value: float) -> _ValueCache:
+    """Return the cache of a value, and free that of the value before."""
+    key = case.name, value
+    if key not in _cache:
+        _cache.clear()
+        _cache[key] = _ValueCache(case, value)
+    return _cache[key]
 
 
 def prepare(case: Case, value: float, bar: float, seconds: float) -> Prepared:
     """Return the reference of a value, searched for within so many seconds of processor time."""
-    with _value_of(case, value) as cache:
-        problem = cache.problem
-        facts = {name: float(x) for name, x in problem.facts.items()}
-        report_stage("truth")
-        if case.measure == "terms":
-            terms = reference_terms(problem, cache.oracle)
-            return Prepared("the own derivation with 34 digits", terms, facts)
-        if case.measure == "energy":
-            return Prepared("the energy at the start, with 34 digits", None, facts, problem.dt)
-        search = _searches.setdefault(case.name, ReferenceSearch())
-        truth, how = search.truth(problem, times_of(problem, case.measure), 0.1 * bar * problem.scale, seconds)
-        return Prepared(how, truth, facts, problem.dt)
+    cache = _value_of(case, value)
+    problem = cache.problem
+    truth: Truth | Terms | None = None
+    report_stage("truth")
+    if case.measure == "terms":
+        how, truth = "the own derivation with 34 digits", reference_terms(problem, cache.oracle)
+    elif case.measure == "energy":
+        how = "the energy at the start, with 34 digits"
+    else:
+        wanted = 0.1 * bar * problem.scale
+        truth, how = reference_motion(problem, times_of(problem, case.measure), wanted, seconds)
+    return Prepared(how, truth, {name: float(x) for name, x in problem.facts.items()}, problem.dt)
 
 
 def condition_number(case: Case, value: float) -> float:
     """Return the condition number of the mass matrix at a value; see `reference.condition`."""
-    with _value_of(case, value) as cache:
-        return condition(cache.oracle, cache.problem.q)
+    cache = _value_of(case, value)
+    return condition(cache.oracle, cache.problem.q)
 
 
-def measure(case: Case, value: float, setting: Setting, truth: Truth | Terms | None) -> Measurement:
-    """Return one cell: a run, or the evaluation of a term, timed, and its error."""
-    with _value_of(case, value) as cache:
-        report_stage("engine")
-        dyn, heard = cache.dynamics(setting.engine)
-        if case.measure != "terms":
-            assert not isinstance(truth, Terms)
-            cell = _integrate(cache, setting, dyn, truth)
-        elif isinstance(truth, Terms):
-            cell = _evaluate(value, setting.method, dyn, truth)
-        else:
-            return Measurement(value, "not run", note="not run: no truth")
-        # A warning when the engine was made holds for all that it does.
-        return replace(cell, warnings=(*heard, *cell.warnings)) if cell.end == "finished" else cell
+def measure(
+    case: Case, value: float, engine: str, method: str, limits: Limits, truth: Truth | Terms | None
+) -> Measurement:
+    """Return one cell: a run by a method, or the evaluation of the term of this name, timed, and its error."""
+    cache = _value_of(case, value)
+    report_stage("engine")
+    dyn, heard = cache.dynamics(engine)
+    if isinstance(truth, Terms):
+        cell = _evaluate(value, method, dyn, truth)
+    elif case.measure == "terms":
+        return Measurement(value, "not run", note="not run: no truth")
+    else:
+        cell = _integrate(cache, method, limits, dyn, truth)
+    # A warning of the engine's construction holds for all that it does.
+    return replace(cell, warnings=(*heard, *cell.warnings)) if cell.end == "finished" else cell
 
 
-def _integrate(cache: _ValueCache, setting: Setting, dyn: Dynamics, truth: Truth | None) -> Measurement:
-    value, problem, method = cache.value, cache.problem, setting.method
+def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, truth: Truth | None) -> Measurement:
+    value, problem = cache.value, cache.problem
     times = times_of(problem, cache.case.measure)
     kind = METHODS[method]
     adaptive = kind.kind == "adaptive"
-    dt = 0.0 if adaptive else step_of(problem, times, setting.dt)
-    step: dict[str, Any] = {"rtol": max(setting.rtol, kind.least)} if adaptive else {"dt": dt}
+    dt = 0.0 if adaptive else step_of(problem, times, limits.dt)
+    step: dict[str, Any] = {"rtol": max(limits.rtol, kind.least)} if adaptive else {"dt": dt}
     start, duration = (dyn, problem.q, problem.v), float(times[-1])
     report_stage("method")
     try:
-        with cpu_limit(setting.compile_seconds):
+        with cpu_limit(limits.preparation):
             short = _MOMENT * float(times[1]) if adaptive else dt
             for name in (*_SWITCHES_TO.get(method, ()), method):
                 quiet_simulate(*start, short, name, save=[short], **step)
         if method in _SWITCHES_TO:
             # The controller's own functions are compiled when it first uses them.
-            with cpu_limit(_UNTIMED * setting.seconds):
+            with cpu_limit(_UNTIMED * limits.seconds):
                 quiet_simulate(*start, duration, method, save=times, **step)
         report_stage("run")
         steps = round(duration / dt) if kind.kind == "native" else 0
@@ -186,12 +181,12 @@ def _integrate(cache: _ValueCache, setting: Setting, dyn: Dynamics, truth: Truth
             begun = _clock()
             quiet_simulate(*start, _TRIAL * dt, method, save=[_TRIAL * dt], **step)
             expected = (_clock() - begun) * steps / _TRIAL
-            if expected > setting.seconds:
+            if expected > limits.seconds:
                 return Measurement(value, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
         with heard_warnings() as heard:
             begun = _clock()
-            look = patience(setting.seconds, _clock)
-            with cpu_limit(_LATER * setting.seconds):
+            look = patience(limits.seconds, _clock)
+            with cpu_limit(_LATER * limits.seconds):
                 run = simulate(*start, duration, method, save=times, progress=look, doubt=False, **step)
             seconds = [_clock() - begun]
     except TooLongError as error:
@@ -211,54 +206,23 @@ def _integrate(cache: _ValueCache, setting: Setting, dyn: Dynamics, truth: Truth
     cell = replace(cell, warnings=tuple(dict.fromkeys([*heard, *doubts])))
     if not (np.isfinite(run.q).all() and np.isfinite(run.v).all()):
         return replace(cell, end="nan", note="states that are not finite, and nothing was said")
-    try:
-        # A run that is judged by its energy alone needs more digits of it than the run has.
-        energy = _energy_error(cache.oracle if truth is None else dyn, run)
-    except MbkitError:
-        energy = math.nan
+    # A run that is judged by its energy alone needs more digits of it than the run has.
+    energy = _energy_error(cache.oracle if truth is None else dyn, run)
     if truth is None:
         return replace(cell, error=energy if cache.case.measure == "energy" else math.nan, energy=energy)
     apart = float(np.abs(problem.model.difference(truth.q, run.q)).max()) / problem.scale
-    return replace(cell, error=min(apart, _MAX_ERROR), energy=energy, floor=truth.floor / problem.scale)
+    return replace(cell, error=min(apart, MAX_ERROR), energy=energy, floor=truth.floor / problem.scale)
 
 
 def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
-    """Return the largest energy change relative to T or the change of V; NaN with dampers, time or much rounding."""
-    model = dyn.model
-    if model.needs.damping or model.time_parameter is not None:
+    """Return the relative `energy_drift`, NaN where it is not known or only rounding."""
+    try:
+        drift, size, largest = energy_drift(dyn, run) or (0.0, 0.0, 0.0)
+    except MbkitError:
         return math.nan
-    T, V = _energy(dyn, "kinetic_energy", run.q, run.v), _energy(dyn, "potential_energy", run.q)
-    if not model.has_bodies:
-        # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
-        T0 = _energy(dyn, "kinetic_energy", run.q, 0 * run.v)
-        T, V = (T[0] - T0[0], T[1] - T0[1]), (V[0] - T0[0], V[1] - T0[1])
-    gained, change = ((high - high[0]) + (low - low[0]) for high, low in (T, V))
-    drift, size = float(np.abs(gained + change).max()), max(float(T[0].max()), float(np.ptp(change)))
-    rounding = 0.0 if dyn.bits > DOUBLE_BITS else _ROUNDINGS * _EPS * float(np.abs([T[0], V[0]]).max())
+    rounding = 0.0 if dyn.bits > DOUBLE_BITS else _ROUNDING * largest
     hidden = rounding > _HIDDEN * size and drift <= rounding
-    return min(drift / size, _MAX_ERROR) if size > 0 and not hidden else math.nan
-
-
-def _energy(dyn: Dynamics, name: str, *state: Array) -> tuple[Array, Array]:
-    """Return an energy as (high, low); a double has no low part."""
-    if isinstance(dyn, OracleDynamics):
-        return dyn.extended(name, *state)
-    if name == "kinetic_energy":
-        # By the mass matrix, which no known defect of an engine touches.
-        high = 0.5 * np.einsum("ni,nij,nj->n", state[1], dyn.mass_matrix(state[0]), state[1])
-    else:
-        high = np.asarray(getattr(dyn, name)(*state))
-    return high, np.zeros_like(high)
-
-
-@contextmanager
-def heard_warnings() -> Iterator[list[str]]:
-    """Collect the library's warnings."""
-    heard: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        yield heard
-    heard += [" ".join(str(w.message).split()) for w in caught if issubclass(w.category, MbkitWarning)]
+    return min(drift / size, MAX_ERROR) if size > 0 and not hidden else math.nan
 
 
 def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Measurement:
@@ -272,7 +236,7 @@ def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Measureme
     # Writeable arrays, as users have them: engines have a fast path for those.
     one = [np.array(x[0]) for x in arguments]
     ns, _ = interleaved({"": lambda: function(*one)}, rounds=3)[""]
-    cell = Measurement(value, "finished", seconds=1e-9 * ns, warnings=tuple(dict.fromkeys(heard)))
+    cell = Measurement(value, "finished", seconds=1e-9 * ns, warnings=tuple(heard))
     if not np.isfinite(computed).all():
         return replace(cell, end="nan", note="numbers that are not finite, and nothing was said")
     if term not in truth.values:

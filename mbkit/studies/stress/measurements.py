@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import statistics
-from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
 from typing import Final, Literal
+
+import numpy as np
 
 from mbkit.engines.registry import DERIVED, PINOCCHIO
 from mbkit.methods.registry import AUTOMATIC_METHOD
@@ -41,9 +42,9 @@ class Measurement:
         ``"finished"``; ``"diverged"`` where the run said so itself; ``"nan"`` where numbers are not finite and nothing
         was said; ``"refused"``, an error of its own; ``"slow"``, stopped at the time allowed; ``"died"``, the process
         ended or took too much memory; ``"not run"``.
-    error : float
+    error, floor : float
         Relative to the problem's scale (motion, terms), or of the energy where that is the measure; NaN where there is
-        none, or no truth to measure it by.
+        none, or no truth to measure it by. And the error of that truth.
     energy : float
         Largest relative energy error, NaN where forces do work or nothing was integrated.
     seconds : float
@@ -52,8 +53,6 @@ class Measurement:
     warnings : tuple of str
     note : str
         Why it ended, what was chosen.
-    floor : float
-        Error of the truth, on the same scale.
     """
 
     value: float
@@ -96,12 +95,8 @@ class BreakingPoint:
     ----------
     held : float or None
         The last value up to which all milder ones held, too; None where the mildest did not.
-    failed : float or None
-        The first that did not; None where all held.
-    how : str
-        The outcome there; empty where all held.
-    cell : Measurement or None
-        The measurement there.
+    failed, how, cell : float or None, str, and Measurement or None
+        The first value that did not hold, its outcome and measurement; None and empty where all held.
     """
 
     held: float | None
@@ -146,7 +141,7 @@ class Row:
 
     def reach(self, bar: float) -> int:
         """Return how many values held before the first that did not."""
-        return next((k for k, cell in enumerate(self.cells) if cell.outcome(bar) != "held"), len(self.cells))
+        return _count([cell.outcome(bar) for cell in self.cells], ("held",))
 
 
 @dataclass(frozen=True)
@@ -159,11 +154,8 @@ class CaseResult:
         As of the `Case`.
     bar : float
         The one that counts here.
-    values : tuple of float
-    truths : tuple of str
-        How each value's truth is known, and to which floor.
-    facts : tuple of dict
-        Further numbers of each value.
+    values, truths, facts : tuple of float, of str and of dict
+        The values, how the truth of each is known and to which floor, and further numbers of each.
     rows : tuple of Row
     """
 
@@ -185,8 +177,6 @@ class CaseResult:
 
 #: The method that mbkit recommends, and the engines that it is recommended on.
 RECOMMENDED: Final = AUTOMATIC_METHOD
-#: Outcomes of use, if not to the bar.
-_USABLE: Final = ("held", "inaccurate")
 
 
 @dataclass(frozen=True)
@@ -194,13 +184,32 @@ class Line:
     """One row of a case, read from mild to extreme."""
 
     row: Row
-    #: Number of the case's values.
-    size: int
-    outcomes: tuple[Outcome, ...]
-    broken: BreakingPoint
-    #: How many values held before the first that did not, and how many stayed at least usable.
-    reach: int
-    usable: int
+    case: CaseResult
+
+    @cached_property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """The outcome at each value."""
+        return tuple(cell.outcome(self.case.bar) for cell in self.row.cells)
+
+    @cached_property
+    def broken(self) -> BreakingPoint:
+        """Where it breaks."""
+        return self.row.breaking(self.case.bar)
+
+    @property
+    def size(self) -> int:
+        """Number of the case's values."""
+        return len(self.case.values)
+
+    @property
+    def reach(self) -> int:
+        """How many values held before the first that did not."""
+        return _count(self.outcomes, ("held",))
+
+    @property
+    def usable(self) -> int:
+        """How many values held or were only inaccurate before the first that was neither."""
+        return _count(self.outcomes, ("held", "inaccurate"))
 
     @property
     def whole(self) -> bool:
@@ -210,9 +219,11 @@ class Line:
     @property
     def seconds(self) -> float:
         """Median run time where it held, or where it finished at all; NaN where it did not."""
-        times = _finite(c.seconds for c in self.row.cells[: self.reach])
-        times = times or _finite(c.seconds for c in self.row.cells if c.end == "finished")
-        return statistics.median(times) if times else math.nan
+        finished = (c for c in self.row.cells if c.end == "finished")
+        for cells in (self.row.cells[: self.reach], finished):
+            if times := [c.seconds for c in cells if math.isfinite(c.seconds)]:
+                return statistics.median(times)
+        return math.nan
 
     @property
     def left_out(self) -> bool:
@@ -234,25 +245,19 @@ class Line:
         return None if self.whole else self.outcomes[self.reach] if self.reach < len(self.outcomes) else "not run"
 
 
+def _count(outcomes: Sequence[Outcome], wanted: Sequence[Outcome]) -> int:
+    """Return how many outcomes are wanted ones before the first that is not."""
+    return next((k for k, how in enumerate(outcomes) if how not in wanted), len(outcomes))
+
+
 def lines(case: CaseResult) -> list[Line]:
     """Return the rows of a case, the furthest first: by what held, by what was usable, by run time."""
-    return sorted((_line(row, case) for row in case.rows), key=_rank)
 
+    def rank(line: Line) -> tuple[float, ...]:
+        seconds = math.inf if math.isnan(line.seconds) else line.seconds
+        return -line.reach, -line.usable, line.outcomes.count("silent"), seconds
 
-def _line(row: Row, case: CaseResult) -> Line:
-    outcomes = tuple(cell.outcome(case.bar) for cell in row.cells)
-    usable = next((k for k, how in enumerate(outcomes) if how not in _USABLE), len(outcomes))
-    return Line(row, len(case.values), outcomes, row.breaking(case.bar), row.reach(case.bar), usable)
-
-
-def _rank(line: Line) -> tuple[float, ...]:
-    seconds = line.seconds
-    silent_ones = line.outcomes.count("silent")
-    return -line.reach, -line.usable, silent_ones, math.inf if math.isnan(seconds) else seconds
-
-
-def _finite(numbers: Iterable[float]) -> list[float]:
-    return [x for x in numbers if math.isfinite(x)]
+    return sorted((Line(row, case) for row in case.rows), key=rank)
 
 
 def name_of(row: Row) -> str:
@@ -267,13 +272,10 @@ def engines_of(cases: Iterable[CaseResult]) -> list[str]:
 
 def best(case: CaseResult) -> dict[str, Line]:
     """Return what speaks for each engine: its furthest method, or of the terms that it has the first to break."""
-    out: dict[str, Line] = {}
     ranked = lines(case)
     if case.measure == "terms":
-        ranked = sorted(ranked, key=lambda line: (line.left_out, line.reach, line.usable))
-    for line in ranked:
-        out.setdefault(line.row.engine, line)
-    return out
+        ranked.sort(key=lambda line: (line.left_out, line.reach, line.usable))
+    return {line.row.engine: line for line in reversed(ranked)}
 
 
 def recommended(case: CaseResult) -> Line | None:
@@ -292,20 +294,13 @@ def place(values: Sequence[float], x: float) -> float:
 
     -1 and the number of values stand for what is beyond the ends; NaN for no number, and for values in no order.
     """
-    if math.isnan(x) or not values or not all(map(math.isfinite, values)):
+    if math.isnan(x) or not values or not np.isfinite(values).all():
         return math.nan
-    decades = min(values) > 0
-    sign = -1.0 if values[-1] < values[0] else 1.0
-
-    def mark(v: float) -> float:
-        if not decades or math.isinf(v):
-            return sign * v
-        return sign * (math.log(v) if v > 0 else -math.inf)
-
-    marks, at = [mark(v) for v in values], mark(x)
-    if any(b <= a for a, b in pairwise(marks)):
+    marks = np.array([*values, x])
+    if min(values) > 0:
+        with np.errstate(divide="ignore"):
+            marks = np.log(np.maximum(marks, 0.0))
+    marks = -marks if values[-1] < values[0] else marks
+    if (np.diff(marks[:-1]) <= 0).any():
         return math.nan
-    if at < marks[0] or at > marks[-1]:
-        return -1.0 if at < marks[0] else float(len(marks))
-    k = min(bisect_right(marks, at), len(marks) - 1)
-    return k - 1 + (at - marks[k - 1]) / (marks[k] - marks[k - 1]) if k else 0.0
+    return float(np.interp(marks[-1], marks[:-1], np.arange(len(values)), left=-1.0, right=len(values)))

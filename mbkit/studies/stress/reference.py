@@ -8,14 +8,10 @@ with 34 digits, for motion that loses digits in double.
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from types import FrameType
 from typing import Any, Final
 
 import numpy as np
@@ -34,46 +30,11 @@ from mbkit.methods.registry import (
     SCIPY_METHOD,
     SCIPY_STIFF_METHOD,
 )
-from mbkit.studies.compare.errors import Errors, Scales, force_errors, matrix_errors
+from mbkit.studies.compare.errors import Scales, acceleration_errors, force_errors, matrix_errors
 from mbkit.studies.compare.terms import States
 from mbkit.studies.stress.case import Problem, Truth
-from mbkit.studies.study_runs import TooLongError, quiet_simulate
+from mbkit.studies.study_runs import cpu_limit, quiet_simulate
 from mbkit.studies.work_precision.reference import gap, reference
-
-#: Seconds after which the signal is sent again, for C++ code may lose it.
-_REPEAT: Final = 0.25
-
-
-@contextmanager
-def cpu_limit(seconds: float) -> Iterator[None]:
-    """Raise `TooLongError` after so many seconds of processor time; only in the main thread, which gets signals.
-
-    Interrupts Python, and CasADi while CVODES runs. Other C++ code goes on until its process is ended.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    sent = threading.Event()
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        sent.set()
-        raise TooLongError(f"given up after {seconds:.2g} s")
-
-    before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, seconds, _REPEAT)
-    try:
-        yield
-    except KeyboardInterrupt:
-        if not sent.is_set():
-            raise
-        # CasADi answers any signal with it.
-        raise TooLongError(f"given up after {seconds:.2g} s") from None
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        signal.signal(signal.SIGPROF, before)
-
-
-# Motions
 
 _EPS: Final = float(np.finfo(float).eps)
 #: The errors of two runs can partly cancel in their difference.
@@ -84,8 +45,6 @@ _MIN_SEARCH: Final = 0.05
 _MIN_SERIES: Final = 5.0
 #: A truth no better than this part of the motion cannot show even gross errors.
 _WORTHLESS: Final = 1e-3
-#: Parts of the time left that the ways may take, in the order in which they are tried.
-_PARTS: Final = (0.35, 0.5, 1.0)
 #: Engine, method, and tolerance or number of steps; the third stands in for the second where that is not installed.
 _EXPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
     (DERIVED, ADAPTIVE_METHOD, 1e-14),
@@ -97,45 +56,34 @@ _IMPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
     (PINOCCHIO, SCIPY_STIFF_METHOD, 1e-11),
     (DERIVED, GAUSS_METHOD, 4000),
 )
-
-#: q at the times, how well it is known, and how it was computed.
-_Candidate = tuple[Array, float, str]
-_Way = Callable[[Problem, Array, float, float], Iterator[_Candidate]]
+#: Runs, none for Taylor series, and the part of the time left that they may take.
+_WAYS: Final = ((_EXPLICIT, 0.35), (_IMPLICIT, 0.5), ((), 1.0))
 
 
-class ReferenceSearch:
-    """Searches for the truths of a case, one value after the other."""
-
-    def __init__(self) -> None:
-        #: The way that was good enough for a milder value is tried first.
-        self._ways: list[_Way] = [partial(_two_runs, _EXPLICIT), partial(_two_runs, _IMPLICIT), _taylor_series]
-
-    def truth(self, problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
-        """Return the truth of a motion to `wanted`, rad or m, or None, and how it is known or why it is not."""
-        if problem.exact is not None:
-            return _closed_form(problem, times)
-        end = time.thread_time() + seconds
-        best: _Candidate | None = None
-        reasons: list[str] = []
-        for way, part in zip(list(self._ways), _PARTS, strict=True):
-            left = end - time.thread_time()
-            if left < (_MIN_SERIES if way is _taylor_series else _MIN_SEARCH):
-                reasons.append("the time was up")
-                break
-            try:
-                for candidate in way(problem, times, wanted, part * left):
-                    best = candidate if best is None or candidate[1] < best[1] else best
-            except MbkitError as error:
-                reasons.append(str(error))
-            if best is not None and best[1] <= wanted:
-                self._ways.remove(way)
-                self._ways.insert(0, way)
-                break
-        if best is None or best[1] > _WORTHLESS * problem.scale:
-            apart = f"{best[2]}, which part by {best[1] / _SAFETY:.1e}" if best else ""
-            return None, "no truth: " + "; ".join(x for x in (apart, *dict.fromkeys(reasons)) if x)
-        q, floor, how = best
-        return Truth(times, q, floor, how), f"{how}; known to {floor:.1e}"
+def reference_motion(problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
+    """Return the truth of a motion to `wanted`, rad or m, or None, and how it is known or why it is not."""
+    if problem.exact is not None:
+        return _closed_form(problem, times)
+    end = time.thread_time() + seconds
+    best: Truth | None = None
+    reasons: list[str] = []
+    for runs, part in _WAYS:
+        left = end - time.thread_time()
+        if left < (_MIN_SEARCH if runs else _MIN_SERIES):
+            reasons.append("the time was up")
+            break
+        try:
+            truth = _two_runs(runs, problem, times, wanted, part * left) if runs else _series(problem, times, left)
+        except MbkitError as error:
+            reasons.append(str(error))
+            continue
+        best = truth if best is None or truth.floor < best.floor else best
+        if best.floor <= wanted:
+            break
+    if best is None or best.floor > _WORTHLESS * problem.scale:
+        apart = f"{best.how}, which part by {best.floor / _SAFETY:.1e}" if best else ""
+        return None, "no truth: " + "; ".join(x for x in (apart, *dict.fromkeys(reasons)) if x)
+    return best, f"{best.how}; known to {best.floor:.1e}"
 
 
 def _closed_form(problem: Problem, times: Array) -> tuple[Truth | None, str]:
@@ -159,11 +107,11 @@ def _rounding(q: Array) -> float:
 
 def _two_runs(
     runs: Sequence[tuple[str, str, float]], problem: Problem, times: Array, wanted: float, seconds: float
-) -> Iterator[_Candidate]:
+) -> Truth:
     """Make runs in double until two agree; `NumericalError` where fewer than two came to the end."""
     end = time.thread_time() + seconds
     done: list[tuple[Array, str]] = []
-    best = np.inf
+    best: Truth | None = None
     for engine, method, setting in runs:
         left = end - time.thread_time()
         if left < _MIN_SEARCH:
@@ -184,24 +132,24 @@ def _two_runs(
         size = f"{each * (len(times) - 1)} steps" if fixed else f"rtol {setting:.0e}"
         how = f"{method} on {engine} ({size})"
         for other_q, other in done:
-            apart = _SAFETY * float(gap(problem.model, other_q, run.q).max()) + _rounding(run.q)
-            if apart < best:
-                best = apart
-                yield run.q, apart, f"{other} and {how}"
+            floor = _SAFETY * float(gap(problem.model, other_q, run.q).max()) + _rounding(run.q)
+            if best is None or floor < best.floor:
+                best = Truth(times, run.q, floor, f"{other} and {how}")
         done.append((run.q, how))
-        if best <= wanted:
-            return
-    if len(done) < 2:
+        if best is not None and best.floor <= wanted:
+            break
+    if best is None:
         tried = ", ".join(dict.fromkeys(method for _, method, _ in runs))
         only = f"{done[0][1]} alone" if done else "none"
         raise NumericalError(f"of {tried}, {only} came to the end in {seconds:.2g} s")
+    return best
 
 
-def _taylor_series(problem: Problem, times: Array, _wanted: float, seconds: float) -> Iterator[_Candidate]:
-    found = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=seconds)
-    if len(found.t) < len(times):
-        raise NumericalError(found.how)
-    yield np.asarray(found.q), float(found.floor.max()), found.how
+def _series(problem: Problem, times: Array, seconds: float) -> Truth:
+    known = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=seconds)
+    if len(known.t) < len(times):
+        raise NumericalError(known.how)
+    return Truth(times, np.asarray(known.q), float(known.floor.max()), known.how)
 
 
 # Terms. Errors are those of `mbkit.studies.compare.errors`, but for forward dynamics: there its error is divided by
@@ -215,7 +163,7 @@ _MAX_DOUBLE_CONDITION: Final = 1e15
 #: Columns of an inverse that are computed side by side.
 _BLOCK: Final = 16
 #: The largest error that a result holds, for JSON has no infinity.
-_MAX_ERROR: Final = 1e300
+MAX_ERROR: Final = 1e300
 
 
 @dataclass(frozen=True)
@@ -254,7 +202,7 @@ def reference_terms(problem: Problem, oracle: OracleDynamics) -> Terms:
     weight = gravity * float(np.sqrt(np.ldexp(model.mass, exponent))) if gravity and model.has_bodies else 0.0
     with np.errstate(all="ignore"):
         scales = Scales.of(np.ldexp(M, exponent), v, np.ldexp(acting, exponent), weight)
-    return Terms(at, values, missing, scales, exponent)
+    return Terms(at, values, missing, replace(scales, condition=np.ones(n)), exponent)
 
 
 def _exponent(M: Array) -> int:
@@ -268,24 +216,13 @@ def error_of(term: str, value: Array, truth: Terms) -> float:
     with np.errstate(all="ignore"):
         error = (value - high) - low
         if term == "forward_dynamics":
-            return min(float(_acceleration_errors(error, high, truth.scales).max()), _MAX_ERROR)
-        # Forces and inertias are both proportional to kg.
-        error, high = np.ldexp(error, truth.exponent), np.ldexp(high, truth.exponent)
-        errors: Errors = (
-            matrix_errors(error, high, truth.scales)
-            if term == "mass_matrix"
-            else force_errors(error, high, truth.scales, heavy=True)
-        )
-        return min(float(errors.relative.max()), _MAX_ERROR)
-
-
-def _acceleration_errors(error: Array, reference: Array, scales: Scales) -> Array:
-    """Return errors in the norm √M_jj a_j, relative to the accelerations, or to what cancels in them."""
-    root = np.sqrt(scales.diagonal)
-    pushed = np.linalg.norm(scales.acting / np.where(root > 0, root, np.inf), axis=1)
-    size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
-    off = np.linalg.norm(root * error, axis=1)
-    return np.where(off == 0, 0.0, off / np.where(size > 0, size, np.finfo(float).tiny))
+            errors = acceleration_errors(error, high, truth.scales)
+        else:
+            # Forces and inertias are both proportional to kg.
+            error, high = np.ldexp(error, truth.exponent), np.ldexp(high, truth.exponent)
+            measured = matrix_errors if term == "mass_matrix" else partial(force_errors, heavy=True)
+            errors = measured(error, high, truth.scales)
+        return min(float(errors.relative.max()), MAX_ERROR)
 
 
 def condition(oracle: OracleDynamics, q: Array) -> float:
@@ -304,11 +241,9 @@ def condition(oracle: OracleDynamics, q: Array) -> float:
 def _norm_of_inverse(high: Array, low: Array) -> float:
     """Return the 2-norm of the inverse of a matrix with 34 digits, NaN where there is none."""
     own, n = arithmetic(), len(high)
-    M, one = own.from_pair(high, low), np.eye(n)
-    pattern = (high != 0) | (low != 0)
+    M, pattern = own.from_pair(high, low), (high != 0) | (low != 0)
     columns = []
-    for k in range(0, n, _BLOCK):
-        rows = one[k : k + _BLOCK]
+    for rows in np.array_split(np.eye(n), range(_BLOCK, n, _BLOCK)):
         many = np.broadcast_to(M, (len(rows), n, n))
         columns.append(own.pair(solve(many, own.array(rows), pattern, range(n), own))[0])
     inverse = np.concatenate(columns)

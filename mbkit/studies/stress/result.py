@@ -22,16 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Breaking:
-    """Where one engine and method breaks in one case, a line of a table.
-
-    Attributes
-    ----------
-    case, engine, method, setting : str
-    held, failed, how
-        As of `BreakingPoint`.
-    note : str
-        Error, warnings and note where it failed.
-    """
+    """Where one engine and method breaks in one case: a `BreakingPoint`, and the error, warnings and note there."""
 
     case: str
     engine: str
@@ -45,14 +36,7 @@ class Breaking:
 
 @dataclass(frozen=True)
 class SilentFailure:
-    """A grossly wrong answer without a warning.
-
-    Attributes
-    ----------
-    case, engine, method : str
-    cell : Measurement
-        With the value and the error.
-    """
+    """A grossly wrong answer without a warning; `cell` has the value and the error."""
 
     case: str
     engine: str
@@ -60,17 +44,22 @@ class SilentFailure:
     cell: Measurement
 
 
-_Item = tuple[CaseResult, Row, Measurement]
+@dataclass(frozen=True)
+class _Item:
+    """A line of the CSV file."""
+
+    case: CaseResult
+    row: Row
+    cell: Measurement
+
+    @property
+    def outcome(self) -> Outcome:
+        return self.cell.outcome(self.case.bar)
 
 
-def _columns(part: int, *names: str) -> list[Column]:
-    """Return columns for attributes of a part of (case, row, cell)."""
-
-    def column(name: str) -> Column:
-        value = attrgetter(name)
-        return Column(name, lambda item: value(item[part]))
-
-    return [column(name) for name in names]
+def _columns(part: str, *names: str) -> list[Column]:
+    """Return columns for attributes of a part of an item."""
+    return [Column(name, attrgetter(f"{part}.{name}")) for name in names]
 
 
 @dataclass(frozen=True)
@@ -98,33 +87,27 @@ class StressResult(ResultTable):
     settings: dict[str, Any] = field(default_factory=dict)
 
     _csv_columns: ClassVar = (
-        Column("case", lambda item: item[0].name),
-        *_columns(0, "parameter", "unit"),
-        *_columns(2, "value"),
-        *_columns(1, "engine", "method", "setting"),
-        Column("outcome", lambda item: item[2].outcome(item[0].bar)),
-        *_columns(2, "end", "error", "floor", "energy", "seconds", "steps"),
-        Column("warnings", lambda item: "; ".join(item[2].warnings)),
-        *_columns(2, "note"),
+        Column("case", attrgetter("case.name")),
+        *_columns("case", "parameter", "unit"),
+        *_columns("cell", "value"),
+        *_columns("row", "engine", "method", "setting"),
+        Column("outcome", attrgetter("outcome")),
+        *_columns("cell", "end", "error", "floor", "energy", "seconds", "steps"),
+        Column("warnings", lambda item: "; ".join(item.cell.warnings)),
+        *_columns("cell", "note"),
     )
 
     @property
     def left_out(self) -> str:
         """One sentence about the cells that were not computed; empty where none was left out."""
-        cells = [cell for _, row in self.rows() for cell in row.cells]
-        late = sum(cell.note == OUT_OF_TIME for cell in cells)
+        notes = [item.cell.note for item in self._csv_rows()]
+        late = notes.count(OUT_OF_TIME)
         if not self.complete:
-            return f"interrupted: {late} of {len(cells)} cells were not reached"
-        return f"the time allowed was used up: {late} of {len(cells)} cells were not run" if late else ""
+            return f"interrupted: {late} of {len(notes)} cells were not reached"
+        return f"the time allowed was used up: {late} of {len(notes)} cells were not run" if late else ""
 
     def case(self, name: str) -> CaseResult:
-        """Return the case of this name.
-
-        Raises
-        ------
-        UnknownNameError
-            There is none in this result.
-        """
+        """Return the case of this name; `UnknownNameError` where there is none."""
         known = {case.name: case for case in self.cases}
         if name not in known:
             raise UnknownNameError("case", name, known)
@@ -137,22 +120,15 @@ class StressResult(ResultTable):
                 yield case, row
 
     def breaking(self, bar: float | None = None) -> tuple[Breaking, ...]:
-        """Return where each engine and method breaks in each case.
-
-        Parameters
-        ----------
-        bar : float, optional
-            Another one than each case's own.
-        """
+        """Return where each engine and method breaks in each case, by its own bar or another one."""
         return tuple(_breaking(case, row, _bar(case, bar)) for case, row in self.rows())
 
     def silent(self, bar: float | None = None) -> tuple[SilentFailure, ...]:
         """Return all answers that were grossly wrong without a word, by each case's bar or another one."""
         return tuple(
-            SilentFailure(case.name, row.engine, row.method, cell)
-            for case, row in self.rows()
-            for cell in row.cells
-            if cell.outcome(_bar(case, bar)) == "silent"
+            SilentFailure(item.case.name, item.row.engine, item.row.method, item.cell)
+            for item in self._csv_rows()
+            if item.cell.outcome(_bar(item.case, bar)) == "silent"
         )
 
     def best(self, case: str, bar: float | None = None) -> tuple[Row, ...]:
@@ -176,9 +152,7 @@ class StressResult(ResultTable):
         return out
 
     def _csv_rows(self) -> Iterator[_Item]:
-        for case, row in self.rows():
-            for cell in row.cells:
-                yield case, row, cell
+        return (_Item(case, row, cell) for case, row in self.rows() for cell in row.cells)
 
     def _blocks(self) -> Iterator[Block]:
         """Yield a table per case of how far each engine and method held, the furthest first."""
@@ -200,7 +174,7 @@ class StressResult(ResultTable):
         return figure(self.cases, case)
 
     def __repr__(self) -> str:
-        counts = Counter(cell.outcome(case.bar) for case, _, cell in self._csv_rows())
+        counts = Counter(item.outcome for item in self._csv_rows())
         outcomes = ", ".join(f"{n} {how}" for how, n in counts.most_common())
         plural = "s" * (len(self.cases) != 1)
         return f"<StressResult of {len(self.cases)} case{plural}: {outcomes or 'nothing run'}>"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import tempfile
 import time
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -16,13 +17,13 @@ from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
+from mbkit.studies._targets import methods_by_engine, numbers_of
 from mbkit.studies.stress.case import Case
+from mbkit.studies.stress.measure import Limits
 from mbkit.studies.stress.measurements import BAR
 from mbkit.studies.stress.reference import TERMS
 from mbkit.studies.stress.result import StressResult
-from mbkit.studies.stress.sweep import CaseSweep, Limits, run_sweeps
-from mbkit.studies.work_precision.result import InterruptedSweepError
-from mbkit.studies.work_precision.settings import pairs
+from mbkit.studies.stress.sweep import CaseSweep, run_sweeps
 from mbkit.studies.worker import CallError, in_worker, processors
 
 #: Seconds that a run may take, and the whole study, quick and not.
@@ -68,9 +69,8 @@ def stress(
         From mild to extreme, instead of the cases' own: for all cases, or by name.
     quick : bool
         Fewer values, methods and seconds.
-    dt : float
-        Step of fixed-step methods, s, where a case prescribes none; shortened to end on the times of measurement.
-    rtol : float
+    dt, rtol : float
+        Step of fixed-step methods, s, where a case prescribes none, shortened to end on the times of measurement;
         rtol and atol of adaptive methods, raised to the least that a method allows.
     bar : float
         A value is held up to this error, relative to the size of the motion or term, unless a case has its own bar.
@@ -105,9 +105,9 @@ def stress(
 
     Notes
     -----
-    Every run takes place in a worker process with a folder of its own, which is ended when a run takes too long, and
-    replaced when it died; so a crash, an endless loop and too little memory are results. The runs of one worker follow
-    each other in the same memory.
+    Every run takes place in a worker process, which is ended when a run takes too long, and replaced when it died; so
+    a crash, an endless loop and too little memory are results. The runs of one worker follow each other in the same
+    memory.
 
     The error of a motion is the largest difference of q to its truth over ten times, on the manifold, divided by the
     problem's scale. The truth is a closed form, or the motion on which two independent runs agree;
@@ -131,7 +131,8 @@ def stress(
             "put what the script does below: if __name__ == '__main__':"
         )
     begun = time.perf_counter()
-    quick = _flag("quick", quick)
+    if not isinstance(quick, bool):
+        raise InputError(f"quick: expected True or False, got {quick!r}")
     limits = Limits(
         _SECONDS[quick] if seconds is None else real("seconds", seconds, positive=True),
         real("dt", dt, positive=True),
@@ -142,9 +143,8 @@ def stress(
     budget = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
     jobs = min(processors(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
     checkpoints = Checkpointer(progress, checkpoint)
-    chosen = _cases(cases)
-    _check_values(values, chosen)
-    methods_of = pairs(engines, _quick_methods(engines) if quick and methods is None else methods)
+    swept = _swept(cases, values, quick=quick)
+    methods_of = methods_by_engine(engines, _quick_methods(engines) if quick and methods is None else methods)
     settings: dict[str, Any] = {
         "engines": list(methods_of),
         "methods": {engine: list(names) for engine, names in methods_of.items()},
@@ -157,16 +157,11 @@ def stress(
         "budget": budget,
         "jobs": jobs,
     }
-    doing = [""]
-
-    def report(text: str) -> None:
-        doing[0] = text
-
-    deadline = begun + budget
-    sweeps = []
-    for case in chosen:
-        rows = _rows(case, methods_of)
-        sweeps.append(CaseSweep(case, _values(case, values, quick), rows, case.bar or bar, limits, report, deadline))
+    doing, deadline = deque([""], maxlen=1), begun + budget
+    sweeps = [
+        CaseSweep(case, own, _rows(case, methods_of), case.bar or bar, limits, doing.append, deadline)
+        for case, own in swept
+    ]
 
     def result(*, complete: bool) -> StressResult:
         return StressResult(
@@ -185,34 +180,12 @@ def stress(
             tempfile.TemporaryDirectory(prefix="mbkit-stress-", ignore_cleanup_errors=True) as home,
             closing(run_sweeps(sweeps, Path(home), memory, width, deadline, _TICK)) as ticks,
         ):
-            for _ in ticks:
-                checkpoints.report(sum(sweep.done for sweep in sweeps) / size, doing[0])
-                checkpoints.save_if_due(lambda: result(complete=False))
-        whole = result(complete=True)
+            steps = ((sum(sweep.done for sweep in sweeps) / size, doing[-1]) for _ in ticks)
+            return checkpoints.run(steps, result)
     except CallError as error:
         raise InputError(
             f"cases: a case of your own cannot be used in other processes: {error}; define its functions in a module"
         ) from None
-    except KeyboardInterrupt:
-        part = result(complete=False)
-        checkpoints.save(part)
-        raise InterruptedSweepError(part) from None
-    except Exception:
-        # Such as one of the progress function: the finished cells are not lost with it.
-        checkpoints.save(result(complete=False))
-        raise
-    checkpoints.save(whole)
-    try:
-        checkpoints.report(1.0, "done")
-    except KeyboardInterrupt:
-        raise InterruptedSweepError(whole) from None
-    return whole
-
-
-def _flag(name: str, value: object) -> bool:
-    if not isinstance(value, bool):
-        raise InputError(f"{name}: expected True or False, got {value!r}")
-    return value
 
 
 def _quick_methods(engines: object) -> dict[str, tuple[str, ...]] | None:
@@ -223,61 +196,47 @@ def _quick_methods(engines: object) -> dict[str, tuple[str, ...]] | None:
     return {engine: tuple(m for m in ENGINES[engine].quick if m in METHODS) for engine in engines}
 
 
-def _cases(cases: object) -> list[Case]:
+def _swept(cases: object, values: object, *, quick: bool) -> list[tuple[Case, tuple[float, ...]]]:
+    """Return the cases, checked, each with its values."""
     # With the named cases come all the models that they are made of.
     from mbkit.studies.stress.cases import get, names
 
-    if cases is None:
-        cases = names()
-    if isinstance(cases, (str, Case)):
-        cases = (cases,)
-    if not isinstance(cases, Iterable):
+    several = names() if cases is None else (cases,) if isinstance(cases, (str, Case)) else cases
+    if not isinstance(several, Iterable):
         raise InputError(f"cases: expected names or Case objects, got {cases!r}")
-    out: list[Case] = []
-    for case in cases:
-        if not isinstance(case, (str, Case)):
-            raise InputError(f"cases: expected names or Case objects, got {case!r}")
-        out.append(get(case) if isinstance(case, str) else _sendable(case))
-    if not out:
+    chosen: dict[str, Case] = {}
+    for one in several:
+        if not isinstance(one, (str, Case)):
+            raise InputError(f"cases: expected names or Case objects, got {one!r}")
+        case = get(one) if isinstance(one, str) else one
+        if case.name in chosen:
+            raise InputError(f"cases: {case.name!r} is there twice; a result finds a case by its name")
+        chosen[case.name] = case
+        try:
+            pickle.dumps(case)
+        except Exception as error:  # pickle raises errors of several kinds
+            raise InputError(
+                f"cases: {case.name!r} cannot be sent to other processes ({error}); define its functions in a module"
+            ) from None
+    if not chosen:
         raise InputError("cases: expected at least one, got none; leave it out for all")
-    names_ = [case.name for case in out]
-    for name in names_:
-        if names_.count(name) > 1:
-            raise InputError(f"cases: {name!r} is there twice; a result finds a case by its name")
-    return out
-
-
-def _sendable(case: Case) -> Case:
-    try:
-        pickle.dumps(case)
-    except Exception as error:  # pickle raises errors of several kinds
-        raise InputError(
-            f"cases: {case.name!r} cannot be sent to other processes ({error}); define its functions in a module"
-        ) from None
-    return case
+    of_cases = values if isinstance(values, Mapping) else dict.fromkeys(chosen, values)
+    for name in of_cases:
+        if name not in chosen:
+            raise InputError(f"values: {name!r} is not among the cases: {', '.join(chosen)}")
+    swept = []
+    for name, case in chosen.items():
+        own = of_cases.get(name)
+        if own is None:
+            own = case.quick if quick and case.quick else case.values
+        numbers = numbers_of("values", own)
+        if len(set(numbers)) < len(numbers):
+            raise InputError(f"values: expected different numbers for {name}, got {list(numbers)}")
+        swept.append((case, numbers))
+    return swept
 
 
 def _rows(case: Case, methods_of: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
     if case.measure == "terms":
         return [(engine, term) for engine in methods_of for term in TERMS]
     return [(e, m) for e, names in methods_of.items() for m in names if not case.methods or m in case.methods]
-
-
-def _values(case: Case, values: object, quick: bool) -> tuple[float, ...]:
-    if isinstance(values, Mapping):
-        values = values.get(case.name)
-    if values is None:
-        values = case.quick if quick and case.quick else case.values
-    if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
-        raise InputError(f"values: expected several numbers, or a mapping from cases to them, got {values!r}")
-    out = tuple(real(f"values[{i}] of {case.name}", x) for i, x in enumerate(values))
-    if not out or len(set(out)) < len(out):
-        raise InputError(f"values: expected different numbers for {case.name}, at least one, got {list(out)}")
-    return out
-
-
-def _check_values(values: object, chosen: Sequence[Case]) -> None:
-    if isinstance(values, Mapping):
-        for name in values:
-            if name not in {case.name for case in chosen}:
-                raise InputError(f"values: {name!r} is not among the cases: {', '.join(c.name for c in chosen)}")

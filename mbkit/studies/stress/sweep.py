@@ -11,12 +11,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from mbkit.methods.registry import METHODS
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.measure import Prepared, Setting, condition_number, measure, prepare
-from mbkit.studies.stress.measurements import CaseResult, End, Measurement, Row
+from mbkit.studies.stress.measure import Limits, Prepared, condition_number, measure, prepare
+from mbkit.studies.stress.measurements import CaseResult, Measurement, Row
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
 from mbkit.studies.worker import (
     OUT_OF_MEMORY,
@@ -29,9 +29,6 @@ from mbkit.studies.worker import (
     describe,
 )
 
-#: Times a run's seconds that making the problem and the engine, and compiling, may take; and at the least, s.
-_MAKING: Final = 15.0
-_MIN_MAKING: Final = 6.0
 #: A run is not begun with less time than this, s.
 _MIN_TIME: Final = 0.1
 #: Runs in a row that did not finish, after which a row is over.
@@ -43,8 +40,6 @@ _MIN_TRUTH: Final = 2.0
 _TERMS: Final = 60.0
 #: Seconds, and the part of a limit, by which the worker may miss it before its process is ended.
 _GRACE: Final = (0.5, 0.25)
-#: Why no cell can be computed: these end the study.
-_FATAL: Final = (CallError, WorkerClosedError, WorkerStartError)
 #: Stage of a call -> what to add to the note of a process that ended there.
 _DURING: Final = {
     "": ", making the problem",
@@ -52,17 +47,6 @@ _DURING: Final = {
     "engine": ", making the engine",
     "method": ", deriving and compiling",
 }
-
-Clock = Callable[[], float]
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Seconds of a run, step and tolerance."""
-
-    seconds: float
-    dt: float
-    rtol: float
 
 
 @dataclass
@@ -105,16 +89,13 @@ class CaseSweep:
         limits: Limits,
         report: Callable[[str], object],
         deadline: float = math.inf,
-        clock: Clock = time.perf_counter,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.case, self.values, self.bar = case, tuple(values), bar
         self._limits = replace(limits, seconds=limits.seconds * case.patience)
-        self._making = max(_MIN_MAKING, _MAKING * self._limits.seconds)
         self._report, self._deadline, self._clock = report, deadline, clock
-        #: By the index of the value; where the problem itself cannot be made, the cell of every row.
+        #: By the index of the value.
         self._prepared: dict[int, Prepared] = {}
-        self._facts: dict[int, dict[str, float]] = {}
-        self._unmade: dict[int, Measurement] = {}
         self._rows = [_Row(e, m, self._setting(m), case.theory(e, m) if case.theory else None) for e, m in rows]
 
     @property
@@ -130,7 +111,7 @@ class CaseSweep:
     @property
     def done(self) -> int:
         """Number of steps that need no more work."""
-        return len(self._facts) + sum(len(self.values) if row.stopped else len(row.cells) for row in self._rows)
+        return len(self._prepared) + sum(len(self.values) if row.stopped else len(row.cells) for row in self._rows)
 
     def _setting(self, method: str) -> str:
         if self.case.measure == "terms":
@@ -140,71 +121,71 @@ class CaseSweep:
             return f"rtol {max(self._limits.rtol, kind.least):.0e}"
         return f"dt {self._limits.dt:g} s"
 
+    def _call(
+        self, worker: Worker, value: float, function: Callable[..., Any], *arguments: object, **stage_seconds: float
+    ) -> Any:
+        """Return what a function answers for a value of the case, or the measurement of how the call ended."""
+        try:
+            return worker.call(
+                function,
+                self.case,
+                value,
+                *arguments,
+                cpu_seconds=_with_grace(self._limits.preparation),
+                stage_seconds={stage: _with_grace(seconds) for stage, seconds in stage_seconds.items()},
+                deadline=self._deadline,
+            )
+        except (CallError, WorkerClosedError, WorkerStartError):
+            # No cell can be computed: these end the study.
+            raise
+        except WorkerTimeoutError as error:
+            if self._clock() >= self._deadline:
+                return Measurement(value, "not run", note=OUT_OF_TIME)
+            return Measurement(value, "slow", note=f"{error}{_DURING.get(worker.stage, '')}")
+        except WorkerDiedError as error:
+            return Measurement(value, "died", note=f"{error}{_DURING.get(worker.stage, '')}")
+        except MemoryError as error:
+            # What its process keeps takes memory from the next call.
+            worker.end()
+            return Measurement(value, "died", note=f"{OUT_OF_MEMORY} ({error})" if str(error) else OUT_OF_MEMORY)
+        except Exception as error:
+            return Measurement(value, "slow" if isinstance(error, TooLongError) else "refused", note=describe(error))
+
     def prepare(self, worker: Worker, until: float) -> bool:
         """Have the truths computed in order, begin none after `until`, and return whether all are there."""
         for i, value in enumerate(self.values):
-            if i in self._facts:
+            if i in self._prepared:
                 continue
             left = until - self._clock()
             if left < _MIN_TIME:
                 return False
             self._report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
-            self._prepare(i, value, worker, left / (len(self.values) - i))
-        return True
-
-    def _prepare(self, i: int, value: float, worker: Worker, share: float) -> None:
-        self._facts[i] = {}
-        seconds = _TERMS if self.case.measure == "terms" else share + _MIN_TRUTH
-        making, truth = _with_grace(self._making), {"truth": _with_grace(seconds)}
-        arguments = (self.case, value, self.bar, _SEARCH * share)
-        try:
-            prepared = worker.call(
-                prepare, *arguments, cpu_seconds=making, stage_seconds=truth, deadline=self._deadline
-            )
-        except _FATAL:
-            raise
-        except Exception as error:
-            end, note = self._failure(error, worker.stage)
-            if worker.stage:
-                self._prepared[i] = Prepared(f"no truth: {note}")
+            share = left / (len(self.values) - i)
+            seconds = _TERMS if self.case.measure == "terms" else share + _MIN_TRUTH
+            answer = self._call(worker, value, prepare, self.bar, _SEARCH * share, truth=seconds)
+            if isinstance(answer, Prepared):
+                number = self._call(worker, value, condition_number)
+                if not isinstance(number, Measurement) and math.isfinite(number):
+                    answer = replace(answer, facts={**answer.facts, "cond(M)": answer.facts.get("cond(M)", number)})
+            elif worker.stage:
+                answer = Prepared(f"no truth: {answer.note}")
             else:
-                self._unmade[i] = Measurement(value, end, note=note)
-            return
-        self._prepared[i], self._facts[i] = prepared, dict(prepared.facts)
-        try:
-            number = worker.call(condition_number, self.case, value, cpu_seconds=making, deadline=self._deadline)
-        except _FATAL:
-            raise
-        except Exception:
-            # The fact is left out.
-            return
-        if math.isfinite(number):
-            self._facts[i].setdefault("cond(M)", number)
-
-    def _failure(self, error: Exception, stage: str) -> tuple[End, str]:
-        """Return how a call ended that raised."""
-        if isinstance(error, WorkerTimeoutError):
-            over = self._clock() >= self._deadline
-            return ("not run", OUT_OF_TIME) if over else ("slow", f"{error}{_DURING.get(stage, '')}")
-        if isinstance(error, WorkerDiedError):
-            return "died", f"{error}{_DURING.get(stage, '')}"
-        if isinstance(error, MemoryError):
-            return "died", f"{OUT_OF_MEMORY} ({error})" if str(error) else OUT_OF_MEMORY
-        return ("slow" if isinstance(error, TooLongError) else "refused"), describe(error)
+                answer = Prepared(answer.note, failure=answer)
+            self._prepared[i] = answer
+        return True
 
     def run(self, engine: str, worker: Worker, until: float) -> bool:
         """Compute this engine's cells in order, begin none after `until`, and return whether all are there."""
         rows = [row for row in self._rows if row.engine == engine]
         for i, value in enumerate(self.values):
-            if i not in self._facts:
-                # Its truth is not there yet.
+            if i not in self._prepared:
                 return False
             # The cheapest first, so that most cells are known when the time is over.
             for row in sorted(rows, key=lambda row: row.expected):
                 if i in row.cells:
                     continue
-                if i in self._unmade:
-                    row.cells[i] = self._unmade[i]
+                if failure := self._prepared[i].failure:
+                    row.cells[i] = failure
                 elif row.stopped:
                     row.cells[i] = Measurement(value, "not run", note=row.stopped)
                 elif until - self._clock() < _MIN_TIME:
@@ -215,17 +196,9 @@ class CaseSweep:
         return True
 
     def _run(self, row: _Row, rows: Sequence[_Row], i: int, worker: Worker) -> None:
-        value, limits, truth = self.values[i], self._limits, self._prepared[i].truth
-        setting = Setting(row.engine, row.method, limits.dt, limits.rtol, limits.seconds, self._making)
-        making, run = _with_grace(self._making), {"run": _with_grace(limits.seconds)}
-        arguments = (self.case, value, setting, truth)
-        try:
-            cell = worker.call(measure, *arguments, cpu_seconds=making, stage_seconds=run, deadline=self._deadline)
-        except _FATAL:
-            raise
-        except Exception as error:
-            end, note = self._failure(error, worker.stage)
-            cell = Measurement(value, end, note=note)
+        limits, truth = self._limits, self._prepared[i].truth
+        arguments = (row.engine, row.method, limits, truth)
+        cell = self._call(worker, self.values[i], measure, *arguments, run=limits.seconds)
         row.add(i, cell)
         if worker.stage == "engine" and cell.end in ("slow", "died"):
             # Every other method of this engine would end like this.
@@ -235,25 +208,19 @@ class CaseSweep:
 
     def result(self) -> CaseResult:
         """Return what is known by now."""
-        count = range(len(self.values))
-        truths = [self._unmade[i].note if i in self._unmade else self._truth(i) for i in count]
+        prepared = [self._prepared.get(i, Prepared(OUT_OF_TIME)) for i in range(len(self.values))]
         return CaseResult(
-            **{k: x for k, x in self.case.facts().items() if k != "bar"},
-            bar=self.bar,
+            **(self.case.facts() | {"bar": self.bar}),
             values=self.values,
-            truths=tuple(truths),
-            facts=tuple(dict(self._facts.get(i, {})) for i in count),
-            rows=tuple(self._result_row(row) for row in self._rows),
+            truths=tuple(p.how for p in prepared),
+            facts=tuple(dict(p.facts) for p in prepared),
+            rows=tuple(self._result_row(row, {p.dt for p in prepared} - {None}) for row in self._rows),
         )
 
-    def _truth(self, i: int) -> str:
-        return self._prepared[i].how if i in self._prepared else OUT_OF_TIME
-
-    def _result_row(self, row: _Row) -> Row:
+    def _result_row(self, row: _Row, prescribed: set[float | None]) -> Row:
         unknown = row.stopped or OUT_OF_TIME
         cells = (row.cells.get(i, Measurement(value, "not run", note=unknown)) for i, value in enumerate(self.values))
         setting = row.setting
-        prescribed = {p.dt for p in tuple(self._prepared.values())} - {None}
         if prescribed and setting.startswith("dt"):
             setting = f"dt {prescribed.pop():g} s" if len(prescribed) == 1 else "dt of the case"
         return Row(row.engine, row.method, tuple(cells), setting, row.theory)
@@ -280,10 +247,13 @@ class _Task:
     @property
     def ready(self) -> bool:
         before = self.after
-        follows = (
-            before is None or before.state == "done" or (before.state == "waiting" and before.rounds > self.rounds)
-        )
-        return self.state == "waiting" and follows
+        if (
+            before is not None
+            and before.state != "done"
+            and (before.state == "running" or before.rounds <= self.rounds)
+        ):
+            return False
+        return self.state == "waiting"
 
 
 def run_sweeps(
@@ -298,13 +268,17 @@ def run_sweeps(
     for sweep in sweeps:
         first = _Task(sweep.prepare)
         tasks += [first, *(_Task(partial(sweep.run, engine), first) for engine in sweep.engines)]
-    workers = [Worker(home, memory, _environment(home)) for _ in range(jobs)]
+    # One thread each: run times are compared. The study has a cache of its own, so that no entries of the user's are
+    # removed for it.
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    caches = {"MBKIT_CACHE_DIR": str(home / "code"), "HEYOKA_CACHE_DIR": str(home / "code-heyoka")}
+    workers = [Worker(home, memory, {**os.environ, **threads, **caches}) for _ in range(jobs)]
     idle = list(workers)
     running: dict[Future[bool], tuple[_Task, Worker]] = {}
     with ExitStack() as stack:
         for worker in workers:
             stack.callback(worker.end)
-        threads = stack.enter_context(ThreadPoolExecutor(jobs))
+        pool = stack.enter_context(ThreadPoolExecutor(jobs))
         for worker in workers:
             stack.callback(worker.close)
         while True:
@@ -316,7 +290,7 @@ def run_sweeps(
                 begun = time.perf_counter()
                 left = max(deadline - begun, 0.0)
                 until = begun + min(left, left * jobs / waiting)
-                running[threads.submit(task.work, worker, until)] = task, worker
+                running[pool.submit(task.work, worker, until)] = task, worker
             if not running:
                 return
             for future in wait(running, tick, FIRST_COMPLETED).done:
@@ -324,11 +298,3 @@ def run_sweeps(
                 idle.append(worker)
                 task.state = "done" if future.result() or time.perf_counter() >= deadline else "waiting"
             yield
-
-
-def _environment(home: Path) -> dict[str, str]:
-    # One thread each: run times are compared. The study has a cache of its own, so that no entries of the user's are
-    # removed for it.
-    threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    caches = {"MBKIT_CACHE_DIR": str(home / "code"), "HEYOKA_CACHE_DIR": str(home / "code-heyoka")}
-    return {**os.environ, **dict.fromkeys(threads, "1"), **caches}

@@ -29,19 +29,16 @@ class PrecisionPoint:
     value : float
         Of the setting, s or 1.
     error : float
-        Largest difference of q to the reference over the saved times, rad or m; NaN
-        where the run did not reach the end.
+        Largest difference of q to the reference over the saved times, rad or m; NaN where the run did not reach the
+        end.
     energy : float
-        Largest |E(t) - E(0)| at the saved times, relative to the larger of the largest
-        kinetic energy and the change of potential energy; NaN with dampers or applied
-        forces, whose work is not known well enough.
+        Largest |E(t) - E(0)| at the saved times, relative to the larger of the largest kinetic energy and the change of
+        potential energy; NaN with dampers or applied forces, whose work is not known well enough.
     seconds, spread : float
-        Run time, median of the repetitions and half their interquartile range (NaN for
-        one run), without derivation and compilation.
-    steps, evaluations : int
-        Of one run; 0 where the engine does not report them.
-    repeats : int
-        Number of timings.
+        Run time, median of the repetitions and half their interquartile range (NaN for one run), without derivation and
+        compilation.
+    steps, evaluations, repeats : int
+        Of one run, 0 where the engine does not report them; and the number of timings.
     note : str
         Why there is no error, or no energy.
     """
@@ -67,15 +64,13 @@ class Curve:
     engine, method : str
     points : tuple of PrecisionPoint
         In the order of the sweep, coarse to fine.
-    order : float
-        Observed order, see `observed_order`; NaN where fewer than three points show it.
-    order_points : int
-        Points in the regression.
+    order, order_points : float and int
+        `observed_order`, NaN where fewer than three points show it, and the points in the regression.
     expected : float
         The method's own order; NaN for adaptive methods.
     compile : float
-        Seconds of derivation, compilation and construction with empty caches, up to the first step;
-        NaN where that failed. For a method that is compiled for each tolerance, of one tolerance.
+        Seconds of derivation, compilation and construction with empty caches, up to the first step; NaN where that
+        failed. For a method that is compiled for each tolerance, of one tolerance.
     ended : str
         Why there are no finer settings, where time ran out.
     """

@@ -7,12 +7,13 @@ precision, or two engines with a method each in double precision. Where they par
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
+from math import inf
 from typing import Any, Final
 
 import numpy as np
@@ -22,18 +23,20 @@ from mbkit._check import Array, real
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.taylor import PRECISIONS, order_of, precision, taylor_system
 from mbkit.derivation.equations import Equations, equations_of
-from mbkit.engines import dynamics
+from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import require_tree
 from mbkit.engines.registry import DERIVED, INDEPENDENT
-from mbkit.errors import InputError, MbkitError, MbkitWarning, UnsupportedError
+from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, METHODS, SCIPY_METHOD, SERIES_METHOD
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
+from mbkit.simulate import Trajectory
 from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.run import simulate
 from mbkit.simulate.solvers.taylor import StoppedError, TaylorSteps
 from mbkit.simulate.time_grid import save_times
 from mbkit.simulate.torque import Torque, TorqueFunction
+from mbkit.studies.study_runs import quiet_simulate
 
 # Pairs of runs of one motion: their difference bounds the error of either.
 
@@ -58,15 +61,19 @@ class Deadline:
     def __init__(
         self, seconds: float, tell: Callable[[float], None], clock: Callable[[], float] = time.perf_counter
     ) -> None:
-        self._end, self._tell, self._clock = clock() + seconds, tell, clock
+        self._tell, self._clock = tell, clock
+        #: Seconds that do not count, of all parts together.
+        self._uncounted = [0.0]
+        self._end = self._now() + seconds
         self._start, self._length = 0.0, 1.0
-        # Seconds that do not count, of all parts together, and those before this part.
-        self._uncounted, self._before = [0.0], 0.0
+
+    def _now(self) -> float:
+        return self._clock() - self._uncounted[0]
 
     @property
     def left(self) -> float:
         """Seconds."""
-        return self._end + self._uncounted[0] - self._before - self._clock()
+        return self._end - self._now()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -75,12 +82,12 @@ class Deadline:
         yield
         self._uncounted[0] += self._clock() - start
 
-    def part(self, start: float, length: float, seconds: float | None = None) -> Deadline:
+    def part(self, start: float, length: float, seconds: float = inf) -> Deadline:
         """Return the limit for a part of the way, which may have a shorter time."""
-        out = Deadline(self.left if seconds is None else min(seconds, self.left), self._tell, self._clock)
-        out._uncounted, out._before = self._uncounted, self._uncounted[0]
-        out._start, out._length = self._start + start * self._length, length * self._length
-        return out
+        part = copy(self)
+        part._end = min(self._end, self._now() + seconds)
+        part._start, part._length = self._start + start * self._length, length * self._length
+        return part
 
     def look(self, done: float) -> None:
         """Report the fraction done of this part, and raise `LateError` when its time is up."""
@@ -150,27 +157,26 @@ def taylor_pair(motion: Motion, bits: int, deadline: Deadline) -> Known:
 
     `UnsupportedError` without heyoka or this format, and for a model too large.
     """
-    kind = precision(bits)
-    why = ""
+    kind, model, nq = precision(bits), motion.model, motion.model.nq
     with deadline.paused():
         system = taylor_system(motion.equations)
+    constants = kind.array(motion.equations.constant_values)
+    tolerances = kind.eps, _COARSER * kind.eps
     runs: list[list[Any]] = []
-    behind = kind.array(motion.equations.constant_values)
-    steps = 0
-    for i, tolerance in enumerate((kind.eps, _COARSER * kind.eps)):
-        half = deadline.part(i / 2, 0.5, None if i else deadline.left / 2)
+    steps, why = 0, ""
+    for i, tolerance in enumerate(tolerances):
+        half = deadline.part(i / 2, 0.5, inf if i else deadline.left / 2)
         with ExitStack() as stack:
             with deadline.paused():
                 integrator = stack.enter_context(system.integrator(kind, tolerance))
-            stepper = TaylorSteps(system, integrator, kind, behind)
+            stepper = TaylorSteps(system, integrator, kind, constants)
             # The second goes no farther than the first came.
             states, count, early = _states(motion, kind, stepper, half, len(runs[0]) if runs else len(motion.save))
         runs.append(states)
         steps, why = steps or count, why or early
-    n, nq = min(map(len, runs)), motion.model.nq
-    first, second = (np.stack(states[:n]) for states in runs)
-    apart = [gap(motion.model, first[:, :nq], second[:, :nq]), _largest(first[:, nq:] - second[:, nq:])]
-    orders = " and ".join(str(order_of(x)) for x in (kind.eps, _COARSER * kind.eps))
+    first, second = (np.stack(states[: min(map(len, runs))]) for states in runs)
+    apart = [gap(model, first[:, :nq], second[:, :nq]), _largest(first[:, nq:] - second[:, nq:])]
+    orders = " and ".join(str(order_of(x)) for x in tolerances)
     how = f"Taylor series of orders {orders} in {PRECISIONS[bits]} numbers on the own derivation"
     return Known(kind.pair(first[:, :nq]), kind.pair(first[:, nq:]), np.array(apart), how, why, steps, shared=True)
 
@@ -179,20 +185,20 @@ def _states(motion: Motion, kind: Any, steps: TaylorSteps, deadline: Deadline, m
     """Return up to so many saved states as far as they come, the steps, and why they end early."""
     model, saved = motion.model, motion.save.tolist()[:most]
     y0 = _unit(model, kind.array(np.concatenate([motion.q0, motion.v0])))
-    out, count, force = [y0], 0, motion.torque.of_member(None)
+    states, count, force = [y0], 0, motion.torque.of_member(None)
     try:
         for t in steps(0.0, y0, motion.stops, force):
             count += 1
-            while len(out) < len(saved) and saved[len(out)] <= t:
-                out.append(_unit(model, steps.at(saved[len(out)])))
-            if len(out) == len(saved):
+            while len(states) < len(saved) and saved[len(states)] <= t:
+                states.append(_unit(model, steps.at(saved[len(states)])))
+            if len(states) == len(saved):
                 break
             deadline.look(t / motion.duration)
     except StoppedError as error:
-        return out, count, f"{error} after t = {steps.t:.6g} s"
+        return states, count, f"{error} after t = {steps.t:.6g} s"
     except LateError:
-        return out, count, f"the time was up at t = {steps.t:.6g} s"
-    return out, count, ""
+        return states, count, f"the time was up at t = {steps.t:.6g} s"
+    return states, count, ""
 
 
 def _unit(model: Model, y: Any) -> Any:
@@ -211,37 +217,35 @@ def two_engines(motion: Motion, deadline: Deadline) -> Known:
     """Return runs of two engines, each with a method of its own, marching by turns until they part."""
     with deadline.paused():
         roads = [_road(motion, choices) for choices in _ROADS]
-    how = " and ".join(f"{method} on {engine}" for engine, method, _ in roads)
-    runs = [[motion.q0[None], motion.v0[None]] for _ in roads]
+    how = " and ".join(f"{method} on {dyn.engine}" for dyn, method in roads)
+    states = [(motion.q0[None], motion.v0[None]) for _ in roads]
     times, why = motion.save, ""
     ends = np.unique(np.linspace(0, len(times) - 1, min(_LEGS, len(times) - 1) + 1).astype(int))
     for j, (k, end) in enumerate(pairwise(ends.tolist())):
-        legs = []
-        for i, ((_, method, dyn), (q, v)) in enumerate(zip(roads, runs, strict=True)):
-            part = deadline.part((2 * j + i) / (2 * len(ends)), 1 / (2 * len(ends)))
-            leg = _leg(motion, dyn, method, q[-1], v[-1], slice(k, end + 1), part)
-            if leg is None:
-                why = f"the time was up after t = {times[k]:.6g} s"
-                break
-            if not leg.stats.finished:
-                why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
-            legs.append(leg)
-        if len(legs) < len(roads):
+        legs: list[Trajectory] = []
+        try:
+            for i, ((dyn, method), (q, v)) in enumerate(zip(roads, states, strict=True)):
+                part = deadline.part((2 * j + i) / (2 * len(ends)), 1 / (2 * len(ends)))
+                legs.append(_leg(motion, dyn, method, q[-1], v[-1], slice(k, end + 1), part))
+                if not legs[-1].stats.finished:
+                    why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
+        except LateError:
+            why = f"the time was up after t = {times[k]:.6g} s"
             break
         n = min(len(leg.t) for leg in legs)
-        runs = [
-            [np.concatenate([q, leg.q[1:n]]), np.concatenate([v, leg.v[1:n]])]
-            for (q, v), leg in zip(runs, legs, strict=True)
+        states = [
+            (np.concatenate([q, leg.q[1:n]]), np.concatenate([v, leg.v[1:n]]))
+            for (q, v), leg in zip(states, legs, strict=True)
         ]
         # What has parted for good need not be followed to the end.
-        if why or gap(motion.model, runs[0][0][-1:], runs[1][0][-1:])[0] > 1e-6:
+        if why or gap(motion.model, states[0][0][-1:], states[1][0][-1:])[0] > 1e-6:
             break
-    (q, v), (other_q, other_v) = runs
+    (q, v), (other_q, other_v) = states
     apart = np.array([gap(motion.model, q, other_q), _largest(v - other_v)])
     return Known((q, np.zeros_like(q)), (v, np.zeros_like(v)), apart, how, why)
 
 
-def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[str, str, Any]:
+def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[Dynamics, str]:
     reasons = []
     for engine, method in choices:
         try:
@@ -253,39 +257,21 @@ def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[str, st
         except UnsupportedError as error:
             reasons.append(f"{engine}: {error}")
         else:
-            return engine, method, dyn
+            return dyn, method
     raise UnsupportedError(f"reference: no independent engine for {motion.model.name}; {'; '.join(reasons)}")
 
 
-def _leg(motion: Motion, dyn: Any, method: str, q: Array, v: Array, rows: slice, deadline: Deadline) -> Any:
-    """Return the motion between two of the saved times, or None when the time is up."""
+def _leg(motion: Motion, dyn: Dynamics, method: str, q: Array, v: Array, rows: slice, deadline: Deadline) -> Trajectory:
+    """Return the motion between two of the saved times."""
     times = motion.save[rows]
-    start = float(times[0])
-    applied: Any = motion.torque_argument
+    start, applied = float(times[0]), motion.torque_argument
+    torque: Any
     if motion.torque.held:
-        applied = np.asarray(applied)[rows.start : rows.stop - 1]
-    elif callable(applied):
-        applied = _later(applied, start)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MbkitWarning)
-            return simulate(
-                dyn,
-                q,
-                v,
-                float(times[-1] - start),
-                method,
-                rtol=METHODS[method].least,
-                torque=applied,
-                save=times - start,
-                progress=deadline.look,
-            )
-    except LateError:
-        return None
-
-
-def _later(function: TorqueFunction, start: float) -> TorqueFunction:
-    return lambda t, q, v: function(start + t, q, v)
+        torque = np.asarray(applied)[rows.start : rows.stop - 1]
+    else:
+        torque = (lambda t, q, v: applied(start + t, q, v)) if callable(applied) else applied
+    settings = {"torque": torque, "save": times - start, "rtol": METHODS[method].least}
+    return quiet_simulate(dyn, q, v, float(times[-1] - start), method, progress=deadline.look, **settings)
 
 
 #: How well two runs must agree, relative to the size of the motion.
@@ -311,25 +297,21 @@ class Reference:
     ----------
     t : (K,) array
         The times of `save`, up to `horizon`; s.
-    q : (K, nq) array
-    v : (K, nv) array
+    q, v : (K, nq) and (K, nv) arrays
         Rounded to double.
     q_low, v_low : (K, nq) and (K, nv) arrays
         What rounding left: q + q_low has the reference's own digits.
     floor : (K,) array
-        How well q is known, rad or m: four times the largest difference between the
-        two runs so far, and what rounding to double takes away.
+        How well q is known, rad or m: four times the largest difference between the two runs so far, and what
+        rounding to double takes away.
     digits : float
-        How many digits q + q_low and v + v_low have at the least, relative to the size
-        of the motion.
+        Least number of digits of q + q_low and v + v_low, relative to the size of the motion.
     scale : (float, float)
-        The size of the motion: the farthest that a coordinate gets from its start
-        (rad or m, of mixed coordinates their largest number), and the largest velocity.
+        The size of the motion: the farthest that a coordinate gets from its start, rad or m, and the largest velocity.
     horizon : float
-        The last of the times up to which both runs agree to 1e-12 of the size of
-        the motion, in q and in v; s.
+        The last of the times up to which both runs agree to 1e-12 of the size of the motion, in q and in v; s.
     how : str
-        How it was computed, and why it ends where it ends, for a report.
+        How it was computed, and why it ends where it ends.
     """
 
     t: Array
@@ -381,12 +363,10 @@ def reference(
     save : (K,) array_like
         Increasing times within the duration, s; 0 is added if it is not among them.
     torque : array_like or callable, optional
-        (nv,), held all the time; (K - 1, nv), held over each interval of `save`,
-        which then runs from 0 to `duration`; or a function of (t, q, v), for which
-        only two engines make a reference.
+        (nv,), held all the time; (K - 1, nv), held over each interval of `save`, which then runs from 0 to `duration`;
+        or a function of (t, q, v), for which only two engines make a reference.
     seconds : float
-        How long the search may take, without what is derived and compiled. What is known by then is
-        returned.
+        Limit of the search, without what is derived and compiled. What is known by then is returned.
     progress : bool or callable, optional
         As in `mbkit.simulate`.
 
@@ -403,12 +383,11 @@ def reference(
 
     Notes
     -----
-    In this order, until one holds to the end: Taylor series in quadruple precision, if
-    its cost is small beside `seconds`; in 80-bit numbers, 2000 times finer than double
-    and some 30 times faster than quadruple ones; in quadruple precision, if there is
-    time; Taylor series (or an embedded Runge-Kutta pair) in double on the own derivation
-    beside DOP853 on another engine. Series share the derivation's formulas, so the
-    accelerations along them are compared with another engine's.
+    In this order, until one holds to the end: Taylor series in quadruple precision, if its cost is small beside
+    `seconds`; in 80-bit numbers, 2000 times finer than double and some 30 times faster than quadruple ones; in
+    quadruple precision, if there is time; Taylor series (or an embedded Runge-Kutta pair) in double on the own
+    derivation beside DOP853 on another engine. Series share the derivation's formulas, so the accelerations along them
+    are compared with another engine's.
 
     Examples
     --------
@@ -418,13 +397,12 @@ def reference(
     >>> truth.horizon
     2.0
     """
-    motion = _checked(model, q0, v0, duration, save, torque)
+    motion = checked_motion(model, q0, v0, duration, save, torque)
     seconds = real("seconds", seconds, positive=True)
     if not motion.duration or not model.nv:
-        return _nothing_moves(motion)
+        return _at_rest(motion)
     with Progress(progress, f"{model.name}: reference") as bar:
-        deadline = Deadline(seconds, bar.update)
-        pairs, refused = _search(motion, deadline, seconds)
+        pairs, refused = _search(motion, Deadline(seconds, bar.update), seconds)
         bar.update(1.0)
     if not pairs:
         raise UnsupportedError(f"reference: {'; '.join(refused)}")
@@ -433,7 +411,10 @@ def reference(
     return replace(best, how=best.how + _witness(motion, best)) if known.shared else best
 
 
-def _checked(model: Model, q0: ArrayLike, v0: ArrayLike, duration: float, save: ArrayLike, torque: Any) -> Motion:
+def checked_motion(
+    model: Model, q0: ArrayLike, v0: ArrayLike, duration: float, save: ArrayLike, torque: Any = None
+) -> Motion:
+    """Return a motion from checked arguments; see `reference`."""
     expect_model(model)
     model.require_values("a reference")
     require_tree(model, "reference")
@@ -448,19 +429,18 @@ def _checked(model: Model, q0: ArrayLike, v0: ArrayLike, duration: float, save: 
     return Motion(model, q, v, duration, times, read, torque)
 
 
-def _nothing_moves(motion: Motion) -> Reference:
-    shape = len(motion.save), 1
-    q, v = np.tile(motion.q0, shape), np.tile(motion.v0, shape)
-    floor = np.zeros(len(q))
+def _at_rest(motion: Motion) -> Reference:
+    t = motion.save
+    q, v, floor = np.tile(motion.q0, (len(t), 1)), np.tile(motion.v0, (len(t), 1)), np.zeros(len(t))
     how = "the given state, since nothing moves"
-    return Reference(motion.save, q, v, 0 * q, 0 * v, floor, float("inf"), (1.0, 1.0), float(motion.save[-1]), how)
+    return Reference(t, q, v, 0 * q, 0 * v, floor, inf, (1.0, 1.0), float(t[-1]), how)
 
 
 def _search(motion: Motion, deadline: Deadline, seconds: float) -> tuple[list[Known], list[str]]:
     pairs: list[Known] = []
     refused: list[str] = []
 
-    def holds(way: Any, *bits: int, within: float | None = None) -> bool:
+    def holds(way: Any, *bits: int, within: float = inf) -> bool:
         # Whether a way leads to the end is known at its end: the first gets half of the bar.
         tried = len(pairs) + len(refused)
         part = deadline.part(1 - 0.5**tried, 0.5 ** (tried + 1), within)
@@ -491,7 +471,7 @@ def _quadruple_seconds(motion: Motion, steps: float) -> float:
     try:
         order, operations = order_of(precision(113).eps), taylor_system(motion.equations).operations
     except UnsupportedError:
-        return float("inf")
+        return inf
     return 2 * steps * operations * order**2 * _QUADRUPLE
 
 
@@ -532,9 +512,9 @@ def _witness(motion: Motion, best: Reference) -> str:
     q, v = best.q[which], best.v[which]
     force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
     tau = np.array([force(min(int(k), last)) for k in which])
-    constants = np.broadcast_to(motion.equations.constant_values, (len(q), len(motion.equations.constant_values)))
-    own = Machine(motion.equations.function("forward_dynamics"))
-    a = own(q, v, tau, *([constants] if constants.size else []))[0][..., 0]
+    values = motion.equations.constant_values
+    constants = [np.broadcast_to(values, (len(q), len(values)))] if len(values) else []
+    a = Machine(motion.equations.function("forward_dynamics"))(q, v, tau, *constants)[0][..., 0]
     for engine in INDEPENDENT:
         try:
             other = dynamics(motion.model, engine).forward_dynamics(q, v, tau)

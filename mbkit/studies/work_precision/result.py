@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def _of_curve(name: str, head: str = "") -> Column:
-    return Column(head or name, lambda row: getattr(row[0], name))
+def _columns(part: int, *names: str) -> list[Column]:
+    """Return columns for attributes of a part of (curve, point)."""
 
+    def column(name: str) -> Column:
+        return Column(name, lambda row: getattr(row[part], name))
 
-def _of_point(name: str) -> Column:
-    return Column(name, lambda row: getattr(row[1], name))
+    return [column(name) for name in names]
 
 
 @dataclass(frozen=True)
@@ -30,15 +31,12 @@ class WorkPrecision(ResultTable):
 
     Attributes
     ----------
-    model : str
-    facts : dict
-        nq, nv, mass, digest, needs and notes of the model.
+    model, facts : str and dict
+        The model's name, and its nq, nv, mass, digest, needs and notes.
     duration, asked : float
         Horizon on which errors are measured, and the one of the arguments, s.
-    reference : str
-        How the reference was computed, and why the horizon was cut if it was.
-    floor : float
-        How well the reference is known, rad or m.
+    reference, floor : str and float
+        How the reference was computed, and why the horizon was cut if it was; how well it is known, rad or m.
     q0, v0 : tuple of float
         Start.
     curves : tuple of Curve
@@ -46,14 +44,11 @@ class WorkPrecision(ResultTable):
         Engines and methods that failed, with the reason.
     complete : bool
         False after an interruption.
-    versions : dict
-    processor : str
-    seconds : float
-        Time of the whole study.
+    versions, processor, seconds : dict, str and float
+        Of the whole study.
     settings : dict
-        seed, repeats, steps, tolerances, torque, the saved times, the executor, and how
-        run times were measured: those of worker processes, which share the cores, cannot
-        be compared with those of another study.
+        seed, repeats, steps, tolerances, torque, the saved times, the executor, and how run times were measured: those
+        of worker processes, which share the cores, cannot be compared with those of another study.
     """
 
     model: str
@@ -73,14 +68,14 @@ class WorkPrecision(ResultTable):
     settings: dict[str, Any] = field(default_factory=dict)
 
     _csv_columns: ClassVar = (
-        *(_of_curve(name) for name in ("engine", "method")),
-        *(_of_point(name) for name in ("setting", "value", "error", "energy", "seconds", "spread")),
+        *_columns(0, "engine", "method"),
+        *_columns(1, "setting", "value", "error", "energy", "seconds", "spread"),
         Column("first_run", lambda row: row[0].compile + row[1].seconds),
-        *(_of_point(name) for name in ("steps", "evaluations")),
-        _of_curve("order"),
-        _of_curve("expected", "expected_order"),
+        *_columns(1, "steps", "evaluations"),
+        *_columns(0, "order"),
+        Column("expected_order", lambda row: row[0].expected),
         Column("front", itemgetter(2)),
-        _of_point("note"),
+        *_columns(1, "note"),
     )
 
     def rows(self) -> Iterator[tuple[Curve, PrecisionPoint]]:
@@ -200,22 +195,3 @@ _CURVE_COLUMNS: Final = (
 
 def _counted(n: int, what: str) -> str:
     return f"{n} {what}{'s' * (n != 1)}"
-
-
-class InterruptedSweepError(KeyboardInterrupt):
-    """A study was interrupted by Ctrl-C; `result` holds the part that was finished.
-
-    A `KeyboardInterrupt`, so that a program that does not handle it ends as usual.
-
-    Attributes
-    ----------
-    result : WorkPrecision or StressResult
-        With ``complete=False``.
-    """
-
-    def __init__(self, result: Any) -> None:
-        super().__init__("interrupted; what was finished is in .result")
-        self.result = result
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.result,)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -17,17 +16,15 @@ from mbkit.engines.registry import STANDARD
 from mbkit.errors import InputError, NumericalError
 from mbkit.methods.registry import METHODS
 from mbkit.model import Model
-from mbkit.model.builder import expect_model
 from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
-from mbkit.studies._targets import with_values
-from mbkit.studies.study_runs import free_of_mimic, start_state
+from mbkit.studies._targets import methods_by_engine, numbers_of, with_values
+from mbkit.studies.study_runs import free_of_mimic, require_motion, start_state
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as compute_reference
-from mbkit.studies.work_precision.result import InterruptedSweepError, WorkPrecision
-from mbkit.studies.work_precision.settings import INTERVALS, pairs, plans, save_grid
-from mbkit.studies.work_precision.sweep import Problem, Sweep, TimeBudget
+from mbkit.studies.work_precision.result import WorkPrecision
+from mbkit.studies.work_precision.sweep import INTERVALS, Problem, Sweep, TimeBudget, plans
 
 #: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
@@ -75,52 +72,45 @@ def work_precision(
     Parameters
     ----------
     model : Model
-        Its mimic joints are free where MuJoCo's own integrators are among the methods: MuJoCo
-        would make them soft.
+        Its mimic joints are free where MuJoCo's own integrators are among the methods: MuJoCo would make them soft.
     engines : sequence of str
     methods : sequence of str, or mapping of str to sequence of str, optional
-        Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by
-        default every method on every engine that has it.
+        Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by default every method on every
+        engine that has it.
     duration : float
         Horizon, s; cut where the reference ends.
-    q0 : (nq,) array_like, optional
-    v0 : (nv,) array_like, optional
-        Start; by default that of `reference`, or a slow motion near the middle of the joints'
-        ranges, chosen by `seed`.
+    q0, v0 : (nq,) and (nv,) array_like, optional
+        Start; by default that of `reference`, or a slow motion near the middle of the joints' ranges, chosen by `seed`.
     torque : (nv,) array_like or callable, optional
         Generalized force, constant, or a function of (t, q, v).
     seed : int
     steps : sequence of float, optional
-        Of fixed-step methods, s, each shortened so that a whole number of them is a tenth of
-        the horizon. By default from 0.05 s downwards until the error no longer falls.
+        Of fixed-step methods, s, each shortened so that a whole number of them is a tenth of the horizon. By default
+        from 0.05 s downwards until the error no longer falls.
     tolerances : sequence of float, optional
-        rtol = atol of adaptive methods; by default from 1e-3 downwards. Those below a
-        method's least are left out.
+        rtol = atol of adaptive methods; by default from 1e-3 downwards. Those below a method's least are left out.
     repeats : int
-        Timings of each setting, in rounds over all of them; fewer of long runs where
-        time is short.
+        Timings of each setting, in rounds over all of them; fewer of long runs where time is short.
     seconds : float, optional
-        Limit of processor time, with the reference and all compilation. What is left out for it is
-        named first in the repr and the reports. A compilation is never broken off, and a part is always
-        left to the runs. By default `work` alone decides on the settings, and the study ends after five times
-        the usual 60 to 120 s.
+        Limit of processor time, with the reference and all compilation. What is left out for it is named first in the
+        repr and the reports. A compilation is never broken off, and a part is always left to the runs. By default
+        `work` alone decides on the settings, and the study ends after five times the usual 60 to 120 s.
     work : int, optional
-        Limit of evaluations of the forward dynamics in a run with the study's own steps and tolerances; an
-        evaluation called from Python counts eight. So the curves do not depend on the machine's speed. By
-        default 200,000, and less beyond 8 velocities.
+        Limit of evaluations of the forward dynamics in a run with the study's own steps and tolerances; an evaluation
+        called from Python counts eight. So the curves do not depend on the machine's speed. By default 200,000, and
+        less beyond 8 velocities.
     executor : concurrent.futures.Executor, optional
-        Measures one curve a call: a pool of processes, Dask's or MPI's. Errors do not
-        depend on it. Run times do, because workers share the cores: leave it out for reliable run
-        times.
+        Measures one curve a call: a pool of processes, Dask's or MPI's. Errors do not depend on it. Run times do,
+        because workers share the cores: leave it out for reliable run times.
     reference : Reference or callable, optional
-        The motion: from `mbkit.studies.work_precision.reference`, whose times are then the saved
-        ones, or an exact function from t to (q, v). By default it is computed.
+        The motion: from `mbkit.studies.work_precision.reference`, whose times are then the saved ones, or an exact
+        function from t to (q, v). By default it is computed.
     progress : callable, optional
-        Called as ``progress(fraction, text)``. Its exception ends the study, after
-        `checkpoint` has got the finished part.
+        Called as ``progress(fraction, text)``. Its exception ends the study, after `checkpoint` has got the finished
+        part.
     checkpoint : path or callable, optional
-        Receives the result so far every few seconds and at the end: a JSON file, which is
-        whole at any time, or a function.
+        Receives the result so far every few seconds and at the end: a JSON file, which is whole at any time, or a
+        function.
 
     Returns
     -------
@@ -135,24 +125,21 @@ def work_precision(
     NumericalError
         No two computations of this motion agree even at its beginning.
     InterruptedSweepError
-        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is the finished part, which
-        `checkpoint` has got before. While the reference is computed, a plain `KeyboardInterrupt`.
+        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is the finished part, which `checkpoint` has got before. While
+        the reference is computed, a plain `KeyboardInterrupt`.
 
     Notes
     -----
-    An error is the largest difference of q to the reference, on the manifold, over
-    eleven times and all coordinates. Timed is `mbkit.simulate` on the same run, as a user
-    would call it, saving these eleven states (SciPy's methods end a step on
-    each, so they take ten at the least). First everything that belongs to the model is
-    derived, compiled and built with empty caches, timed apart. Then all settings are run
-    once, the cheapest next run of all curves first, until finer settings bring no smaller
-    error or would take too much work. Then they are timed in rounds, each round in another
-    order. For the observed order see `mbkit.studies.work_precision.curve.observed_order`.
+    An error is the largest difference of q to the reference, on the manifold, over eleven times and all coordinates.
+    Timed is `mbkit.simulate` on the same run, as a user would call it, saving these eleven states (SciPy's methods end
+    a step on each, so they take ten at the least). First everything that belongs to the model is derived, compiled and
+    built with empty caches, timed apart. Then all settings are run once, the cheapest next run of all curves first,
+    until finer settings bring no smaller error or would take too much work. Then they are timed in rounds, each round
+    in another order. For the observed order see `mbkit.studies.work_precision.curve.observed_order`.
 
-    A script that hands over a pool of processes needs ``if __name__ == "__main__":``,
-    and the pool a context that does not fork, such as
-    ``ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))``. With
-    Dask, ``pip install mbkit[dask]``, it is ``distributed.Client().get_executor()``.
+    A script that hands over a pool of processes needs ``if __name__ == "__main__":``, and the pool a context that does
+    not fork, such as ``ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))``. With Dask, ``pip install
+    mbkit[dask]``, it is ``distributed.Client().get_executor()``.
 
     Examples
     --------
@@ -163,7 +150,7 @@ def work_precision(
     (4, 3)
     """
     begun = time.perf_counter()
-    _check_model(model)
+    require_motion(model, "integrate").require_values("a study of run time")
     usual = min(_USUAL + _PER_VELOCITY * model.nv, _MAX_USUAL)
     limit = _LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
     most = _WORK * min(1.0, _VELOCITIES / model.nv) if work is None else count("work", work, least=1)
@@ -171,23 +158,21 @@ def work_precision(
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     _check_executor(executor, torque)
     checkpoints = Checkpointer(progress, checkpoint)
-    methods_of = pairs(engines, methods)
+    methods_of = methods_by_engine(engines, methods)
     integrated = _integrated_model(model, methods_of)
     asked = real("duration", duration, positive=True)
-    steps, tolerances = _positive_numbers("steps", steps), _positive_numbers("tolerances", tolerances)
+    steps = None if steps is None else numbers_of("steps", steps, positive=True)
+    tolerances = None if tolerances is None else numbers_of("tolerances", tolerances, positive=True)
     force = _constant_torque(torque, integrated)
     checkpoints.report(0.0, "reference")
-    start = _start(integrated, (q0, v0), seed, reference)
-    if reference is None:
-        reference = _computed_reference(
-            integrated,
-            *start,
-            asked,
-            force,
-            _FOR_REFERENCE * budget.usual,
+    known = _known_reference(reference, integrated, asked)
+    start = _start(integrated, (q0, v0), seed, known)
+    if known is None:
+        known = _computed_reference(
+            *(integrated, *start, asked, force, _FOR_REFERENCE * budget.usual),
             lambda done: checkpoints.report(0.1 * done, "reference"),
         )
-    problem, how = _problem(integrated, start, force, asked, reference)
+    problem = _problem(integrated, start, force, asked, known)
     if problem.motion == 0.0:
         raise InputError(
             "q0, v0: expected a start from which something moves, got one at rest in equilibrium, where every method "
@@ -206,7 +191,7 @@ def work_precision(
             facts=facts,
             duration=problem.duration,
             asked=asked,
-            reference=how,
+            reference=known.how,
             floor=problem.floor,
             q0=tuple(problem.q0.tolist()),
             v0=tuple(problem.v0.tolist()),
@@ -230,55 +215,46 @@ def work_precision(
             },
         )
 
-    try:
-        for fraction, text in sweep.steps():
-            checkpoints.report(0.1 + 0.9 * fraction, text)
-            checkpoints.save_if_due(partial(result, complete=False))
-        whole = result(complete=True)
-    except KeyboardInterrupt:
-        part = result(complete=False)
-        checkpoints.save(part)
-        raise InterruptedSweepError(part) from None
-    except Exception:
-        # An error of a progress function, or a fault: the finished part is not lost.
-        checkpoints.save(result(complete=False))
-        raise
-    checkpoints.save(whole)
-    checkpoints.report(1.0, "done")
-    return whole
+    return checkpoints.run(((0.1 + 0.9 * fraction, text) for fraction, text in sweep.steps()), result)
 
 
-def _start(
-    model: Model, start: tuple[ArrayLike | None, ArrayLike | None], seed: int, reference: Reference | Exact | None
-) -> tuple[Array, Array]:
-    known: tuple[Array, Array] | None = None
-    if isinstance(reference, Reference):
-        known = np.asarray(reference.q[0]), np.asarray(reference.v[0])
-    elif callable(reference):
-        known = _exact_state(model, reference, 0.0)
-    elif reference is not None:
+def _known_reference(reference: object, model: Model, duration: float) -> Reference | None:
+    """Return the caller's reference; an exact function at the times of measurement."""
+    if reference is None or isinstance(reference, Reference):
+        return reference
+    if not callable(reference):
         raise InputError(
             f"reference: expected a Reference or a function from t to (q, v), got {type(reference).__name__}"
         )
-    default = start_state(model, seed) if known is None else known
+    states = []
+    times = np.linspace(0.0, duration, INTERVALS + 1)
+    for t in times.tolist():
+        try:
+            state = reference(t)
+        except Exception as error:
+            raise InputError(
+                f"reference: the function raised {type(error).__name__} at t = {t:g} s: {error}"
+            ) from error
+        if not isinstance(state, Sequence) or len(state) != 2:
+            raise InputError(f"reference: expected the function to return (q, v), got {state!r} at t = {t:g} s")
+        q = finite_array("reference's q", state[0], (model.nq,))
+        states.append((q, finite_array("reference's v", state[1], (model.nv,))))
+    q, v = (np.stack(x) for x in zip(*states, strict=True))
+    floor, how = np.full(len(q), 8 * _EPS * float(np.abs(q).max())), "an exact function, to rounding"
+    return Reference(times, q, v, 0 * q, 0 * v, floor, -np.log10(8 * _EPS), (1.0, 1.0), duration, how)
+
+
+def _start(
+    model: Model, start: tuple[ArrayLike | None, ArrayLike | None], seed: int, known: Reference | None
+) -> tuple[Array, Array]:
+    default = start_state(model, seed) if known is None else (known.q[0], known.v[0])
     q, v = (usual if own is None else own for own, usual in zip(start, default, strict=True))
     q0, v0 = model.check_q(q, "q0"), model.check_v(v, "v0")
     if q0.ndim != 1 or v0.ndim != 1:
         raise InputError(f"q0, v0: expected one state, got shapes {q0.shape} and {v0.shape}")
-    if known is not None and float(np.abs(v0 - known[1]).max()) > _SAME_START:
+    if known is not None and float(np.abs(v0 - known.v[0]).max()) > _SAME_START:
         raise InputError("reference: does not start with v0; leave v0 out, or use the reference of this start")
     return q0, v0
-
-
-def _exact_state(model: Model, exact: Exact, t: float) -> tuple[Array, Array]:
-    try:
-        state = exact(float(t))
-    except Exception as error:
-        raise InputError(f"reference: the function raised {type(error).__name__} at t = {t:g} s: {error}") from error
-    if not isinstance(state, Sequence) or len(state) != 2:
-        raise InputError(f"reference: expected the function to return (q, v), got {state!r} at t = {t:g} s")
-    q = finite_array("reference's q", state[0], (model.nq,))
-    return q, finite_array("reference's v", state[1], (model.nv,))
 
 
 def _computed_reference(
@@ -286,33 +262,26 @@ def _computed_reference(
 ) -> Reference:
     """Return a reference as far as it holds; search again over a tenth of the time if it holds nowhere."""
     for part in (duration, duration / INTERVALS):
-        out = compute_reference(model, q0, v0, part, save_grid(part), torque, seconds=seconds, progress=progress)
+        save = np.linspace(0.0, part, INTERVALS + 1)
+        out = compute_reference(model, q0, v0, part, save, torque, seconds=seconds, progress=progress)
         if len(out.t) > 1:
             return out
     raise NumericalError(f"{model.name}: no reference holds for even {part / INTERVALS:g} s; {out.how}")
 
 
-def _problem(
-    model: Model, start: tuple[Array, Array], torque: Any, duration: float, reference: Reference | Exact
-) -> tuple[Problem, str]:
-    """Return the problem up to where its reference holds, and how the reference was computed."""
-    if isinstance(reference, Reference):
-        keep = reference.t <= duration * (1 + 1e-12)
-        times, q, how = reference.t[keep], reference.q[keep], reference.how
-        floor = float(reference.floor[keep].max())
-        if len(times) < 2 or np.abs(times / times[1] - np.rint(times / times[1])).max() > 1e-9:
-            raise InputError(
-                "reference: expected times that are 0 and multiples of the first after it, within the duration"
-            )
-    else:
-        times = save_grid(duration)
-        q = np.stack([_exact_state(model, reference, t)[0] for t in times])
-        floor, how = 8 * _EPS * float(np.abs(q).max()), "an exact function, to rounding"
+def _problem(model: Model, start: tuple[Array, Array], torque: Any, duration: float, reference: Reference) -> Problem:
+    """Return the problem up to where its reference holds."""
+    keep = reference.t <= duration * (1 + 1e-12)
+    times, q, floor = reference.t[keep], reference.q[keep], float(reference.floor[keep].max())
+    if len(times) < 2 or np.abs(times / times[1] - np.rint(times / times[1])).max() > 1e-9:
+        raise InputError(
+            "reference: expected times that are 0 and multiples of the first after it, within the duration"
+        )
     if q.shape != (len(times), model.nq):
         raise InputError(f"reference: expected states of {model.nq} coordinates, got {q.shape}; it is of another model")
     if float(np.abs(model.difference(start[0], q[0])).max()) > _SAME_START:
         raise InputError("reference: does not start at q0 (and v0); leave them out, or use the reference of this start")
-    return Problem(model, *start, torque, times, q, floor), how
+    return Problem(model, *start, torque, times, q, floor)
 
 
 def _check_executor(executor: Executor | None, torque: object) -> None:
@@ -332,13 +301,6 @@ def _check_executor(executor: Executor | None, torque: object) -> None:
             ) from None
 
 
-def _check_model(model: Model) -> None:
-    expect_model(model)
-    if not model.nv:
-        raise InputError(f"model: nothing moves in {model.name} (nv = 0), nothing to integrate; add a joint")
-    model.require_values("a study of run time")
-
-
 def _integrated_model(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
     """Return the model with parameters as numbers, and mimic joints free where MuJoCo's own integrators run."""
     model = with_values(model)
@@ -350,24 +312,12 @@ def _constant_torque(torque: ArrayLike | TorqueFunction | None, model: Model) ->
     if torque is None or callable(torque):
         return torque
     try:
-        shape: tuple[int, ...] | None = np.shape(torque)
+        got = f"shape {np.shape(torque)}"
     except ValueError:
-        shape = None
-    if shape != (model.nv,):
-        got = "rows of different lengths" if shape is None else f"shape {shape}"
+        got = "rows of different lengths"
+    if got != f"shape ({model.nv},)":
         raise InputError(
             f"torque: expected shape ({model.nv},), held all the time, or a function of (t, q, v), "
             f"got {got}; rows would be held for other times with every other step"
         )
     return finite_array("torque", torque, (model.nv,))
-
-
-def _positive_numbers(name: str, values: Sequence[float] | None) -> tuple[float, ...] | None:
-    if values is None:
-        return None
-    if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
-        raise InputError(f"{name}: expected several numbers, got {values!r}")
-    out = tuple(real(f"{name}[{i}]", x, positive=True) for i, x in enumerate(values))
-    if not out:
-        raise InputError(f"{name}: expected at least one number, got none; leave it out for the study's own")
-    return out

@@ -8,11 +8,11 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -23,13 +23,23 @@ from mbkit.codegen.disk_cache import force_recompile
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.registry import find_engine
 from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
 from mbkit.studies.results import Refusal
-from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, patience, quiet_simulate
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, energy_drift, patience, quiet_simulate
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
-from mbkit.studies.work_precision.settings import Settings
 from mbkit.studies.worker import run
+
+#: Errors are measured at the ends of this many equal parts of the horizon.
+INTERVALS: Final = 10
+#: The coarsest step, s, and the finest, as a part of the horizon.
+_COARSEST: Final = 0.05
+_FINEST: Final = 1e-7
+#: Ratio of neighbouring steps, by the method's order: an error falls by 4 to 16 at each.
+_RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
+#: An evaluation called from Python costs so many compiled ones.
+_PYTHON_CALL: Final = 8
 
 #: A run shorter than this is repeated within a round, s.
 _SHORT: Final = 2e-3
@@ -110,6 +120,63 @@ def _without_heyoka_cache() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
+class Settings:
+    """The steps, s, or tolerances of one method on one engine, coarse to fine."""
+
+    engine: str
+    method: str
+    setting: Literal["dt", "rtol"]
+    values: tuple[float, ...]
+    #: Whether the caller chose the values, so that each is reported. Otherwise the sweep ends where finer values
+    #: improve nothing or take too much work.
+    required: bool
+
+    @property
+    def info(self) -> Method:
+        """The method as data."""
+        return method_of(self.method)
+
+    def work(self, steps: int, evaluations: int) -> int:
+        """Return the cost of a run in compiled evaluations of the forward dynamics, equal on every machine."""
+        each = 1 if self.info.runs_compiled(derived=find_engine(self.engine).derived) else _PYTHON_CALL
+        return each * (evaluations or steps * max(self.info.stages, 1))
+
+
+def plans(
+    pairs: Mapping[str, Sequence[str]],
+    interval: float,
+    steps: Sequence[float] | None,
+    tolerances: Sequence[float] | None,
+) -> tuple[Settings, ...]:
+    """Return the settings for every engine's methods.
+
+    A step of the caller is shortened so that a whole number of them is an interval between two saved states; a
+    tolerance below a method's least is left out.
+    """
+    settings = []
+    for engine, name in ((engine, name) for engine, names in pairs.items() for name in names):
+        method = METHODS[name]
+        if method.kind == "adaptive":
+            # A Taylor series is compiled for each order that a tolerance needs.
+            own = [float(f"1e-{k}") for k in range(3, 16, 4 if method.extended else 1)]
+            wanted = own if tolerances is None else tolerances
+            values = tuple(sorted({float(x) for x in wanted if x >= method.least}, reverse=True))
+            settings.append(Settings(engine, name, "rtol", values, tolerances is not None))
+        else:
+            wanted = _steps(method, interval) if steps is None else steps
+            counts = sorted({max(1, int(np.ceil(interval / h * (1 - 1e-9)))) for h in wanted})
+            settings.append(Settings(engine, name, "dt", tuple(interval / n for n in counts), steps is not None))
+    return tuple(settings)
+
+
+def _steps(method: Method, interval: float) -> tuple[float, ...]:
+    ratio = _RATIOS.get(method.order, 2.0)
+    coarsest = min(interval, _COARSEST)
+    count = int(np.log(coarsest / (interval * INTERVALS * _FINEST)) / np.log(ratio)) + 1
+    return tuple(coarsest / ratio**k for k in range(count))
+
+
+@dataclass(frozen=True)
 class Problem:
     """The initial value problem that every method solves, and its reference q at times from 0 to the horizon."""
 
@@ -133,39 +200,19 @@ class Problem:
 
     def solve(self, dyn: Dynamics, settings: Settings, value: float, limit: float | None = None) -> Trajectory:
         """Integrate to the horizon; give up after `limit` seconds."""
-        return self._simulate(dyn, settings, value, self.duration, self.times, limit)
+        return self._simulate(dyn, settings, value, self.times, limit)
 
     def start(self, dyn: Dynamics, settings: Settings, value: float) -> Trajectory:
         """Integrate one step, or a thousandth of an interval."""
         duration = value if settings.setting == "dt" else 1e-3 * float(self.times[1])
-        return self._simulate(dyn, settings, value, duration, np.array([duration]), None)
+        return self._simulate(dyn, settings, value, np.array([duration]), None)
 
     def _simulate(
-        self, dyn: Dynamics, settings: Settings, value: float, duration: float, save: Array, limit: float | None
+        self, dyn: Dynamics, settings: Settings, value: float, save: Array, limit: float | None
     ) -> Trajectory:
         setting: dict[str, Any] = {settings.setting: value, "torque": self.torque, "save": save}
         progress = None if limit is None else patience(limit)
-        return quiet_simulate(dyn, self.q0, self.v0, duration, settings.method, progress=progress, **setting)
-
-    def error(self, run: Trajectory) -> float:
-        """Return the largest difference to the reference over times and coordinates."""
-        return float(np.abs(self.model.difference(self.q, run.q)).max())
-
-    def energy_drift(self, dyn: Dynamics, run: Trajectory) -> float:
-        """Return the drift of the energy, relative to the larger of T and of the change of V.
-
-        NaN with dampers, applied forces or explicit time: the saved states are too few to know their work.
-        """
-        if self.torque is not None or self.model.needs.damping or self.model.time_parameter is not None:
-            return math.nan
-        kinetic = 0.5 * np.einsum("ni,nij,nj->n", run.v, dyn.mass_matrix(run.q), run.v)
-        potential = dyn.potential_energy(run.q)
-        if not self.model.has_bodies:
-            # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
-            potential = potential - dyn.kinetic_energy(run.q, 0 * run.v)
-        drift = np.abs((kinetic - kinetic[0]) + (potential - potential[0])).max()
-        size = max(float(kinetic.max()), float(np.ptp(potential)))
-        return float(drift) / size if size > 0 else math.nan
+        return quiet_simulate(dyn, self.q0, self.v0, float(save[-1]), settings.method, progress=progress, **setting)
 
 
 @dataclass
@@ -181,6 +228,16 @@ class _Run:
     evaluations: int = 0
     note: str = ""
     times: list[float] = field(default_factory=list)
+
+    def point(self, setting: Literal["dt", "rtol"]) -> PrecisionPoint:
+        """Return it for a result."""
+        # The first run counts only if it was not repeated.
+        times = self.times or [self.first]
+        low, median, high = map(float, np.percentile(times, [25, 50, 75]))
+        spread = (high - low) / 2 if len(times) > 1 else math.nan
+        count = len(times) if math.isfinite(times[0]) else 0
+        cost = (median, spread, self.steps, self.evaluations, count)
+        return PrecisionPoint(setting, self.value, self.error, self.energy, *cost, self.note)
 
 
 class CurveMeasurement:
@@ -207,13 +264,8 @@ class CurveMeasurement:
 
     @property
     def expected(self) -> float:
-        """Estimated seconds of the next run; 0 before the first."""
-        return 0.0 if self._last is None else self._last.first * self._growth(self._last)
-
-    @property
-    def expected_with_preparation(self) -> float:
-        """Estimated seconds of the next run with what is compiled for it."""
-        return self.expected + (self._last.preparation if self._last else 0.0)
+        """Estimated seconds of the next run, with what is compiled for it; 0 before the first."""
+        return 0.0 if self._last is None else self._last.first * self._growth(self._last) + self._last.preparation
 
     @property
     def work(self) -> float:
@@ -229,13 +281,13 @@ class CurveMeasurement:
     def compile(self) -> None:
         """Derive, compile and build, timed."""
         # Where the code depends on the tolerance, the middle one stands for all.
-        value = self._left[len(self._left) // 2]
+        settings, value = self.settings, self._left[len(self._left) // 2]
         with self._refusing():
             self._dyn, self._compile = first_run(
                 self.problem.model,
-                self.settings.engine,
-                self.settings.method,
-                lambda dyn: self.problem.start(dyn, self.settings, value),
+                settings.engine,
+                settings.method,
+                lambda dyn: self.problem.start(dyn, settings, value),
             )
 
     def run_next(self, limit: float) -> None:
@@ -252,11 +304,11 @@ class CurveMeasurement:
 
     def _run(self, one: _Run, limit: float) -> None:
         assert self._dyn is not None
-        begun = time.perf_counter()
+        problem, begun = self.problem, time.perf_counter()
         try:
-            self.problem.start(self._dyn, self.settings, one.value)
+            problem.start(self._dyn, self.settings, one.value)
             one.preparation, begun = time.perf_counter() - begun, time.perf_counter()
-            run = self.problem.solve(self._dyn, self.settings, one.value, limit)
+            run = problem.solve(self._dyn, self.settings, one.value, limit)
         except UnsupportedError:
             raise
         except MbkitError as error:
@@ -266,30 +318,31 @@ class CurveMeasurement:
             return
         one.first = time.perf_counter() - begun
         one.steps, one.evaluations = run.stats.steps, run.stats.evaluations
-        if not run.stats.finished or len(run.t) != len(self.problem.times):
+        if not run.stats.finished or len(run.t) != len(problem.times):
             one.note = run.stats.message or f"ended at t = {run.t[-1]:g} s"
             return
-        one.error = self.problem.error(run)
+        one.error = float(np.abs(problem.model.difference(problem.q, run.q)).max())
         try:
-            one.energy = self.problem.energy_drift(self._dyn, run)
+            # With applied forces the saved states are too few to know their work.
+            drift, size, _ = (problem.torque is None and energy_drift(self._dyn, run)) or (0.0, 0.0, 0.0)
+            one.energy = drift / size if size > 0 else math.nan
         except MbkitError as error:
             one.note = f"no energy: {error}"
 
     def _no_gain(self) -> bool:
         """Return whether the last settings brought no smaller error: at the reference's floor, or at rounding."""
+        floor = self.problem.floor
         # Steps that end on the saved times can be shorter than a coarse tolerance needs: of settings that hardly
         # add a step, only the first shows whether finer ones help.
         counted = self._runs[:1]
         for one in self._runs[1:]:
-            if not one.error > self.problem.floor or one.steps >= _FINER * counted[-1].steps:
+            if not one.error > floor or one.steps >= _FINER * counted[-1].steps:
                 counted.append(one)
         errors = [one.error for one in counted]
-        before, last = errors[:-_MAX_WITHOUT_GAIN], errors[-_MAX_WITHOUT_GAIN:]
-        finite = [e for e in before if math.isfinite(e)]
-        if not finite or min(finite) > _CONVERGED:
+        least = min(filter(math.isfinite, errors[:-_MAX_WITHOUT_GAIN]), default=math.inf)
+        if least > _CONVERGED:
             return False
-        floor = self.problem.floor
-        return all(not e < max(0.5 * min(finite), floor) or e <= floor for e in last)
+        return all(not e < max(0.5 * least, floor) or e <= floor for e in errors[-_MAX_WITHOUT_GAIN:])
 
     def give_up(self, reason: str) -> None:
         """End here; settings that the caller chose are reported with the reason why they were not run."""
@@ -333,37 +386,12 @@ class CurveMeasurement:
         if not self._runs:
             return None
         settings, problem = self.settings, self.problem
-        fixed = settings.setting == "dt"
-        runs = self._runs if fixed else []
-        steps, errors = [one.value for one in runs], [one.error for one in runs]
-        order = observed_order(steps, errors, floor=problem.floor, motion=problem.motion)
-        return Curve(
-            settings.engine,
-            settings.method,
-            tuple(self._point(one) for one in self._runs),
-            order.order,
-            order.points,
-            float(settings.info.order) if fixed and settings.info.order is not None else math.nan,
-            compile=self._compile,
-            ended=self._ended,
-        )
-
-    def _point(self, one: _Run) -> PrecisionPoint:
-        # The first run counts only if it was not repeated.
-        times = one.times or [one.first]
-        low, median, high = np.percentile(times, [25, 50, 75])
-        return PrecisionPoint(
-            setting=self.settings.setting,
-            value=one.value,
-            error=one.error,
-            energy=one.energy,
-            seconds=float(median),
-            spread=float(high - low) / 2 if len(times) > 1 else math.nan,
-            steps=one.steps,
-            evaluations=one.evaluations,
-            repeats=len(times) if math.isfinite(times[0]) else 0,
-            note=one.note,
-        )
+        points = tuple(one.point(settings.setting) for one in self._runs)
+        fixed = points if settings.setting == "dt" else ()
+        steps, errors = [p.value for p in fixed], [p.error for p in fixed]
+        order, used = observed_order(steps, errors, floor=problem.floor, motion=problem.motion)
+        expected = float(settings.info.order) if fixed and settings.info.order is not None else math.nan
+        return Curve(settings.engine, settings.method, points, order, used, expected, self._compile, self._ended)
 
 
 def _same_steps(a: _Run, b: _Run) -> bool:
@@ -398,20 +426,15 @@ class TimeBudget:
     usual: float
     #: Counted work of a run with the study's own settings; see `Settings.work`.
     work: float
-    clock: Callable[[], float] = field(default_factory=lambda: time.process_time)
-    begun: float = math.nan
-
-    def __post_init__(self) -> None:
-        if math.isnan(self.begun):
-            object.__setattr__(self, "begun", self.clock())
+    begun: float = field(default_factory=lambda: time.process_time())
 
     def until(self, part: float, least: float = 0.0) -> float:
         """Return when a part of `seconds` is over, leaving at least the part `least` from now on."""
-        return max(self.begun + part * self.seconds, self.clock() + least * self.seconds)
+        return max(self.begun + part * self.seconds, time.process_time() + least * self.seconds)
 
     def timed_until(self) -> float:
         """Return when timing ends, leaving a least part of the usual time from now on."""
-        return max(self.begun + self.usual, self.clock() + _MIN_PART * self.usual)
+        return max(self.begun + self.usual, time.process_time() + _MIN_PART * self.usual)
 
 
 #: A curve, and why it has no further points.
@@ -449,18 +472,18 @@ class Sweep:
         return self._in_executor(self._executor) if self._executor else self._here()
 
     def _here(self) -> Iterator[tuple[float, str]]:
-        clock, until = self._budget.clock, self._budget.until(_COMPILED, _MIN_PART)
+        until = self._budget.until(_COMPILED, _MIN_PART)
         # Jacobians and series take longest to derive; they come last, so that the others have their time.
         for k, one in enumerate(sorted(self._curves, key=_derivation_cost)):
             yield 0.2 * k / len(self._curves), f"compiling {one.settings.method} on {one.settings.engine}"
-            if k and clock() > until:
+            if k and time.process_time() > until:
                 one.give_up(OUT_OF_TIME)
             elif not one.over:
                 one.compile()
-        begun = clock()
+        begun = time.process_time()
         for one in self._coarse_to_fine(self._budget.until(_EXPLORED, _MIN_PART)):
             # Costs grow geometrically, so the root of the time shows the progress.
-            done = ((clock() - begun) / (_EXPLORED * self._budget.usual)) ** 0.5
+            done = ((time.process_time() - begun) / (_EXPLORED * self._budget.usual)) ** 0.5
             yield 0.2 + 0.4 * min(done, 1.0), f"{one.settings.method} on {one.settings.engine}"
         yield 0.6, "timing"
         for k in self._repeat(self._budget.timed_until()):
@@ -470,36 +493,34 @@ class Sweep:
         """Run each setting once, the cheapest next run of all curves first; begin none that would not end in time."""
         while going := [one for one in self._curves if not one.over]:
             one = min(going, key=lambda x: x.expected)
-            left = until - self._budget.clock()
-            if one.expected_with_preparation > left:
+            left = until - time.process_time()
+            if one.expected > left:
                 for other in going:
                     other.give_up(OUT_OF_TIME)
-                return
-            if one.work > self._budget.work and not one.settings.required:
+            elif one.work > self._budget.work and not one.settings.required:
                 one.end("")
-                continue
-            # The estimate may be wrong: one run must not take all that is left.
-            one.run_next(limit=float(f"{max(left / 4, 2 * one.expected, 0.1):.2g}"))
-            yield one
+            else:
+                # The estimate may be wrong: one run must not take all that is left.
+                one.run_next(limit=float(f"{max(left / 4, 2 * one.expected, 0.1):.2g}"))
+                yield one
 
     def _repeat(self, until: float) -> Iterator[int]:
         """Time every setting in rounds, each in another order, so that drifts of the machine meet all runs alike.
 
         Where time is short, the longest runs are repeated less.
         """
-        clock = self._budget.clock
         runs = [x for one in self._curves for x in one.repeatable()]
-        counts = repetitions([max(first, _SHORT) for first, _ in runs], self._repeats, until - clock())
+        counts = repetitions([max(first, _SHORT) for first, _ in runs], self._repeats, until - time.process_time())
         rng = np.random.default_rng(self._seed)
         for k in range(self._repeats):
             for i in rng.permutation(len(runs)):
-                if k < counts[i] and clock() + runs[i][0] < until:
+                if k < counts[i] and time.process_time() + runs[i][0] < until:
                     runs[i][1]()
             yield k
 
     def _in_executor(self, executor: Executor) -> Iterator[tuple[float, str]]:
         yield 0.0, f"{len(self._settings)} curves by {type(executor).__name__}"
-        left = self._budget.until(1.0, 2 * _MIN_PART) - self._budget.clock()
+        left = self._budget.until(1.0, 2 * _MIN_PART) - time.process_time()
         each = 1 / max(len(self._settings), 1)
         part = replace(self._budget, seconds=left * each, usual=min(self._budget.usual, left) * each)
         calls = {
@@ -518,7 +539,7 @@ class Sweep:
 
 def _measure(problem: Problem, settings: Settings, repeats: int, seed: int, budget: TimeBudget) -> Outcome:
     """Measure one curve in a worker."""
-    sweep = Sweep(problem, [settings], repeats, seed, replace(budget, begun=math.nan))
+    sweep = Sweep(problem, [settings], repeats, seed, replace(budget, begun=time.process_time()))
     for _ in sweep.steps():
         pass
     return sweep.outcomes()[0]

@@ -6,19 +6,13 @@ from typing import Final
 
 from mbkit.errors import UnknownNameError
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.cases import large, mass_ratio, near_singular, spin, step, stiffness
+from mbkit.studies.stress.cases import chains, large, rotations, springs
 
 __all__ = ["CASES", "get", "names"]
 
 _FAMILIES: Final = (
-    stiffness.CASES,
-    mass_ratio.CASES,
-    mass_ratio.LENGTH_CASES,
-    spin.CASES,
-    near_singular.CASES,
-    large.CASES,
-    step.CASES,
-    step.LONG_CASES,
+    *(springs.CASES, chains.CASES, chains.LENGTH_CASES, rotations.SPIN_CASES, rotations.SINGULAR_CASES),
+    *(large.CASES, springs.STEP_CASES, springs.LONG_CASES),
 )
 #: Name -> case: stiff ones first, those that take longest last.
 CASES: Final[dict[str, Case]] = {case.name: case for family in _FAMILIES for case in family}

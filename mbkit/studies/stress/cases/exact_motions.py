@@ -10,6 +10,7 @@ from typing import Any, Final
 import mpmath as mp
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legroots
+from scipy.interpolate import BarycentricInterpolator
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc, ellipkm1, elliprf, elliprj
 
@@ -33,34 +34,34 @@ Residual = Callable[[Any, Any], Any]
 
 def slow_motion(residual: Residual, start: Array, duration: float, steps: int) -> Callable[[Array], Array]:
     """Return y, (K, n), of F(y, ẏ) = 0 up to the duration; F is analytic, for a complex step differentiates it."""
-    points, slopes = _radau()
+    basis = _radau()[2]
     h = duration / steps
     pieces: list[Array] = []
 
     def motion(t: Array) -> Array:
         which = np.minimum((t / h).astype(int), steps - 1)
-        # Steps are made when a time is asked for: making a problem costs nothing.
+        # Steps are computed when a time needs them: a problem costs nothing.
         while len(pieces) <= int(which.max(initial=0)):
             y = pieces[-1][-1] if pieces else np.asarray(start, dtype=np.float64)
-            pieces.append(_step(residual, y, pieces[-1] if pieces else None, h, points, slopes))
-        weights = _lagrange(points, t / h - which)
-        return np.asarray(np.einsum("kj,kjn->kn", weights, np.stack(pieces)[which]))
+            pieces.append(_step(residual, y, pieces[-1] if pieces else None, h))
+        return np.asarray(np.einsum("kj,kjn->kn", basis(t / h - which), np.stack(pieces)[which]))
 
     return motion
 
 
-def _step(residual: Residual, y: Array, before: Array | None, h: float, points: Array, slopes: Array) -> Array:
+def _step(residual: Residual, y: Array, before: Array | None, h: float) -> Array:
     """Return y at the points of a step, (s + 1, n), by Newton's method with the first iterate's derivatives."""
     s, n = _STAGES, len(y)
-    Y = np.tile(y, (s, 1)) if before is None else _lagrange(points, 1 + points[1:]) @ before
-    by_y, by_rate = _jacobians(residual, Y, slopes @ np.vstack([y, Y]) / h)
-    J = np.einsum("ik,iab->iakb", slopes[:, 1:] / h, by_rate)
+    points, slopes, basis = _radau()
+    slopes = slopes / h
+    Y = np.tile(y, (s, 1)) if before is None else basis(1 + points[1:]) @ before
+    by_y, by_rate = _jacobians(residual, Y, slopes @ np.vstack([y, Y]))
+    J = np.einsum("ik,iab->iakb", slopes[:, 1:], by_rate)
     J[np.arange(s), :, np.arange(s), :] += by_y
     inverse = np.linalg.inv(J.reshape(s * n, s * n))
     last = np.inf
     for _ in range(_ITERATIONS):
-        F = residual(Y, slopes @ np.vstack([y, Y]) / h)
-        change = (inverse @ F.ravel()).reshape(s, n)
+        change = (inverse @ residual(Y, slopes @ np.vstack([y, Y])).ravel()).reshape(s, n)
         Y = Y - change
         size = float(np.abs(change).max())
         # Rounding is reached where it no longer falls.
@@ -81,26 +82,12 @@ def _jacobians(residual: Residual, Y: Array, dY: Array) -> tuple[Array, Array]:
 
 
 @cache
-def _radau() -> tuple[Array, Array]:
-    """Return 0 and Radau's points in (0, 1], and the derivatives there of the polynomial through all of them."""
-    ends = np.zeros(_STAGES + 1)
-    ends[-2:] = -1.0, 1.0
-    points = np.concatenate([[0.0], (np.sort(legroots(ends)) + 1) / 2])
+def _radau() -> tuple[Array, Array, BarycentricInterpolator]:
+    """Return 0 and Radau's points in (0, 1]; the polynomials that are 1 at one of them; before, their derivatives."""
+    points = np.concatenate([[0.0], (np.sort(legroots([*[0.0] * (_STAGES - 1), -1.0, 1.0])) + 1) / 2])
     points[-1] = 1.0
-    apart = points[:, None] - points + np.eye(len(points))
-    w = 1 / apart.prod(axis=1)
-    slopes = (w / w[:, None]) / apart
-    np.fill_diagonal(slopes, 0.0)
-    np.fill_diagonal(slopes, -slopes.sum(axis=1))
-    return points, slopes[1:]
-
-
-def _lagrange(points: Array, x: Array) -> Array:
-    """Return the weights, (K, s + 1), of values at the points for the polynomial's value at x."""
-    others = x[:, None, None] - points[None, None, :]
-    apart = points[:, None] - points[None, :]
-    own = np.eye(len(points), dtype=bool)
-    return np.asarray(np.where(own, 1.0, others / np.where(own, 1.0, apart)).prod(axis=2))
+    basis = BarycentricInterpolator(points, np.eye(_STAGES + 1))
+    return points, basis.derivative(points[1:]), basis
 
 
 _GRAVITY: Final = 9.81
@@ -173,22 +160,15 @@ def released(start: float, square: float, rate: float) -> Exact:
     return lambda t: (start * (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow))[:, None]
 
 
-def modal(M: Array, C: Array, K: Array, q0: Array, v0: Array) -> Exact:
-    """Return q of M q̈ + C q̇ + K q = 0, by 50-digit eigenvalues of the companion matrix, no two the same."""
-    n = len(M)
+def modal(rates: Array, start: Array) -> Exact:
+    """Return the first half of x of ẋ = A x, by 50-digit eigenvalues of A, no two the same."""
+    n = len(start)
     with mp.workdps(_DIGITS):
-        inverse = mp.matrix(M.tolist()) ** -1
-        companion = mp.zeros(2 * n)
-        stiff, damped = inverse * mp.matrix(K.tolist()), inverse * mp.matrix(C.tolist())
-        for i in range(n):
-            companion[i, n + i] = mp.mpf(1)
-            for j in range(n):
-                companion[n + i, j], companion[n + i, n + j] = -stiff[i, j], -damped[i, j]
-        values, vectors = mp.eig(companion)
-        weights = mp.lu_solve(vectors, mp.matrix([*q0.tolist(), *v0.tolist()]))
-        rates = np.array([complex(x) for x in values])
-        shapes = np.array([[complex(vectors[i, k] * weights[k]) for k in range(2 * n)] for i in range(n)])
-    return lambda t: np.real(np.exp(np.multiply.outer(t, rates)) @ shapes.T)
+        values, vectors = mp.eig(mp.matrix(rates.tolist()))
+        weights = mp.lu_solve(vectors, mp.matrix(start.tolist()))
+        exponents = np.array([complex(x) for x in values])
+        shapes = np.array([[complex(vectors[i, k] * weights[k]) for k in range(n)] for i in range(n // 2)])
+    return lambda t: np.real(np.exp(np.multiply.outer(t, exponents)) @ shapes.T)
 
 
 def slowest_mode(M: Array, stiffness: Array) -> tuple[float, Array, float]:
@@ -210,23 +190,11 @@ _NODES: Final = 128
 _TABLE: Final = 4000
 
 
-@cache
-def _nodes() -> tuple[Array, Array]:
-    return leggauss(_NODES)
-
-
 def pendulum(theta: float, speed: float, square: float) -> Exact:
-    """Return θ, (K, 1), of θ̈ + ω² sin θ = 0.
+    """Return θ, (K, 1), of θ̈ + ω² sin θ = 0 from θ₀, below π, and θ̇₀, rad and rad/s, and ω² = g/l, 1/s².
 
     sin(θ/2) = k sn(ω t + u₀ | k²) where it swings, θ/2 = am(k ω t + u₀ | 1/k²) where it goes round, with
     k² = sin²(θ₀/2) + θ̇₀²/(4 ω²) (Landau, Lifshitz 1976, §11; Whittaker 1937, §44).
-
-    Parameters
-    ----------
-    theta, speed : float
-        At the start, |θ| below π, rad and rad/s.
-    square : float
-        ω² = g/l, 1/s².
     """
     w = math.sqrt(square)
     # k² ω², which stays what it is where there is no gravity.
@@ -240,32 +208,23 @@ def pendulum(theta: float, speed: float, square: float) -> Exact:
     return lambda t: 2 * ellipj(rate * t + start, m)[3][:, None]
 
 
-def cart_pole(theta: float, cart: float, square: float = 9.81) -> Exact:
-    """Return (x, θ), (K, 2), of a cart-pole let go at rest at x = 0; pole of 1 kg and 1 m.
+def cart_pole(theta: float, cart: float) -> Exact:
+    """Return (x, θ), (K, 2), of a cart of M kg with a pole of 1 kg and 1 m, let go at rest at x = 0, 0 < θ₀ < π.
 
     No force acts along x, so x = (sin θ₀ - sin θ)/(M + 1), and energy gives
     θ̇² = 2 g (M + 1)(cos θ - cos θ₀)/(M + sin² θ). With sin(θ/2) = k sin φ, k = sin(θ₀/2), φ grows for ever, and
     dt = √(M/(1 - k² sin² φ) + 4 k² sin² φ) dφ/√(g (M + 1)): a quadrature, by Gauss-Legendre in y, φ = ε sinh y, for
     the root bends within ε = √M/(2 k) of φ = 0. Inverted by a table and Newton's method.
-
-    Parameters
-    ----------
-    theta : float
-        At the start, between 0 and π, rad.
-    cart : float
-        M, kg.
-    square : float
-        g/l, 1/s².
     """
     k = math.sin(theta / 2)
     bend = math.sqrt(cart) / (2 * k)
-    nodes, weights = _nodes()
+    nodes, weights = leggauss(_NODES)
     last = math.asinh(math.pi / 2 / bend)
 
     def slope(y: Array) -> Array:
         s2 = np.sin(bend * np.sinh(y)) ** 2
         root = np.sqrt(cart / (1 - k * k * s2) + 4 * k * k * s2)
-        return np.asarray(root * bend * np.cosh(y) / math.sqrt(square * (cart + 1)))
+        return np.asarray(root * bend * np.cosh(y) / math.sqrt(_GRAVITY * (cart + 1)))
 
     def spent(y: Array) -> Array:
         return y / 2 * (slope(y[:, None] / 2 * (1 + nodes)) @ weights)
@@ -419,25 +378,20 @@ def ringing_spring(square: float, radius: float, push: float, turn: float) -> tu
 
     Energy and angular momentum L give r² ṙ² = -ω² (r - r₁)(r - r₂)(r² + p r + s) with the turning points r₁, r₂ as
     roots. With r = a - b cos φ between them, dt = r dφ/(ω √(r² + p r + s)) and dθ = L dt/r² (Landau, Lifshitz 1976,
-    §14), both even and periodic in φ: sums of a Fourier series' integrals.
-
-    Parameters
-    ----------
-    square : float
-        ω² = stiffness/mass, 1/s².
-    radius, push, turn : float
-        r, ṙ > 0 and θ̇ at the start, m, m/s and rad/s.
+    §14), both even and periodic in φ: sums of a Fourier series' integrals. `square` is ω² = stiffness/mass, 1/s²;
+    `radius`, `push` and `turn` are r, ṙ > 0 and θ̇ at the start, m, m/s and rad/s.
     """
     momentum = radius**2 * turn
     energy = (push**2 + momentum**2 / radius**2 + square * (radius - 1) ** 2) / 2
-    r1, r2 = _turning_points(square, energy, momentum)
+    r1 = _turning_point(momentum / math.sqrt(2 * energy), square, energy, momentum)
+    r2 = _turning_point(1 + math.sqrt(2 * energy / square), square, energy, momentum)
     p, s = r1 + r2 - 2, momentum**2 / (square * r1 * r2)
     a, b = (r1 + r2) / 2, (r2 - r1) / 2
     grid = a - b * np.cos(2 * math.pi * np.arange(_POINTS) / _POINTS)
     rate = grid / np.sqrt(square * (grid * (grid + p) + s))
     order = np.arange(1, _POINTS // 2)
 
-    def integral(values: np.ndarray) -> tuple[float, np.ndarray]:
+    def integral(values: Array) -> tuple[float, Array]:
         terms = np.fft.rfft(values).real / _POINTS
         return float(terms[0]), 2 * terms[1:-1] / order
 
@@ -446,34 +400,28 @@ def ringing_spring(square: float, radius: float, push: float, turn: float) -> tu
     pace = push * radius / math.sqrt(square * (radius * (radius + p) + s))
     first = math.atan2(pace, a - radius)
 
-    def spent(phi: np.ndarray, line: float, terms: np.ndarray) -> np.ndarray:
-        value: np.ndarray = line * phi + np.sin(np.multiply.outer(phi, order)) @ terms
-        return value
+    def since_start(phi: Array, line: float, terms: Array) -> Array:
+        values, at_start = (line * x + np.sin(np.multiply.outer(x, order)) @ terms for x in (phi, np.array([first])))
+        return np.asarray(values - at_start)
 
-    def motion(t: np.ndarray) -> np.ndarray:
-        start = spent(np.array([first]), mean, waves)[0]
+    def motion(t: Array) -> Array:
         phi = first + t / mean
         for _ in range(20):
             r = a - b * np.cos(phi)
             slope = r / np.sqrt(square * (r * (r + p) + s))
-            phi = phi - (spent(phi, mean, waves) - start - t) / slope
-        theta = spent(phi, mean_turn, waves_turn) - spent(np.array([first]), mean_turn, waves_turn)[0]
+            phi = phi - (since_start(phi, mean, waves) - t) / slope
+        theta = since_start(phi, mean_turn, waves_turn)
         return np.stack([theta, a - 1 - b * np.cos(phi)], axis=-1)
 
     return motion, 2 * math.pi * mean
 
 
-def _turning_points(square: float, energy: float, momentum: float) -> tuple[float, float]:
-    """Return the roots of r² ṙ² = (2 E - ω² (r - 1)²) r² - L² between which it moves, by Newton's method."""
-    ends = []
-    for bound in (momentum / math.sqrt(2 * energy), 1 + math.sqrt(2 * energy / square)):
-        r, last = bound, math.inf
-        while abs(step := _step_springs(r, square, energy, momentum)) < last:
-            r, last = r - step, abs(step)
-        ends.append(r)
-    return ends[0], ends[1]
-
-
-def _step_springs(r: float, square: float, energy: float, momentum: float) -> float:
-    kinetic = 2 * energy - square * (r - 1) ** 2
-    return (kinetic * r * r - momentum**2) / (2 * r * kinetic - 2 * square * (r - 1) * r * r)
+def _turning_point(bound: float, square: float, energy: float, momentum: float) -> float:
+    """Return the root of r² ṙ² = (2 E - ω² (r - 1)²) r² - L² nearest to a bound of it, by Newton's method."""
+    r, last = bound, math.inf
+    while True:
+        kinetic = 2 * energy - square * (r - 1) ** 2
+        step = (kinetic * r * r - momentum**2) / (2 * r * kinetic - 2 * square * (r - 1) * r * r)
+        if not abs(step) < last:
+            return r
+        r, last = r - step, abs(step)

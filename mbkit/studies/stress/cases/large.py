@@ -12,10 +12,11 @@ import numpy as np
 
 from mbkit import catalog
 from mbkit.load import load
+from mbkit.model import Model
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import EPS, powers, register, terms_at
+from mbkit.studies.stress.cases._common import EPS, motion, powers, register, terms_at
 from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum
-from mbkit.studies.stress.cases.spin import tumbling
+from mbkit.studies.stress.cases.rotations import tumbling
 
 CASES: Final[list[Case]] = []
 _case = partial(register, CASES, "large")
@@ -35,34 +36,19 @@ def many_turns(angle: float) -> Problem:
         # The rounded angle less its whole turns.
         apart = float(mp.mpf(start) - turns * turn)
     swing = pendulum(apart, 0.0, 9.81)
-    return Problem(
-        catalog.pendulum(),
-        np.array([start]),
-        np.zeros(1),
-        duration=2.0,
-        exact=lambda t: start + (swing(t) - apart),
-        floor=EPS * start + 1e-14,
-        source=_SOURCE,
-        facts={"spacing of doubles there, rad": math.ulp(start)},
-    )
+    floor, facts = EPS * start + 1e-14, {"spacing of doubles there, rad": math.ulp(start)}
+    return motion(catalog.pendulum(), [start], 0.0, 2.0, lambda t: start + (swing(t) - apart), floor, _SOURCE, facts)
 
 
 @_case("place", "m", *_FAR)
 def far_on_rail(place: float) -> Problem:
     """A cart-pole falls from 2 rad for 2 s, far out on its rail."""
-    theta = 2.0
-    motion = cart_pole(theta, 1.0)
-    return Problem(
-        catalog.cart_pole(),
-        np.array([place, theta]),
-        np.zeros(2),
-        duration=2.0,
-        exact=lambda t: motion(t) + np.array([place, 0.0]),
-        floor=EPS * place + 1e-12,
-        source="energy and momentum with a quadrature",
-        scale=2 * theta,
-        facts={"spacing of doubles there, m": math.ulp(place)},
-    )
+    theta, start = 2.0, np.array([place, 0.0])
+    falling = cart_pole(theta, 1.0)
+    floor, facts = EPS * place + 1e-12, {"spacing of doubles there, m": math.ulp(place)}
+    model, source = catalog.cart_pole(), "energy and momentum with a quadrature"
+    q = np.array([place, theta])
+    return motion(model, q, 0.0, 2.0, lambda t: falling(t) + start, floor, source, facts, scale=2 * theta)
 
 
 @_case("place", "m", *_FAR)
@@ -81,29 +67,28 @@ def far_base_terms(place: float) -> Problem:
     return replace(problem, q=q, facts={"spacing of doubles there, m": math.ulp(place)})
 
 
-def _swing(gravity: float, speed: float, duration: float) -> Problem:
-    return Problem(
-        catalog.pendulum(gravity=gravity),
-        np.ones(1),
-        np.array([speed]),
-        duration=duration,
-        exact=pendulum(1.0, speed, gravity),
-        floor=16 * EPS * (1 + math.sqrt(gravity) * duration),
-        source=_SOURCE,
-        facts={"fastest frequency, rad/s": math.sqrt(gravity)},
-    )
+def _swing(
+    model: Model, gravity: float, speed: float, duration: float, floor: float, facts: dict[str, float] | None = None
+) -> Problem:
+    """Return a pendulum of 1 m that starts at 1 rad."""
+    return motion(model, np.ones(1), speed, duration, pendulum(1.0, speed, gravity), floor, _SOURCE, facts)
+
+
+def _under_gravity(gravity: float, speed: float, duration: float) -> Problem:
+    floor, facts = 16 * EPS * (1 + math.sqrt(gravity) * duration), {"fastest frequency, rad/s": math.sqrt(gravity)}
+    return _swing(catalog.pendulum(gravity=gravity), gravity, speed, duration, floor, facts)
 
 
 @_case("gravity", "m/s²", powers(0, 6), (1.0, 1e3, 1e6))
 def strong_gravity(gravity: float) -> Problem:
     """A pendulum swings from 1 rad for 1 s under ever stronger gravity."""
-    return _swing(gravity, 0.0, 1.0)
+    return _under_gravity(gravity, 0.0, 1.0)
 
 
 @_case("gravity", "m/s²", (*powers(0, -6), 0.0), (1.0, 1e-3, 0.0))
 def weak_gravity(gravity: float) -> Problem:
     """A pendulum starts at 1 rad with 1 rad/s under ever weaker gravity, and none."""
-    return _swing(gravity, 1.0, 2.0)
+    return _under_gravity(gravity, 1.0, 2.0)
 
 
 _HUGE: Final = (
@@ -116,43 +101,28 @@ _TINY: Final = (
 )
 
 
-def _pendulum_of(inertia: float) -> Problem:
-    """Return a pendulum of 1 m: its motion does not depend on its mass, but all forces do."""
-    return Problem(
-        catalog.pendulum(mass=inertia),
-        np.ones(1),
-        np.zeros(1),
-        duration=1.0,
-        exact=pendulum(1.0, 0.0, 9.81),
-        floor=16 * EPS,
-        source=_SOURCE,
-    )
-
-
-def _terms_of(inertia: float) -> Problem:
-    """Return the terms of a double pendulum; forces of the size of its inertia."""
-    return terms_at(catalog.double_pendulum(mass1=inertia, mass2=inertia), force=inertia)
+# The motion of a pendulum of 1 m does not depend on its mass, but all forces do.
 
 
 @_case("inertia", "kg m²", *_HUGE)
 def huge_inertia(inertia: float) -> Problem:
     """A pendulum of 1 m swings from 1 rad for 1 s, ever heavier."""
-    return _pendulum_of(inertia)
+    return _swing(catalog.pendulum(mass=inertia), 9.81, 0.0, 1.0, 16 * EPS)
 
 
 @_case("inertia", "kg m²", *_TINY)
 def tiny_inertia(inertia: float) -> Problem:
     """A pendulum of 1 m swings from 1 rad for 1 s, ever lighter, down to subnormal numbers."""
-    return _pendulum_of(inertia)
+    return _swing(catalog.pendulum(mass=inertia), 9.81, 0.0, 1.0, 16 * EPS)
 
 
 @_case("inertia", "kg m²", *_HUGE, measure="terms")
 def huge_inertia_terms(inertia: float) -> Problem:
     """Terms of a double pendulum of 1 m each, ever heavier."""
-    return _terms_of(inertia)
+    return terms_at(catalog.double_pendulum(mass1=inertia, mass2=inertia), force=inertia)
 
 
 @_case("inertia", "kg m²", *_TINY, measure="terms")
 def tiny_inertia_terms(inertia: float) -> Problem:
     """Terms of a double pendulum of 1 m each, ever lighter, down to subnormal numbers."""
-    return _terms_of(inertia)
+    return terms_at(catalog.double_pendulum(mass1=inertia, mass2=inertia), force=inertia)

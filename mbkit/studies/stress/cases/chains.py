@@ -12,9 +12,9 @@ import numpy as np
 from mbkit import catalog
 from mbkit._check import Array
 from mbkit.load import load
-from mbkit.model import Body, Model
+from mbkit.model import Body, Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import powers, register, rods, terms_at
+from mbkit.studies.stress.cases._common import SWING, motion, powers, register, terms_at
 from mbkit.studies.stress.cases.exact_motions import HangingChain
 
 CASES: Final[list[Case]] = []
@@ -24,6 +24,21 @@ _UP: Final = (powers(0, 9), (1.0, 1e3, 1e6, 1e9))
 _DOWN: Final = (powers(0, -9), (1.0, 1e-3, 1e-6, 1e-9))
 _RATIO: Final = "last over first mass"
 _ARM: Final = (1.0, 1.0, 1.0)
+
+
+def rods(name: str, masses: Sequence[float], load_mass: float = 0.0) -> Model:
+    """Return thin rods of 1 m, hinged end to end, with a point mass at the last end."""
+    b = ModelBuilder(name)
+    for i, mass in enumerate(masses, start=1):
+        across = mass / 12
+        parent = f"rod{i - 1}" if i > 1 else "world"
+        b.add_body(f"rod{i}", mass=mass, com=(0.0, 0.0, -0.5), inertia=(across, across, 0.0))
+        place = (0.0, 0.0, -1.0 if i > 1 else 0.0)
+        b.add_joint(f"theta{i}", "continuous", parent=parent, child=f"rod{i}", axis=SWING, translation=place)
+    if load_mass:
+        b.add_body("load", mass=load_mass)
+        b.add_joint("hold", "fixed", parent=f"rod{len(masses)}", child="load", translation=(0.0, 0.0, -1.0))
+    return b.build()
 
 
 def _graded(ratio: float) -> tuple[float, ...]:
@@ -41,21 +56,12 @@ def _terms(model: Model) -> Problem:
 
 
 def _swinging(name: str, masses: Sequence[float], load_mass: float = 0.0, *, taut: bool = True) -> Problem:
-    """Let a chain go at rest, its first rod half a radian from below."""
-    model, chain = rods(name, masses, load_mass), HangingChain(masses, load_mass)
-    angle, duration = 0.5, 1.0
+    """Let a chain go at rest, its first rod half a radian from below, for 1 s."""
+    model, chain, angle = rods(name, masses, load_mass), HangingChain(masses, load_mass), 0.5
     q = chain.taut(angle) if taut else np.array([angle, *[0.0] * (len(masses) - 1)])
-    return Problem(
-        model,
-        q,
-        np.zeros(len(q)),
-        duration=duration,
-        exact=chain.motion(q, duration),
-        # Measured against Taylor series with 34 digits.
-        floor=1e-11,
-        source="collocation in angles from the vertical, Radau IIA of order 15",
-        facts=_facts(model),
-    )
+    source = "collocation in angles from the vertical, Radau IIA of order 15"
+    # The error was measured against Taylor series with 34 digits.
+    return motion(model, q, 0.0, 1.0, chain.motion(q, 1.0), 1e-11, source, _facts(model))
 
 
 @_case(_RATIO, "", *_UP)
@@ -131,9 +137,8 @@ def robots_as_found(ratio: float) -> Problem:
     return _terms(load(_ROBOTS[min(_ROBOTS, key=lambda known: abs(known - ratio))]))
 
 
-# Chains from short to long
-
 LENGTH_CASES: Final[list[Case]] = []
+_LENGTHS: Final = tuple(2.0**k for k in range(1, 9))
 
 
 def straight_inertia(n: int) -> Array:
@@ -147,16 +152,7 @@ def straight_inertia(n: int) -> Array:
 
 
 # The longest take a minute to derive, with 34 digits.
-@register(
-    LENGTH_CASES,
-    "length",
-    "rods",
-    "",
-    tuple(2.0**k for k in range(1, 9)),
-    (2.0, 8.0, 32.0),
-    measure="terms",
-    patience=6.0,
-)
+@register(LENGTH_CASES, "length", "rods", "", _LENGTHS, (2.0, 8.0, 32.0), measure="terms", patience=6.0)
 def chain(n: float) -> Problem:
     """Terms of a planar chain of thin rods, straight and bent: its condition number grows as the fourth power."""
     count = round(n)
