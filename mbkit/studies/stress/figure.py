@@ -17,7 +17,6 @@ from mbkit.errors import UnknownNameError
 from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, style
 from mbkit.studies.stress.measurements import (
     CaseResult,
-    Line,
     Measurement,
     Outcome,
     best,
@@ -29,7 +28,6 @@ from mbkit.studies.stress.measurements import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Where one shade ends and the next begins, in digits of error.
@@ -43,6 +41,17 @@ SHADES: Final = {
     "end": "#d4d8dd",
     "mute": "#aab1ba",
     "none": "#ffffff",
+}
+_SHADES: Final[dict[Outcome, str]] = {
+    "warned": "gross",
+    "silent": "gross",
+    "diverged": "end",
+    "refused": "end",
+    "slow": "end",
+    "nan": "mute",
+    "died": "mute",
+    "not run": "none",
+    "unjudged": "none",
 }
 #: Outcome -> its word in a wide and in a narrow cell.
 WORDS: Final[dict[Outcome, tuple[str, str]]] = {
@@ -59,18 +68,13 @@ ROOMY: Final = 14
 _WIDTH: Final = 10.4
 #: The width of a letter of a row's name, in.
 _LETTER: Final = 0.075
+_DASHED: Final = (0, (1.5, 1))
 
 
 def shade(cell: Measurement, outcome: Outcome) -> str:
     """Return the name of a cell's shade, a key of `SHADES`."""
-    if outcome in ("warned", "silent"):
-        return "gross"
-    if outcome in ("diverged", "refused", "slow"):
-        return "end"
-    if outcome in ("nan", "died"):
-        return "mute"
-    if outcome in ("not run", "unjudged"):
-        return "none"
+    if outcome in _SHADES:
+        return _SHADES[outcome]
     digits = math.inf if cell.seen == 0 else -math.log10(cell.seen) if cell.seen > 0 else -math.inf
     return ("h" if outcome == "held" else "w") + str(sum(digits < d for d in _DIGITS))
 
@@ -122,6 +126,7 @@ def figure(cases: Sequence[CaseResult], case: str | None = None, palette: Palett
 def _map(case: CaseResult, palette: Palette) -> Figure:
     """Draw one case."""
     from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
 
     ranked, count = lines(case), len(case.values)
     height = 1.5 + 0.24 * max(len(ranked), 1)
@@ -131,15 +136,25 @@ def _map(case: CaseResult, palette: Palette) -> Figure:
     margins = {"left": left, "right": 0.995, "top": 1 - 0.55 / height, "bottom": 0.9 / height}
     ax = fig.subplots(gridspec_kw=margins)
     for y, line in enumerate(ranked):
-        _strip(ax, y, line, count, palette)
-        _limits(ax, y, line, case, palette)
+        for x, (cell, how) in enumerate(zip(line.row.cells[:count], line.outcomes, strict=False)):
+            face, weight = SHADES[shade(cell, how)], "bold" if how == "silent" else "normal"
+            ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=1.0))
+            text = cell_text(cell, how, short=count > ROOMY)
+            # Cells are light on every paper.
+            ax.text(x, y, text, ha="center", va="center", fontsize=7.5, weight=weight, color=PLAIN.ink)
+        ends = [y - 0.5, y + 0.5]
+        if line.broken.failed is not None:
+            ax.plot([line.reach - 0.5] * 2, ends, color=palette.ink, linewidth=2.2, solid_capstyle="butt")
+        # Before the first value beyond what linear theory allows.
+        at = math.nan if line.row.theory is None else place(case.values, line.row.theory)
+        if at < count - 1:
+            ax.plot([math.floor(at) + 0.5] * 2, ends, color=palette.series[3], linewidth=2.0, linestyle=_DASHED)
     ax.set_xlim(-0.5, max(count, 1) - 0.5)
     ax.set_ylim(max(len(ranked), 1) - 0.5, -0.5)
     ax.set_xticks(range(count), [number_text(v) for v in case.values], fontsize=8.5)
     ax.set_yticks(range(len(ranked)), names, fontsize=8.5)
     ax.tick_params(length=0)
-    for side in ("left", "bottom"):
-        ax.spines[side].set_visible(False)
+    ax.spines[["left", "bottom"]].set_visible(False)
     unit = f", {case.unit}" if case.unit else ""
     ax.set_xlabel(one_line(f"{case.parameter}{unit}", 90))
     # From the figure's left edge, for a sentence is longer than the axes.
@@ -148,30 +163,6 @@ def _map(case: CaseResult, palette: Palette) -> Figure:
         ax.text(0.5, 0.5, "nothing was run", transform=ax.transAxes, ha="center", color=palette.muted)
     _legend(fig, case.bar, palette)
     return fig
-
-
-def _strip(ax: Axes, y: int, line: Line, count: int, palette: Palette) -> None:
-    from matplotlib.patches import Rectangle
-
-    for x, (cell, how) in enumerate(zip(line.row.cells[:count], line.outcomes, strict=False)):
-        face = SHADES[shade(cell, how)]
-        ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=1.0))
-        weight = "bold" if how == "silent" else "normal"
-        text = cell_text(cell, how, short=count > ROOMY)
-        # Cells are light on every paper.
-        ax.text(x, y, text, ha="center", va="center", fontsize=7.5, weight=weight, color=PLAIN.ink)
-    if line.broken.failed is not None:
-        ax.plot([line.reach - 0.5] * 2, [y - 0.5, y + 0.5], color=palette.ink, linewidth=2.2, solid_capstyle="butt")
-
-
-def _limits(ax: Axes, y: int, line: Line, case: CaseResult, palette: Palette) -> None:
-    """Draw a dashed line before the first value beyond what linear theory allows."""
-    at = math.nan if line.row.theory is None else place(case.values, line.row.theory)
-    if at < len(case.values) - 1:
-        dashes = (0, (1.5, 1))
-        ax.plot(
-            [math.floor(at) + 0.5] * 2, [y - 0.5, y + 0.5], color=palette.series[3], linewidth=2.0, linestyle=dashes
-        )
 
 
 def _legend(fig: Figure, bar: float, palette: Palette) -> None:
@@ -184,7 +175,7 @@ def _legend(fig: Figure, bar: float, palette: Palette) -> None:
         Patch(facecolor=SHADES["gross"], label="wrong: ! with a warning, ✗ in silence"),
         Patch(facecolor=SHADES["end"], label="ended otherwise"),
         Line2D([], [], color=palette.ink, linewidth=2.2, label="breaks"),
-        Line2D([], [], color=palette.series[3], linewidth=1.8, linestyle=(0, (1.5, 1)), label="linear theory"),
+        Line2D([], [], color=palette.series[3], linewidth=1.8, linestyle=_DASHED, label="linear theory"),
     ]
     fig.legend(handles=handles, loc="lower left", ncols=len(handles), columnspacing=1.2, handlelength=1.4)
 
@@ -192,24 +183,26 @@ def _legend(fig: Figure, bar: float, palette: Palette) -> None:
 def _overview(cases: Sequence[CaseResult], palette: Palette) -> Figure:
     """Draw how much of each sweep every engine's furthest method held, and mbkit's own choice."""
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     cases = [c for c in cases if c.values]
     height = 1.3 + 0.26 * max(len(cases), 1)
     fig = Figure(figsize=(_WIDTH, height))
     margins = {"left": 0.25, "right": 0.8, "top": 1 - 0.6 / height, "bottom": 0.55 / height}
     ax = fig.subplots(gridspec_kw=margins)
-    engines = engines_of(cases)
+    engines, chosen = engines_of(cases), False
     for y, case in enumerate(cases):
-        leaders = best(case)
+        size, leaders, choice = len(case.values), best(case), recommended(case)
         for k, engine in enumerate(engines):
             if engine in leaders:
                 shift = (k - (len(engines) - 1) / 2) * 0.2
                 colour, mark = palette.engine(engine), engine_mark(engine)
-                ax.plot([leaders[engine].reach / len(case.values)], [y + shift], mark, color=colour, markersize=5.5)
-        choice = recommended(case)
+                ax.plot([leaders[engine].reach / size], [y + shift], mark, color=colour, markersize=5.5)
         if choice is not None:
-            ax.plot([choice.reach / len(case.values)], [y], "|", color=palette.ink, markersize=13, markeredgewidth=1.6)
-        ax.text(1.03, y, one_line(_span(case), 44), va="center", fontsize=8.0, color=palette.muted)
+            chosen = True
+            ax.plot([choice.reach / size], [y], "|", color=palette.ink, markersize=13, markeredgewidth=1.6)
+        span = f"{case.parameter} {number_text(case.values[0])} … {number_text(case.values[-1])} {case.unit}".rstrip()
+        ax.text(1.03, y, one_line(span, 44), va="center", fontsize=8.0, color=palette.muted)
     ax.set_yticks(range(len(cases)), [one_line(c.name, 34) for c in cases])
     ax.set_ylim(max(len(cases), 1) - 0.5, -0.5)
     ax.set_xlim(-0.02, 1.02)
@@ -217,18 +210,6 @@ def _overview(cases: Sequence[CaseResult], palette: Palette) -> Figure:
     ax.set_xlabel("part of the sweep that held, mild to extreme")
     ax.tick_params(axis="y", length=0)
     ax.grid(axis="x")
-    _engines_legend(fig, engines, palette, chosen=any(recommended(c) for c in cases))
-    return fig
-
-
-def _span(case: CaseResult) -> str:
-    unit = f" {case.unit}" if case.unit else ""
-    return f"{case.parameter} {number_text(case.values[0])} … {number_text(case.values[-1])}{unit}"
-
-
-def _engines_legend(fig: Figure, engines: list[str], palette: Palette, *, chosen: bool) -> None:
-    from matplotlib.lines import Line2D
-
     handles = [
         Line2D([], [], color=palette.engine(e), marker=engine_mark(e), linestyle="none", label=f"{e}, its best")
         for e in engines
@@ -238,3 +219,4 @@ def _engines_legend(fig: Figure, engines: list[str], palette: Palette, *, chosen
         handles.append(auto)
     if handles:
         fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.02, 1.0), ncols=len(handles))
+    return fig

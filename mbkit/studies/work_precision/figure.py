@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import one_line
 from mbkit.methods.registry import METHODS
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_Place = tuple[float, float]
+#: Run time, s, error or energy drift, and whose they are.
+_Place = tuple[float, float, Curve]
 _Measure = Callable[[PrecisionPoint], float]
 
 #: MuJoCo's own integrators stand in the panel of the same formula.
@@ -25,7 +26,6 @@ _WIDTH: Final = 10.4
 _TOP: Final = 4.4
 #: Right end of the axes; leaves room for half of the last tick's label.
 _RIGHT: Final = 0.98
-_MIN_LEGEND: Final = 5.0
 _ROW: Final = 1.5
 _NAME: Final = 9.0  # points, and the width of a bold letter, in
 _LETTER: Final = 0.077
@@ -34,6 +34,7 @@ USEFUL: Final = 0.1
 _MAX_ERROR: Final = 1.0
 _MIN_ERROR: Final = 1e-17
 _EPS: Final = 2.0**-52
+_DASHED: Final = (0, (4, 3))
 
 
 def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Palette = PLAIN) -> Figure:
@@ -57,13 +58,13 @@ def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Pale
     with rc_context(style(palette)):  # type: ignore[arg-type]
         height = _TOP + (0.75 + _ROW * rows if rows else 0.0)
         fig = Figure(figsize=(_WIDTH, height))
-        above, below = 0.62 / height, 0.55 / height
         split = 1 - _TOP / height
         # With dampers the energy is not conserved, and there is no drift to show.
         conserved = any(_drawable(p.seconds, p.energy) for c in curves for p in c.points)
-        margins = {"left": 0.07, "right": _RIGHT, "top": 1 - above, "bottom": split + below, "wspace": 0.2}
+        margins = {"left": 0.07, "right": _RIGHT, "top": 1 - 0.62 / height, "bottom": split + 0.55 / height}
         ratios = (1.55, 1.0) if conserved else (1.0,)
-        axes = fig.subplots(1, len(ratios), width_ratios=ratios, squeeze=False, gridspec_kw=margins)[0]
+        gridspec = margins | {"wspace": 0.2}
+        axes = fig.subplots(1, len(ratios), width_ratios=ratios, squeeze=False, gridspec_kw=gridspec)[0]
         _overview(axes[0], curves, error, floor, palette, show_floor=floor > 0)
         axes[0].set_title("error: lower left is better", loc="left")
         axes[0].set_ylabel("largest error of q, rad or m")
@@ -79,158 +80,142 @@ def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Pale
             if any(c.method in _SAME_FORMULA for some in methods.values() for c in some):
                 caption += "; dashed: MuJoCo's own integrator of the same formulas"
             fig.text(0.025, split - 0.12 / height, caption, va="top")
-            margins = {"left": 0.07, "right": _RIGHT, "top": split - 0.58 / height, "bottom": 0.42 / height}
-            margins |= {"wspace": 0.08, "hspace": 0.3}
+            margins |= {"top": split - 0.58 / height, "bottom": 0.42 / height, "wspace": 0.08, "hspace": 0.3}
             grid = fig.subplots(rows, _COLUMNS, sharex=True, sharey=True, squeeze=False, gridspec_kw=margins)
-            _by_method(list(grid.flat), methods, curves, error, floor, palette)
+            _by_method(list(grid.flat), methods, _places(curves, error), error, floor, palette)
     return fig
 
 
-def _methods(curves: Iterable[Curve]) -> dict[str, list[Curve]]:
+def _methods(curves: Sequence[Curve]) -> dict[str, list[Curve]]:
     """Return the curves of each panel, methods on most engines first."""
     panels: dict[str, list[Curve]] = {}
     for curve in curves:
         if any(_drawable(p.seconds, p.error) for p in curve.points):
             panels.setdefault(_SAME_FORMULA.get(curve.method, curve.method), []).append(curve)
-    return dict(sorted(panels.items(), key=lambda item: -len({c.engine for c in item[1]})))
-
-
-def _drawable(seconds: float, y: float) -> bool:
-    return math.isfinite(seconds) and seconds > 0 and math.isfinite(y)
-
-
-def _places(points: Iterable[PrecisionPoint], measure: _Measure) -> list[_Place]:
-    places = [(p.seconds, max(measure(p), _MIN_ERROR)) for p in points if _drawable(p.seconds, measure(p))]
-    return [(x, y) for x, y in places if y <= _MAX_ERROR]
-
-
-def _front(places: Iterable[tuple[Curve, _Place]], floor: float) -> list[tuple[Curve, _Place]]:
-    """Return the points that none beats in both error and run time, fastest first; below the floor all are equal."""
-    out: list[tuple[Curve, _Place]] = []
-    for curve, (x, y) in sorted(places, key=lambda item: item[1]):
-        if not out or max(y, floor) < max(out[-1][1][1], floor):
-            out.append((curve, (x, y)))
-    return out
-
-
-def _useful(places: Iterable[tuple[Curve, _Place]]) -> list[tuple[Curve, _Place]]:
-    return [(curve, (x, y)) for curve, (x, y) in places if y <= USEFUL]
-
-
-def _overview(
-    ax: Axes, curves: Sequence[Curve], measure: _Measure, floor: float, palette: Palette, *, show_floor: bool = False
-) -> None:
-    """Draw all curves thin, the best of each engine, and the front with its names."""
-    known = [(c, place) for c in curves for place in _places(c.points, measure)]
-    for curve in curves:
-        ax.plot(*_columns(_places(curve.points, measure)), color=palette.engine(curve.engine), linewidth=0.7, alpha=0.4)
-    front = _front(_useful(known), floor)
-    ax.plot(*_columns([p for _, p in front]), color=palette.ink, alpha=0.16, linewidth=11.0, solid_capstyle="round")
-    for engine in _engines(curves):
-        best = _front([item for item in known if item[0].engine == engine], floor)
-        ax.plot(
-            *_columns([p for _, p in best]),
-            color=palette.engine(engine),
-            marker=engine_mark(engine),
-            markersize=4.5,
-            linewidth=2.0,
-        )
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    names = _names(front)
-    if known:
-        _limits(ax, [p for _, p in known], floor, names)
-    if show_floor:
-        ax.axhline(floor, color=palette.muted, linestyle=(0, (4, 3)), linewidth=1.0)
-    ax.grid(which="major")
-    log_ticks(ax)
-    _name(ax, names, palette)
-
-
-def _columns(places: Sequence[_Place]) -> tuple[list[float], list[float]]:
-    return [x for x, _ in places], [y for _, y in places]
-
-
-def _limits(ax: Axes, places: Sequence[_Place], floor: float, names: Sequence[tuple[Curve, _Place, bool]]) -> None:
-    """Set the limits to hold all places, and at the left the names of the front: nothing else can be there."""
-    xs, ys = _columns(places)
-    low, high = math.log10(min(xs)) - 0.15, math.log10(max(xs)) + 0.15
-    width = float(ax.get_window_extent().width) / ax.get_figure(root=True).dpi  # type: ignore[union-attr]
-    for curve, (x, _), below in names:
-        share = min(0.6, (_LETTER * len(_short(curve)) + (-0.2 if below else 0.2)) / width)
-        low = min(low, (math.log10(x) - share * high) / (1 - share))
-    ax.set_xlim(10**low, 10**high)
-    room = 0.7 + 0.9 * sum(below for _, _, below in names)
-    ax.set_ylim(min([*ys, floor] if floor > 0 else ys) / 10**room, max(ys) * 2)
-
-
-def _names(front: Sequence[tuple[Curve, _Place]]) -> list[tuple[Curve, _Place, bool]]:
-    """Return each of the front's curves with its first point, and whether its name stands below that."""
-    out: list[tuple[Curve, _Place, bool]] = []
-    for k, (curve, (x, y)) in enumerate(front):
-        if all(curve is not c for c, _, _ in out):
-            # Where the front has become flat, what is left of a point is the front.
-            flat = k > 0 and math.log10(front[k - 1][1][1] / y) < 2 * math.log10(x / front[k - 1][1][0])
-            out.append((curve, (x, y), flat))
-    return out
-
-
-def _name(ax: Axes, names: Sequence[tuple[Curve, _Place, bool]], palette: Palette) -> None:
-    """Write the names of the front's methods where all is empty: left of the front, or below it."""
-    scale = ax.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
-    last = math.inf
-    for curve, place, below in names:
-        wanted = float(ax.transData.transform(place)[1]) / scale - (16.0 if below else 0.0)
-        # Downwards, where the front is further right, so that no name meets another.
-        placed = min(wanted, last - 12.0)
-        shift = placed - wanted - (16.0 if below else 0.0)
-        last = placed
-        ax.annotate(
-            _short(curve),
-            place,
-            (9.0 if below else -11.0, shift),
-            textcoords="offset points",
-            ha="right",
-            va="center",
-            fontsize=_NAME,
-            fontweight="bold",
-            color=palette.engine(curve.engine),
-        )
-
-
-def _short(curve: Curve) -> str:
-    return one_line(curve.method, 30)
+    return dict(sorted(panels.items(), key=lambda item: -len(_engines(item[1]))))
 
 
 def _engines(curves: Sequence[Curve]) -> list[str]:
     return list(dict.fromkeys(c.engine for c in curves))
 
 
+def _drawable(seconds: float, y: float) -> bool:
+    return math.isfinite(seconds) and seconds > 0 and math.isfinite(y)
+
+
+def _places(curves: Sequence[Curve], measure: _Measure) -> list[_Place]:
+    points = ((p.seconds, measure(p), c) for c in curves for p in c.points)
+    places = ((x, max(y, _MIN_ERROR), c) for x, y, c in points if _drawable(x, y))
+    return [place for place in places if place[1] <= _MAX_ERROR]
+
+
+def _xy(places: Sequence[_Place]) -> tuple[list[float], list[float]]:
+    return [x for x, _, _ in places], [y for _, y, _ in places]
+
+
+def _front(places: Sequence[_Place], floor: float) -> list[_Place]:
+    """Return the points that none beats in both error and run time, fastest first; below the floor all are equal."""
+    front: list[_Place] = []
+    for place in sorted(places, key=lambda place: place[:2]):
+        if not front or max(place[1], floor) < max(front[-1][1], floor):
+            front.append(place)
+    return front
+
+
+def _draw_front(ax: Axes, places: Sequence[_Place], floor: float, palette: Palette, width: float) -> list[_Place]:
+    """Draw the front of all useful points as a band, and return it."""
+    front = _front([place for place in places if place[1] <= USEFUL], floor)
+    ax.plot(*_xy(front), color=palette.ink, alpha=0.16, linewidth=width, solid_capstyle="round")
+    return front
+
+
+def _overview(
+    ax: Axes, curves: Sequence[Curve], measure: _Measure, floor: float, palette: Palette, *, show_floor: bool = False
+) -> None:
+    """Draw all curves thin, the best of each engine, and the front with its names."""
+    places = _places(curves, measure)
+    for curve in curves:
+        ax.plot(*_xy(_places([curve], measure)), color=palette.engine(curve.engine), linewidth=0.7, alpha=0.4)
+    front = _draw_front(ax, places, floor, palette, 11.0)
+    for engine in _engines(curves):
+        best = _xy(_front([place for place in places if place[2].engine == engine], floor))
+        ax.plot(*best, color=palette.engine(engine), marker=engine_mark(engine), markersize=4.5, linewidth=2.0)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    names = _names(front)
+    _limits(ax, places, floor, names)
+    if show_floor:
+        ax.axhline(floor, color=palette.muted, linestyle=_DASHED, linewidth=1.0)
+    ax.grid(which="major")
+    log_ticks(ax)
+    _write_names(ax, names, palette)
+
+
+def _limits(ax: Axes, places: Sequence[_Place], floor: float, names: Sequence[tuple[_Place, bool]]) -> None:
+    """Set the limits to hold all places, and at the left the names of the front: nothing else can be there."""
+    if not places:
+        return
+    xs, ys = _xy(places)
+    low, high = math.log10(min(xs)) - 0.15, math.log10(max(xs)) + 0.15
+    width = float(ax.get_window_extent().width) / ax.get_figure(root=True).dpi  # type: ignore[union-attr]
+    for (x, _, curve), below in names:
+        share = min(0.6, (_LETTER * len(_short(curve)) + (-0.2 if below else 0.2)) / width)
+        low = min(low, (math.log10(x) - share * high) / (1 - share))
+    ax.set_xlim(10**low, 10**high)
+    room = 0.7 + 0.9 * sum(below for _, below in names)
+    ax.set_ylim(min([*ys, floor] if floor > 0 else ys) / 10**room, max(ys) * 2)
+
+
+def _names(front: Sequence[_Place]) -> list[tuple[_Place, bool]]:
+    """Return the first point of each of the front's curves, and whether its name stands below that."""
+    names: list[tuple[_Place, bool]] = []
+    for k, (x, y, curve) in enumerate(front):
+        if all(curve is not known for (_, _, known), _ in names):
+            # Where the front has become flat, what is left of a point is the front.
+            flat = k > 0 and math.log10(front[k - 1][1] / y) < 2 * math.log10(x / front[k - 1][0])
+            names.append(((x, y, curve), flat))
+    return names
+
+
+def _write_names(ax: Axes, names: Sequence[tuple[_Place, bool]], palette: Palette) -> None:
+    """Write the names of the front's methods where all is empty: left of the front, or below it."""
+    scale = ax.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
+    last = math.inf
+    for (x, y, curve), below in names:
+        at = float(ax.transData.transform((x, y))[1]) / scale
+        # Downwards, where the front is further right, so that no name meets another.
+        last = min(at - (16.0 if below else 0.0), last - 12.0)
+        offset, colour = (9.0 if below else -11.0, last - at), palette.engine(curve.engine)
+        font: dict[str, Any] = {"fontsize": _NAME, "fontweight": "bold", "color": colour}
+        ax.annotate(_short(curve), (x, y), offset, textcoords="offset points", ha="right", va="center", **font)
+
+
+def _short(curve: Curve) -> str:
+    return one_line(curve.method, 30)
+
+
 def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette) -> None:
     from matplotlib.lines import Line2D
 
-    handles = [
-        Line2D(
-            [], [], color=palette.engine(e), marker=engine_mark(e), linewidth=2.0, label=f"best of {one_line(e, 20)}"
-        )
-        for e in _engines(curves)
-    ]
+    handles = []
+    for e in _engines(curves):
+        look: dict[str, Any] = {"color": palette.engine(e), "marker": engine_mark(e), "linewidth": 2.0}
+        handles.append(Line2D([], [], label=f"best of {one_line(e, 20)}", **look))
     handles.append(Line2D([], [], color=palette.ink, alpha=0.16, linewidth=9.0, label="the front"))
     handles.append(Line2D([], [], color=palette.muted, linewidth=0.7, label="every curve"))
     if floor > 0:
         label = f"reference known to {floor:.0e}"
-        handles.append(Line2D([], [], color=palette.muted, linestyle=(0, (4, 3)), linewidth=1.0, label=label))
+        handles.append(Line2D([], [], color=palette.muted, linestyle=_DASHED, linewidth=1.0, label=label))
+    place: dict[str, Any] = {
+        "loc": "upper left",
+        "bbox_to_anchor": (0.02, 1.0),
+        "ncols": len(handles),
+        "columnspacing": 1.6,
+    }
     # On one line, in letters as small as long names need.
-    for size in (10.0, 9.0, 8.0, 7.0, 6.0, _MIN_LEGEND):
-        legend = fig.legend(
-            handles=handles,
-            loc="upper left",
-            bbox_to_anchor=(0.02, 1.0),
-            ncols=len(handles),
-            columnspacing=1.6,
-            prop={"size": size},
-        )
-        if size == _MIN_LEGEND or legend.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
+    for size in (10.0, 9.0, 8.0, 7.0, 6.0, 5.0):
+        legend = fig.legend(handles=handles, ncols=len(handles), prop={"size": size}, **place)
+        if size == 5.0 or legend.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
             return
         legend.remove()
 
@@ -238,32 +223,24 @@ def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette
 def _by_method(
     panels: Sequence[Axes],
     methods: dict[str, list[Curve]],
-    curves: Sequence[Curve],
+    places: Sequence[_Place],
     measure: _Measure,
     floor: float,
     palette: Palette,
 ) -> None:
     """Draw one method a panel, each engine in its colour, with the front as a band behind."""
-    known = [(c, place) for c in curves for place in _places(c.points, measure)]
-    front = _columns([p for _, p in _front(_useful(known), floor)])
     for ax, (method, some) in zip(panels, methods.items(), strict=False):
-        ax.plot(*front, color=palette.ink, alpha=0.16, linewidth=6.0, solid_capstyle="round")
+        _draw_front(ax, places, floor, palette, 6.0)
         for curve in some:
             own = curve.method in _SAME_FORMULA
-            ax.plot(
-                *_columns(_places(curve.points, measure)),
-                color=palette.engine(curve.engine),
-                marker="" if own else engine_mark(curve.engine),
-                linestyle=(0, (2, 1)) if own else "-",
-                markersize=3.0,
-                linewidth=1.3,
-            )
+            mark, line = ("", (0, (2, 1))) if own else (engine_mark(curve.engine), "-")
+            look: dict[str, Any] = {"color": palette.engine(curve.engine), "marker": mark, "markersize": 3.0}
+            ax.plot(*_xy(_places([curve], measure)), linestyle=line, linewidth=1.3, **look)
         ax.set_title(one_line(method, 30), loc="left", fontsize=9.5, pad=3)
     first = panels[0]
     first.set_xscale("log")
     first.set_yscale("log")
-    if known:
-        _limits(first, [p for _, p in known], floor, ())
+    _limits(first, places, floor, ())
     for k, ax in enumerate(panels):
         if k >= len(methods):
             ax.remove()
