@@ -1,15 +1,14 @@
 """What the cells of one value are measured against: a reference motion, or terms with 34 digits.
 
 Where there is no closed form, the difference of two runs that share as little as possible bounds the error of either
-(Hairer, Nørsett, Wanner 1993, II.4, on why one run alone cannot). Three ways are tried until one is good enough:
-explicit methods of high order on two engines; implicit methods of different families, for stiff motion; Taylor series
-with 34 digits, for motion that loses digits in double.
+(Hairer, Nørsett, Wanner 1993, II.4, on why one run alone cannot). Runs are made until two agree: explicit methods of
+high order on two engines; implicit methods of different families, for stiff motion; Taylor series with 34 digits, for
+motion that loses digits in double.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
@@ -46,18 +45,16 @@ _MIN_SERIES: Final = 5.0
 #: A truth no better than this part of the motion cannot show even gross errors.
 _WORTHLESS: Final = 1e-3
 #: Engine, method, and tolerance or number of steps; the third stands in for the second where that is not installed.
-_EXPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
+_RUNS: Final[tuple[tuple[str, str, float], ...]] = (
     (DERIVED, ADAPTIVE_METHOD, 1e-14),
     *((engine, SCIPY_METHOD, 1e-13) for engine in INDEPENDENT),
-)
-_IMPLICIT: Final[tuple[tuple[str, str, float], ...]] = (
     (DERIVED, BDF_METHOD, 1e-12),
     (DERIVED, GAUSS_METHOD, 1000),
     (PINOCCHIO, SCIPY_STIFF_METHOD, 1e-11),
     (DERIVED, GAUSS_METHOD, 4000),
 )
-#: Runs, none for Taylor series, and the part of the time left that they may take.
-_WAYS: Final = ((_EXPLICIT, 0.35), (_IMPLICIT, 0.5), ((), 1.0))
+#: The part of the time left that one of them may take.
+_PART: Final = 0.2
 
 
 def reference_motion(problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
@@ -65,25 +62,53 @@ def reference_motion(problem: Problem, times: Array, wanted: float, seconds: flo
     if problem.exact is not None:
         return _closed_form(problem, times)
     end = time.thread_time() + seconds
+    runs: list[tuple[Array, str]] = []
     best: Truth | None = None
-    reasons: list[str] = []
-    for runs, part in _WAYS:
+    for engine, method, setting in _RUNS:
         left = end - time.thread_time()
-        if left < (_MIN_SEARCH if runs else _MIN_SERIES):
-            reasons.append("the time was up")
+        if left < _MIN_SEARCH or (best is not None and best.floor <= wanted):
             break
         try:
-            truth = _two_runs(runs, problem, times, wanted, part * left) if runs else _series(problem, times, left)
+            q, how = _run(problem, times, engine, method, setting, _PART * left)
+        except MbkitError:
+            # The other runs may do without it.
+            continue
+        for other_q, other in runs:
+            floor = _SAFETY * float(gap(problem.model, other_q, q).max()) + _rounding(q)
+            if best is None or floor < best.floor:
+                best = Truth(times, q, floor, f"{other} and {how}")
+        runs.append((q, how))
+    reasons = [f"{best.how}, which part by {best.floor / _SAFETY:.1e}"] if best else []
+    left = end - time.thread_time()
+    if best is None or best.floor > wanted:
+        try:
+            if left < _MIN_SERIES:
+                raise NumericalError("the time was up")
+            known = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=left)
+            if len(known.t) < len(times):
+                raise NumericalError(known.how)
+            series = Truth(times, np.asarray(known.q), float(known.floor.max()), known.how)
+            best = series if best is None or series.floor < best.floor else best
         except MbkitError as error:
             reasons.append(str(error))
-            continue
-        best = truth if best is None or truth.floor < best.floor else best
-        if best.floor <= wanted:
-            break
     if best is None or best.floor > _WORTHLESS * problem.scale:
-        apart = f"{best.how}, which part by {best.floor / _SAFETY:.1e}" if best else ""
-        return None, "no truth: " + "; ".join(x for x in (apart, *dict.fromkeys(reasons)) if x)
+        return None, "no truth: " + "; ".join(reasons)
     return best, f"{best.how}; known to {best.floor:.1e}"
+
+
+def _run(problem: Problem, times: Array, engine: str, method: str, setting: float, seconds: float) -> tuple[Array, str]:
+    """Return q of a run in double to the end, and how it was computed."""
+    fixed = METHODS[method].kind == "fixed"
+    # A whole number of steps to each saved time.
+    each = max(1, round(setting / (len(times) - 1)))
+    step: dict[str, Any] = {"dt": float(times[1]) / each} if fixed else {"rtol": setting}
+    dyn = dynamics(problem.model, engine)
+    with cpu_limit(seconds):
+        run = quiet_simulate(dyn, problem.q, problem.v, float(times[-1]), method, save=times, **step)
+    if not run.stats.finished or len(run.q) < len(times):
+        raise NumericalError(run.stats.message)
+    size = f"{each * (len(times) - 1)} steps" if fixed else f"rtol {setting:.0e}"
+    return run.q, f"{method} on {engine} ({size})"
 
 
 def _closed_form(problem: Problem, times: Array) -> tuple[Truth | None, str]:
@@ -103,53 +128,6 @@ def _closed_form(problem: Problem, times: Array) -> tuple[Truth | None, str]:
 def _rounding(q: Array) -> float:
     """Return the error of rounding a motion to double."""
     return 0.5 * _EPS * float(np.abs(q).max())
-
-
-def _two_runs(
-    runs: Sequence[tuple[str, str, float]], problem: Problem, times: Array, wanted: float, seconds: float
-) -> Truth:
-    """Make runs in double until two agree; `NumericalError` where fewer than two came to the end."""
-    end = time.thread_time() + seconds
-    done: list[tuple[Array, str]] = []
-    best: Truth | None = None
-    for engine, method, setting in runs:
-        left = end - time.thread_time()
-        if left < _MIN_SEARCH:
-            break
-        fixed = METHODS[method].kind == "fixed"
-        # A whole number of steps to each saved time.
-        each = max(1, round(setting / (len(times) - 1)))
-        step: dict[str, Any] = {"dt": float(times[1]) / each} if fixed else {"rtol": setting}
-        try:
-            dyn = dynamics(problem.model, engine)
-            with cpu_limit(left):
-                run = quiet_simulate(dyn, problem.q, problem.v, float(times[-1]), method, save=times, **step)
-        except MbkitError:
-            # The other runs may do without it.
-            continue
-        if not run.stats.finished or len(run.q) < len(times):
-            continue
-        size = f"{each * (len(times) - 1)} steps" if fixed else f"rtol {setting:.0e}"
-        how = f"{method} on {engine} ({size})"
-        for other_q, other in done:
-            floor = _SAFETY * float(gap(problem.model, other_q, run.q).max()) + _rounding(run.q)
-            if best is None or floor < best.floor:
-                best = Truth(times, run.q, floor, f"{other} and {how}")
-        done.append((run.q, how))
-        if best is not None and best.floor <= wanted:
-            break
-    if best is None:
-        tried = ", ".join(dict.fromkeys(method for _, method, _ in runs))
-        only = f"{done[0][1]} alone" if done else "none"
-        raise NumericalError(f"of {tried}, {only} came to the end in {seconds:.2g} s")
-    return best
-
-
-def _series(problem: Problem, times: Array, seconds: float) -> Truth:
-    known = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=seconds)
-    if len(known.t) < len(times):
-        raise NumericalError(known.how)
-    return Truth(times, np.asarray(known.q), float(known.floor.max()), known.how)
 
 
 # Terms. Errors are those of `mbkit.studies.compare.errors`, but for forward dynamics: there its error is divided by

@@ -77,26 +77,25 @@ class _Row:
             self.stopped = f"not run: {' and '.join(dict.fromkeys(last))} at milder values before"
 
 
+@dataclass(eq=False)
 class CaseSweep:
     """A case with its values from mild to extreme, truths and rows of (engine, method)."""
 
-    def __init__(
-        self,
-        case: Case,
-        values: Sequence[float],
-        rows: Sequence[tuple[str, str]],
-        bar: float,
-        limits: Limits,
-        report: Callable[[str], object],
-        deadline: float = math.inf,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        self.case, self.values, self.bar = case, tuple(values), bar
-        self._limits = replace(limits, seconds=limits.seconds * case.patience)
-        self._report, self._deadline, self._clock = report, deadline, clock
+    case: Case
+    values: tuple[float, ...]
+    pairs: Sequence[tuple[str, str]]
+    bar: float
+    limits: Limits
+    report: Callable[[str], object]
+    deadline: float = math.inf
+    clock: Callable[[], float] = time.perf_counter
+
+    def __post_init__(self) -> None:
+        theory = self.case.theory or (lambda _engine, _method: None)
+        self.limits = replace(self.limits, seconds=self.limits.seconds * self.case.patience)
         #: By the index of the value.
         self._prepared: dict[int, Prepared] = {}
-        self._rows = [_Row(e, m, self._setting(m), case.theory(e, m) if case.theory else None) for e, m in rows]
+        self._rows = [_Row(e, m, self._setting(m), theory(e, m)) for e, m in self.pairs]
 
     @property
     def engines(self) -> tuple[str, ...]:
@@ -118,8 +117,8 @@ class CaseSweep:
             return ""
         kind = METHODS[method]
         if kind.kind == "adaptive":
-            return f"rtol {max(self._limits.rtol, kind.least):.0e}"
-        return f"dt {self._limits.dt:g} s"
+            return f"rtol {max(self.limits.rtol, kind.least):.0e}"
+        return f"dt {self.limits.dt:g} s"
 
     def _call(
         self, worker: Worker, value: float, function: Callable[..., Any], *arguments: object, **stage_seconds: float
@@ -131,15 +130,15 @@ class CaseSweep:
                 self.case,
                 value,
                 *arguments,
-                cpu_seconds=_with_grace(self._limits.preparation),
+                cpu_seconds=_with_grace(self.limits.preparation),
                 stage_seconds={stage: _with_grace(seconds) for stage, seconds in stage_seconds.items()},
-                deadline=self._deadline,
+                deadline=self.deadline,
             )
         except (CallError, WorkerClosedError, WorkerStartError):
             # No cell can be computed: these end the study.
             raise
         except WorkerTimeoutError as error:
-            if self._clock() >= self._deadline:
+            if self.clock() >= self.deadline:
                 return Measurement(value, "not run", note=OUT_OF_TIME)
             return Measurement(value, "slow", note=f"{error}{_DURING.get(worker.stage, '')}")
         except WorkerDiedError as error:
@@ -156,10 +155,10 @@ class CaseSweep:
         for i, value in enumerate(self.values):
             if i in self._prepared:
                 continue
-            left = until - self._clock()
+            left = until - self.clock()
             if left < _MIN_TIME:
                 return False
-            self._report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
+            self.report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
             share = left / (len(self.values) - i)
             seconds = _TERMS if self.case.measure == "terms" else share + _MIN_TRUTH
             answer = self._call(worker, value, prepare, self.bar, _SEARCH * share, truth=seconds)
@@ -188,15 +187,15 @@ class CaseSweep:
                     row.cells[i] = failure
                 elif row.stopped:
                     row.cells[i] = Measurement(value, "not run", note=row.stopped)
-                elif until - self._clock() < _MIN_TIME:
+                elif until - self.clock() < _MIN_TIME:
                     return False
                 else:
-                    self._report(f"{self.case.name}: {row.method} on {engine}, {self.case.parameter} = {value:g}")
+                    self.report(f"{self.case.name}: {row.method} on {engine}, {self.case.parameter} = {value:g}")
                     self._run(row, rows, i, worker)
         return True
 
     def _run(self, row: _Row, rows: Sequence[_Row], i: int, worker: Worker) -> None:
-        limits, truth = self._limits, self._prepared[i].truth
+        limits, truth = self.limits, self._prepared[i].truth
         arguments = (row.engine, row.method, limits, truth)
         cell = self._call(worker, self.values[i], measure, *arguments, run=limits.seconds)
         row.add(i, cell)

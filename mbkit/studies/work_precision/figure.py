@@ -206,12 +206,7 @@ def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette
     if floor > 0:
         label = f"reference known to {floor:.0e}"
         handles.append(Line2D([], [], color=palette.muted, linestyle=_DASHED, linewidth=1.0, label=label))
-    place: dict[str, Any] = {
-        "loc": "upper left",
-        "bbox_to_anchor": (0.02, 1.0),
-        "ncols": len(handles),
-        "columnspacing": 1.6,
-    }
+    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.02, 1.0), "columnspacing": 1.6}
     # On one line, in letters as small as long names need.
     for size in (10.0, 9.0, 8.0, 7.0, 6.0, 5.0):
         legend = fig.legend(handles=handles, ncols=len(handles), prop={"size": size}, **place)

@@ -71,7 +71,7 @@ def first_run(model: Model, engine: str, method: str, start: Callable[[Dynamics]
     hold. Imports, and what is the same for every model, are done before the clock starts.
     """
     _import_for(engine, method)
-    with _empty_caches():
+    with force_recompile(), _without_heyoka_cache() if "heyoka" in sys.modules else contextlib.nullcontext():
         begun = time.perf_counter()
         dyn = dynamics(model, engine)
         start(dyn)
@@ -88,23 +88,9 @@ def _import_for(engine: str, method: str) -> None:
 
 
 @contextlib.contextmanager
-def _empty_caches() -> Iterator[None]:
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(force_recompile())
-        if "heyoka" in sys.modules:
-            stack.enter_context(_without_heyoka_cache())
-        yield
-
-
-@contextlib.contextmanager
 def _without_heyoka_cache() -> Iterator[None]:
     from heyoka import llvm_state
 
-    # Older versions have no cache on disk.
-    if not hasattr(llvm_state, "set_diskcache_enabled"):
-        llvm_state.clear_memcache()
-        yield
-        return
     with _HEYOKA_LOCK:
         _HEYOKA_BEFORE.append(llvm_state.get_diskcache_enabled())
         llvm_state.set_diskcache_enabled(False)
@@ -200,19 +186,17 @@ class Problem:
 
     def solve(self, dyn: Dynamics, settings: Settings, value: float, limit: float | None = None) -> Trajectory:
         """Integrate to the horizon; give up after `limit` seconds."""
-        return self._simulate(dyn, settings, value, self.times, limit)
+        progress = None if limit is None else patience(limit)
+        return self._simulate(dyn, settings, value, self.times, progress=progress)
 
     def start(self, dyn: Dynamics, settings: Settings, value: float) -> Trajectory:
         """Integrate one step, or a thousandth of an interval."""
         duration = value if settings.setting == "dt" else 1e-3 * float(self.times[1])
-        return self._simulate(dyn, settings, value, np.array([duration]), None)
+        return self._simulate(dyn, settings, value, np.array([duration]))
 
-    def _simulate(
-        self, dyn: Dynamics, settings: Settings, value: float, save: Array, limit: float | None
-    ) -> Trajectory:
-        setting: dict[str, Any] = {settings.setting: value, "torque": self.torque, "save": save}
-        progress = None if limit is None else patience(limit)
-        return quiet_simulate(dyn, self.q0, self.v0, float(save[-1]), settings.method, progress=progress, **setting)
+    def _simulate(self, dyn: Dynamics, settings: Settings, value: float, save: Array, **more: Any) -> Trajectory:
+        more |= {settings.setting: value, "torque": self.torque, "save": save}
+        return quiet_simulate(dyn, self.q0, self.v0, float(save[-1]), settings.method, **more)
 
 
 @dataclass
