@@ -18,7 +18,7 @@ from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, TorqueErr
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Trajectory, at_section, simulate, stiffness
 from mbkit.simulate.solvers.auto import StepRateMonitor
-from mbkit.simulate.solvers.step_attempts import AcceptedSteps
+from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.studies.stress import cases
 from mbkit.studies.stress.cases.exact_motions import cart_pole as light_cart_pole
 from tests.random_trees import SOUND, random_tree

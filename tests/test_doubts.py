@@ -11,9 +11,13 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning
+from mbkit.methods.registry import Tolerances
 from mbkit.simulate import METHODS
 from mbkit.simulate.diagnostics.checks import lost, massless_joints
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord
+from mbkit.simulate.torque import Torque
 from mbkit.studies.stress.cases.exact_motions import pendulum
 
 LINEAR = sorted(name for name, method in METHODS.items() if method.stability)
@@ -317,7 +321,10 @@ def test_a_joint_that_moves_no_mass_in_a_pose_is_named():
 
 @pytest.mark.parametrize(("reached", "ends"), [(0.5, False), (1e-5, False), (1e-8, True)])
 def test_steps_that_cover_nothing_end_a_run(reached, ends):
-    member = TrajectoryRecord(mb.catalog.pendulum(), duration=1.0)
+    dyn, rule = mb.dynamics(mb.catalog.pendulum()), Tolerances(1e-9, 1e-9)
+    torque, start = Torque(None, dyn.model, None, None), (np.zeros(1), np.zeros(1))
+    problem = IntegrationProblem(dyn, "rk853", *start, 0.0, 1.0, rule, torque, None, (), Progress(None, ""))
+    member = TrajectoryRecord(problem, 0)
     member.steps, member.rejected, member.reached = 19_000, 900, reached / 2
     assert not member.crawls()
     member.rejected, member.reached = 1_000, reached

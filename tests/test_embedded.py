@@ -21,8 +21,11 @@ from mbkit.methods.tableaus import EmbeddedTableau, dormand_prince_853
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import Event, Trajectory, at_section, simulate
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
-from mbkit.simulate.solvers.step_attempts import AcceptedSteps, RungeKuttaAttempts
+from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
+from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 
@@ -62,8 +65,11 @@ def both(model: Model) -> dict[str, Dynamics]:
 
 
 def trials(kind: str, dyn: Any, rtol: float = 1e-10) -> CompiledAttempts | RungeKuttaAttempts:
-    make = {"lanes": CompiledAttempts, "stages": RungeKuttaAttempts}[kind]
-    return make(dyn, Space(dyn.model), Tolerances(rtol, rtol), Torque(None, dyn.model, None, None), 1.0, None)
+    make, model = {"lanes": CompiledAttempts, "stages": RungeKuttaAttempts}[kind], dyn.model
+    tolerances, torque = Tolerances(rtol, rtol), Torque(None, model, None, None)
+    start = model.neutral(), np.zeros(model.nv)
+    problem = IntegrationProblem(dyn, "rk853", *start, 0.0, 1.0, tolerances, torque, None, (), Progress(None, ""))
+    return make(problem, Space(model), tolerances)
 
 
 def quiet(*args: Any, **kwargs: Any) -> Trajectory:

@@ -20,8 +20,11 @@ from mbkit.methods.tableaus import rodas5p
 from mbkit.model import ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import at_section, simulate
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
-from mbkit.simulate.solvers.step_attempts import AcceptedSteps, RosenbrockAttempts
+from mbkit.simulate.solvers.step_attempts import RosenbrockAttempts
+from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms
@@ -72,10 +75,12 @@ def test_it_is_l_stable() -> None:
 
 def both(dyns: dict[str, Dynamics], rtol: float = 1e-10) -> dict[str, Any]:
     made: dict[str, Any] = {}
-    for name, make in (("lanes", CompiledAttempts), ("stages", RosenbrockAttempts)):
-        dyn = dyns[name]
-        given = Space(dyn.model), Tolerances(rtol, rtol), Torque(None, dyn.model, None, None), 1.0, None
-        made[name] = make(dyn, *given, *(("rodas5",) if name == "lanes" else ()))  # type: ignore[arg-type, operator]
+    for name, dyn in dyns.items():
+        model, tolerances = dyn.model, Tolerances(rtol, rtol)
+        start, torque = (model.neutral(), np.zeros(model.nv)), Torque(None, model, None, None)
+        problem = IntegrationProblem(dyn, "rodas5", *start, 0.0, 1.0, tolerances, torque, None, (), Progress(None, ""))
+        own = problem, Space(model), tolerances
+        made[name] = CompiledAttempts(*own, "rodas5") if name == "lanes" else RosenbrockAttempts(*own)
     return made
 
 

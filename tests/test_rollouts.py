@@ -24,6 +24,7 @@ from mbkit.errors import MbkitWarning, UnknownNameError
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import RK4, Trajectory, simulate
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers import compiled_fixed_step
 from mbkit.simulate.time_grid import Grid
@@ -239,7 +240,8 @@ def outcome(dyn: LagrangianDynamics, q: np.ndarray, v: np.ndarray, workers: int,
     grid = Grid.of(0.0, steps * 1e-3, 1e-3)
     tau = Torque(np.linspace(-1, 1, len(q) * steps * dyn.model.nv).reshape(len(q), steps, -1), dyn.model, len(q), steps)
     with Progress(None, "") as bar:
-        return compiled_fixed_step.run_rollout(dyn, "rk4", q, v, grid, np.arange(0, steps + 1), tau, bar, workers)
+        problem = IntegrationProblem.on_grid(dyn, "rk4", q, v, grid, np.arange(0, steps + 1), tau, bar)
+        return compiled_fixed_step.run_rollout(problem, workers)
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 9, 65, 300])

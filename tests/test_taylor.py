@@ -22,13 +22,8 @@ from mbkit.codegen.taylor import TaylorSystem, _functions, order_of, precision, 
 from mbkit.derivation import Equations
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
-from mbkit.methods.registry import Tolerances
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, Trajectory, at_section, simulate
-from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.progress import Progress
-from mbkit.simulate.solvers.taylor import run_taylor
-from mbkit.simulate.torque import Torque
 from tests.random_trees import random_tree
 
 hy = pytest.importorskip("heyoka")
@@ -343,23 +338,11 @@ def test_progress_is_told(swing: Any) -> None:
 # Bad input
 
 
-def _direct(dyn: Any, torque: Any) -> None:
-    read = Torque(torque, dyn.model, None, None)
-    q, v = dyn.model.neutral(), np.zeros(dyn.model.nv)
-    run_taylor(
-        IntegrationProblem(dyn, "taylor", q, v, 0.0, 1.0, Tolerances(1e-10, 1e-10), read, None, (), Progress(None, ""))
-    )
-
-
 def test_what_has_no_series_is_refused(swing: Any) -> None:
     with pytest.raises(UnsupportedError, match=r"torque.*rk853.*dop853"):
         taylor(swing, [1.0], [0.0], torque=lambda t, q, v: [0.0])
-    with pytest.raises(UnsupportedError, match=r"a torque function has no Taylor series.*'rk853' or 'dop853'"):
-        _direct(swing, lambda t, q, v: [0.0])
     with pytest.raises(UnsupportedError, match="not on the pinocchio engine"):
         taylor(dynamics(catalog.pendulum()), [1.0], [0.0])
-    with pytest.raises(UnsupportedError, match="not on the pinocchio engine"):
-        _direct(dynamics(catalog.pendulum()), None)
     with pytest.raises(InputError, match="save: expected a grid of times for a batch"):
         taylor(swing, [[1.0], [2.0]], [0.0])
     with pytest.raises(InputError, match=r"rtol: expected at least 2.22e-16"):

@@ -60,17 +60,38 @@ def _stage_weights(alpha: Array, beta: Array, tree: Tree) -> Array:
     return out
 
 
-def _require_order(name: str, matrix: Array, weights: Array, order: int) -> None:
-    slack = 16 * len(weights) * np.finfo(float).eps
+#: What the sixteen digits of published coefficients leave of a sum of a Rosenbrock method.
+_DIGITS: Final = 1e-12
+
+
+def _require_order(name: str, alpha: Array, beta: Array, weights: Array, order: int) -> None:
+    """Raise where an order condition fails; a Runge-Kutta method has the same weights alpha and beta."""
+    eps = 16 * len(weights) * float(np.finfo(float).eps)
     for p in range(1, order + 1):
         for tree in rooted_trees(p):
-            stages = _stage_weights(matrix, matrix, tree)
+            stages = _stage_weights(alpha, beta, tree)
             got, wanted = float(weights @ stages), 1 / density(tree)
-            if abs(got - wanted) > slack * float(np.abs(weights) @ np.abs(stages)):
+            if abs(got - wanted) > (eps * float(np.abs(weights) @ np.abs(stages)) if alpha is beta else _DIGITS):
                 raise InputError(
                     f"tableau {name!r}: order {p} condition of tree {tree}: got {got:.17g}, "
                     f"expected 1/{density(tree)}; the method has not order {order}"
                 )
+
+
+def _numbers(tableau: str, name: str, value: ArrayLike) -> Array:
+    """Return an argument of a tableau as a read-only array of finite numbers."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"tableau {tableau!r}: {name}: expected an array of numbers, got {value!r}") from None
+    if not np.isfinite(array).all():
+        raise InputError(f"tableau {tableau!r}: {name}: expected finite numbers, got {array.tolist()}")
+    array.setflags(write=False)
+    return array
+
+
+def _digest(*arrays: Array) -> str:
+    return hashlib.sha256(b"".join(x.tobytes() for x in arrays)).hexdigest()[:8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,21 +129,15 @@ class Tableau:
     explicit: ClassVar[bool] = True
 
     def __init__(self, name: str, A: ArrayLike, b: ArrayLike, order: int) -> None:
-        matrix, weights = np.array(A, dtype=np.float64), np.array(b, dtype=np.float64)
+        matrix, weights = _numbers(name, "A", A), _numbers(name, "b", b)
         s = len(weights) if weights.ndim == 1 else 0
         if not s or matrix.shape != (s, s):
             raise InputError(f"tableau {name!r}: expected A (s, s) and b (s,), got {matrix.shape} and {weights.shape}")
-        if not np.isfinite(matrix).all() or not np.isfinite(weights).all():
-            raise InputError(f"tableau {name!r}: expected finite numbers")
         if self.explicit and np.any(np.triu(matrix)):
             raise InputError(f"tableau {name!r}: A is not strictly lower triangular, so the method is not explicit")
-        _require_order(name, matrix, weights, order)
-        for array in (matrix, weights):
-            array.setflags(write=False)
-        object.__setattr__(self, "name", name)
-        object.__setattr__(self, "A", matrix)
-        object.__setattr__(self, "b", weights)
-        object.__setattr__(self, "order", order)
+        _require_order(name, matrix, matrix, weights, order)
+        for attribute, value in (("name", name), ("A", matrix), ("b", weights), ("order", order)):
+            object.__setattr__(self, attribute, value)
 
     @property
     def c(self) -> Array:
@@ -142,7 +157,7 @@ class Tableau:
     @property
     def digest(self) -> str:
         """Eight digits that tell the coefficients, for the name of compiled code."""
-        return hashlib.sha256(self.A.tobytes() + self.b.tobytes()).hexdigest()[:8]
+        return _digest(self.A, self.b)
 
     def step(
         self, space: Space, rates: StageRates, stages: Stages, t: Any, h: Any, q: Any, w: Any
@@ -237,14 +252,18 @@ class EmbeddedTableau(Tableau):
         super().__init__(name, A, b, order)
         errors = []
         for p, given in lower:
-            error = np.array(given, dtype=np.float64)
+            error = _numbers(name, f"lower, of order {p}", given)
             if error.shape != self.b.shape:
                 raise InputError(f"tableau {name!r}: expected {self.b.shape} errors of order {p}, got {error.shape}")
-            _require_order(f"{name}, embedded", self.A, self.b - error, p)
-            error.setflags(write=False)
+            _require_order(f"{name}, embedded", self.A, self.A, self.b - error, p)
             errors.append(error)
         object.__setattr__(self, "errors", tuple(errors))
         object.__setattr__(self, "_orders", tuple(p for p, _ in lower))
+
+    @property
+    def digest(self) -> str:
+        """Eight digits that tell the coefficients, for the name of compiled code."""
+        return _digest(self.A, self.b, *self.errors)
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         orders: tuple[int, ...] = self.__dict__["_orders"]
@@ -308,9 +327,6 @@ _B_3: Final = (0.2440944881889764, 0.7338466882816118, 0.022058823529411766)
 #
 #     (1/(γ h) - J) k_i = f(t + c_i h, y + Σ a_ij k_j) + Σ (C_ij/h) k_j + d_i h ∂f/∂t      y1 = y + Σ b_i k_i
 
-#: What the coefficients' sixteen digits leave of a sum.
-_DIGITS: Final = 1e-12
-
 
 @dataclass(frozen=True, eq=False)
 class RosenbrockTableau:
@@ -358,21 +374,28 @@ class RosenbrockTableau:
 
     def __post_init__(self) -> None:
         for name in ("A", "C", "b", "error", "dense"):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, _numbers(self.name, name, getattr(self, name)))
         s = self.stages
-        if self.A.shape != (s, s) or self.C.shape != (s, s) or self.error.shape != (s,) or self.dense.shape != (3, s):
-            raise InputError(f"tableau {self.name!r}: expected A, C ({s}, {s}), error ({s},) and dense (3, {s})")
+        shapes = {"A": (s, s), "C": (s, s), "b": (s,), "error": (s,), "dense": (3, s)}
+        for name, shape in shapes.items():
+            got = getattr(self, name).shape
+            if got != shape:
+                raise InputError(f"tableau {self.name!r}: {name}: expected shape {shape}, got {got}")
         if np.any(np.triu(self.A)) or np.any(np.triu(self.C)):
             raise InputError(f"tableau {self.name!r}: A and C are not strictly lower triangular")
-        self._require(self.b, self.order)
-        self._require(self.b - self.error, self.lower)
+        alpha, coupling = self._alpha, self._coupling
+        for weights, order in ((self.b, self.order), (self.b - self.error, self.lower)):
+            _require_order(self.name, alpha, alpha + coupling, weights @ coupling, order)
 
     @property
     def stages(self) -> int:
         """Number of stages."""
-        return len(self.b)
+        return self.b.size
+
+    @property
+    def digest(self) -> str:
+        """Eight digits that tell the coefficients, for the name of compiled code."""
+        return _digest(np.array(self.gamma), self.A, self.C, self.b, self.error, self.dense)
 
     @property
     def c(self) -> Array:
@@ -395,18 +418,6 @@ class RosenbrockTableau:
     @property
     def _alpha(self) -> Array:
         return np.asarray(self.A @ self._coupling)
-
-    def _require(self, weights: Array, order: int) -> None:
-        alpha, coupling = self._alpha, self._coupling
-        b = weights @ coupling
-        for p in range(1, order + 1):
-            for tree in rooted_trees(p):
-                got, wanted = float(b @ _stage_weights(alpha, alpha + coupling, tree)), 1 / density(tree)
-                if abs(got - wanted) > _DIGITS:
-                    raise InputError(
-                        f"tableau {self.name!r}: order {p} condition of tree {tree}: got {got:.17g}, "
-                        f"expected {wanted:.17g}; the method has not order {order}"
-                    )
 
 
 @cache

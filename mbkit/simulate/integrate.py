@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.result import SolverResult, Stats
 from mbkit.simulate.run_data import RunData, RunSettings
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
-from mbkit.simulate.torque import Applied, Torque, TorqueFunction
+from mbkit.simulate.torque import Torque, TorqueFunction
 
 #: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
 _LEAST_EXTENDED: Final = 1e-32
@@ -73,17 +73,27 @@ def integrate(
         _refuse("torque functions", chosen, [m.name for m in METHODS.values() if m.callables])
     _warn_beyond_limits(model, q)
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
-    arguments: dict[str, Any] = {"batch": batch, "torque": torque, "save": save, "bar": bar}
     started = time.perf_counter()
     setting: float | Tolerances
     with bar:
         if chosen.kind == "adaptive":
             setting = _tolerances(dyn, chosen, rtol, atol)
-            applied, outcome = _adaptive(dyn, chosen, q, v, start, duration, setting, events=wanted, **arguments)
+            if isinstance(save, (int, np.integer)):
+                raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
+            times = None if save is None else save_times(save, start, start + duration)
+            whole = times is not None and times[0] == start and times[-1] == start + duration
+            read = Torque(torque, model, batch, len(times) - 1 if whole and times is not None else None)
+            problem = IntegrationProblem(dyn, method, q, v, start, duration, setting, read, times, wanted, bar)
+            applied = read.applied(times)
         else:
             setting = dt
             _refuse_tolerances(chosen, rtol, atol)
-            applied, outcome = _stepped(dyn, chosen, q, v, Grid.of(start, duration, dt), **arguments)
+            grid = Grid.of(start, duration, dt)
+            indices = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
+            read = Torque(torque, model, batch, grid.steps)
+            problem = IntegrationProblem.on_grid(dyn, method, q, v, grid, indices, read, bar)
+            applied = read.applied(grid.times)
+        outcome = _solver(dyn, chosen, read)(problem)
     seconds = time.perf_counter() - started
     outcome = along_constraints(dyn, outcome)
     settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
@@ -112,9 +122,11 @@ def integrate(
     return data, outcome.error
 
 
-def solver_of(method: Method) -> Callable[..., SolverResult]:
+def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[IntegrationProblem], SolverResult]:
     """Return the function that runs a method, imported when it is first needed."""
     module, function = method.solver.split(":")
+    if method.kind == "fixed" and method.compiled and method.formula and not torque.callable and _compiles(dyn):
+        module, function = "compiled_fixed_step", "run_rollout"
     run: Callable[..., SolverResult] = getattr(import_module(f"mbkit.simulate.solvers.{module}"), function)
     return run
 
@@ -214,30 +226,6 @@ def _batch(dyn: Dynamics, states: int | None) -> int | None:
     return samples
 
 
-def _adaptive(
-    dyn: Dynamics,
-    method: Method,
-    q: Array,
-    v: Array,
-    start: float,
-    duration: float,
-    tolerances: Tolerances,
-    *,
-    batch: int | None,
-    torque: ArrayLike | TorqueFunction | None,
-    save: ArrayLike | int | None,
-    bar: Progress,
-    events: tuple[Event, ...],
-) -> tuple[Applied | None, SolverResult]:
-    if isinstance(save, (int, np.integer)):
-        raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
-    times = None if save is None else save_times(save, start, start + duration)
-    whole = times is not None and times[0] == start and times[-1] == start + duration
-    read = Torque(torque, dyn.model, batch, len(times) - 1 if whole and times is not None else None)
-    problem = IntegrationProblem(dyn, method.name, q, v, start, duration, tolerances, read, times, events, bar)
-    return read.applied(times), solver_of(method)(problem)
-
-
 def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float | None) -> Tolerances:
     rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
     least = _LEAST_EXTENDED if dyn.bits > DOUBLE_BITS and method.extended else method.least
@@ -252,29 +240,3 @@ def _refuse_tolerances(method: Method, rtol: float | None, atol: float | None) -
             raise InputError(
                 f"{name}: {method.name} has a fixed step and no tolerance; give dt, or method={ADAPTIVE_METHOD!r}"
             )
-
-
-def _stepped(
-    dyn: Dynamics,
-    method: Method,
-    q: Array,
-    v: Array,
-    grid: Grid,
-    *,
-    batch: int | None,
-    torque: ArrayLike | TorqueFunction | None,
-    save: ArrayLike | int | None,
-    bar: Progress,
-) -> tuple[Applied | None, SolverResult]:
-    model = dyn.model
-    kept = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
-    read = Torque(torque, model, batch, grid.steps)
-    if method.kind == "native":
-        outcome = solver_of(method)(dyn, method, q, v, grid, kept, read, bar)
-        bar.update(1.0)
-    else:
-        run = solver_of(method)
-        if method.compiled and method.formula is not None and not read.callable and _compiles(dyn):
-            from mbkit.simulate.solvers.compiled_fixed_step import run_rollout as run
-        outcome = run(dyn, method.name, q, v, grid, kept, read, bar)
-    return read.applied(grid.times), outcome

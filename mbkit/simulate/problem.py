@@ -1,9 +1,9 @@
-"""The integration problem handed to every adaptive solver."""
+"""The integration problem handed to every solver."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,14 +12,14 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError
 from mbkit.methods.registry import Tolerances
 from mbkit.simulate.events import Event
-from mbkit.simulate.progress import Progress, reporter
-from mbkit.simulate.time_grid import check_save
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.time_grid import Grid, Indices, check_room, check_save
 from mbkit.simulate.torque import Torque
 
 
 @dataclass(frozen=True, eq=False)
 class IntegrationProblem:
-    """States to integrate, and how."""
+    """States to integrate, and how: an adaptive method by tolerances, one with a fixed step on a grid."""
 
     dyn: Dynamics
     method: str
@@ -35,9 +35,30 @@ class IntegrationProblem:
     save: Array | None
     events: tuple[Event, ...]
     bar: Progress
+    # Of a fixed step: the steps, and the indices of the states to keep.
+    equal_steps: Grid | None = None
+    kept: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
 
     def __post_init__(self) -> None:
-        check_save(self.save, self.batch, self.q0.shape[-1] + self.v0.shape[-1])
+        numbers = self.q0.shape[-1] + self.v0.shape[-1]
+        if self.equal_steps is None:
+            check_save(self.save, self.batch, numbers)
+        else:
+            check_room(len(self.kept) * len(self.q), numbers)
+
+    @classmethod
+    def on_grid(
+        cls, dyn: Dynamics, method: str, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque, bar: Progress
+    ) -> IntegrationProblem:
+        """Return the problem of a method with a fixed step."""
+        none = Tolerances(0.0, 0.0)
+        return cls(dyn, method, q0, v0, grid.start, grid.end - grid.start, none, torque, None, (), bar, grid, kept)
+
+    @property
+    def grid(self) -> Grid:
+        """Steps of a method with a fixed step."""
+        assert self.equal_steps is not None
+        return self.equal_steps
 
     @property
     def end(self) -> float:
@@ -64,6 +85,12 @@ class IntegrationProblem:
         """States at the start, (N, nq + nv)."""
         return np.concatenate([self.q, self.v], axis=1)
 
+    @property
+    def stops(self) -> list[float]:
+        """Times at which an adaptive run must stop on its way: where a held torque jumps, and the end."""
+        held = self.save.tolist() if self.save is not None and self.torque.held else []
+        return sorted({*held, self.end} - {self.start})
+
     def member(self, i: int) -> int | None:
         """Return the place of the i-th state in the batch, None where there is none."""
         return None if self.batch is None else i
@@ -79,4 +106,4 @@ class IntegrationProblem:
 
     def report(self, i: int) -> Callable[[float], None]:
         """Return a function that reports the time that the i-th state has reached."""
-        return reporter(self.bar, i, len(self.q), self.start, self.duration)
+        return lambda t: self.bar.update((i + (t - self.start) / self.duration) / len(self.q))

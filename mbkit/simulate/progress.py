@@ -57,8 +57,3 @@ class Progress:
             self._bar.stop()
         elif kind is None and callable(self._wanted):
             self._wanted(self._done)
-
-
-def reporter(bar: Progress, i: int, count: int, start: float, duration: float) -> Callable[[float], None]:
-    """Return a function that reports the time that the i-th of `count` trajectories has reached."""
-    return lambda t: bar.update((i + (t - start) / duration) / count)

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -23,9 +24,9 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.diagnostics.linearization import Stiffness, linearized, stiffness_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.adaptive import TrajectoryRecorder, make_attempts, march, stop_times
-from mbkit.simulate.solvers.step_attempts import ROUNDS, AcceptedSteps, StepAttempts
-from mbkit.simulate.solvers.trajectory_record import assemble_result
+from mbkit.simulate.solvers.adaptive import make_attempts, march, run_groups
+from mbkit.simulate.solvers.step_attempts import ROUNDS, StepAttempts
+from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, TrajectoryRecord, assemble_result
 
 EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
 #: No tolerance below: rounding would count as error, and steps shrink without end.
@@ -60,20 +61,18 @@ _IN_PYTHON: Final = Costs(first=5, later=2, worth=100, guess=300, pilot=8)
 class AutoContext:
     """What all trajectories of a run share: the problem, the costs and the counts."""
 
-    def __init__(self, problem: IntegrationProblem, space: Space, stops: Sequence[float]) -> None:
-        self.dyn, self._torque, self.batch = problem.dyn, problem.torque, problem.batch
-        self.space, self.tolerances, self.stops = space, problem.tolerances, stops
-        self.start, self.end, self.duration = problem.start, problem.end, problem.duration
-        self._trials: list[StepAttempts] = []
+    def __init__(self, problem: IntegrationProblem) -> None:
+        self.problem, self.space, self.tolerances = problem, Space(problem.dyn.model), problem.tolerances
+        self.start, self.end, self.duration, self.stops = problem.start, problem.end, problem.duration, problem.stops
+        self._attempts: list[StepAttempts] = []
         self.costs = _IN_PYTHON
 
     def make(self, method: str, tolerances: Tolerances) -> StepAttempts:
         """Return the step attempts of a method, whose evaluations are counted with all others."""
-        arguments = self.dyn, self.space, tolerances, self._torque, self.duration, self.batch
-        trials = make_attempts(method, *arguments)
-        self._trials.append(trials)
-        self.costs = _COMPILED if trials.rounds > 1 else _IN_PYTHON
-        return trials
+        attempts = make_attempts(self.problem, method, self.space, tolerances)
+        self._attempts.append(attempts)
+        self.costs = _COMPILED if attempts.rounds > 1 else _IN_PYTHON
+        return attempts
 
     def loosest(self, method: str, base: Tolerances) -> Tolerances:
         """Return the loosest tolerances of a method."""
@@ -83,12 +82,12 @@ class AutoContext:
     @property
     def evaluations(self) -> int:
         """Evaluations of the forward dynamics."""
-        return sum(trials.evaluations for trials in self._trials)
+        return sum(attempts.evaluations for attempts in self._attempts)
 
     @property
     def jacobians(self) -> int:
         """Jacobians of the forward dynamics."""
-        return sum(trials.jacobians for trials in self._trials)
+        return sum(attempts.jacobians for attempts in self._attempts)
 
 
 class StepRateMonitor:
@@ -216,9 +215,9 @@ def limit_rounds(trials: StepAttempts, controllers: Sequence[SwitchingController
 class SwitchingController:
     """Stiffness detection and switching for one trajectory, and its adaptive tolerance."""
 
-    def __init__(self, context: AutoContext, index: int, problem: IntegrationProblem) -> None:
+    def __init__(self, context: AutoContext, index: int) -> None:
         self._context, self._index = context, index
-        self.track = TrajectoryRecorder(problem, context.space, index)
+        self.record = TrajectoryRecord(context.problem, index, context.space)
         self.doubt = ""
         # The first is the user's or loosened, the second for the number of steps.
         self._base, self._tolerances = context.tolerances, context.loosest(EXPLICIT, context.tolerances)
@@ -251,8 +250,7 @@ class SwitchingController:
 
     @property
     def _over(self) -> bool:
-        member = self.track.member
-        return member.ended != "finished" or member.reached >= self._context.end
+        return self.record.ended != "finished" or self.record.reached >= self._context.end
 
     def leaves(self, trials: StepAttempts, place: int, steps: AcceptedSteps) -> bool:
         """Add accepted steps; return whether another method goes on from their end."""
@@ -271,9 +269,10 @@ class SwitchingController:
         while self._next is not None and not self._over:
             trials, self._next, self._monitor = self._next, None, None
             ahead, self._ahead = self._ahead, []
-            if all(self.track.take(trials, 0, steps) and not self.leaves(trials, 0, steps) for steps in ahead):
+            within = partial(trials.within, 0)
+            if all(self.record.take(steps, within) and not self.leaves(trials, 0, steps) for steps in ahead):
                 limit_rounds(trials, [self])
-                for (_, steps), *_ in march(trials, [self.track], self._context.stops, self._interval):
+                for (_, steps), *_ in march(trials, [self.record], self._context.stops, self._interval):
                     if self.leaves(trials, 0, steps):
                         trials.drop(0)
                     limit_rounds(trials, [self])
@@ -456,58 +455,29 @@ _KINDS: Final = 3
 
 def run_auto(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
-    q0, v0, batch = problem.q, problem.v, problem.batch
-    space = Space(problem.dyn.model)
-    context = AutoContext(problem, space, stop_times(problem))
-    controllers = [SwitchingController(context, i, problem) for i in range(len(q0))]
+    context = AutoContext(problem)
+    controllers = [SwitchingController(context, i) for i in range(len(problem.q))]
     explicit = context.make(EXPLICIT, context.loosest(EXPLICIT, problem.tolerances))
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for first in range(0, len(q0), explicit.width):
-            part = slice(first, first + explicit.width)
-            group = _Group(controllers[part], first, problem)
-            try:
-                for controller, q, v in zip(group.controllers, q0[part], v0[part], strict=True):
-                    controller.track.begin(q, v)
-                begun = space.enter(q0[part], v0[part])
-                explicit.start(range(first, first + len(group.controllers)), q0[part], begun, problem.start)
-                group.together(context, explicit)
-            except FunctionError as error:
-                # Where the torque is a function, trajectories run one by one.
-                which = getattr(error, "member", None)
-                group.controllers[0 if which is None else which - first].track.member.fail(error)
-                break
-    records = [controller.track.member for controller in controllers]
+
+    def to_end(group: Sequence[TrajectoryRecord], report: Callable[[], None]) -> None:
+        # Explicitly side by side; what leaves that one by one.
+        own = [controllers[record.index] for record in group]
+        limit_rounds(explicit, own)
+        for accepted in march(explicit, group, context.stops):
+            for place, steps in accepted:
+                if own[place].leaves(explicit, place, steps):
+                    explicit.drop(place)
+            limit_rounds(explicit, [own[place] for place, _ in accepted])
+            report()
+        for controller in own:
+            controller.alone(report)
+
+    records = [controller.record for controller in controllers]
+    run_groups(problem, context.space, explicit, records, to_end)
     outcome = assemble_result(problem, records, evaluations=context.evaluations, jacobians=context.jacobians)
     finished = outcome.ended in ("finished", "event")
     doubts = tuple(dict.fromkeys(controller.doubt for controller in controllers if controller.doubt and finished))
-    return replace(outcome, chosen=_chosen(controllers, batch), doubts=(*outcome.doubts, *doubts))
-
-
-class _Group:
-    """Trajectories that begin side by side."""
-
-    def __init__(self, controllers: Sequence[SwitchingController], first: int, problem: IntegrationProblem) -> None:
-        self.controllers, self._first, self._problem = controllers, first, problem
-
-    def together(self, context: AutoContext, explicit: StepAttempts) -> None:
-        """Take all to the end: explicitly side by side, what leaves that one by one."""
-        tracks = [controller.track for controller in self.controllers]
-        limit_rounds(explicit, self.controllers)
-        for accepted in march(explicit, tracks, context.stops):
-            for place, steps in accepted:
-                if self.controllers[place].leaves(explicit, place, steps):
-                    explicit.drop(place)
-            limit_rounds(explicit, [self.controllers[place] for place, _ in accepted])
-            self._report()
-        for controller in self.controllers:
-            controller.alone(self._report)
-
-    def _report(self) -> None:
-        problem = self._problem
-        done = (
-            sum(controller.track.member.reached - problem.start for controller in self.controllers) / problem.duration
-        )
-        problem.bar.update((self._first + done) / len(problem.q))
+    return replace(outcome, chosen=_chosen(controllers, problem.batch), doubts=(*outcome.doubts, *doubts))
 
 
 def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> str:

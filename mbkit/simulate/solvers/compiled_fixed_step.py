@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -21,22 +20,21 @@ from mbkit.derivation.steps.fixed import Part, march, march_in_stages
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.registry import method_of
 from mbkit.model.integration_space import Space
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import divergence_reason
-from mbkit.simulate.solvers.trajectory_record import grid_result
-from mbkit.simulate.solvers.vector_field import BOUND, is_bounded
-from mbkit.simulate.time_grid import Grid, Indices, check_room
-from mbkit.simulate.torque import Torque
+from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason
+from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
+from mbkit.simulate.time_grid import Indices
 
 #: Steps that are made without a look at them, at most.
 BLOCK: Final = 16
 
-# Above this many operations the forward dynamics is compiled once and called for each
-# stage: LLVM's time grows faster than the step, which then runs no faster than its parts.
+# Above this many operations the forward dynamics is compiled once and called for each stage: LLVM's time grows faster
+# than the step, which then runs no faster than its parts.
 _ONE_PIECE: Final = 20_000
-# Half of what a core has in its second cache.
-_CACHE: Final = 2**19
+#: Half of what a core has in its second cache.
+CACHE: Final = 2**19
 _LANES: Final = 8
 _MOST: Final = 1032
 # What a step writes -> what the next one reads.
@@ -47,14 +45,20 @@ class BlockLoop:
     """Room for the states of a block of steps side by side, one trajectory in each column.
 
     Columns beyond the `count` states repeat the last one. `sizes` has for each name the number of places, one for each
-    step that has its own, and of rows.
+    step that has its own, and of rows. `block` is the number of steps of the next block, at most; `good` are the good
+    steps of the last one, (n,), or None where nobody looked; `carried` names q and what goes with it.
     """
 
-    block: int  # steps of the next block, at most
+    block: int
+    good: Indices | None = None
+    carried = ("q", "w")
 
     def __init__(self, sizes: Mapping[str, tuple[int, int]], count: int) -> None:
-        self._width = padded(count)
-        self._room = {name: _room(places, rows, self._width) for name, (places, rows) in sizes.items()}
+        width = padded(count)
+        self._room = {}
+        for name, (places, rows) in sizes.items():
+            self._room[name] = aligned(places * rows * width).reshape(places, rows, width)
+            self._room[name][:] = 0.0
         self._count = self._taken = 0
 
     def _array(self, name: str, place: int) -> Array:
@@ -66,9 +70,18 @@ class BlockLoop:
         room[:, : self._count] = columns
         room[:, self._count :] = room[:, self._count - 1 : self._count]
 
-    def _fill_parameters(self, values: Array) -> None:
-        for place in range(len(self._room.get("parameters", ())) if values.size else 0):
-            self._fill("parameters", place, np.atleast_2d(values).T)
+    def _begin(self, parameters: Array, **states: Array) -> None:
+        """Put in states, (n, rows), and the values of parameters, (p,) or (n, p)."""
+        self._count = len(states["q"])
+        for name, x in states.items():
+            self._fill(name, 0, x.T)
+        for place in range(len(self._room.get("parameters", ())) if parameters.size else 0):
+            self._fill("parameters", place, np.atleast_2d(parameters).T)
+
+    def _hold(self, steps: int, dt: float, torques: Array) -> None:
+        self._room["dt"][:] = dt
+        for j in range(min(steps, len(self._room["tau"]))):
+            self._fill("tau", j, torques[j])
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
         """Take at most `block` steps of length dt from where the last ones ended; torques (steps or 1, nv, n or 1)."""
@@ -77,6 +90,15 @@ class BlockLoop:
     def again(self) -> None:
         """Make the last state the first one of the next block."""
         raise NotImplementedError
+
+    def leave(self, q: Array, w: Array) -> Array:  # noqa: ARG002
+        """Return what is kept of w, (n, steps, nv)."""
+        return w
+
+    def states(self, name: str, which: Sequence[int] | Indices) -> Array:
+        """Return q, w, ... after these many steps of the block, (n, steps, rows)."""
+        room = self._room[name]
+        return np.asarray(room[np.asarray(which) % len(room), :, : self._count].transpose(2, 0, 1))
 
 
 def padded(count: int) -> int:
@@ -87,29 +109,40 @@ def padded(count: int) -> int:
     return -(-count // _LANES) * _LANES | _LANES
 
 
-def _room(places: int, rows: int, width: int) -> Array:
-    out = aligned(places * rows * width).reshape(places, rows, width)
-    out[:] = 0.0
-    return out
-
-
-def blocks(
-    loop: BlockLoop, grid: Grid, torque: Torque, members: slice | Indices, ends: Iterable[int] = ()
-) -> Iterator[tuple[int, int]]:
+def run_blocks(
+    problem: IntegrationProblem, record: GridRecord, loop: BlockLoop, members: Indices, ends: Iterable[int] = ()
+) -> Iterator[tuple[int, dict[int, list[Array]]]]:
     """Take members of the batch, which are in the loop, through the run in blocks that stop at `ends` too.
 
-    Yields the number of steps before and after each block.
+    Yields the number of steps after each block, and the last good state of the trajectories that were lost in it.
     """
-    k, torques = 0, np.empty(0)
+    grid, torque, kept = problem.grid, problem.torque, record.kept
+    k, torques, alive = 0, np.empty(0), np.full(len(members), True)
+    # Most parts of a batch are contiguous, which is read and written faster.
+    whole = slice(int(members[0]), int(members[-1]) + 1)
+    which: slice | Indices = whole if whole.stop - whole.start == len(members) else members
     # The last step may have a length of its own.
     stops = {*ends, grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps}
     for stop in sorted(stops):
         while k < stop:
             n = min(loop.block, stop - k)
             if torque.held or not torques.size:
-                torques = torque.columns(members, k, k + n)
+                torques = torque.columns(which, k, k + n)
             loop.advance(n, grid.time(k), grid.step(k), torques)
-            yield k, k + n
+            rows, good, last = record.rows(k + 1, k + n), loop.good, dict[int, list[Array]]()
+            if rows.start < rows.stop:
+                q, w = (loop.states(name, kept[rows] - k) for name in loop.carried)
+                record.q[which, rows], record.v[which, rows] = q, loop.leave(q, w)
+            if good is None:
+                record.steps[which] = k + n
+            else:
+                record.steps[members[alive]] = k + good[alive]
+                for m in np.flatnonzero(alive & (good < n)).tolist():
+                    last[int(members[m])] = [loop.states(name, [good[m]])[m, 0] for name in loop.carried]
+                alive &= good == n
+            yield k + n, last
+            if not alive.any():
+                return
             loop.again()
             k += n
 
@@ -176,23 +209,25 @@ class Plan:
     @property
     def widest(self) -> int:
         """States that the cache holds with all that belongs to them, from 72 to 1032."""
-        return min(max(padded(_CACHE // (8 * sum(self.sizes.values()))), 9 * _LANES), _MOST)
+        return min(max(padded(CACHE // (8 * sum(self.sizes.values()))), 9 * _LANES), _MOST)
 
 
 class Chunk(BlockLoop):
     """At most `most` states that take explicit steps.
 
-    `torques`: each step of a block has its own; `all_kept`: each state of a block can be read, not only the last.
+    `torques`: each step of a block has its own; `all_kept`: each state of a block can be read, not only the last;
+    `watched`: it is looked for steps that are not good.
     """
 
     block = BLOCK
 
-    def __init__(self, plan: Plan, most: int, *, torques: bool, all_kept: bool) -> None:
-        self._all_kept, self._torques = all_kept, BLOCK if torques else 1
-        places = {**dict.fromkeys(_STATE.values(), BLOCK + 1 if all_kept else 2), "tau": self._torques}
+    def __init__(
+        self, plan: Plan, space: Space, most: int, *, torques: bool, all_kept: bool, watched: bool = False
+    ) -> None:
+        places = {**dict.fromkeys(_STATE.values(), BLOCK + 1 if all_kept else 2), "tau": BLOCK if torques else 1}
         own = {name: (places.get(name, 1), rows) for name, rows in plan.sizes.items() if name not in _STATE}
         super().__init__(own, most)
-        self._calls = len(plan.parts)
+        self._calls, self._space, self._watched = len(plan.parts), space, watched
         period = BLOCK if all_kept or torques else 2
         steps = [call for j in range(period) for call in self._step(plan, j)]
         self._sequence = KernelSequence(steps, BLOCK // period)
@@ -208,19 +243,25 @@ class Chunk(BlockLoop):
 
     def begin(self, q: Array, w: Array, parameters: Array) -> None:
         """Put in states, (n, nq) and (n, nv) of `Space`, and the values of parameters, (p,) or (n, p)."""
-        self._count = len(q)
-        self._fill("q", 0, q.T)
-        self._fill("w", 0, w.T)
-        self._room["squares"][0] = 0.0
-        self._fill_parameters(parameters)
+        self._begin(parameters, q=q, w=w, squares=np.zeros((len(q), 1)))
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:  # noqa: ARG002  # no time enters
         """Take some steps."""
-        self._room["dt"][:] = dt
-        for j in range(min(steps, self._torques)):
-            self._fill("tau", j, torques[j])
+        self._hold(steps, dt, torques)
         self._sequence.run(0, steps * self._calls)
         self._taken = steps
+        if self._watched:
+            q, w = (self.states(name, np.arange(1, steps + 1)) for name in self.carried)
+            self.good = np.logical_and.accumulate(are_bounded(q, w), axis=1).sum(axis=1)
+
+    def leave(self, q: Array, w: Array) -> Array:
+        """Return mbkit's v of states (n, steps, ...)."""
+        if self._space.flat:
+            return w
+        flat = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, w))
+        # What a lost state has become is nobody's concern here.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(self._space.leave(*flat).reshape(w.shape))
 
     def again(self) -> None:
         """Make the last state the first one of the next block."""
@@ -228,36 +269,52 @@ class Chunk(BlockLoop):
             room = self._room[name]
             room[0] = room[self._taken % len(room)]
 
-    def states(self, name: str) -> Array:
-        """Return q, w or squares after each step of the block, or after its last one: (steps or 1, rows, n)."""
-        room = self._room[name]
-        first = self._taken % len(room)
-        places = room[1 : self._taken + 1] if self._all_kept else room[first : first + 1]
-        return places[:, :, : self._count]
 
-    def start(self, name: str) -> Array:
-        """Return q, w or squares before the block, (rows, n)."""
-        return self._room[name][0, :, : self._count]
-
-
-def run_rollout(
-    dyn: LagrangianDynamics,
-    method: str,
-    q0: Array,
-    v0: Array,
-    grid: Grid,
-    kept: Indices,
-    torque: Torque,
-    bar: Progress,
-    workers: int | None = None,
-) -> SolverResult:
+def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> SolverResult:
     """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core."""
-    single = q0.ndim == 1
-    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
-    check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])
-    run = _Run(dyn, method, q0, v0, grid, kept, torque)
-    run.all(bar, workers or dyn.threads or cores())
-    return run.result(single)
+    dyn, method, grid, record = problem.dyn, problem.method, problem.grid, GridRecord(problem)
+    assert isinstance(dyn, LagrangianDynamics)
+    plan, space, n = _plan(dyn, method), Space(dyn.model), len(problem.q)
+    w0, values = space.enter(problem.q, problem.v), dyn.parameter_values
+    squares = np.zeros(n)
+
+    def new_chunk(most: int, *, all_kept: bool, watched: bool = False) -> Chunk:
+        return Chunk(plan, space, most, torques=problem.torque.held, all_kept=all_kept, watched=watched)
+
+    def blocks(chunk: Chunk, members: Indices, ends: Indices) -> Iterator[tuple[int, dict[int, list[Array]]]]:
+        chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values)
+        return run_blocks(problem, record, chunk, members, ends.tolist())
+
+    workers = workers or dyn.threads or cores()
+    parts = _split(n, plan.widest, workers)
+    # Every block costs some calls: worth it for a state now and then, not for most.
+    dense = 2 * len(record.kept) > grid.steps
+
+    def new_worker() -> Callable[[slice], Iterator[int]]:
+        # The parts differ by one state at most.
+        chunk = new_chunk(-(-n // len(parts)), all_kept=dense)
+
+        def run(part: slice) -> Iterator[int]:
+            for end, _ in blocks(chunk, np.arange(n)[part], record.kept[:0] if dense else record.kept):
+                yield end
+            squares[part] = chunk.states("squares", [0])[:, 0, 0]
+
+        return run
+
+    run_parts(parts, new_worker, workers, grid.steps, problem.bar)
+    # A NaN is not below anything.
+    suspects, lost = np.flatnonzero(~(squares < BOUND**2)), dict[int, list[Array]]()
+    for first in range(0, len(suspects), plan.widest):
+        members = suspects[first : first + plan.widest]
+        for _, last in blocks(new_chunk(len(members), all_kept=True, watched=True), members, members[:0]):
+            lost |= last
+
+    def why(i: int) -> str:
+        k, (q, w) = int(record.steps[i]), lost[i]
+        force = np.asarray(problem.torque.columns(np.array([i]), k, k + 1)[0][:, 0])
+        return divergence_reason(dyn.of_samples([i]), method, grid.time(k), grid.step(k), q[None], w[None], force[None])
+
+    return record.result(why, method_of(method).stages * (int(record.steps.sum()) + len(lost)))
 
 
 def _plan(dyn: LagrangianDynamics, method: str) -> Plan:
@@ -266,107 +323,6 @@ def _plan(dyn: LagrangianDynamics, method: str) -> Plan:
     if name not in plans:
         plans[name] = Plan(dyn, method)
     return plans[name]
-
-
-@dataclass(frozen=True)
-class _Lost:
-    """A state that diverged: steps that were good, and what it was after them."""
-
-    steps: int
-    q: Array
-    w: Array
-
-
-class _Run:
-    def __init__(
-        self, dyn: LagrangianDynamics, method: str, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque
-    ) -> None:
-        self._dyn, self._method, self._grid, self._kept, self._torque = dyn, method, grid, kept, torque
-        self._plan, self._space = _plan(dyn, method), Space(dyn.model)
-        self._parameters = dyn.parameter_values
-        self._q0, self._w0 = q0, self._space.enter(q0, v0)
-        n = len(q0)
-        # Written by the threads, so that each of them pays for its own pages.
-        self._q, self._v = np.empty((n, len(kept), q0.shape[1])), np.empty((n, len(kept), v0.shape[1]))
-        if kept[0] == 0:
-            self._q[:, 0], self._v[:, 0] = q0, v0
-        self._squares = np.zeros(n)
-        self._lost: dict[int, _Lost] = {}
-
-    def all(self, bar: Progress, workers: int) -> None:
-        """Run every state, and those that got lost once more."""
-        parts = _split(len(self._q0), self._plan.widest, workers)
-        # Every block costs some calls: worth it for a state now and then, not for most.
-        dense = 2 * len(self._kept) > self._grid.steps
-
-        def new_worker() -> Callable[[slice], Iterator[int]]:
-            # The parts differ by one state at most.
-            chunk = self._chunk(-(-len(self._q0) // len(parts)), all_kept=dense)
-            return lambda members: self._march(chunk, members, dense=dense)
-
-        run_parts(parts, new_worker, workers, self._grid.steps, bar)
-        # A NaN is not below anything.
-        lost = np.flatnonzero(~(self._squares < BOUND**2))
-        for start in range(0, len(lost), self._plan.widest):
-            self._look(lost[start : start + self._plan.widest])
-
-    def _chunk(self, most: int, *, all_kept: bool) -> Chunk:
-        return Chunk(self._plan, most, torques=self._torque.held, all_kept=all_kept)
-
-    def _blocks(self, chunk: Chunk, members: slice | Indices, ends: Indices) -> Iterator[tuple[int, int]]:
-        own = self._parameters[members] if self._parameters.ndim == 2 else self._parameters
-        chunk.begin(self._q0[members], self._w0[members], own)
-        return blocks(chunk, self._grid, self._torque, members, ends.tolist())
-
-    def _march(self, chunk: Chunk, members: slice, *, dense: bool) -> Iterator[int]:
-        kept = self._kept
-        for k, end in self._blocks(chunk, members, kept[:0] if dense else kept):
-            rows = slice(*np.searchsorted(kept, (k, end), side="right"))
-            if rows.start < rows.stop:
-                self._keep(members, rows, chunk, kept[rows] - k - 1 if dense else slice(None))
-            yield end
-        self._squares[members] = chunk.start("squares")[0]
-
-    def _keep(self, members: slice, rows: slice, chunk: Chunk, which: Indices | slice) -> None:
-        q, w = (chunk.states(name)[which].transpose(2, 0, 1) for name in ("q", "w"))
-        self._q[members, rows] = q
-        if self._space.flat:
-            self._v[members, rows] = w
-            return
-        (n, count, nq), nv = q.shape, w.shape[2]
-        flat = np.ascontiguousarray(q).reshape(n * count, nq), np.ascontiguousarray(w).reshape(n * count, nv)
-        # What a lost state has become is nobody's concern here.
-        with np.errstate(over="ignore", invalid="ignore"):
-            self._v[members, rows] = self._space.leave(*flat).reshape(n, count, nv)
-
-    def _look(self, members: Indices) -> None:
-        chunk = self._chunk(len(members), all_kept=True)
-        alive = np.full(len(members), True)
-        for k, _ in self._blocks(chunk, members, members[:0]):
-            q, w = (np.concatenate([chunk.start(n)[None], chunk.states(n)]) for n in ("q", "w"))
-            for j in range(len(q) - 1):
-                good = is_bounded(q[j + 1].T) & is_bounded(w[j + 1].T)
-                for m in np.flatnonzero(alive & ~good):
-                    self._lost[int(members[m])] = _Lost(k + j, q[j, :, m].copy(), w[j, :, m].copy())
-                alive &= good
-            if not alive.any():
-                break
-
-    def result(self, single: bool) -> SolverResult:
-        """Return what was kept; NaN where there is nothing."""
-        steps = np.full(len(self._q0), self._grid.steps)
-        for i, lost in self._lost.items():
-            steps[i] = lost.steps
-        evaluations = method_of(self._method).stages * (int(steps.sum()) + len(self._lost))
-        return grid_result(
-            self._grid, self._kept, self._q, self._v, steps, single=single, why=self._reason, evaluations=evaluations
-        )
-
-    def _reason(self, i: int) -> str:
-        lost, grid, k = self._lost[i], self._grid, self._lost[i].steps
-        force = np.asarray(self._torque.columns(np.array([i]), k, k + 1)[0][:, 0])
-        state = (lost.q[None], lost.w[None], force[None])
-        return divergence_reason(self._dyn.of_samples([i]), self._method, grid.time(k), grid.step(k), *state)
 
 
 def _split(n: int, widest: int, workers: int) -> list[slice]:

@@ -7,7 +7,8 @@ the right-hand side.
 from __future__ import annotations
 
 import re
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import Any, Final
 
 import casadi as ca
 import numpy as np
@@ -15,13 +16,17 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import UnsupportedError
-from mbkit.methods.registry import METHODS, Tolerances
 from mbkit.model import Model
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, record_of
-from mbkit.simulate.solvers.vector_field import DIVERGED, is_bounded
+from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.trajectory_record import (
+    StoppedError,
+    TrajectoryRecord,
+    assemble_result,
+    diverged,
+    run_each,
+)
+from mbkit.simulate.solvers.vector_field import is_bounded
 
 _GRAPH: Final = "_cvodes_graph"
 _EPS: Final = float(np.finfo(float).eps)
@@ -34,150 +39,102 @@ _MOST_STEPS: Final = 2_000_000
 _REMEMBERED: Final = 32
 
 
-#: Methods that take what this one does not.
-_OTHERS: Final = "method=" + " or ".join(repr(m.name) for m in METHODS.values() if m.multistep and m.callables)
-
-
-class _Failure(NamedTuple):
-    ended: Ended
-    message: str
-
-
 def run_cvodes(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself; CVODES interpolates, and starts again where a torque jumps."""
-    dyn, torque = problem.dyn, problem.torque
-    if not isinstance(dyn, LagrangianDynamics):
-        raise UnsupportedError(
-            f"{problem.method}: integrates expressions, which {dyn.engine} has not; "
-            f"use mbkit.dynamics(model, 'lagrangian'), or {_OTHERS}"
-        )
-    if torque.callable or problem.events:
-        raise UnsupportedError(f"{problem.method}: takes neither torque functions nor events; use {_OTHERS}")
-    save, times = problem.saved_times()
-    solve = _Solve(dyn, problem.tolerances)
-    members = []
-    for i, start in enumerate(problem.y):
-        which = problem.member(i)
-        run = _Run(solve, record_of(problem, i), save, problem.report(i))
-        values = dyn.parameter_values if which is None else dyn.of_samples([which]).parameter_values
-        force = torque.of_member(which)
+    _, times = problem.saved_times()
+    solve, torque = _Solve(problem), problem.torque
+
+    def walk(i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, None]]:
+        member = problem.member(i)
+        force = torque.of_member(member)
         # A jump within a call is one that CVODES does not know of: its error test fails.
-        pieces = [times[k : k + 2] for k in range(len(times) - 1)] if torque.held else [times]
-        run.keep(problem.start, start)
-        for k, piece in enumerate(pieces):
-            given = np.concatenate([np.asarray(force(k)), np.ravel(values)])
-            if not run.over(piece, given):
-                break
-        members.append(run.record)
-    return assemble_result(problem, members, evaluations=solve.evaluations, jacobians=solve.jacobians)
+        for k in range(len(times) - 1 if torque.held else 1):
+            piece = times[k : k + 2] if torque.held else times
+            known = np.concatenate([np.asarray(force(k)), solve.parameters(member)])
+            at, intervals, failing = 0, 1, 0
+            while at < len(piece) - 1:
+                # Of intervals that fail together, those that can be reached are found by halves.
+                n = failing // 2 or min(intervals, len(piece) - 1 - at)
+                try:
+                    states, steps = solve(piece[at : at + n + 1], y, known, record)
+                except StoppedError as error:
+                    failing, failure = n, error
+                else:
+                    for t, state in zip(piece[at + 1 : at + n + 1].tolist(), states, strict=True):
+                        yield t, state, None
+                    y, at, failing = states[-1], at + n, max(failing - n, 0)
+                    intervals = max(1, min(4 * n, n * _PIECE // max(steps, 1)))
+                if failing == 1:
+                    raise failure
 
-
-class _Run:
-    """One trajectory on its way."""
-
-    def __init__(self, solve: _Solve, record: TrajectoryRecord, save: Array, done: Any) -> None:
-        self._solve, self._saved, self._done = solve, frozenset(save.tolist()), done
-        self.record = record
-        self._y: Array = np.empty(0)
-        self._intervals = 1
-
-    def over(self, times: Array, given: Array) -> bool:
-        """Go on to these times, of which the first is reached; return whether that was possible."""
-        at, last = 0, len(times) - 1
-        while at < last:
-            n = min(self._intervals, last - at)
-            steps, failure = self._piece(times[at : at + n + 1], given)
-            if failure is not None:
-                # What can be reached is found by halves.
-                while n > 1:
-                    half = n // 2
-                    _, first = self._piece(times[at : at + half + 1], given)
-                    at, n, failure = (at + half, n - half, failure) if first is None else (at, half, first)
-                self.record.stop(*failure)
-                return False
-            at += n
-            self._intervals = max(1, min(4 * n, n * _PIECE // max(steps, 1)))
-        return True
-
-    def _piece(self, times: Array, given: Array) -> tuple[int, _Failure | None]:
-        out = self._solve(times, self._y, given)
-        if isinstance(out, _Failure):
-            return 0, out
-        y, steps, rejected = out
-        good = is_bounded(y)
-        if not good.all():
-            return 0, _Failure("diverged", f"diverged: {DIVERGED}")
-        self.record.steps += steps
-        self.record.rejected += rejected
-        for t, state in zip(times[1:].tolist(), y, strict=True):
-            self.keep(t, state)
-            self._done(t)
-        return steps, None
-
-    def keep(self, t: float, y: Array) -> None:
-        """Go on from a state."""
-        self._y, self.record.reached = y, t
-        if t in self._saved:
-            self.record.keep(t, y)
+    records = run_each(problem, walk)
+    return assemble_result(problem, records, evaluations=solve.evaluations, jacobians=solve.jacobians)
 
 
 class _Solve:
     """CVODES from one time to several others."""
 
-    def __init__(self, dyn: LagrangianDynamics, tolerances: Tolerances) -> None:
-        self._graph = _graph(dyn)
-        clock = _clock(dyn.model)
+    def __init__(self, problem: IntegrationProblem) -> None:
+        dyn, (self._rtol, atol) = problem.dyn, problem.tolerances
+        assert isinstance(dyn, LagrangianDynamics)
+        self._dyn, self._graph, clock = dyn, _graph(dyn), _clock(dyn.model)
         self._clock = None if clock is None else dyn.model.nv + clock
         self._options = {
-            "reltol": tolerances.rtol,
-            "abstol": tolerances.atol,
+            "reltol": self._rtol,
+            "abstol": atol,
             "max_num_steps": _MOST_STEPS,
             "min_step_size": _EPS,
             # The result reports failures, not on the terminal.
             "show_eval_warnings": False,
             "disable_internal_warnings": True,
         }
-        self._rtol = tolerances.rtol
-        self._made: dict[tuple[float, ...], Any] = {}
+        self._integrators: dict[tuple[float, ...], Any] = {}
         self.evaluations = self.jacobians = 0
 
-    def __call__(self, times: Array, y: Array, given: Array) -> tuple[Array, int, int] | _Failure:
-        """Return states at times[1:], steps and rejected steps, or why there are none."""
+    def parameters(self, member: int | None) -> Array:
+        """Return the parameters' values of a member of the batch."""
+        own = self._dyn if member is None else self._dyn.of_samples([member])
+        return np.ravel(own.parameter_values)
+
+    def __call__(self, times: Array, y: Array, known: Array, record: TrajectoryRecord) -> tuple[Array, int]:
+        """Return states at times[1:], and the steps, which are recorded; `StoppedError` where there are none."""
         # In units of the whole call, so that one integrator serves every single interval.
         length = float(times[-1] - times[0])
         grid = tuple(((times[1:] - times[0]) / length).tolist())
-        integrator = self._made.get(grid) or ca.integrator(
+        integrator = self._integrators.get(grid) or ca.integrator(
             "cvodes", "cvodes", self._graph, 0.0, list(grid), self._options
         )
-        if len(self._made) > _REMEMBERED:
-            self._made.clear()
-        self._made[grid] = integrator
-        given = np.append(given, length)
+        if len(self._integrators) > _REMEMBERED:
+            self._integrators.clear()
+        self._integrators[grid] = integrator
+        known = np.append(known, length)
         if self._clock is not None:
-            given[self._clock] = times[0]
+            known[self._clock] = times[0]
         try:
-            out = integrator(x0=y, p=given)
+            out = integrator(x0=y, p=known)
         except RuntimeError as error:
-            return _read(str(error), self._rtol)
+            raise self._failure(str(error)) from None
         finally:
             stats = integrator.stats()
             # Of a call that fails, CasADi counts what came before the interval at fault.
             self.evaluations += int(stats["nfevals"])
             self.jacobians += int(stats["nlinsetups"])
-        return np.array(out["xf"]).T, int(stats["nsteps"]), int(stats["netfails"]) + int(stats["nncfails"])
+        states = np.array(out["xf"]).T
+        if not is_bounded(states).all():
+            raise diverged()
+        record.steps += int(stats["nsteps"])
+        record.rejected += int(stats["netfails"]) + int(stats["nncfails"])
+        return states, int(stats["nsteps"])
 
-
-def _read(message: str, rtol: float) -> _Failure:
-    found = re.search(r'"(CV_\w+)"', message)
-    code = found[1] if found else ""
-    # CasADi looks for signals while it evaluates, and takes Ctrl-C for a failure of the function.
-    if code in ("CV_RHSFUNC_FAIL", "CV_LSETUP_FAIL"):
-        raise KeyboardInterrupt
-    if "RHSFUNC" in code:
-        return _Failure("diverged", f"diverged: the acceleration is not finite ({code})")
-    return _Failure(
-        "step_too_small", f"step below rounding at rtol = {rtol:g}: stiff, singular or diverging ({code or message})"
-    )
+    def _failure(self, message: str) -> StoppedError:
+        code = match[1] if (match := re.search(r'"(CV_\w+)"', message)) else ""
+        # CasADi looks for signals while it evaluates, and takes Ctrl-C for a failure of the function.
+        if code in ("CV_RHSFUNC_FAIL", "CV_LSETUP_FAIL"):
+            raise KeyboardInterrupt
+        if "RHSFUNC" in code:
+            return diverged(f"the acceleration is not finite ({code})")
+        why = f"step below rounding at rtol = {self._rtol:g}: stiff, singular or diverging ({code or message})"
+        return StoppedError("step_too_small", why)
 
 
 def _graph(dyn: LagrangianDynamics) -> ca.Function:

@@ -1,9 +1,10 @@
-"""Fixed steps in NumPy, on any engine and under any torque."""
+"""Fixed steps in Python, on any engine and under any torque; and the record of any run with a fixed step."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,103 +16,175 @@ from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
-from mbkit.simulate.progress import Progress
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.gauss import CollocationStep
-from mbkit.simulate.solvers.trajectory_record import grid_result
-from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED, DivergenceError, Field, is_bounded
-from mbkit.simulate.time_grid import Grid, Indices, check_room
-from mbkit.simulate.torque import Force, Torque
+from mbkit.simulate.solvers.vector_field import ALL, DIVERGED, DivergenceError, Field, are_bounded
+from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.torque import Force
 
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
 
-_GOOD: Final = np.array(True)
+
+class GridRecord:
+    """Kept states of each trajectory of a run with a fixed step, (n, K, ...), and its good steps, (n,)."""
+
+    def __init__(self, problem: IntegrationProblem) -> None:
+        self._problem, self.kept = problem, problem.kept
+        n, rows = len(problem.q), len(problem.kept)
+        # Written by the threads, so that each of them pays for its own pages.
+        self.q, self.v = np.empty((n, rows, problem.q.shape[1])), np.empty((n, rows, problem.v.shape[1]))
+        self.steps: Indices = np.zeros(n, dtype=np.intp)
+        if self.kept[0] == 0:
+            self.q[:, 0], self.v[:, 0] = problem.q, problem.v
+
+    def rows(self, first: int, last: int) -> slice:
+        """Return the rows of what is kept of the states from the first to the last."""
+        return slice(*self.kept.searchsorted((first, last + 1)).tolist())
+
+    def result(
+        self,
+        why: Callable[[int], str],
+        evaluations: int,
+        jacobians: int = 0,
+        error: FunctionError | None = None,
+    ) -> SolverResult:
+        """Return the result, with NaN behind the good steps; why(i) is why trajectory i diverged, or empty."""
+        grid, kept, steps, q, v = self._problem.grid, self.kept, self.steps, self.q, self.v
+        single = self._problem.batch is None
+        lost = np.flatnonzero(steps < grid.steps)
+        for i in lost:
+            after = bisect_right(kept, steps[i])
+            q[i, after:], v[i, after:] = np.nan, np.nan
+        message = "" if error is None else str(error)
+        if error is None and len(lost):
+            first = int(lost[np.argmin(steps[lost])])
+            k, reason = int(steps[first]), why(first)
+            message = f"diverged after t = {grid.time(k):.6g} s (step {k + 1})" + (f": {reason}" if reason else "")
+            message += f"; dt = {grid.dt:g} s may be too long"
+            if not single:
+                message += f"; {len(lost)} of {len(steps)} trajectories diverged, see reached"
+        rows = int(np.count_nonzero(kept <= steps.max())) if len(steps) else len(kept)
+        q, v = (x if rows == len(kept) else x[:, :rows].copy() for x in (q, v))
+        # Read-only, so that nobody needs a copy.
+        q.setflags(write=False)
+        v.setflags(write=False)
+        reached = np.array([grid.time(int(k)) for k in steps])
+        return SolverResult(
+            t=np.array([grid.time(int(k)) for k in kept[:rows]]),
+            q=q[0] if single else q,
+            v=v[0] if single else v,
+            steps=int(steps.sum()),
+            evaluations=evaluations,
+            ended="function_failed" if error is not None else "diverged" if message else "finished",
+            reached=np.asarray(reached[0] if single else reached),
+            message=message,
+            jacobians=jacobians,
+            error=error,
+        )
 
 
-def run_fixed(
-    dyn: Dynamics,
-    method: str,
-    q0: Array,
-    v0: Array,
-    grid: Grid,
-    kept: Indices,
-    torque: Torque,
-    bar: Progress,
-) -> SolverResult:
-    """Step one state or a batch over the grid.
+class Stepper(Protocol):
+    """Steps of one state or a batch, one at a time; w is the velocity or momentum that the method carries along."""
 
-    A trajectory that diverges stops there; the others of its batch go on. A torque
-    function that fails stops all of them, with what they have.
+    def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        """Return q and w at t + h; NaN where there are none, or `DivergenceError`."""
+
+    def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:
+        """Go on with these members of the batch, those of the last ones that are good."""
+
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+        """Return the state to go on from."""
+
+    def leave(self, q: Array, w: Array) -> Array:
+        """Return what is kept of w."""
+
+    def reason(self, q: Array, w: Array) -> str:
+        """Return why a step from such a state failed."""
+
+
+class _FieldStepper:
+    """Steps of a method that is made of evaluations of ẇ."""
+
+    def __init__(self, problem: IntegrationProblem) -> None:
+        self.space = Space(problem.dyn.model)
+        self.field = Field(problem.dyn, self.space)
+        self._step = make_step(problem.method, self.field, self.space)
+        self.settled, self.leave = self.field.settled, self.space.leave
+
+    def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        return self._step(t, h, q, w, force)
+
+    def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:  # noqa: ARG002
+        self.field.only(members)
+
+    def reason(self, q: Array, w: Array) -> str:  # noqa: ARG002
+        return DIVERGED
+
+
+def run_fixed(problem: IntegrationProblem) -> SolverResult:
+    """Step one state or a batch over the grid, on any engine.
+
+    A trajectory that diverges stops there; the others of its batch go on. A torque function that fails stops all of
+    them, with what they have.
     """
-    space = Space(dyn.model)
-    field = Field(dyn, space)
-    run = _Run(make_step(method, field, space), field, torque, space, q0, v0, grid, kept)
-    error: FunctionError | None = None
-    # An overflow is a divergence, and reported as one.
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for k in range(grid.steps):
-            try:
-                if not run.advance(k):
-                    break
-            except FunctionError as caught:
-                error = caught
-                break
-            bar.update((k + 1) / grid.steps)
-    return grid_result(
-        grid,
-        kept,
-        run.q_kept,
-        run.v_kept,
-        run.steps,
-        single=q0.ndim == 1,
-        why=lambda _: run.why,
-        evaluations=field.evaluations,
-        error=error,
-    )
+    stepper = _FieldStepper(problem)
+    run = SteppedRun(problem, stepper, stepper.space.enter(problem.q0, problem.v0))
+    error = run.to_end()
+    return run.record.result(lambda _: run.why, stepper.field.evaluations, error=error)
 
 
-class _Run:
-    """The current states, those kept so far (n, K, ...), good steps of each (n,), and why the first one diverged."""
+class SteppedRun:
+    """The current states, their record, and why the first of them diverged."""
 
-    def __init__(
-        self, step: Step, field: Field, torque: Torque, space: Space, q0: Array, v0: Array, grid: Grid, kept: Indices
-    ) -> None:
-        self._field = field
-        self._step, self._torque, self._space, self._grid, self._kept = step, torque, space, grid, kept
-        n = 1 if q0.ndim == 1 else len(q0)
-        check_room(len(kept) * n, q0.shape[-1] + v0.shape[-1])
-        self.q_kept, self.v_kept = (np.full((n, len(kept), x.shape[-1]), np.nan) for x in (q0, v0))
-        self.steps, self.why = np.zeros(n, dtype=np.intp), ""
+    def __init__(self, problem: IntegrationProblem, stepper: Stepper, w0: Array) -> None:
+        self._problem, self._step, self.record, self.why = problem, stepper, GridRecord(problem), ""
         # Those of a batch that are still good.
-        self._members: Indices | None = None if q0.ndim == 1 else np.arange(n)
-        self._row = 0
-        self._q, self._w = q0.copy(), space.enter(q0, v0)
-        if kept[0] == 0:
-            self._keep(q0, v0)
+        self._members: Indices | None = None if problem.batch is None else np.arange(problem.batch)
+        self._row = self.record.rows(0, 0).stop
+        self._q, self._w = problem.q0.copy(), w0
 
-    def advance(self, k: int) -> bool:
+    def to_end(self) -> FunctionError | None:
+        """Step over the grid; return the error of a torque function that ended it."""
+        steps = self._problem.grid.steps
+        # An overflow is a divergence, and reported as one.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            for k in range(steps):
+                try:
+                    if not self._advance(k):
+                        break
+                except FunctionError as error:
+                    return error
+                self._problem.bar.update((k + 1) / steps)
+        return None
+
+    def _advance(self, k: int) -> bool:
         """Take step k; return whether any trajectory goes on."""
-        t, h = self._grid.time(k), self._grid.step(k)
-        why = DIVERGED
+        grid, torque, step, record = self._problem.grid, self._problem.torque, self._step, self.record
+        t, h, why = grid.time(k), grid.step(k), ""
         try:
-            q, w = self._step(t, h, self._q, self._w, self._torque.during(k, self._members))
-            good = _bounded(q, w)
+            q, w = step(t, h, self._q, self._w, torque.during(k, self._members))
+            good = are_bounded(q, w)
         except DivergenceError as error:
             q, w, good = self._one_by_one(t, h, k)
             why = str(error)
-        if good is not _GOOD and not good.all():
-            self.why = self.why or why
+        if good is not ALL and not good.all():
             if self._members is None:
+                self.why = why or step.reason(self._q, self._w)
                 return False
+            first = int(np.argmin(good))
+            self.why = self.why or why or step.reason(self._q[first], self._w[first])
             self._members, q, w = self._members[good], q[good], w[good]
             if not len(self._members):
                 return False
-            self._field.only(self._members)
-        self._q, self._w = self._field.settled(self._grid.time(k + 1), q, w)
-        self.steps[... if self._members is None else self._members] = k + 1
-        if self._row < len(self._kept) and k + 1 == self._kept[self._row]:
-            self._keep(self._q, self._space.leave(self._q, self._w))
+            step.only(self._members, good)
+        self._q, self._w = step.settled(grid.time(k + 1), q, w)
+        which: Any = slice(None) if self._members is None else self._members
+        record.steps[which] = k + 1
+        if self._row < len(record.kept) and k + 1 == record.kept[self._row]:
+            record.q[which, self._row], record.v[which, self._row] = self._q, step.leave(self._q, self._w)
+            self._row += 1
         return True
 
     def _one_by_one(self, t: float, h: float, k: int) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -119,30 +192,16 @@ class _Run:
         q, w = np.full(self._q.shape, np.nan), np.full(self._w.shape, np.nan)
         if self._members is None:
             return q, w, np.array(False)
-        good = np.zeros(len(q), dtype=bool)
         for i in range(len(q)):
             one = slice(i, i + 1)
-            force = self._torque.during(k, self._members[one])
-            self._field.only(self._members[one])
+            self._step.only(self._members[one])
+            force = self._problem.torque.during(k, self._members[one])
             try:
                 q[one], w[one] = self._step(t, h, self._q[one], self._w[one], force)
             except DivergenceError:
                 continue
-            good[i] = is_bounded(q[i]) and is_bounded(w[i])
-        self._field.only(self._members)
-        return q, w, good
-
-    def _keep(self, q: Array, v: Array) -> None:
-        which = slice(None) if self._members is None else self._members
-        self.q_kept[which, self._row], self.v_kept[which, self._row] = q, v
-        self._row += 1
-
-
-def _bounded(q: Array, w: Array) -> NDArray[np.bool_]:
-    """Return which states are bounded; for one state the squares usually tell, and are quicker."""
-    if q.ndim == 1 and q @ q + w @ w < BOUND**2:
-        return _GOOD
-    return np.asarray(is_bounded(q) & is_bounded(w))
+        self._step.only(self._members)
+        return q, w, are_bounded(q, w)
 
 
 def divergence_reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, force: Array) -> str:
@@ -162,22 +221,17 @@ def make_step(method: str, field: Field, space: Space) -> Step:
     if isinstance(formula, ImplicitTableau):
         return CollocationStep(formula, field, space)
     assert isinstance(formula, (Tableau, SemiImplicitEuler))
-    return _explicit_step(formula, field, space)
-
-
-def _explicit_step(formula: Tableau | SemiImplicitEuler, field: Field, space: Space) -> Step:
-    """Return the step of a method with an explicit formula."""
-    stages: ArrayStages | None = None
+    explicit, stages = formula, ArrayStages(formula.stages, (space.nv,))
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
             return w if u is None else space.rate(u, w), field.consistent(t, q, w, force)
 
         nonlocal stages
-        if stages is None or stages.shape != w.shape:
-            stages = ArrayStages(formula.stages, w.shape)
+        if stages.shape != w.shape:
+            stages = ArrayStages(explicit.stages, w.shape)
         stages.keep(0)
-        q, w, _ = formula.step(space, rates, stages, t, h, q, w)
+        q, w, _ = explicit.step(space, rates, stages, t, h, q, w)
         return q, w
 
     return step

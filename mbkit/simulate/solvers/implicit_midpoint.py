@@ -7,9 +7,9 @@ converges linearly, at the rate of the step times the torque's derivative.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,111 +18,195 @@ from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
-from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import FunctionError, UnsupportedError
-from mbkit.methods.registry import IMPLICIT_METHODS
+from mbkit.errors import FunctionError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import refuse_constraints
-from mbkit.simulate.progress import Progress
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.trajectory_record import grid_result
+from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun
 from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
-from mbkit.simulate.time_grid import Grid, Indices, check_room
-from mbkit.simulate.torque import Torque
+from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.torque import Force
 
 # With a torque function the iteration converges linearly.
 _WITH_FUNCTION: Final = 60
 _EPS: Final = float(np.finfo(float).eps)
+_UNSOLVED: Final = "Newton's iteration does not solve the step's equations"
+# Numbers that are turned from momenta into velocities at a time.
+_SLICE: Final = 2**16
+
+
+def run_midpoint(problem: IntegrationProblem) -> SolverResult:
+    """Step one state or a batch over the grid; a trajectory that diverges stops there, and the others go on."""
+    dyn = problem.dyn
+    assert isinstance(dyn, LagrangianDynamics)
+    refuse_constraints(dyn, problem.method, "which its step in (q, p) does not know")
+    midpoint, q0 = Midpoint(dyn.equations), problem.q
+    why: Callable[[int], str]
+    error: FunctionError | None = None
+    w0 = Space(dyn.model).enter(q0, problem.v)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        (pi0,) = called(dyn, midpoint.momentum, None, problem.start, q0, problem.v)
+        if _machine_code(dyn, midpoint, problem):
+            record, iterations, why = _in_chunks(dyn, problem, pi0, w0)
+        else:
+            stepper = MidpointStepper(dyn, problem, w0)
+            run = SteppedRun(problem, stepper, pi0[0] if problem.batch is None else pi0)
+            error = run.to_end()
+            record, iterations, why = run.record, stepper.iterations, lambda _: run.why
+        _to_velocities(dyn, midpoint, problem, record)
+    # Each iteration is an evaluation, and so is the end of each step.
+    evaluations = iterations + int(record.steps.sum())
+    return record.result(why, evaluations, iterations, error)
 
 
 def called(
-    dyn: LagrangianDynamics, part: Part, members: slice | Indices, t: Array | float, *arguments: Array
+    dyn: LagrangianDynamics, part: Part, members: Indices | None, t: Array | float, *arguments: Array
 ) -> list[Array]:
-    """Return a part's results for members of a batch: vectors as (n, rows), matrices as (n, rows, columns).
+    """Return a part's results for members of a batch, or all: vectors as (n, rows), matrices as (n, rows, columns).
 
     `t`, one for all or (n,), is the time of evaluation, where the dynamics depends on it.
     """
     n = len(arguments[0])
-    given = [np.broadcast_to(x, (n, x.shape[-1])) for x in arguments]
+    args = [np.broadcast_to(x, (n, x.shape[-1])) for x in arguments]
     if dyn.model.parameters:
         values = dyn.parameter_values
-        own = values[members] if values.ndim == 2 else np.broadcast_to(values, (n, len(values)))
+        if values.ndim == 2 and members is not None:
+            values = values[members]
+        own = np.broadcast_to(values, (n, values.shape[-1]))
         if dyn.model.time_parameter is not None:
             own = own.copy()
             own[:, list(dyn.model.parameters).index(dyn.model.time_parameter)] = t
-        given.append(own)
-    results = dyn.code(part.name, make=part.make)(*given, threads=dyn.threads)
+        args.append(own)
+    results = dyn.code(part.name, make=part.make)(*args, threads=dyn.threads)
     return [
         x[..., 0] if x.shape[-1] == 1 and name not in ("M", "jacobian") else x
         for name, x in zip(part.writes, results, strict=True)
     ]
 
 
-class MidpointSolver:
+def _machine_code(dyn: LagrangianDynamics, midpoint: Midpoint, problem: IntegrationProblem) -> bool:
+    if problem.torque.callable or not dyn.model.nv or not dyn.compile or not dyn.written_out:
+        return False
+    return not any(isinstance(dyn.code(p.name, make=p.make), Machine) for p in (midpoint.newton, midpoint.end))
+
+
+def _reason(q: Array, pi: Array) -> str:
+    # An overflow in the middle of a step leaves no number for the iteration either.
+    return DIVERGED if max(np.abs(x).max() for x in (q, pi)) > BOUND**0.5 else _UNSOLVED
+
+
+def _in_chunks(
+    dyn: LagrangianDynamics, problem: IntegrationProblem, pi0: Array, w0: Array
+) -> tuple[GridRecord, int, Callable[[int], str]]:
+    """Run every trajectory, some side by side, and such chunks at once on several cores.
+
+    Returns also Newton's iterations, and why trajectories were lost.
+    """
+    # These load LLVM, which interpreting never needs.
+    from mbkit.codegen.compiled import cores
+    from mbkit.simulate.solvers.compiled_fixed_step import run_blocks, run_parts
+    from mbkit.simulate.solvers.implicit_midpoint_compiled import WIDEST, MidpointChunk
+
+    record, grid, values, n = GridRecord(problem), problem.grid, dyn.parameter_values, len(pi0)
+    count = -(-n // WIDEST)
+    ends = [n * i // max(count, 1) for i in range(count + 1)]
+    # Threads append to it, and write their own members.
+    iterations, reasons = list[int](), dict[int, str]()
+
+    def run(part: slice) -> Iterator[int]:
+        members = np.arange(n)[part]
+        chunk = MidpointChunk(dyn, len(members), grid.steps, torques=problem.torque.held)
+        chunk.begin(problem.q[part], pi0[part], w0[part], values[part] if values.ndim == 2 else values)
+        for end, lost in run_blocks(problem, record, chunk, members):
+            reasons.update({i: _reason(*last) for i, last in lost.items()})
+            yield end
+        iterations.append(chunk.iterations)
+
+    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, dyn.threads or cores(), grid.steps, problem.bar)
+    return record, sum(iterations), reasons.__getitem__
+
+
+class MidpointStepper:
     """Newton's iteration for trajectories side by side, one step at a time; `iterations` are of all together."""
 
-    def __init__(self, dyn: LagrangianDynamics, torque: Torque, *, single: bool) -> None:
-        self._dyn, self._torque, self._single = dyn, torque, single
-        self._midpoint, self._space = Midpoint(dyn.equations), Space(dyn.model)
+    def __init__(self, dyn: LagrangianDynamics, problem: IntegrationProblem, w0: Array) -> None:
+        self._dyn, self._midpoint, self._space = dyn, Midpoint(dyn.equations), Space(dyn.model)
+        self._single = problem.batch is None
+        self._members: Indices = np.arange(len(w0))
+        # The velocities of the last steps, and the first guess of the next one.
+        self._last, self._guess = [w0] * len(GUESS), w0
         self.iterations = 0
 
-    def velocity(
-        self, members: Indices, k: int, t: float, h: float, q: Array, pi: Array, guess: Array
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the velocity of step k, the torque that acted, and whether the step is solved, per trajectory.
+    def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:
+        """Go on with these members of the batch."""
+        self._members = members
+        self._last, self._guess = [w[good] for w in self._last], self._guess[good]
+
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        """Return the state."""
+        return q, w
+
+    def leave(self, q: Array, w: Array) -> Array:  # noqa: ARG002
+        """Return the momentum."""
+        return w
+
+    def reason(self, q: Array, w: Array) -> str:
+        """Return why a step is not solved."""
+        return _reason(q, w)
+
+    def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        """Return q and π after a step; NaN where it is not solved."""
+        q, pi = np.atleast_2d(q), np.atleast_2d(w)
+        velocity, tau, good = self._velocity(t, h, q, pi, force)
+        self._last = [velocity, *self._last[:-1]]
+        zero, step = np.zeros((1, 1)), np.array([[h]])
+        members, middle = self._members, t + h / 2
+        given = q, pi, *self._last, tau, step, zero, zero
+        q1, pi1, self._guess, _ = called(self._dyn, self._midpoint.end, members, middle, *given)
+        q1[~good] = np.nan
+        return (q1[0], pi1[0]) if self._single else (q1, pi1)
+
+    def _velocity(self, t: float, h: float, q: Array, pi: Array, force: Force) -> tuple[Array, Array, Any]:
+        """Return the velocity of a step, the torque that acted, and whether the step is solved, per trajectory.
 
         With a torque function it goes on until corrections stop shrinking.
         """
-        w, good = guess.copy(), np.full(len(q), False)
+        w, good = self._guess.copy(), np.full(len(q), False)
         tau = np.empty(w.shape)
-        if not self._torque.callable:
-            tau[:] = self._torque.columns(members, k, k + 1)[0].T
+        if isinstance(force, np.ndarray):
+            tau[:] = force
         last, todo = np.full(len(q), np.inf), np.arange(len(q))
-        for _ in range(_WITH_FUNCTION if self._torque.callable else MOST):
+        for _ in range(MOST if isinstance(force, np.ndarray) else _WITH_FUNCTION):
             # A user's function never sees a state that is none.
             todo = todo[np.isfinite(w[todo]).all(axis=1) & ~good[todo]]
             if not len(todo):
                 break
-            if self._torque.callable:
-                tau[todo] = self._function(members[todo], k, t, h, q[todo], w[todo])
-            w1, solved = self._newton(members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
+            if not isinstance(force, np.ndarray):
+                q_m = self._space.move(q[todo], (h / 2) * w[todo])
+                state = q_m, self._space.leave(q_m, w[todo])
+                tau[todo] = force(t + h / 2, *(x[0] for x in state)) if self._single else force(t + h / 2, *state)
+            w1, solved = self._newton(self._members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
             change = np.abs(w1 - w[todo]).max(axis=1, initial=0.0)
-            if self._torque.callable:
+            if not isinstance(force, np.ndarray):
                 solved &= (change <= 4 * _EPS * np.abs(w1).max(axis=1, initial=0.0)) | (change >= last[todo] / 2)
             w[todo], good[todo], last[todo] = w1, solved, change
         return w, tau, good
-
-    def _function(self, members: Indices, k: int, t: float, h: float, q: Array, w: Array) -> Array:
-        force = self._torque.during(k, None if self._single else members)
-        assert callable(force)
-        q_m = self._space.move(q, (h / 2) * w)
-        state = q_m, self._space.leave(q_m, w)
-        if self._single:
-            return np.asarray(force(t + h / 2, *(x[0] for x in state)))[None]
-        return force(t + h / 2, *state)
 
     def _newton(
         self, members: Indices, t: float, q: Array, pi: Array, w: Array, tau: Array, h: float
     ) -> tuple[Array, NDArray[np.bool_]]:
         self.iterations += len(q)
-        given = (q, pi, w, tau, np.array([[h]]))
+        args = (q, pi, w, tau, np.array([[h]]))
         if self._dyn.written_out:
-            w1, miss = called(self._dyn, self._midpoint.newton, members, t, *given)
+            w1, miss = called(self._dyn, self._midpoint.newton, members, t, *args)
             return w1, miss[:, 0] == 0
-        residual, jacobian = called(self._dyn, self._midpoint.system, members, t, *given)
+        residual, jacobian = called(self._dyn, self._midpoint.system, members, t, *args)
         change = _solved(jacobian, residual)
         w1 = w - change
         limit = SMALL**2 * np.sum(w1**2, axis=1) + (LEAST / h) ** 2 * (1 + np.sum(q**2, axis=1))
         return w1, np.sum(change**2, axis=1) < limit
-
-    def end(
-        self, members: Indices, t: float, h: float, q: Array, pi: Array, ws: list[Array], tau: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return q and π after the step, and the first guess of the next velocity, from those of the last steps."""
-        zero = np.zeros((1, 1))
-        outs = called(self._dyn, self._midpoint.end, members, t + h / 2, q, pi, *ws, tau, np.array([[h]]), zero, zero)
-        return outs[0], outs[1], outs[2]
 
 
 def _solved(A: Array, b: Array) -> Array:
@@ -130,182 +214,27 @@ def _solved(A: Array, b: Array) -> Array:
         return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
     except np.linalg.LinAlgError:
         # One singular matrix must not stop the others of a batch.
-        out = np.full(b.shape, np.nan)
-        for i in range(len(b)):
-            try:
-                out[i] = np.linalg.solve(A[i], b[i])
-            except np.linalg.LinAlgError:
-                continue
-        return out
+        if len(b) == 1:
+            return np.full(b.shape, np.nan)
+        return np.concatenate([_solved(A[i : i + 1], b[i : i + 1]) for i in range(len(b))])
 
 
-_UNSOLVED: Final = "Newton's iteration does not solve the step's equations"
-# Numbers that are turned from momenta into velocities at a time.
-_SLICE: Final = 2**16
-
-
-def run_midpoint(
-    dyn: Dynamics,
-    method: str,
-    q0: Array,
-    v0: Array,
-    grid: Grid,
-    kept: Indices,
-    torque: Torque,
-    bar: Progress,
-) -> SolverResult:
-    """Step one state or a batch over the grid; a trajectory that diverges stops there, and the others go on."""
-    if not isinstance(dyn, LagrangianDynamics):
-        raise UnsupportedError(
-            f"{method}: {dyn.engine} gives neither momenta nor ∂T/∂q, which the midpoint rule in (q, p) is made of; "
-            f"mbkit.dynamics(model, 'lagrangian') has them; {IMPLICIT_METHODS} run on any engine"
-        )
-    refuse_constraints(dyn, method, "which its step in (q, p) does not know")
-    single = q0.ndim == 1
-    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
-    check_room(len(kept) * len(q0), q0.shape[1] + v0.shape[1])
-    run = _Run(dyn, q0, v0, grid, kept, torque)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        if _machine_code(dyn, torque):
-            run.in_chunks(bar)
+def _to_velocities(
+    dyn: LagrangianDynamics, midpoint: Midpoint, problem: IntegrationProblem, record: GridRecord
+) -> None:
+    """Turn the kept momenta into velocities."""
+    kept, (n, rows, nv) = record.kept, record.v.shape
+    times = np.array([problem.grid.time(int(k)) for k in kept])
+    size = max(_SLICE // max(n * (nv or 1), 1), 1)
+    for start in range(0, rows, size):
+        q, v = (x[:, start : start + size] for x in (record.q, record.v))
+        at_k = kept[start : start + size]
+        who, at = np.nonzero((at_k > 0) & (at_k <= record.steps[:, None]))
+        if not len(who):
+            continue
+        args = who, times[start + at], q[who, at], v[who, at]
+        if dyn.written_out:
+            v[who, at] = called(dyn, midpoint.velocity, *args)[0]
         else:
-            run.step_by_step(bar, single=single)
-        return run.result(single)
-
-
-def _machine_code(dyn: LagrangianDynamics, torque: Torque) -> bool:
-    if torque.callable or not dyn.model.nv or not dyn.compile or not dyn.written_out:
-        return False
-    midpoint = Midpoint(dyn.equations)
-    return not any(isinstance(dyn.code(p.name, make=p.make), Machine) for p in (midpoint.newton, midpoint.end))
-
-
-class _Run:
-    """Kept states of all trajectories: momenta at first, velocities in the end."""
-
-    def __init__(
-        self, dyn: LagrangianDynamics, q0: Array, v0: Array, grid: Grid, kept: Indices, torque: Torque
-    ) -> None:
-        self._dyn, self._grid, self._kept, self._torque = dyn, grid, kept, torque
-        self._midpoint = Midpoint(dyn.equations)
-        self._q0, self._v0, self._w0 = q0, v0, Space(dyn.model).enter(q0, v0)
-        n, rows = len(q0), len(kept)
-        (self._pi0,) = called(self._dyn, self._midpoint.momentum, slice(None), grid.start, q0, v0)
-        self._q, self._v = np.full((n, rows, q0.shape[1]), np.nan), np.full((n, rows, v0.shape[1]), np.nan)
-        self._steps = np.zeros(n, dtype=np.intp)
-        self._last = np.zeros(n)
-        # Threads append to it.
-        self._iterations: list[int] = []
-        self._error: FunctionError | None = None
-
-    def _rows(self, first: int, last: int) -> slice:
-        """Return the rows of what is kept of the states from the first to the last."""
-        return slice(*np.searchsorted(self._kept, (first, last + 1), side="left"))
-
-    # In machine code
-
-    def in_chunks(self, bar: Progress) -> None:
-        """Run every trajectory, some side by side, and such chunks at once on several cores."""
-        # These load LLVM, which interpreting never needs.
-        from mbkit.codegen.compiled import cores
-        from mbkit.simulate.solvers.compiled_fixed_step import blocks, run_parts
-        from mbkit.simulate.solvers.implicit_midpoint_compiled import WIDEST, MidpointChunk
-
-        n, grid = len(self._q0), self._grid
-        count = -(-n // WIDEST)
-        ends = [n * i // max(count, 1) for i in range(count + 1)]
-
-        def run(members: slice) -> Iterator[int]:
-            chunk = MidpointChunk(self._dyn, members.stop - members.start, grid.steps, torques=self._torque.held)
-            own = values[members] if values.ndim == 2 else values
-            chunk.begin(self._q0[members], self._pi0[members], self._w0[members], own)
-            alive = np.full(members.stop - members.start, True)
-            for k, end in blocks(chunk, grid, self._torque, members):
-                good, block = chunk.good, end - k
-                if (rows := self._rows(k + 1, end)).start < rows.stop:
-                    at = self._kept[rows] - k
-                    self._q[members, rows], self._v[members, rows] = chunk.states("q", at), chunk.states("pi", at)
-                self._steps[members][alive] = k + good[alive]
-                for m in np.flatnonzero(alive & (good < block)):
-                    last = [chunk.states(name, good[m : m + 1])[m] for name in ("q", "pi")]
-                    self._last[members.start + m] = max(np.abs(x).max() for x in last)
-                alive &= good == block
-                yield end
-                if not alive.any():
-                    break
-            self._iterations.append(chunk.iterations)
-
-        values = self._dyn.parameter_values
-        parts = [slice(a, b) for a, b in pairwise(ends)]
-        run_parts(parts, lambda: run, self._dyn.threads or cores(), grid.steps, bar)
-
-    # In Python
-
-    def step_by_step(self, bar: Progress, *, single: bool) -> None:
-        """Run all trajectories side by side, with a look at every step."""
-        grid = self._grid
-        members: Indices = np.arange(len(self._q0))
-        solver = MidpointSolver(self._dyn, self._torque, single=single)
-        q, pi, ws, guess = self._q0, self._pi0, [self._w0] * len(GUESS), self._w0
-        try:
-            for k in range(grid.steps):
-                w, tau, good = solver.velocity(members, k, grid.time(k), grid.step(k), q, pi, guess)
-                ws = [w, *ws[:-1]]
-                q1, pi1, guess = solver.end(members, grid.time(k), grid.step(k), q, pi, ws, tau)
-                good &= (np.abs(q1) < BOUND).all(axis=1) & (np.abs(pi1) < BOUND).all(axis=1)
-                if not good.all():
-                    self._last[members[~good]] = np.maximum(np.abs(q).max(axis=1), np.abs(pi).max(axis=1))[~good]
-                    members, q1, pi1, guess = members[good], q1[good], pi1[good], guess[good]
-                    ws = [w[good] for w in ws]
-                    if not len(members):
-                        break
-                q, pi = q1, pi1
-                self._steps[members] = k + 1
-                if (rows := self._rows(k + 1, k + 1)).start < rows.stop:
-                    self._q[members, rows.start], self._v[members, rows.start] = q, pi
-                bar.update((k + 1) / grid.steps)
-        except FunctionError as error:
-            self._error = error
-        self._iterations.append(solver.iterations)
-
-    # In the end
-
-    def result(self, single: bool) -> SolverResult:
-        """Return what was kept, with velocities."""
-        for i in np.flatnonzero(self._steps < self._grid.steps):
-            self._v[i, self._kept > self._steps[i]] = np.nan
-        self._to_velocities()
-        if self._kept[0] == 0:
-            self._q[:, 0], self._v[:, 0] = self._q0, self._v0
-        iterations = sum(self._iterations)
-        return grid_result(
-            self._grid,
-            self._kept,
-            self._q,
-            self._v,
-            self._steps,
-            single=single,
-            # An overflow in the middle of a step leaves no number for the iteration either.
-            why=lambda i: DIVERGED if self._last[i] > BOUND**0.5 else _UNSOLVED,
-            # Each iteration is one, and so is the end of each step.
-            evaluations=iterations + int(self._steps.sum()),
-            jacobians=iterations,
-            error=self._error,
-        )
-
-    def _to_velocities(self) -> None:
-        n, rows, nv = self._v.shape
-        times = np.array([self._grid.time(int(k)) for k in self._kept])
-        size = max(_SLICE // max(n * (nv or 1), 1), 1)
-        for start in range(0, rows, size):
-            q, v = (x[:, start : start + size] for x in (self._q, self._v))
-            good = np.isfinite(v).all(axis=2)
-            who, at = np.nonzero(good)
-            if len(who):
-                v[who, at] = self._velocities(who, times[start + at], q[who, at], v[who, at])
-
-    def _velocities(self, members: Indices, t: Array, q: Array, pi: Array) -> Array:
-        if self._dyn.written_out:
-            return called(self._dyn, self._midpoint.velocity, members, t, q, pi)[0]
-        M, p = called(self._dyn, self._midpoint.velocity_system, members, t, q, pi)
-        return np.asarray(np.linalg.solve(M, p[..., None])[..., 0])
+            M, p = called(dyn, midpoint.velocity_system, *args)
+            v[who, at] = np.linalg.solve(M, p[..., None])[..., 0]

@@ -7,22 +7,19 @@ from math import isqrt
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.codegen.compiled import Call, KernelSequence
 from mbkit.derivation.steps.midpoint import GUESS, MOST, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.simulate.solvers.compiled_fixed_step import BlockLoop, padded
-from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.solvers.compiled_fixed_step import CACHE, BlockLoop, padded
 
 #: States that go side by side, at most: enough for the processor's vectors, and nine
 #: cache lines in a row of them, because an even number would meet in the same sets.
 WIDEST: Final = 72
 # Blocks without a miss after which one iteration less is tried.
 _PATIENCE: Final = 32
-# Steps of a block: until its states fill half of what a core has in its second cache.
-_CACHE: Final = 2**19
+# Steps of a block, whose states fill half of a core's second cache.
 _SHORTEST, _LONGEST = 16, 256
 # Until there are velocities to guess the next one from, more iterations are needed.
 _FIRST: Final = len(GUESS)
@@ -31,15 +28,16 @@ _FIRST: Final = len(GUESS)
 class MidpointChunk(BlockLoop):
     """At most `WIDEST` trajectories that take blocks of steps with equally many Newton iterations each.
 
-    Where a step is not solved, the block is repeated with more. `good` are the solved steps of the last block, (n,);
-    `torques`: each step has its own torque.
+    Where a step is not solved, the block is repeated with more. `torques`: each step has its own torque.
     """
+
+    carried = ("q", "pi")
 
     def __init__(self, dyn: LagrangianDynamics, count: int, steps: int, *, torques: bool) -> None:
         midpoint, nq, nv = Midpoint(dyn.equations), dyn.model.nq, dyn.model.nv
         self._newton, self._end = midpoint.newton, midpoint.end
         self._codes = {part.name: dyn.code(part.name, make=part.make) for part in (self._newton, self._end)}
-        most = min(_CACHE // (8 * padded(count) * (nq + 3 * nv + 1)), _LONGEST, isqrt(steps))
+        most = min(CACHE // (8 * padded(count) * (nq + 3 * nv + 1)), _LONGEST, isqrt(steps))
         n, back = max(most, _SHORTEST), len(GUESS) - 1
         self._longest, self.block = n, _FIRST
         # The time is one of the parameters, and another in each step.
@@ -55,16 +53,12 @@ class MidpointChunk(BlockLoop):
         self._iterations, self._smooth = 2, 0
         self.iterations = 0
         self._alive = np.full(count, True)
-        self.good: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
 
     def begin(self, q: Array, pi: Array, w: Array, parameters: Array) -> None:
         """Put (n, nq) configurations, (n, nv) momenta and velocities in, and the parameters' values, (p,) or (n, p)."""
-        self._fill("q", 0, q.T)
-        self._fill("pi", 0, pi.T)
-        self._fill("guess", 0, w.T)
+        self._begin(parameters, q=q, pi=pi, guess=w)
         for place in range(self._back):
             self._fill("w", place, w.T)
-        self._fill_parameters(parameters)
 
     def _sequence(self, iterations: int) -> KernelSequence:
         key = iterations, self.block
@@ -93,9 +87,7 @@ class MidpointChunk(BlockLoop):
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
         """Take some steps, and count in `good` how many of them are solved."""
-        self._room["dt"][:] = dt
-        for j in range(min(steps, len(self._room["tau"]))):
-            self._fill("tau", j, torques[j])
+        self._hold(steps, dt, torques)
         if self._clock is not None:
             middles = start + (np.arange(steps) + 0.5) * dt
             self._room["parameters"][:steps, self._clock] = middles[:, None]
@@ -132,7 +124,3 @@ class MidpointChunk(BlockLoop):
             self._room[name][0] = self._room[name][n]
         self._room["guess"][0] = self._room["guess"][1]
         self._room["w"][: self._back] = self._room["w"][n : n + self._back].copy()
-
-    def states(self, name: str, which: Indices) -> Array:
-        """Return q or pi after these many steps of the block, (n, steps, rows)."""
-        return np.asarray(self._room[name][which, :, : self._count].transpose(2, 0, 1))

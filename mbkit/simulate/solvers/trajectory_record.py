@@ -1,24 +1,24 @@
-"""The record of each trajectory while a solver runs, and all of them as one result."""
+"""The record of each trajectory while an adaptive solver runs, and all of them as one result."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from math import inf
-from typing import Final
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import FunctionError
 from mbkit.methods.registry import Tolerances
-from mbkit.model import Model
+from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.constraint_projection import SingularPoses
-from mbkit.simulate.events import Hit
+from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.time_grid import Grid, Indices
+from mbkit.simulate.solvers.vector_field import DIVERGED, are_bounded
+from mbkit.simulate.time_grid import Indices
 
 #: Attempted steps between two looks at the time that they covered, and the least part of the run that they must
 #: cover. A run at that pace takes 2e10 steps.
@@ -26,59 +26,161 @@ _ATTEMPTS: Final = 20_000
 _COVERED: Final = 1e-6
 
 
-class TrajectoryRecord:
-    """One trajectory of an adaptive solver: `save` are times to keep, None for the end of every step.
+class StoppedError(Exception):
+    """A state that has no next one; never leaves mbkit. `ended` is as in `Stats`."""
 
-    `reached` is the time and `last` the configuration of the last good state; `ended` is as in `Stats`.
+    def __init__(self, ended: Ended, message: str) -> None:
+        super().__init__(message)
+        self.ended = ended
+
+
+def diverged(reason: str = "") -> StoppedError:
+    """Return the end of a run whose states or rates are no numbers."""
+    return StoppedError("diverged", f"diverged: {reason or DIVERGED}")
+
+
+def below_rounding(tolerances: Tolerances) -> StoppedError:
+    """Return the end of a run where no step is long enough to change the time."""
+    rtol, atol = tolerances
+    own = "" if atol == rtol else f", atol = {atol:g}"
+    return StoppedError("step_too_small", f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging")
+
+
+@dataclass(frozen=True, eq=False)
+class AcceptedSteps:
+    """Accepted steps of one trajectory in a row, the state before the first in front."""
+
+    t: Array  # (n + 1,)
+    q: Array  # (n + 1, nq)
+    w: Array  # (n + 1, nv), of `Space`
+    tried: int = 1  # attempted steps
+
+    def rows(self, which: Indices) -> AcceptedSteps:
+        """Return some of the states."""
+        return AcceptedSteps(self.t[which], self.q[which], self.w[which], 0)
+
+
+#: (start, times) -> (q, w) at times, (m, nq) and (m, nv), each within the step from the state of the same row.
+Within = Callable[[AcceptedSteps, Array], tuple[Array, Array]]
+
+
+class TrajectoryRecord:
+    """One trajectory of an adaptive solver: kept states, counts, events, and how it ended.
+
+    `reached` is the time and `last` the configuration of the last good state; `ended` is as in `Stats`. Without a
+    space, velocities are mbkit's and quaternions of any length.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        save: Sequence[float] | None = None,
-        start: float = 0.0,
-        duration: float = inf,
-        poses: SingularPoses | None = None,
-    ) -> None:
-        self._model, self._save, self._duration = model, save, duration
+    def __init__(self, problem: IntegrationProblem, i: int, space: Space | None = None) -> None:
+        dyn, member, self.index = problem.dyn, problem.member(i), i
+        self._problem, self._model, self._space, self._save = problem, dyn.model, space, problem.save
+        self._watch = Watch(problem.events, member) if problem.events else None
+        own = dyn if member is None or not dyn.model.constrained else dyn.of_samples([member])
+        self.poses = SingularPoses(own) if dyn.model.constrained else None
         self.steps = self.rejected = 0
-        self.reached = self._last_time = start
-        self.poses = poses
+        self.reached = problem.start
         self.last: Array | None = None
         self.ended: Ended = "finished"
         self.message = ""
         self.events: list[Hit] = []
         self.error: FunctionError | None = None
-        self._look = 0, start
+        self._look = 0, problem.start
         self._kept: list[tuple[Array, Array, Array]] = []
-        self._count = 0
 
-    def begin(self, t: float, y: Array) -> None:
+    def begin(self, q: Array, v: Array) -> None:
         """Keep the start if it is wanted."""
-        if self._save is None or (len(self._save) and self._save[0] == t):
-            self.keep(t, y)
+        if self._save is None or (len(self._save) and self._save[0] == self.reached):
+            self._kept.append((np.array([self.reached]), q[None], v[None]))
+        if self._watch is not None:
+            self._watch.start(self.reached, q, v)
 
-    def add(self, t: Array, q: Array, v: Array) -> None:
-        """Keep states: (n,), (n, nq) and (n, nv)."""
-        if len(t):
-            self._kept.append((t, q, v))
-            self._count += len(t)
-            self._last_time = float(t[-1])
+    def take(self, made: AcceptedSteps, within: Within) -> bool:
+        """Add steps; return whether to go on."""
+        steps = len(made.t) - 1
+        self.rejected += made.tried - steps
+        # A state that is not bounded stays so: the last one tells.
+        lost = not are_bounded(made.q[-1], made.w[-1])
+        if lost:
+            good = are_bounded(made.q[1:], made.w[1:])
+            steps = int(np.argmin(good)) if len(good) else 0
+        hit = None if self._watch is None else self._first_end(self._watch, made, steps, within)
+        if hit is not None:
+            steps = int(np.searchsorted(made.t, hit.t))
+        until = float(made.t[steps]) if hit is None else hit.t
+        if not self._keep(made, steps, until, within):
+            # A shorter step than one that was good met what is no number.
+            steps, hit, lost = 0, None, True
+            until = float(made.t[0])
+        self.steps += steps
+        self.reached = until
+        if steps:
+            self.last = made.q[steps]
+        if self.poses is not None:
+            for k in range(1, steps + 1):
+                self.poses.saw(float(made.t[k]), made.q[k])
+        if hit is not None:
+            self._stop_at(hit)
+        elif lost:
+            self.stop(diverged())
+        return hit is None and not lost
 
-    def keep(self, t: float, y: Array) -> None:
-        """Keep a state (q, v) with quaternions of any length."""
-        nq = self._model.nq
-        q, _ = unit_quaternions(self._model, y[:nq])
-        self.add(np.array([t]), q[None].copy(), y[None, nq:].copy())
+    def reach(self, t: float, y: Array) -> None:
+        """Go on to a state (q, v), of a solver that does not tell its steps."""
+        self.reached = t
+        if self._save is not None and t in self._save:
+            nq = self._model.nq
+            self._add(np.array([t]), y[None, :nq], y[None, nq:])
 
-    def keep_step(self, t: float, end: float, state: Callable[[float], Array]) -> None:
-        """Keep what is wanted of a step that ended at t, up to `end`; state(t) is (q, v) within the step."""
+    def _state(self, q: Array, w: Array) -> tuple[Array, Array]:
+        """Return q and mbkit's v."""
+        if self._space is not None:
+            return q, self._space.leave(q, w)
+        if self._model.quaternions:
+            # Row by row: NumPy rounds the norms of several rows otherwise.
+            q = np.array([unit_quaternions(self._model, x)[0] for x in np.atleast_2d(q)]).reshape(q.shape)
+        return q, w
+
+    def _first_end(self, watch: Watch, made: AcceptedSteps, steps: int, within: Within) -> Hit | None:
+        """Look for events in the first steps; return the one that ends the run."""
+
+        def in_step(k: int) -> State:
+            def state(t: float) -> tuple[Array, Array]:
+                if t in (made.t[k], made.t[k + 1]):
+                    at = k + int(t == made.t[k + 1])
+                    return self._state(made.q[at], made.w[at])
+                q, w = within(made.rows(np.array([k])), np.array([t]))
+                return self._state(q[0], w[0])
+
+            return state
+
+        for k in range(steps):
+            hits, last = watch.look(float(made.t[k + 1]), in_step(k))
+            self.events += hits
+            if last is not None:
+                return last
+        return None
+
+    def _keep(self, made: AcceptedSteps, steps: int, until: float, within: Within) -> bool:
+        """Keep the wanted states up to a time in the last step; return False, and keep none, if one is unbounded."""
         if self._save is None:
-            if end == t:
-                self.keep(t, state(t))
-            return
-        while self._count < len(self._save) and self._save[self._count] <= end:
-            self.keep(self._save[self._count], state(self._save[self._count]))
+            ends = slice(1, steps + 1 - int(until != made.t[steps]))
+            return self._add(made.t[ends], made.q[ends], made.w[ends])
+        first, last = self._save.searchsorted((made.t[0], until), side="right")
+        if first == last:
+            return True
+        times = self._save[first:last]
+        after = np.searchsorted(made.t, times)
+        q, w = made.q[after], made.w[after]
+        between = np.flatnonzero(made.t[after] != times)
+        if len(between):
+            q[between], w[between] = within(made.rows(after[between] - 1), times[between])
+        return self._add(times, q, w)
+
+    def _add(self, t: Array, q: Array, w: Array) -> bool:
+        good = bool(are_bounded(q, w).all())
+        if good and len(t):
+            self._kept.append((t, *self._state(q, w)))
+        return good
 
     @property
     def states(self) -> tuple[Array, Array, Array]:
@@ -88,12 +190,6 @@ class TrajectoryRecord:
         t, q, v = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
         return t, q, v
 
-    def saw(self, t: float, q: Array) -> None:
-        """Take in the end of a step that is part of the run."""
-        self.last = q
-        if self.poses is not None:
-            self.poses.saw(t, q)
-
     def crawls(self) -> bool:
         """End the run where many steps cover next to none of it; return whether they do."""
         attempts, (before, since) = self.steps + self.rejected, self._look
@@ -101,42 +197,66 @@ class TrajectoryRecord:
             return False
         covered = self.reached - since
         self._look = attempts, self.reached
-        if covered < _COVERED * self._duration:
-            self.stop(
-                "step_too_small",
-                f"{attempts - before} steps covered {covered:.2g} s alone: stiff, singular or diverging",
-            )
+        if covered < _COVERED * self._problem.duration:
+            why = f"{attempts - before} steps covered {covered:.2g} s alone: stiff, singular or diverging"
+            self.stop(StoppedError("step_too_small", why))
             return True
         return False
 
-    def stop(self, ended: Ended, message: str) -> None:
+    def stop(self, reason: StoppedError) -> None:
         """End early, after `reached`."""
-        self.ended, self.message = ended, f"{message} after t = {self.reached:.6g} s"
+        self.ended, self.message = reason.ended, f"{reason} after t = {self.reached:.6g} s"
 
-    def stop_below_rounding(self, tolerances: Tolerances) -> None:
-        """End where no step is long enough to change the time."""
-        rtol, atol = tolerances
-        own = "" if atol == rtol else f", atol = {atol:g}"
-        self.stop("step_too_small", f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging")
-
-    def stop_at(self, hit: Hit) -> None:
-        """End at an event; of one of a batch the state is with the event, off the common times."""
-        self.ended, self.reached = "event", hit.t
-        self.message = f"stopped by {hit.name} at t = {hit.t:.6g} s"
-        if hit.member is None and not (self._kept and self._last_time == hit.t):
-            self.add(np.array([hit.t]), hit.q[None], hit.v[None])
+    def _stop_at(self, hit: Hit) -> None:
+        # The state of one of a batch is with the event, off the common times.
+        self.ended, self.message = "event", f"stopped by {hit.name} at t = {hit.t:.6g} s"
+        if hit.member is None and not (self._kept and self._kept[-1][0][-1] == hit.t):
+            self._kept.append((np.array([hit.t]), hit.q[None], hit.v[None]))
 
     def fail(self, error: FunctionError) -> None:
         """End where a torque or event function failed."""
         self.ended, self.message, self.error = "function_failed", str(error), error
 
 
-def record_of(problem: IntegrationProblem, i: int) -> TrajectoryRecord:
-    """Return the empty record of the i-th trajectory."""
-    dyn, member = problem.dyn, problem.member(i)
-    poses = SingularPoses(dyn if member is None else dyn.of_samples([member])) if dyn.model.constrained else None
-    save = None if problem.save is None else problem.save.tolist()
-    return TrajectoryRecord(dyn.model, save, problem.start, problem.duration, poses)
+def run_each(
+    problem: IntegrationProblem, walk: Callable[[int, Array, TrajectoryRecord], Iterable[tuple[float, Array, Any]]]
+) -> list[TrajectoryRecord]:
+    """Integrate the states y = (q, v) one by one.
+
+    walk(i, y, record) yields the end of each step as (t, y, at), with at(t) -> y within the step. Where at is None it
+    yields saved states, and counts its steps in the record.
+    """
+    records, nq = [], problem.dyn.model.nq
+    for i, y in enumerate(problem.y):
+        record, report = TrajectoryRecord(problem, i), problem.report(i)
+        records.append(record)
+        try:
+            record.begin(unit_quaternions(problem.dyn.model, y[:nq])[0], y[nq:])
+            t = problem.start
+            for t1, y1, at in walk(i, y, record):
+                if at is None:
+                    record.reach(t1, y1)
+                else:
+                    both = np.array([y, y1])
+                    made = AcceptedSteps(np.array([t, t1]), both[:, :nq], both[:, nq:])
+                    if not record.take(made, _by_rows(at, nq)) or record.crawls():
+                        break
+                report(t1)
+                t, y = t1, y1
+        except StoppedError as error:
+            record.stop(error)
+        except FunctionError as error:
+            record.fail(error)
+            break
+    return records
+
+
+def _by_rows(at: Callable[[float], Array], nq: int) -> Within:
+    def within(_start: AcceptedSteps, times: Array) -> tuple[Array, Array]:
+        states = np.array([at(t) for t in times.tolist()])
+        return states[:, :nq], states[:, nq:]
+
+    return within
 
 
 def assemble_result(
@@ -161,6 +281,7 @@ def assemble_result(
         for i, (own, *state) in enumerate(states):
             q[i, : len(own)], v[i, : len(own)] = state
     ended, message = _end(records, batch)
+    poses = [record.poses.describe() for record in records if record.poses and record.poses.times]
     return SolverResult(
         t=np.array(t, dtype=np.float64),
         q=q,
@@ -175,9 +296,7 @@ def assemble_result(
         events=tuple(hit for record in records for hit in record.events),
         error=next((record.error for record in records if record.error), None),
         last=next((record.last for record in records if record.ended in ("diverged", "step_too_small")), None),
-        doubts=tuple(
-            dict.fromkeys(record.poses.describe() for record in records if record.poses and record.poses.times)
-        ),
+        doubts=tuple(dict.fromkeys(poses)),
     )
 
 
@@ -191,53 +310,3 @@ def _end(records: Sequence[TrajectoryRecord], batch: int | None) -> tuple[Ended,
     if batch is None or first.error is not None:
         return first.ended, first.message
     return first.ended, f"{first.message}; {len(early)} of {batch} trajectories ended early, see reached"
-
-
-def grid_result(
-    grid: Grid,
-    kept: Indices,
-    q: Array,
-    v: Array,
-    steps: Indices,
-    *,
-    single: bool,
-    why: Callable[[int], str],
-    evaluations: int,
-    jacobians: int = 0,
-    error: FunctionError | None = None,
-) -> SolverResult:
-    """Return the result of a run with a fixed step.
-
-    `kept` are the indices of the states q and v, (n, K, ...), which are overwritten by NaN behind the good `steps` of
-    each trajectory, (n,). why(i) is the reason why trajectory i diverged, or empty.
-    """
-    lost = np.flatnonzero(steps < grid.steps)
-    for i in lost:
-        after = bisect_right(kept, steps[i])
-        q[i, after:], v[i, after:] = np.nan, np.nan
-    message = "" if error is None else str(error)
-    if error is None and len(lost):
-        first = int(lost[np.argmin(steps[lost])])
-        k, reason = int(steps[first]), why(first)
-        message = f"diverged after t = {grid.time(k):.6g} s (step {k + 1})" + (f": {reason}" if reason else "")
-        message += f"; dt = {grid.dt:g} s may be too long"
-        if not single:
-            message += f"; {len(lost)} of {len(steps)} trajectories diverged, see reached"
-    rows = int(np.count_nonzero(kept <= steps.max())) if len(steps) else len(kept)
-    q, v = (x if rows == len(kept) else x[:, :rows].copy() for x in (q, v))
-    # Read-only, so that nobody needs a copy.
-    q.setflags(write=False)
-    v.setflags(write=False)
-    reached = np.array([grid.time(int(k)) for k in steps])
-    return SolverResult(
-        t=np.array([grid.time(int(k)) for k in kept[:rows]]),
-        q=q[0] if single else q,
-        v=v[0] if single else v,
-        steps=int(steps.sum()),
-        evaluations=evaluations,
-        ended="function_failed" if error is not None else "diverged" if message else "finished",
-        reached=np.asarray(reached[0] if single else reached),
-        message=message,
-        jacobians=jacobians,
-        error=error,
-    )

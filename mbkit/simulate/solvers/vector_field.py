@@ -18,8 +18,11 @@ from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
 DIVERGED: Final = "the state grew beyond all bounds"
-#: A state with a number of this size has diverged.
+#: A state with a number of this size has diverged: no machine goes there, and energies below can still be computed.
 BOUND: Final = 1e100
+#: An engine overflows before its state does, and blames the model: from this size on its reason does not count.
+BLAMELESS: Final = 1e50
+ALL: Final = np.array(True)
 
 
 class DivergenceError(Exception):
@@ -27,22 +30,25 @@ class DivergenceError(Exception):
 
 
 def is_bounded(x: Array) -> NDArray[np.bool_]:
-    """Return, per state, whether all its numbers are finite and below 1e100.
-
-    No machine goes there, and energies of what lies below can still be computed.
-    """
+    """Return, per state, whether all its numbers are finite and below 1e100."""
     return np.asarray((np.abs(x) < BOUND).all(axis=-1))
 
 
-def _finite(q: Array, v: Array) -> bool:
-    return bool(np.isfinite(q).all() and np.isfinite(v).all())
+def are_bounded(q: Array, w: Array) -> NDArray[np.bool_]:
+    """Return which states are bounded; of one state the squares usually tell, and are quicker."""
+    if q.ndim == 1 and q @ q + w @ w < BOUND**2:
+        return ALL
+    return np.asarray(is_bounded(q) & is_bounded(w))
 
 
 class Field:
-    """ẇ of the integrators' state, from an engine's forward dynamics; `evaluations` are summed over a batch."""
+    """ẇ of the integrators' state, from an engine's forward dynamics; `evaluations` are summed over a batch.
 
-    def __init__(self, dyn: Dynamics, space: Space) -> None:
-        self._dyn, self._space, self._flat = dyn, space, space.flat
+    Without a space, w is mbkit's v. Under constraints an `explicit` method's stages near a singular pose are projected.
+    """
+
+    def __init__(self, dyn: Dynamics, space: Space | None, *, explicit: bool = True) -> None:
+        self._dyn, self._space, self._explicit = dyn, None if space is None or space.flat else space, explicit
         self._use(dyn)
         self.evaluations = 0
 
@@ -57,28 +63,30 @@ class Field:
     @property
     def near_singular(self) -> bool:
         """Whether constraints may soon depend on each other."""
-        return self._constrained and self._approach.near
+        return self._constrained and self._explicit and self._approach.near
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
         if not self._constrained:
             return q, w
         q, w = settled(self._own, t, q, w)
-        self._approach.saw(self._own, t, q)
+        if self._explicit:
+            self._approach.saw(self._own, t, q)
         return q, w
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
-        if self._constrained and self._approach.near:
-            q, w = beside(self._own, t, q, w)
+        if self._constrained and self.near_singular:
+            # One of a batch with parameters of its own is a batch of one.
+            q, w = (x.reshape(y.shape) for x, y in zip(beside(self._own, t, q, w), (q, w), strict=True))
         return self(t, q, w, force)
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""
-        v = w if self._flat else self._space.leave(q, w)
+        v = w if self._space is None else self._space.leave(q, w)
         if not isinstance(force, np.ndarray):
             # Never call the user's function on a state that is not finite.
-            if not (is_bounded(q).all() and is_bounded(v).all()):
+            if not are_bounded(q, v).all():
                 raise DivergenceError(DIVERGED)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
@@ -87,18 +95,15 @@ class Field:
         try:
             a = self._forward(q, v, force)
         except NumericalError as error:
-            raise DivergenceError(_blamed(str(error), q, v)) from None
+            largest = max(float(np.abs(x).max()) for x in (q, v))
+            raise DivergenceError(str(error) if largest < BLAMELESS else DIVERGED) from None
         except InputError:
-            if _finite(q, v):
+            if np.isfinite(q).all() and np.isfinite(v).all():
                 raise
             raise DivergenceError(DIVERGED) from None
-        return a if self._flat else np.asarray(self._space.acceleration(q, v, a))
-
-
-def _blamed(message: str, q: Array, v: Array) -> str:
-    # An engine overflows before its state does, and blames the model for it.
-    largest = max(float(np.abs(x).max()) for x in (q, v))
-    return message if largest < 1e50 else DIVERGED
+        if a.ndim != v.ndim:
+            a = a[0]
+        return a if self._space is None else np.asarray(self._space.acceleration(q, v, a))
 
 
 class Rates:
@@ -108,28 +113,24 @@ class Rates:
     """
 
     def __init__(self, dyn: Dynamics, *, explicit: bool = False) -> None:
-        self._explicit, self._approach = explicit, Approach()
-        self._dyn, self._model, self._own = dyn, dyn.model, dyn
-        self._forward, self._timed = dyn.forward_dynamics, dyn.model.time_parameter is not None
+        self._model, self._field = dyn.model, Field(dyn, None, explicit=explicit)
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
-        self.evaluations = 0
         self.why = ""
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the forward dynamics."""
+        return self._field.evaluations
 
     def only(self, member: int) -> None:
         """Go on with this member of a batch."""
-        self._own, self._approach = self._dyn.of_samples([member]), Approach()
-        self._forward = self._own.forward_dynamics
+        self._field.only(np.array([member]))
 
     def settled(self, t: float, y: Array) -> Array:
         """Return the state that a step led to, on its constraints if there are some."""
-        if not self._model.constrained:
-            return y
         nq = self._model.nq
-        q, v = settled(self._own, t, y[:nq], y[nq:])
-        if self._explicit:
-            self._approach.saw(self._own, t, q)
-        return np.concatenate([q, v])
+        return np.concatenate(self._field.settled(t, y[:nq], y[nq:])) if self._model.constrained else y
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
@@ -139,17 +140,9 @@ class Rates:
         nq = self._model.nq
         q, lengths = unit_quaternions(self._model, y[:nq])
         v = y[nq:]
-        if self._explicit and self._model.constrained and self._approach.near:
-            # One of a batch with parameters of its own is a batch of one.
-            q, v = (x.reshape(-1) for x in beside(self._own, t, q, v))
-        tau = force if isinstance(force, np.ndarray) else force(t, q, v)
-        self.evaluations += 1
-        if self._timed:
-            self._forward = at_time(self._own, t).forward_dynamics
         try:
-            # One of a batch with parameters of its own is a batch of one.
-            a = self._forward(q, v, tau).reshape(-1)
-        except NumericalError as error:
+            a = self._field.consistent(t, q, v, force)
+        except DivergenceError as error:
             self.why = str(error)
             return np.full(len(y), np.nan)
         return np.concatenate([self._qdot(q, v, lengths), a])
@@ -162,8 +155,7 @@ class Rates:
         out = np.empty(len(q))
         for kind, a, b in self._joints:
             out[a] = kind.qdot(q[a].tolist(), v[b].tolist())
-        # D is linear in the quaternion: with its own length put back, the drift
-        # of that length never bends the rotation.
+        # D is linear in the quaternion: with its length put back, the drift of that length never bends the rotation.
         for (start, _), length in zip(self._model.quaternions, lengths, strict=True):
             out[start : start + 4] *= length
         return out

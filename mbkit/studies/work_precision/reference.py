@@ -33,7 +33,8 @@ from mbkit.model.builder import expect_model
 from mbkit.simulate import Trajectory
 from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.run import simulate
-from mbkit.simulate.solvers.taylor import StoppedError, TaylorSteps
+from mbkit.simulate.solvers.taylor import TaylorSteps
+from mbkit.simulate.solvers.trajectory_record import StoppedError
 from mbkit.simulate.time_grid import save_times
 from mbkit.simulate.torque import Torque, TorqueFunction
 from mbkit.studies.study_runs import quiet_simulate
