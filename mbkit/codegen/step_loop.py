@@ -42,18 +42,10 @@ def width() -> int:
 
 
 class CompiledStepLoop:
-    """The machine code of parts, and where everything is in the arena.
+    """The machine code of parts, `loaded`, and where everything is in the arena.
 
-    Attributes
-    ----------
-    rows : dict of str to (int, int)
-        First row and number of rows of each name that the parts read or write.
-    size : int
-        Rows of the arena; a row has a number for each lane.
-    operations : int
-        Scalar operations of one round.
-    loaded : jit.Loaded
-        The code itself.
+    `rows` has the first row and number of rows of each name that the parts read or write; the arena has `size` rows,
+    each with a number for each lane. `operations` are the scalar ones of one round.
     """
 
     def __init__(self, about: dict[str, Any], code: bytes) -> None:
@@ -82,13 +74,13 @@ def _compile(parts: Sequence[Part], state: Sequence[str]) -> tuple[dict[str, Any
     made = {part.name: part.make for part in parts}
     programs = {name: program(make()) for name, make in made.items()}
     rows, size = _rows(parts, programs, state)
-    written = {part.name: _Function(part, programs[part.name], rows, size) for part in parts}
-    size += max(f.work for f in written.values())
+    written = {part.name: _function(part, programs[part.name], rows, size) for part in parts}
+    size += max(work for _, work in written.values())
     calls = [f"  call void @{_NAME}_{p.name}(ptr %arena, ptr %out_{p.writes[0]})" for p in parts]
     first, count = rows[state[0]][0], sum(rows[name][1] for name in state)
     round_ = _round(calls, {p.writes[0]: rows[p.writes[0]][0] for p in parts}, (first, rows[f"{state[0]}1"][0], count))
     text = "\n".join(
-        [declarations(width()), library(width(), *programs.values()), *(f.text for f in written.values()), round_]
+        [declarations(width()), library(width(), *programs.values()), *(text for text, _ in written.values()), round_]
     )
     operations = sum(programs[part.name].arithmetic for part in parts)
     return {"rows": rows, "size": size, "operations": operations}, jit.object_code(text)
@@ -118,22 +110,19 @@ def _rows(
     return rows, starts[-1]
 
 
-class _Function:
-    """The code of one part: a function of the arena and of where its results go."""
-
-    def __init__(self, part: Part, made: Program, rows: dict[str, tuple[int, int]], size: int) -> None:
-        pieces = pieces_of(made)
-        slots = slots_of(made, pieces)
-        self.work = max(slots.values(), default=0) + 1
-        names = [f"{_NAME}_{part.name}_{k}" for k in range(len(pieces))]
-        texts = []
-        for k, piece in enumerate(pieces):
-            one = _Placed(made, piece, [rows[name][0] for name in part.reads], size)
-            one.write(slots, first=k == 0)
-            texts.append(one.function(names[k]))
-        calls = "\n".join(f"  call void @{name}(ptr %arena, ptr %out)" for name in names)
-        head = f"define internal void @{_NAME}_{part.name}(ptr noalias %arena, ptr noalias %out) nounwind {{"
-        self.text = "\n".join([*texts, f"{head}\n{calls}\n  ret void\n}}\n"])
+def _function(part: Part, made: Program, rows: dict[str, tuple[int, int]], size: int) -> tuple[str, int]:
+    """Return the code of one part, a function of the arena and of where its results go, and its rows of work space."""
+    pieces = pieces_of(made)
+    slots = slots_of(made, pieces)
+    names = [f"{_NAME}_{part.name}_{k}" for k in range(len(pieces))]
+    texts = []
+    for k, piece in enumerate(pieces):
+        one = _Placed(made, piece, [rows[name][0] for name in part.reads], size)
+        one.write(slots, first=k == 0)
+        texts.append(one.function(names[k]))
+    calls = "\n".join(f"  call void @{name}(ptr %arena, ptr %out)" for name in names)
+    head = f"define internal void @{_NAME}_{part.name}(ptr noalias %arena, ptr noalias %out) nounwind {{"
+    return "\n".join([*texts, f"{head}\n{calls}\n  ret void\n}}\n"]), max(slots.values(), default=0) + 1
 
 
 class _Placed(Piece):

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.methods.one_step import SemiImplicitEuler
@@ -169,198 +169,124 @@ class Tolerances(NamedTuple):
     atol: float
 
 
-def _fixed(name: str, order: int, about: str, **more: object) -> Method:
-    return Method(name, "fixed", order, solver="fixed_step:run_fixed", about=about, **{"stages": 0, **more})  # type: ignore[arg-type]
-
-
-def _adaptive(name: str, order: int | None, about: str, solver: str, **more: object) -> Method:
-    more = {"stages": 0, "events": True, "least": _EPS, **more}
-    return Method(name, "adaptive", order, about=about, solver=solver, **more)  # type: ignore[arg-type]
-
-
-def _scipy(name: str, scheme: str, order: int | None, about: str, **more: object) -> Method:
-    # SciPy's solvers raise a smaller rtol to this by themselves.
-    return _adaptive(name, order, about, "scipy:run_scipy", scheme=scheme, least=100 * _EPS, **more)
-
-
-def _mujoco(scheme: str, stability: Stability, about: str, *, own: str = "") -> Method:
-    order = 4 if isinstance(stability, TableauStability) else 1
-    return Method(
-        f"mujoco_{scheme}",
-        "native",
-        order,
-        stages=order,
-        about=about,
-        engines=("mujoco",),
-        callables=False,
-        solver="native:run_native",
-        scheme=scheme,
-        stability=stability,
-        own=own,
-    )
-
-
-def _drake(scheme: str, order: int | None, about: str) -> Method:
-    return Method(
-        f"drake_{scheme}",
-        "adaptive",
-        order,
-        stages=0,
-        about=about,
-        engines=("drake",),
-        least=1e-15,
-        callables=False,
-        solver="native:run_drake",
-        scheme=scheme,
-    )
-
-
 _RK4_STABILITY: Final = TableauStability(RK4)
 _MIDPOINT: Final = ImplicitTableau("implicit_midpoint", [[0.5]], [1.0], 2)
+
+_ABOUT: Final = {
+    DEFAULT_METHOD: "Kutta's method of 1901; Munthe-Kaas (1999) on rotations, as MuJoCo 4 does it",
+    EULER_METHOD: "new velocity, then the position with it, as MuJoCo does it",
+    "implicit_midpoint": "the midpoint rule in (q, p), on rotations its variational form: symplectic",
+    "gauss4": "Gauss-Legendre collocation, 2 stages (Hairer, Nørsett, Wanner 1993, II.7)",
+    GAUSS_METHOD: "Gauss-Legendre collocation, 3 stages (Hairer, Nørsett, Wanner 1993, II.7)",
+    ADAPTIVE_METHOD: "Dormand and Prince 8(5,3) on the manifold, compiled where the dynamics is",
+    AUTOMATIC_METHOD: f"{ADAPTIVE_METHOD}, or {STIFF_METHOD} where stability holds its steps, by a look at the "
+    "linearized system; stats.chosen tells",
+    STIFF_METHOD: "Rosenbrock's method Rodas5P, stiff: one Jacobian and one factorization a step (Steinebach 2023)",
+    SERIES_METHOD: "heyoka's Taylor series, order by tolerance (Jorba and Zou 2005); 34 digits on the oracle",
+    SCIPY_METHOD: "SciPy's DOP853 (Hairer, Nørsett, Wanner 1993, II.5)",
+    SCIPY_STIFF_METHOD: "SciPy's Radau IIA, implicit (Hairer, Wanner 1996, IV.8)",
+    "bdf": "SciPy's BDF, orders 1 to 5, implicit (Shampine, Reichelt 1997)",
+    "lsoda": "ODEPACK's LSODA: Adams or BDF, whichever suits (Petzold 1983)",
+    BDF_METHOD: "SUNDIALS' CVODES through CasADi: BDF, orders 1 to 5 (Hindmarsh and others 2005)",
+    "mujoco_euler": "MuJoCo's own semi-implicit Euler",
+    "mujoco_rk4": "MuJoCo's own RK4",
+    "mujoco_implicit": "MuJoCo's own Euler, implicit in dampers and all velocity terms",
+    "mujoco_implicitfast": "as mujoco_implicit, with the Coriolis derivatives of free bodies alone",
+    "mujoco_discrete": "MuJoCo's own Euler, implicit in dampers and springs",
+    "drake_runge_kutta3": "Drake's own third-order Runge-Kutta with error control",
+    "drake_runge_kutta5": "Drake's own Dormand-Prince 5(4)",
+    "drake_bogacki_shampine3": "Drake's own Bogacki-Shampine 3(2)",
+    "drake_radau3": "Drake's own Radau IIA of two stages, implicit",
+    "drake_implicit_euler": "Drake's own implicit Euler with error control",
+}
+
+
+def _fixed(name: str, order: int, **more: Any) -> Method:
+    return Method(name, "fixed", order, about=_ABOUT[name], **{"stages": 0, "solver": "fixed_step:run_fixed", **more})
+
+
+def _adaptive(name: str, order: int | None, solver: str, **more: Any) -> Method:
+    more = {"stages": 0, "events": True, "least": _EPS, **more}
+    return Method(name, "adaptive", order, about=_ABOUT[name], solver=solver, **more)
+
+
+def _scipy(name: str, scheme: str, order: int | None, **more: Any) -> Method:
+    # SciPy's solvers raise a smaller rtol to this by themselves.
+    return _adaptive(name, order, "scipy:run_scipy", scheme=scheme, least=100 * _EPS, **more)
+
+
+def _mujoco(scheme: str, stability: Stability, own: str = "") -> Method:
+    order, name = 4 if isinstance(stability, TableauStability) else 1, f"mujoco_{scheme}"
+    more: dict[str, Any] = {"solver": "native:run_native", "scheme": scheme, "stability": stability, "own": own}
+    return Method(name, "native", order, order, _ABOUT[name], engines=("mujoco",), callables=False, **more)
+
+
+def _drake(scheme: str, order: int) -> Method:
+    more: dict[str, Any] = {"engines": ("drake",), "events": False, "callables": False}
+    return _adaptive(f"drake_{scheme}", order, "native:run_drake", scheme=scheme, least=1e-15, **more)
+
+
+_STIFF: Final[dict[str, Any]] = {"jacobian": True, "fills_tolerance": True}
+_STIFF_OWN: Final[dict[str, Any]] = {**_STIFF, "compiled": True}
+_MOMENTA: Final[dict[str, Any]] = {
+    "engines": ("lagrangian",),
+    "lacks": "gives neither momenta nor ∂T/∂q with their derivatives, which the rule in (q, p) is made of",
+    "solver": "implicit_midpoint:run_midpoint",
+}
+_SERIES: Final[dict[str, Any]] = {
+    "engines": ("lagrangian", "oracle"),
+    "callables": False,
+    "lacks": "gives numbers and no expressions, which a series is made of",
+}
+_EXPRESSIONS: Final[dict[str, Any]] = {
+    **_STIFF_OWN,
+    "engines": ("lagrangian",),
+    "events": False,
+    "callables": False,
+    "lacks": "gives numbers and no expressions, which it integrates",
+}
 
 METHODS: Final[dict[str, Method]] = {
     m.name: m
     for m in (
+        _fixed(DEFAULT_METHOD, 4, stages=4, formula_source=RK4, stability=_RK4_STABILITY, compiled=True),
         _fixed(
-            DEFAULT_METHOD,
-            4,
-            "Kutta's method of 1901; Munthe-Kaas (1999) on rotations, as MuJoCo 4 does it",
-            stages=4,
-            formula_source=RK4,
-            stability=_RK4_STABILITY,
-            compiled=True,
+            EULER_METHOD, 1, stages=1, formula_source=SemiImplicitEuler(), stability=SYMPLECTIC_EULER, compiled=True
         ),
         _fixed(
-            EULER_METHOD,
-            1,
-            "new velocity, then the position with it, as MuJoCo does it",
-            stages=1,
-            formula_source=SemiImplicitEuler(),
-            stability=SYMPLECTIC_EULER,
-            compiled=True,
-        ),
-        Method(
-            "implicit_midpoint",
-            "fixed",
-            2,
-            0,
-            "the midpoint rule in (q, p), on rotations its variational form: symplectic",
-            engines=("lagrangian",),
-            lacks="gives neither momenta nor ∂T/∂q with their derivatives, which the rule in (q, p) is made of",
-            solver="implicit_midpoint:run_midpoint",
-            stability=TableauStability(_MIDPOINT),
-            mass_matrix=True,
-            compiled=True,
+            "implicit_midpoint", 2, stability=TableauStability(_MIDPOINT), mass_matrix=True, compiled=True, **_MOMENTA
         ),
         *(
-            _fixed(
-                f"gauss{2 * stages}",
-                2 * stages,
-                f"Gauss-Legendre collocation, {stages} stages (Hairer, Nørsett, Wanner 1993, II.7)",
-                formula_source=gauss_legendre(stages),
-                stability=TableauStability(gauss_legendre(stages)),
-            )
-            for stages in (2, 3)
+            _fixed(tableau.name, tableau.order, formula_source=tableau, stability=TableauStability(tableau))
+            for tableau in (gauss_legendre(2), gauss_legendre(3))
         ),
         _adaptive(
-            ADAPTIVE_METHOD,
-            8,
-            "Dormand and Prince 8(5,3) on the manifold, compiled where the dynamics is",
-            "adaptive:run_embedded",
-            stages=12,
-            formula_source=dormand_prince_853,
-            compiled=True,
+            ADAPTIVE_METHOD, 8, "adaptive:run_embedded", stages=12, formula_source=dormand_prince_853, compiled=True
+        ),
+        _adaptive(AUTOMATIC_METHOD, None, "auto:run_auto", jacobian=True, compiled=True),
+        _adaptive(
+            STIFF_METHOD, 5, "adaptive:run_embedded", stages=8, formula_source=rodas5p, mass_matrix=True, **_STIFF_OWN
         ),
         _adaptive(
-            AUTOMATIC_METHOD,
-            None,
-            f"{ADAPTIVE_METHOD}, or {STIFF_METHOD} where stability holds its steps, by a look at the linearized "
-            "system; stats.chosen tells",
-            "auto:run_auto",
-            jacobian=True,
-            compiled=True,
+            SERIES_METHOD, None, "taylor:run_taylor", scaled_by_start=True, extended=True, compiled=True, **_SERIES
         ),
+        _scipy(SCIPY_METHOD, "DOP853", 8, stages=12),
+        _scipy(SCIPY_STIFF_METHOD, "Radau", 5, **_STIFF),
+        _scipy("bdf", "BDF", None, multistep=True, **_STIFF),
+        _scipy("lsoda", "LSODA", None, multistep=True, **_STIFF),
         _adaptive(
-            STIFF_METHOD,
-            5,
-            "Rosenbrock's method Rodas5P, stiff: one Jacobian and one factorization a step (Steinebach 2023)",
-            "adaptive:run_embedded",
-            stages=8,
-            formula_source=rodas5p,
-            jacobian=True,
-            mass_matrix=True,
-            compiled=True,
-            fills_tolerance=True,
+            BDF_METHOD, None, "cvodes:run_cvodes", scheme="cvodes", least=100 * _EPS, multistep=True, **_EXPRESSIONS
         ),
-        _adaptive(
-            SERIES_METHOD,
-            None,
-            "heyoka's Taylor series, order by tolerance (Jorba and Zou 2005); 34 digits on the oracle",
-            "taylor:run_taylor",
-            engines=("lagrangian", "oracle"),
-            callables=False,
-            lacks="gives numbers and no expressions, which a series is made of",
-            scaled_by_start=True,
-            extended=True,
-            compiled=True,
-        ),
-        _scipy(SCIPY_METHOD, "DOP853", 8, "SciPy's DOP853 (Hairer, Nørsett, Wanner 1993, II.5)", stages=12),
-        _scipy(
-            SCIPY_STIFF_METHOD,
-            "Radau",
-            5,
-            "SciPy's Radau IIA, implicit (Hairer, Wanner 1996, IV.8)",
-            jacobian=True,
-            fills_tolerance=True,
-        ),
-        _scipy(
-            "bdf",
-            "BDF",
-            None,
-            "SciPy's BDF, orders 1 to 5, implicit (Shampine, Reichelt 1997)",
-            jacobian=True,
-            fills_tolerance=True,
-            multistep=True,
-        ),
-        _scipy(
-            "lsoda",
-            "LSODA",
-            None,
-            "ODEPACK's LSODA: Adams or BDF, whichever suits (Petzold 1983)",
-            jacobian=True,
-            fills_tolerance=True,
-            multistep=True,
-        ),
-        _adaptive(
-            BDF_METHOD,
-            None,
-            "SUNDIALS' CVODES through CasADi: BDF, orders 1 to 5 (Hindmarsh and others 2005)",
-            "cvodes:run_cvodes",
-            engines=("lagrangian",),
-            events=False,
-            least=100 * _EPS,
-            callables=False,
-            lacks="gives numbers and no expressions, which it integrates",
-            scheme="cvodes",
-            jacobian=True,
-            compiled=True,
-            fills_tolerance=True,
-            multistep=True,
-        ),
-        _mujoco("euler", SYMPLECTIC_EULER, "MuJoCo's own semi-implicit Euler", own=EULER_METHOD),
-        _mujoco("rk4", _RK4_STABILITY, "MuJoCo's own RK4", own=DEFAULT_METHOD),
-        _mujoco("implicit", IMPLICIT_IN_VELOCITY, "MuJoCo's own Euler, implicit in dampers and all velocity terms"),
-        _mujoco(
-            "implicitfast",
-            IMPLICIT_IN_VELOCITY,
-            "as mujoco_implicit, with the Coriolis derivatives of free bodies alone",
-        ),
-        _mujoco("discrete", IMPLICIT_EULER, "MuJoCo's own Euler, implicit in dampers and springs"),
-        _drake("runge_kutta3", 3, "Drake's own third-order Runge-Kutta with error control"),
-        _drake("runge_kutta5", 5, "Drake's own Dormand-Prince 5(4)"),
-        _drake("bogacki_shampine3", 3, "Drake's own Bogacki-Shampine 3(2)"),
-        _drake("radau3", 3, "Drake's own Radau IIA of two stages, implicit"),
-        _drake("implicit_euler", 1, "Drake's own implicit Euler with error control"),
+        _mujoco("euler", SYMPLECTIC_EULER, EULER_METHOD),
+        _mujoco("rk4", _RK4_STABILITY, DEFAULT_METHOD),
+        _mujoco("implicit", IMPLICIT_IN_VELOCITY),
+        _mujoco("implicitfast", IMPLICIT_IN_VELOCITY),
+        _mujoco("discrete", IMPLICIT_EULER),
+        _drake("runge_kutta3", 3),
+        _drake("runge_kutta5", 5),
+        _drake("bogacki_shampine3", 3),
+        _drake("radau3", 3),
+        _drake("implicit_euler", 1),
     )
 }
 _BUILT_IN: Final = frozenset(METHODS)
@@ -443,12 +369,7 @@ def registered_methods() -> tuple[Method, ...]:
 
 
 def _runge_kutta(tableau: Tableau) -> Method:
-    return _fixed(
-        tableau.name,
-        tableau.order,
-        f"Runge-Kutta method of order {tableau.order} in {tableau.stages} stages",
-        stages=tableau.stages if tableau.explicit else 0,
-        formula_source=tableau,
-        stability=TableauStability(tableau),
-        compiled=tableau.explicit,
-    )
+    about = f"Runge-Kutta method of order {tableau.order} in {tableau.stages} stages"
+    stages, stability = tableau.stages if tableau.explicit else 0, TableauStability(tableau)
+    more: dict[str, Any] = {"solver": "fixed_step:run_fixed", "formula_source": tableau, "compiled": tableau.explicit}
+    return Method(tableau.name, "fixed", tableau.order, stages, about, stability=stability, **more)

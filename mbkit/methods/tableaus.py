@@ -98,9 +98,8 @@ def _digest(*arrays: Array) -> str:
 class Tableau:
     """An explicit Runge-Kutta method.
 
-    The constructor checks the shape, the row sums c = A 1, and every order
-    condition Σ b Φ(tree) = 1 / γ(tree) up to `order`
-    (Hairer, Nørsett, Wanner 1993, theorem II.2.13).
+    The constructor checks the shapes, and every order condition Σ b Φ(tree) = 1 / γ(tree) up to `order` (Hairer,
+    Nørsett, Wanner 1993, theorem II.2.13).
 
     Parameters
     ----------
@@ -235,8 +234,7 @@ class EmbeddedTableau(Tableau):
     name, A, b, order
         As of a `Tableau`.
     lower : sequence of (int, (s,) array_like)
-        Of each other method the order, and b minus its weights. Its order conditions
-        are checked too.
+        Of each other method the order, which is checked too, and b minus its weights.
 
     Attributes
     ----------
@@ -277,13 +275,10 @@ def dormand_prince_853() -> EmbeddedTableau:
     Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.5 and
     its program DOP853. Constructed at the first call: 218 order conditions are checked.
     """
-    A = np.zeros((12, 12))
-    for i, row in enumerate(_A_853):
-        A[i, : len(row)] = row
     b = np.array(_B_853)
     third = b.copy()
     third[[0, 8, 11]] -= _B_3
-    return EmbeddedTableau("dormand_prince_853", A, b, 8, [(5, _E_853), (3, third)])
+    return EmbeddedTableau("dormand_prince_853", _lower(_A_853), b, 8, [(5, _E_853), (3, third)])
 
 
 # fmt: off
@@ -442,7 +437,7 @@ def rodas5p() -> RosenbrockTableau:
 
 
 def _lower(rows: tuple[tuple[float, ...], ...]) -> Array:
-    out = np.zeros((8, 8))
+    out = np.zeros((len(rows), len(rows)))
     for i, row in enumerate(rows):
         out[i, : len(row)] = row
     return out

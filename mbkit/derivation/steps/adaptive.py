@@ -16,72 +16,49 @@ from mbkit.derivation.steps.fixed import SYMBOLS, Part, SymbolicSpace, SymbolicS
 from mbkit.methods.one_step import StepFactors, embedded_error, end_of_attempt, larger, next_step, predictive_factors
 from mbkit.methods.tableaus import EmbeddedTableau
 
-#: A round reads these and writes the same names with a 1 behind, from which the next one
-#: starts. `h` is the length to try, `most` what it may grow by at most, `last` the 32nd
-#: root of the last accepted error, `end` the time not to pass. `error` is that of the
-#: last attempt in terms of the tolerance, and `go` is 1 while there is a way to go and a
-#: step to go it with.
+#: A round reads these and writes the same names with a 1 behind, from which the next one starts. `h` is the length to
+#: try, `most` what it may grow by at most, `last` the 32nd root of the last accepted error, `end` the time not to pass.
+#: `error` is that of the last attempt in terms of the tolerance, and `go` is 1 while there is a way to go and a step to
+#: go it with.
 STATE: Final = ("q", "w", "t", "h", "most", "last", "end", "error", "go")
 
 
-def embedded_parts(equations: Equations, tableau: EmbeddedTableau) -> tuple[Part, ...]:
-    """Return the parts of one attempt, in order.
+def embedded_parts(equations: Equations, tableau: EmbeddedTableau) -> list[Part]:
+    """Return the parts of one attempt of a method of order 8, with errors of order 5 and of order 3, in order.
 
-    Parameters
-    ----------
-    equations : Equations
-    tableau : EmbeddedTableau
-        Of order 8, with errors of order 5 and of order 3.
-
-    Returns
-    -------
-    tuple of Part
-        They read the names of `STATE`, tau, rtol, atol, least (the shortest step that is
-        worth an attempt) and the equations' trailing arguments. The part "field", which
-        holds the forward dynamics, stands once for each stage, and writes the rates
-        k_i = ẇ and r_i = u̇ of stage i.
+    They read the names of `STATE`, tau, rtol, atol, least (the shortest step that is worth an attempt) and the
+    equations' trailing arguments. The part "field", which holds the forward dynamics, stands once for each stage, and
+    writes the rates k_i = ẇ and r_i = u̇ of stage i.
     """
     parts, stages = AttemptParts(equations), SymbolicStages(equations.model.nv)
-    s, rates_so_far = parts.symbols, dict[str, Any]()
+    s, known = parts.symbols, dict[str, Any]()
 
     def rates(t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:  # noqa: ARG001  # the time is a parameter
         i = len(stages)
         if u is not None:
-            arguments = {**parts.named("q", "w", "step"), **rates_so_far}
-            parts.add(f"stage_{i}", arguments, {"q_i": q, "w_i": w, "u_i": u})
+            parts.add(f"stage_{i}", {**parts.named("q", "w", "step"), **known}, {"q_i": q, "w_i": w, "u_i": u})
         k, r = (ca.SX.sym(f"{kind}_{i}", equations.model.nv) for kind in "kr")
         parts.add_field(f"k_{i}", f"r_{i}")
-        rates_so_far.update({f"k_{i}": k, f"r_{i}": r})
+        known.update({f"k_{i}": k, f"r_{i}": r})
         return r, k
 
     parts.begin()
     q1, w1, u = tableau.step(parts.space, rates, stages, s["t"], s["step"], s["q"], s["w"])
     scales = parts.scales(q1, w1, u)
     error = embedded_error(SYMBOLS, tableau.errors, stages, scales, s["step"], 2 * equations.model.nv)
-    parts.decide(rates_so_far, q1, w1, error, predictive_factors(SYMBOLS, error, s["last"]))
-    return tuple(parts.parts)
+    parts.decide(known, q1, w1, error, predictive_factors(SYMBOLS, error, s["last"]))
+    return parts.parts
 
 
 class AttemptParts:
-    """The parts that any one-step method with an embedded error has, and how it goes on.
+    """The `parts` that any one-step method with an embedded error has, in order, and how it goes on.
 
-    Parameters
-    ----------
-    equations : Equations
-
-    Attributes
-    ----------
-    parts : list of Part
-        Those so far, in order.
-    space : SymbolicSpace
-    symbols : dict of str to casadi.SX
-    at : dict of str to casadi.SX
-        State of the stage that is evaluated.
+    `symbols` are the state and numbers by name, `at` is the state of the stage that is evaluated.
     """
 
     def __init__(self, equations: Equations) -> None:
         self.parts: list[Part] = []
-        self._equations, self.space = equations, SymbolicSpace(equations.model)
+        self.equations, self.space = equations, SymbolicSpace(equations.model)
         nq, nv = equations.model.nq, equations.model.nv
         sizes = {"q": nq, **dict.fromkeys(("w", "tau"), nv), **dict.fromkeys(STATE[2:], 1)}
         sizes.update(dict.fromkeys(("step", "t_new", "rtol", "atol", "least"), 1))
@@ -90,7 +67,7 @@ class AttemptParts:
 
     def add(self, name: str, arguments: dict[str, Any], results: dict[str, Any]) -> None:
         """Add a part of named symbols and results."""
-        self.parts.append(Part(name, tuple(arguments), tuple(results), lambda: function_of(name, arguments, results)))
+        self.parts.append(Part.of(name, arguments, results))
 
     def named(self, *names: str) -> dict[str, Any]:
         """Return some of the symbols by name."""
@@ -106,13 +83,13 @@ class AttemptParts:
 
     def add_field(self, k: str, r: str) -> None:
         """Evaluate the rates ẇ and u̇ of a stage, under these names."""
-        space, trailing = self.space, self._equations.trailing
+        space, trailing = self.space, self.equations.trailing
         arguments = {**self.at, **self.named("tau"), **trailing}
 
         def make() -> ca.Function:
             q, w, u = self.at.values()
             v = space.leave(q, w)
-            a = self._equations.function("forward_dynamics")(q, v, self.symbols["tau"], *trailing.values())
+            a = self.equations.function("forward_dynamics")(q, v, self.symbols["tau"], *trailing.values())
             return function_of("field", arguments, {"k": space.acceleration(q, v, a), "r": space.rate(u, w)})
 
         self.parts.append(Part("field", tuple(arguments), (k, r), make))
@@ -128,21 +105,10 @@ class AttemptParts:
 
     def decide(self, rates: dict[str, Any], q1: Any, w1: Any, error: Any, factors: StepFactors) -> None:
         """Go on to the new state if its error is below 1, or stay; choose the length of the next attempt."""
-        names = ("q", "w", "t", "h", "most", "last", "end", "step", "t_new", "rtol", "atol", "least")
-        s = self.symbols
+        s = self.named("q", "w", "t", "h", "most", "last", "end", "step", "t_new", "rtol", "atol", "least")
         # NaN is not below 1. Where there is no way to go, nothing changes.
         good = (error < 1) * (s["step"] > 0)
         h, most, last = next_step(SYMBOLS, factors, good, s["step"], s["h"], s["most"], s["last"])
-        t = choose(good, s["t_new"], s["t"])
-        results = {
-            "q1": choose(good, q1, s["q"]),
-            "w1": choose(good, w1, s["w"]),
-            "t1": t,
-            "h1": h,
-            "most1": most,
-            "last1": last,
-            "end1": s["end"],
-            "error1": error,
-            "go1": (t < s["end"]) * (s["least"] < h),
-        }
-        self.add("end", {**self.named(*names), **rates}, results)
+        q, w, t = (choose(good, new, s[old]) for new, old in ((q1, "q"), (w1, "w"), (s["t_new"], "t")))
+        state = q, w, t, h, most, last, s["end"], error, (t < s["end"]) * (s["least"] < h)
+        self.add("end", {**s, **rates}, {f"{name}1": value for name, value in zip(STATE, state, strict=True)})

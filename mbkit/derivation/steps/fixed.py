@@ -43,34 +43,19 @@ SYMBOLS: Final = Arithmetic(ca.sqrt, ca.sin, ca.cos, choose)
 class SymbolicSpace(Space):
     """The integrators' space on casadi.SX columns."""
 
-    @staticmethod
-    def arithmetic(x: Any) -> Arithmetic:  # noqa: ARG004  # of symbols there is one kind
-        """Return the functions of symbols."""
-        return SYMBOLS
-
-    @staticmethod
-    def part(x: Any, part: slice) -> Any:
-        """Return a part of a column."""
-        return x[part]
-
-    @staticmethod
-    def components(x: Any, part: slice) -> list[Any]:
-        """Return the scalars of a part of a column."""
-        return ca.vertsplit(x[part])
+    arithmetic = staticmethod(lambda x: SYMBOLS)  # noqa: ARG005  # of symbols there is one kind
+    part = staticmethod(lambda x, part: x[part])
+    components = staticmethod(lambda x, part: ca.vertsplit(x[part]))
+    copied = staticmethod(lambda x: ca.SX(x))
 
     @staticmethod
     def put(x: Any, part: slice, components: Any) -> None:
         """Write scalars or a column into a part of a column."""
         x[part] = ca.vertcat(*components) if isinstance(components, list) else components
 
-    @staticmethod
-    def copied(x: Any) -> Any:
-        """Return a copy to write into."""
-        return ca.SX(x)
-
 
 class SymbolicStages:
-    """Rates of the stages so far as expressions."""
+    """Rates of the stages so far as expressions, as `mbkit.methods.one_step.Stages`."""
 
     def __init__(self, nv: int) -> None:
         self._nv, self._rates = nv, list[tuple[Any, Any]]()
@@ -105,13 +90,8 @@ class SymbolicStages:
 
     def sums(self, weights: Array) -> tuple[Any, Any]:
         """Return the weighted sums of u̇ and ẇ."""
-        u, w = (
-            sum(
-                (weight * pair[kind] for weight, pair in zip(weights.tolist(), self._rates, strict=False) if weight),
-                ca.SX.zeros(self._nv),
-            )
-            for kind in (0, 1)
-        )
+        used = [(weight, pair) for weight, pair in zip(weights.tolist(), self._rates, strict=False) if weight]
+        u, w = (sum((weight * pair[kind] for weight, pair in used), ca.SX.zeros(self._nv)) for kind in (0, 1))
         return u, w
 
     def squares(self, weights: Array, scales: tuple[Any, Any]) -> Any:
@@ -122,16 +102,9 @@ class SymbolicStages:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a step: a function, and the names of what it reads and writes.
+    """A part of a step: a function of columns, and the names of what it reads and writes.
 
-    Attributes
-    ----------
-    name : str
-        Unique among the functions of one model.
-    reads, writes : tuple of str
-        As many as the function has arguments and results, all of them columns.
-    make : callable
-        Derives the function.
+    `name` is unique among the functions of one model; `make` derives the function.
     """
 
     name: str
@@ -139,28 +112,18 @@ class Part:
     writes: tuple[str, ...]
     make: Callable[[], ca.Function]
 
+    @classmethod
+    def of(cls, name: str, arguments: dict[str, Any], results: dict[str, Any]) -> Part:
+        """Return a part of named symbols and results."""
+        arguments = dict(arguments)
+        return cls(name, tuple(arguments), tuple(results), lambda: function_of(name, arguments, results))
+
 
 def step(equations: Equations, method: str) -> ca.Function:
     """Return (q, v, tau, dt) -> (q1, v1), with the equations' trailing arguments behind.
 
-    Parameters
-    ----------
-    equations : Equations
-    method : str
-        With a fixed step and compiled: ``"rk4"``, ``"semi_implicit_euler"``, an explicit method of the user's.
-
-    Returns
-    -------
-    casadi.Function
-        The state after dt seconds under the torque tau; q1 has unit quaternions
-        and v1 is mbkit's velocity, body axes on a free joint.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no method of this name.
-    InputError
-        The method has no explicit step.
+    The state after dt seconds under the torque tau, by an explicit method with a fixed step; q1 has unit quaternions
+    and v1 is mbkit's velocity, body axes on a free joint. An `InputError` where the method has no explicit step.
     """
     s, space = _symbols(equations), SymbolicSpace(equations.model)
     names = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.trailing)}
@@ -174,30 +137,26 @@ def march(equations: Equations, method: str) -> tuple[Part, ...]:
     It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
     far: a number that once was not finite, or beyond all bounds, shows in it for ever.
     """
-    name, trailing = f"{method_of(method).code_name}_march", tuple(equations.trailing)
+    name, reads = f"{method_of(method).code_name}_march", (*_MARCH, *equations.trailing)
 
     def make() -> ca.Function:
         s, space = _symbols(equations), SymbolicSpace(equations.model)
         q1, w1 = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s))
-        return function_of(name, {n: s[n] for n in (*_MARCH, *trailing)}, _with_squares(s, q1, w1))
+        return function_of(name, {n: s[n] for n in reads}, _with_squares(s, q1, w1))
 
-    return (Part(name, (*_MARCH, *trailing), _MARCHED, make),)
+    return (Part(name, reads, _MARCHED, make),)
 
 
 def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
     """Return the same step cut at each evaluation of the forward dynamics.
 
-    The forward dynamics, most of the step, is then compiled once instead of once a
-    stage. Between the parts go the stages' states (q_i, v_i) and accelerations a_i.
+    The forward dynamics, most of the step, is then compiled once instead of once a stage. Between the parts go the
+    stages' states (q_i, v_i) and accelerations a_i.
     """
     s, space = _symbols(equations), SymbolicSpace(equations.model)
     known = {n: s[n] for n in ("q", "w", "dt")}
     parts: list[Part] = []
     prefix = method_of(method).code_name
-
-    def cut(name: str, results: dict[str, Any]) -> None:
-        arguments = dict(known)
-        parts.append(Part(name, tuple(arguments), tuple(results), lambda: function_of(name, arguments, results)))
 
     def acceleration(q: Any, w: Any) -> Any:
         i = sum(part.name == "forward_dynamics" for part in parts)
@@ -205,7 +164,7 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
         at = ("q", "w")
         if i or not space.flat:
             at = (f"q_{i}", f"v_{i}")
-            cut(f"{prefix}_stage_{i}", dict(zip(at, (q, v), strict=True)))
+            parts.append(Part.of(f"{prefix}_stage_{i}", known, dict(zip(at, (q, v), strict=True))))
         reads = (*at, "tau", *equations.trailing)
         parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
         a = known[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
@@ -213,8 +172,7 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
 
     q1, w1 = _stepped(equations, method, s, s["w"], acceleration)
     known["squares"] = s["squares"]
-    cut(f"{prefix}_end", _with_squares(s, q1, w1))
-    return tuple(parts)
+    return (*parts, Part.of(f"{prefix}_end", known, _with_squares(s, q1, w1)))
 
 
 def _stepped(
@@ -240,12 +198,11 @@ def _symbols(equations: Equations) -> dict[str, Any]:
 
 
 def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Callable[[Any, Any], Any]:
-    forward = equations.function("forward_dynamics")
-    trailing = [s["tau"], *equations.trailing.values()]
+    forward, behind = equations.function("forward_dynamics"), [s["tau"], *equations.trailing.values()]
 
     def acceleration(q: Any, w: Any) -> Any:
         v = space.leave(q, w)
-        return space.acceleration(q, v, forward(q, v, *trailing))
+        return space.acceleration(q, v, forward(q, v, *behind))
 
     return acceleration
 

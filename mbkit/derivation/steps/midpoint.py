@@ -107,10 +107,6 @@ class Midpoint:
     """The parts of a step of the implicit midpoint rule, and the way between v and momenta.
 
     Every function takes the equations' trailing arguments behind its own.
-
-    Parameters
-    ----------
-    equations : Equations
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -119,49 +115,28 @@ class Midpoint:
         sizes = {"q": nq, **dict.fromkeys(("v", "pi", "w", "w_1", "w_2", "tau"), nv)}
         sizes |= dict.fromkeys(("dt", "miss", "misses"), 1)
         self._s = {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.trailing}
+        step = ("q", "pi", "w", "tau", "dt")
+        #: One step of Newton's iteration, and 0 where it was the last one needed.
+        self.newton = self._part("newton", step, ("w1", "miss"), self._newton)
+        #: The same equation, to be solved elsewhere.
+        self.system = self._part("system", step, ("residual", "jacobian"), self._system)
+        #: The state after the step from its velocity w and those of the two before, the first guess of the next
+        #: velocity, and the number of steps that were not solved or ended nowhere.
+        ends = ("q", "pi", "w", "w_1", "w_2", "tau", "dt", "miss", "misses")
+        self.end = self._part("end", ends, ("q1", "pi1", "guess", "misses1"), self._end)
+        self.momentum = self._part("momentum", ("q", "v"), ("pi",), self._momentum)
+        #: By the tree's sparse factorization of the mass matrix.
+        self.velocity = self._part("velocity", ("q", "pi"), ("v",), self._velocity)
+        #: M and M v, the momentum less what it is at rest, in mbkit's velocity, to be solved elsewhere.
+        self.velocity_system = self._part("velocity_system", ("q", "pi"), ("M", "p"), self._velocity_system)
 
-    @property
-    def newton(self) -> Part:
-        """(q, pi, w, tau, dt) -> w1, miss: one step of Newton's iteration, and 0 where it was the last one needed."""
-        return self._part("midpoint_newton", ("q", "pi", "w", "tau", "dt"), ("w1", "miss"), self._newton)
-
-    @property
-    def system(self) -> Part:
-        """(q, pi, w, tau, dt) -> residual, jacobian: the same equation, to be solved elsewhere."""
-        return self._part("midpoint_system", ("q", "pi", "w", "tau", "dt"), ("residual", "jacobian"), self._system)
-
-    @property
-    def end(self) -> Part:
-        """The state after the step from its velocity w and those of the two before, w_1 and w_2.
-
-        It writes q1, pi1, the first guess of the next velocity, and `misses`, the number of
-        steps that were not solved or ended nowhere.
-        """
-        reads = ("q", "pi", "w", "w_1", "w_2", "tau", "dt", "miss", "misses")
-        return self._part("midpoint_end", reads, ("q1", "pi1", "guess", "misses1"), self._end)
-
-    @property
-    def momentum(self) -> Part:
-        """(q, v) -> pi."""
-        return self._part("midpoint_momentum", ("q", "v"), ("pi",), self._momentum)
-
-    @property
-    def velocity(self) -> Part:
-        """(q, pi) -> v, by the tree's sparse factorization of the mass matrix."""
-        return self._part("midpoint_velocity", ("q", "pi"), ("v",), self._velocity)
-
-    @property
-    def velocity_system(self) -> Part:
-        """(q, pi) -> M and M v, the momentum less what it is at rest, in mbkit's velocity, to be solved elsewhere."""
-        return self._part("midpoint_velocity_system", ("q", "pi"), ("M", "p"), self._velocity_system)
-
-    def _part(self, name: str, reads: tuple[str, ...], writes: tuple[str, ...], make: Any) -> Part:
-        given = (*reads, *self._equations.trailing)
+    def _part(self, name: str, own: tuple[str, ...], writes: tuple[str, ...], make: Any) -> Part:
+        name, reads = f"midpoint_{name}", (*own, *self._equations.trailing)
 
         def function() -> ca.Function:
-            return function_of(name, {n: self._s[n] for n in given}, dict(zip(writes, make(), strict=True)))
+            return function_of(name, {n: self._s[n] for n in reads}, dict(zip(writes, make(), strict=True)))
 
-        return Part(name, given, writes, function)
+        return Part(name, reads, writes, function)
 
     def _at_midpoint(self, w: Any) -> tuple[Any, Any, Any]:
         """Return q_m, μ and f of a step with this velocity."""

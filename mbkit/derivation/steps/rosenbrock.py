@@ -1,8 +1,7 @@
 """An adaptive Rosenbrock step for stiff systems, as parts around the forward dynamics.
 
-On the space of `mbkit.model.integration_space`, u̇ = r(u, w) and ẇ = k(u, w) around the state (q, w), u = 0. With g = γ
-h, and
-r_i, k_i of stage i at what the stages before it lead to, a stage (u_i, w_i) solves ::
+On the space of `mbkit.model.integration_space`, u̇ = r(u, w) and ẇ = k(u, w) around the state (q, w), u = 0. With
+g = γ h, and r_i, k_i of stage i at what the stages before it lead to, a stage (u_i, w_i) solves ::
 
     u_i - g (L u_i + w_i) = g r_i + γ Σ C_ij u_j        L = ∂r/∂u
     w_i - g (∂k/∂u u_i + ∂k/∂w w_i) = g k_i + γ Σ C_ij w_j
@@ -20,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -33,35 +31,81 @@ from mbkit.methods.one_step import elementary_factors, with_defect
 from mbkit.methods.tableaus import RosenbrockTableau
 
 
-def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> tuple[Part, ...]:
-    """Return the parts of one attempt, in order.
+def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[Part]:
+    """Return the parts of one attempt of a method of order 5 with one of order 4 inside, in order.
 
-    Parameters
-    ----------
-    equations : Equations
-        In which time does not enter.
-    tableau : RosenbrockTableau
-        Of order 5 with one of order 4 inside.
-
-    Returns
-    -------
-    tuple of Part
-        They read and write what those of `mbkit.derivation.steps.adaptive` do. The parts
-        "field" and "solve" stand once for each stage, "field" at the end too; it writes k = ẇ and r = u̇.
+    They read and write what those of `mbkit.derivation.steps.adaptive` do; time does not enter. The parts "field" and
+    "solve" stand once for each stage, "field" at the end too; it writes k = ẇ and r = u̇.
     """
-    parts = _Parts(equations, tableau)
+    parts, nv = AttemptParts(equations), equations.model.nv
+    s, space = parts.symbols, _Space(equations.model)
+    s |= {name: ca.SX.sym(name, nv) for name in ("k", "r", "sum_u", "sum_w")}
+    gamma, stages, increments = tableau.gamma, SymbolicStages(nv), dict[str, Any]()
+    linear: list[tuple[Any, Any, Any]] = []
+
+    def system() -> tuple[Any, Any, Any]:
+        if not linear:
+            linear.append(_linear_system(equations, space, s["q"], s["w"], s["k"]))
+        return linear[0]
+
+    def matrix() -> ca.Function:
+        M, D, K = system()
+        g = gamma * s["step"]
+        pull = g * ca.mtimes(K, space.spun(s["w"], g))
+        factors = Factors.of(M + g * D + g * pull, equations.elimination_order)
+        results = {"mass": _entries(M), "pull": _entries(pull), "factors": ca.vertcat(*factors.values)}
+        return function_of("matrix", {**parts.named("q", "w", "k", "step"), **equations.trailing}, results)
+
+    solved = ("w", "k", "r", "sum_u", "sum_w", "step")
+
+    def solve() -> ca.Function:
+        M, D, K = system()
+        g = gamma * s["step"]
+        spun = space.spun(s["w"], g)
+        pattern = ca.mtimes(K, spun)
+        factors = Factors.of(M + D + pattern, equations.elimination_order)
+        # Symbols with the same zeros.
+        sizes = {"mass": M.nnz(), "pull": pattern.nnz(), "factors": len(factors.values)}
+        known = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
+        a, b = g * s["r"] + gamma * s["sum_u"], g * s["k"] + gamma * s["sum_w"]
+        pulled = ca.mtimes(ca.SX(pattern.sparsity(), known["pull"]), a)
+        dw = factors.applied(ca.vertsplit(known["factors"]), ca.mtimes(ca.SX(M.sparsity(), known["mass"]), b) - pulled)
+        return function_of("solve", {**parts.named(*solved), **known}, {"du": ca.mtimes(spun, a + g * dw), "dw": dw})
+
+    def go(name: str, weights: Array, more: dict[str, Any]) -> None:
+        u, dw = stages.sums(weights)
+        results = {"q_i": parts.space.move(s["q"], u), "w_i": s["w"] + dw, "u_i": u, **more}
+        parts.add(name, {**parts.named("q", "w"), **increments}, results)
+
     parts.begin()
+    parts.add("sums", parts.named("w"), {"sum_u": 0 * s["w"], "sum_w": 0 * s["w"]})
     for i in range(tableau.stages):
         if i:
-            parts.add_stage(i)
+            sum_u, sum_w = stages.sums(tableau.C[i, :i])
+            go(f"stage_{i}", tableau.A[i, :i], {"sum_u": sum_u, "sum_w": sum_w})
         parts.add_field("k", "r")
         if not i:
-            parts.add_matrix()
-        parts.add_solve(i)
-    parts.arrive()
+            reads = ("q", "w", "k", "step", *equations.trailing)
+            parts.parts.append(Part("matrix", reads, ("mass", "pull", "factors"), matrix))
+        stage = {name: ca.SX.sym(name, nv) for name in (f"du_{i}", f"dw_{i}")}
+        parts.parts.append(Part("solve", (*solved, "mass", "pull", "factors"), tuple(stage), solve))
+        increments |= stage
+        stages.append(*stage.values())
+    go("arrive", tableau.b, {})
     parts.add_field("k", "r")
-    parts.end()
-    return tuple(parts.parts)
+    q1, w1, u = parts.at.values()
+    by_u, by_w = parts.scales(q1, w1, u)
+
+    def norm(in_u: Any, in_w: Any) -> Any:
+        return ca.sqrt((ca.sumsqr(in_w / by_w) + ca.sumsqr(in_u / by_u)) / (2 * nv))
+
+    # The slope of the polynomial at the end, times the step.
+    slope_u, slope_w = stages.sums(tableau.b - tableau.dense.sum(axis=0))
+    defect = norm(s["step"] * s["r"] - slope_u, s["step"] * s["k"] - slope_w)
+    error = with_defect(SYMBOLS, norm(*stages.sums(tableau.error)), defect)
+    rates = {**parts.at, **parts.named("k", "r"), **increments}
+    parts.decide(rates, q1, w1, error, elementary_factors(SYMBOLS, error, s["last"]))
+    return parts.parts
 
 
 class _Space(SymbolicSpace):
@@ -75,123 +119,23 @@ class _Space(SymbolicSpace):
         return out
 
 
-class _Parts(AttemptParts):
-    def __init__(self, equations: Equations, tableau: RosenbrockTableau) -> None:
-        super().__init__(equations)
-        nv = equations.model.nv
-        self._tableau, self._gamma, self._rotating = tableau, tableau.gamma, _Space(equations.model)
-        self.symbols |= {name: ca.SX.sym(name, nv) for name in ("k", "r", "sum_u", "sum_w")}
-        self._stages, self._increments = SymbolicStages(nv), dict[str, Any]()
-
-    def begin(self) -> None:
-        """Choose the length of the step; the first stage is where the state is."""
-        super().begin()
-        w = self.named("w")
-        self.add("sums", w, {"sum_u": 0 * w["w"], "sum_w": 0 * w["w"]})
-
-    # The linear system
-
-    @cached_property
-    def _linear(self) -> tuple[Any, Any, Any]:
-        """M, D and K at the state, as expressions of q, w and k there."""
-        eq, space, s = self._equations, self.space, self.symbols
-        q, w, k = s["q"], s["w"], s["k"]
-        trailing = list(eq.trailing.values())
-        u = ca.SX.sym("u", eq.model.nv)
-        v, moved = space.leave(q, w), space.move(q, u)
-        by_w = ca.jacobian(v, w)
-        # v̇ of ẇ: the axes may turn below it.
-        qdot = ca.substitute(eq.kin.qdot, ca.vertcat(eq.q, eq.v), ca.vertcat(q, v))
-        rate = ca.mtimes(by_w, k) + ca.jtimes(v, q, qdot)
-        a = ca.SX.sym("a", eq.model.nv)
-        there = space.leave(moved, w)
-        force = eq.function("inverse_dynamics")(moved, there, a, *trailing)
-        led = space.acceleration(moved, there, a)
-        M = ca.mtimes(ca.substitute(eq.mass_matrix, eq.q, q), by_w)
-        K = ca.jacobian(force, u) - ca.mtimes(M, ca.jacobian(led, u))
-        D = ca.jacobian(force, w) - ca.mtimes(M, ca.jacobian(led, w))
-        at = ca.vertcat(u, a), ca.vertcat(ca.SX.zeros(eq.model.nv), rate)
-        K, D = (_pruned(ca.substitute(x, *at)) for x in (K, D))
-        return _pruned(M), D, K
-
-    def add_matrix(self) -> None:
-        """Form the linear system at the state and factorize it."""
-        g = self._gamma * self.symbols["step"]
-        arguments = {**self.named("q", "w", "k", "step"), **self._equations.trailing}
-
-        def make() -> ca.Function:
-            M, D, K = self._linear
-            pull = g * ca.mtimes(K, self._rotating.spun(self.symbols["w"], g))
-            factors = Factors.of(M + g * D + g * pull, self._equations.elimination_order)
-            results = {"mass": _entries(M), "pull": _entries(pull), "factors": ca.vertcat(*factors.values)}
-            return function_of("matrix", arguments, results)
-
-        self.parts.append(Part("matrix", tuple(arguments), ("mass", "pull", "factors"), make))
-
-    def add_solve(self, i: int) -> None:
-        """Solve for stage i."""
-        names = ("w", "k", "r", "sum_u", "sum_w", "step")
-
-        def make() -> ca.Function:
-            s, g = self.symbols, self._gamma * self.symbols["step"]
-            M, D, K = self._linear
-            spun = self._rotating.spun(s["w"], g)
-            pattern = ca.mtimes(K, spun)
-            factors = Factors.of(M + D + pattern, self._equations.elimination_order)
-            # Symbols with the same zeros.
-            mass, pull = ca.SX.sym("mass", M.nnz()), ca.SX.sym("pull", pattern.nnz())
-            known = ca.SX.sym("factors", len(factors.values))
-            a, b = g * s["r"] + self._gamma * s["sum_u"], g * s["k"] + self._gamma * s["sum_w"]
-            right = ca.mtimes(ca.SX(M.sparsity(), mass), b) - ca.mtimes(ca.SX(pattern.sparsity(), pull), a)
-            dw = factors.applied(ca.vertsplit(known), right)
-            du = ca.mtimes(spun, a + g * dw)
-            arguments = {**self.named(*names), "mass": mass, "pull": pull, "factors": known}
-            return function_of("solve", arguments, {"du": du, "dw": dw})
-
-        nv = self._equations.model.nv
-        increments = {name: ca.SX.sym(name, nv) for name in (f"du_{i}", f"dw_{i}")}
-
-        self.parts.append(Part("solve", (*names, "mass", "pull", "factors"), tuple(increments), make))
-        self._increments |= increments
-        self._stages.append(*increments.values())
-
-    # Stages and the end
-
-    def add_stage(self, i: int) -> None:
-        """Go to where stage i is evaluated."""
-        sum_u, sum_w = self._stages.sums(self._tableau.C[i, :i])
-        self._go(f"stage_{i}", self._tableau.A[i, :i], {"sum_u": sum_u, "sum_w": sum_w})
-
-    def arrive(self) -> None:
-        """Form the new state, where the rates are evaluated too."""
-        self._go("arrive", self._tableau.b, {})
-
-    def _go(self, name: str, weights: Array, more: dict[str, Any]) -> None:
-        arguments = {**self.named("q", "w"), **self._increments}
-        u, dw = self._stages.sums(weights)
-        results = {"q_i": self.space.move(arguments["q"], u), "w_i": arguments["w"] + dw, "u_i": u}
-        self.add(name, arguments, results | more)
-
-    def end(self) -> None:
-        """Estimate the error of the new state, and decide."""
-        s, step, own = self.symbols, self.symbols["step"], self._tableau
-        q1, w1, u = self.at["q_i"], self.at["w_i"], self.at["u_i"]
-        by_u, by_w = self.scales(q1, w1, u)
-
-        def norm(in_u: Any, in_w: Any) -> Any:
-            return ca.sqrt((ca.sumsqr(in_w / by_w) + ca.sumsqr(in_u / by_u)) / (2 * self._equations.model.nv))
-
-        # The slope of the polynomial at the end, times the step.
-        slope_u, slope_w = self._stages.sums(own.b - own.dense.sum(axis=0))
-        defect = norm(step * s["r"] - slope_u, step * s["k"] - slope_w)
-        error = with_defect(SYMBOLS, norm(*self._stages.sums(own.error)), defect)
-        rates = {**self.at, **self.named("k", "r"), **self._increments}
-        self.decide(rates, q1, w1, error, elementary_factors(SYMBOLS, error, s["last"]))
-
-
-def _pruned(A: Any) -> Any:
-    """Return the matrix without entries that are zeros after all."""
-    return ca.sparsify(A)
+def _linear_system(eq: Equations, space: SymbolicSpace, q: Any, w: Any, k: Any) -> tuple[Any, Any, Any]:
+    """Return M, D and K at a state, without entries that are zeros after all."""
+    u, a = ca.SX.sym("u", eq.model.nv), ca.SX.sym("a", eq.model.nv)
+    v, moved = space.leave(q, w), space.move(q, u)
+    by_w = ca.jacobian(v, w)
+    # v̇ of ẇ: the axes may turn below it.
+    qdot = ca.substitute(eq.kin.qdot, ca.vertcat(eq.q, eq.v), ca.vertcat(q, v))
+    rate = ca.mtimes(by_w, k) + ca.jtimes(v, q, qdot)
+    there = space.leave(moved, w)
+    force = eq.function("inverse_dynamics")(moved, there, a, *eq.trailing.values())
+    led = space.acceleration(moved, there, a)
+    M = ca.mtimes(ca.substitute(eq.mass_matrix, eq.q, q), by_w)
+    K = ca.jacobian(force, u) - ca.mtimes(M, ca.jacobian(led, u))
+    D = ca.jacobian(force, w) - ca.mtimes(M, ca.jacobian(led, w))
+    at = ca.vertcat(u, a), ca.vertcat(ca.SX.zeros(eq.model.nv), rate)
+    K, D = (ca.sparsify(ca.substitute(x, *at)) for x in (K, D))
+    return ca.sparsify(M), D, K
 
 
 def _entries(A: Any) -> Any:
@@ -203,21 +147,15 @@ class Factors:
     """Factors of a matrix with the zeros of a tree's mass matrix, eliminated from the leaves to the root.
 
     There is no fill-in and no pivoting.
-
-    Attributes
-    ----------
-    values : list of casadi.SX
-    steps : list of (i, k)
-        Row i loses a multiple of row k, in this order; the first values are the factors.
-    rest : list of (k, j)
-        What is left in row k before its pivot; the next values. The pivots' inverses come last.
-    rows : tuple of int
-        Of each coordinate its row.
     """
 
+    # The factors of `steps`, the entries of `rest`, and the pivots' inverses.
     values: list[Any]
+    # (i, k): row i loses a multiple of row k, in this order.
     steps: list[tuple[int, int]]
+    # (k, j): what is left in row k before its pivot.
     rest: list[tuple[int, int]]
+    # Of each coordinate its row.
     rows: tuple[int, ...]
 
     @classmethod
@@ -247,16 +185,15 @@ class Factors:
 
     def applied(self, values: Sequence[Any], b: Any) -> Any:
         """Return the solution for a right-hand side."""
-        n = len(self.rows)
-        x: list[Any] = [None] * n
+        ahead = len(self.steps)
+        x: list[Any] = [None] * len(self.rows)
         for index, row in enumerate(self.rows):
             x[row] = b[index]
-        ahead = len(self.steps)
         for factor, (i, k) in zip(values[:ahead], self.steps, strict=True):
             x[i] = x[i] - factor * x[k]
         inverses = values[ahead + len(self.rest) :]
         behind = dict(zip(self.rest, values[ahead : ahead + len(self.rest)], strict=True))
-        for k in range(n):
+        for k, inverse in enumerate(inverses):
             done = [entry * x[j] for (row, j), entry in behind.items() if row == k]
-            x[k] = (x[k] - sum(done, 0.0)) * inverses[k]
+            x[k] = (x[k] - sum(done, 0.0)) * inverse
         return ca.vertcat(ca.SX(0, 1), *(x[row] for row in self.rows))

@@ -117,7 +117,6 @@ class CompiledAttempts:
         return force
 
     def hold(self, k: int, stop: float) -> None:
-        """Go on to a time; at the beginning, with a first step."""
         arena, self._k = self._outer, k
         arena["tau"][:] = np.column_stack([self._force(k, i) for i in self._which])
         if not self._begun:
@@ -147,7 +146,6 @@ class CompiledAttempts:
         return np.where(h > 0, h, 1e-6 * (stop - arena.state[self._row["t"]]))
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
-        """Attempt steps until all have arrived or are stuck, some hundred times at most."""
         if not self._active.any():
             return []
         arena, log = self._outer, self._log
@@ -167,13 +165,11 @@ class CompiledAttempts:
         return out
 
     def drop(self, place: int) -> None:
-        """Leave a lane where it is."""
         self._dropped[place], self._active[place] = True, False
         state = self._outer.state
         state[self._row["end"], place] = state[self._row["t"], place]
 
     def stuck(self, place: int) -> StoppedError | None:
-        """Return why a lane that has a way to go has no step."""
         state = self._outer.state[:, place]
         t, end, error, go = (float(state[self._row[name]]) for name in ("t", "end", "error", "go"))
         if go or t >= end:
@@ -189,7 +185,6 @@ class CompiledAttempts:
         return diverged()
 
     def tighten(self, place: int, tolerances: Tolerances) -> None:
-        """Go on with other tolerances."""
         for name, value in zip(("rtol", "atol"), tolerances, strict=True):
             self._outer[name][:, place] = value
 
@@ -202,7 +197,6 @@ class CompiledAttempts:
         return self._inner
 
     def rates(self, place: int, q: Array, w: Array) -> Array:
-        """Return ẇ at states."""
         arena, out = self._beside(place), []
         for start in range(0, len(q), self.width):
             # Those beyond the last repeat it. An attempt of no length has the rates in its first stage.

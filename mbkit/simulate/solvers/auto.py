@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -36,10 +36,40 @@ LEAST: Final = 1e-13
 _SHARE: Final = 0.1
 #: Steps whose mean is compared with the rates where they end.
 _RECENT: Final = 8
+#: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative and 5 on the imaginary
+#: axis; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
+_EDGE: Final = 3.0
+#: h|λ| that rk853 would have, where rodas5 is compared with it.
+_KEPT: Final = 5.0
+#: Time of an attempt of rodas5 over that of one of rk853, and how much faster rodas5 must be.
+_DEARER: Final = 1.2
+_FASTER: Final = 1.5
+#: First step of rodas5, of what remains: one too long is soon rejected, while growing takes a step for each decade.
+_BEGIN: Final = 1e-3
+#: Fastest rate times duration from which on the tolerance follows the number of steps.
+_MANY: Final = 1000.0
+#: Errors of n steps, in a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most: the limit, in the user's
+#: tolerances. Measured is a third to a three-hundredth of it for rk853, a tenth to a thirtieth for rodas5.
+_SUM: Final = {EXPLICIT: 300.0, IMPLICIT: 1000.0}
+#: Steps to come that count at most, for each step so far.
+_BELIEVED: Final = 64
+#: Where rounding keeps steps short: by how much the tolerance is loosened, and up to what.
+_LOOSER: Final = 10.0
+_LOOSEST: Final = 1e-5
+#: Rounding of accelerations is the residual of a cubic through points within this part of a step.
+_NEAR: Final = 0.03
+_AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
+_CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
+_RESIDUAL: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
+_LEFT: Final = len(_AHEAD) - 4
+#: Rounding in a step's estimated error: the length of rk853's weights, and the part that is too much.
+_WEIGHT: Final = 2.0
+_ROUNDED: Final = 0.03
+#: First and last changes of the method that are described, and sequences of methods in a batch.
+_DESCRIBED: Final = 3
 
 
-@dataclass(frozen=True)
-class Costs:
+class Costs(NamedTuple):
     """When to check for stiffness."""
 
     # Steps before the first check, and the factor to each next one.
@@ -59,53 +89,47 @@ _IN_PYTHON: Final = Costs(first=5, later=2, worth=100, guess=300, pilot=8)
 
 
 class AutoContext:
-    """What all trajectories of a run share: the problem, the costs and the counts."""
+    """What all trajectories of a run share: the problem, the costs of checks, and all attempts."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
-        self.problem, self.space, self.tolerances = problem, Space(problem.dyn.model), problem.tolerances
-        self.start, self.end, self.duration, self.stops = problem.start, problem.end, problem.duration, problem.stops
-        self._attempts: list[StepAttempts] = []
+        self.problem, self.space, self.stops = problem, Space(problem.dyn.model), problem.stops
+        self.attempts: list[StepAttempts] = []
         self.costs = _IN_PYTHON
 
     def make(self, method: str, tolerances: Tolerances) -> StepAttempts:
         """Return the step attempts of a method, whose evaluations are counted with all others."""
         attempts = make_attempts(self.problem, method, self.space, tolerances)
-        self._attempts.append(attempts)
+        self.attempts.append(attempts)
         self.costs = _COMPILED if attempts.rounds > 1 else _IN_PYTHON
         return attempts
 
-    def loosest(self, method: str, base: Tolerances) -> Tolerances:
-        """Return the loosest tolerances of a method."""
-        share = 1.0 if method == IMPLICIT else min(1.0, max(_SHARE, LEAST / base.rtol))
-        return Tolerances(*(share * x for x in base))
 
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the forward dynamics."""
-        return sum(attempts.evaluations for attempts in self._attempts)
+def _scaled(tolerances: Tolerances, factor: float) -> Tolerances:
+    return Tolerances(*(factor * x for x in tolerances))
 
-    @property
-    def jacobians(self) -> int:
-        """Jacobians of the forward dynamics."""
-        return sum(attempts.jacobians for attempts in self._attempts)
+
+def loosest(method: str, base: Tolerances) -> Tolerances:
+    """Return the loosest tolerances of a method."""
+    return base if method == IMPLICIT else _scaled(base, min(1.0, max(_SHARE, LEAST / base.rtol)))
 
 
 class StepRateMonitor:
-    """How fast a method goes, judged by the later half of its tries."""
+    """How fast a method goes, judged by the later half of its attempts."""
 
     def __init__(self, t: float, first: int, later: int) -> None:
-        self._next, self._later, self._begin = first, later, t
-        # Tries and time.
+        self._next, self._later = first, later
+        # Attempts and time; the ends of the last steps.
+        self._begin = t
         self._marks = [(0, t)]
         self._ends = [t]
 
     @property
     def missing(self) -> int:
-        """Tries until the next check."""
+        """Attempts until the next check."""
         return self._next - self._marks[-1][0]
 
     def saw(self, steps: AcceptedSteps) -> None:
-        """Count tries."""
+        """Count attempts."""
         tries = self._marks[-1][0]
         if steps.tried > 1:
             self._marks.append((tries + steps.tried // 2, float(steps.t[len(steps.t) // 2])))
@@ -117,28 +141,26 @@ class StepRateMonitor:
         due = self.missing <= 0
         if due:
             self._next = self._later * self._marks[-1][0]
-            # Marks before a quarter of the tries are not needed again.
+            # Marks before a quarter of the attempts are not needed again.
             self._marks = [mark for mark in self._marks if 4 * mark[0] >= self._marks[-1][0]]
         return due
 
     def rate(self) -> float:
-        """Return the tries for each second of the motion."""
-        tries, t = self._marks[-1]
-        before = next((mark for mark in reversed(self._marks) if mark[0] <= tries / 2), self._marks[0])
-        return (tries - before[0]) / (t - before[1]) if t > before[1] else math.inf
+        """Return the attempts for each second of the motion."""
+        half = self._marks[-1][0] / 2
+        return self._since(next((mark for mark in reversed(self._marks) if mark[0] <= half), self._marks[0]))
 
     def overall(self) -> float:
-        """Return the tries for each second of the motion from the beginning."""
+        """Return the attempts for each second of the motion from the beginning."""
+        return self._since((0, self._begin))
+
+    def _since(self, mark: tuple[int, float]) -> float:
         tries, t = self._marks[-1]
-        return tries / (t - self._begin) if t > self._begin else math.inf
+        return (tries - mark[0]) / (t - mark[1]) if t > mark[1] else math.inf
 
     def step(self) -> float:
         """Return the mean length of the last steps, s; 0 where there were none."""
         return (self._ends[-1] - self._ends[0]) / max(1, len(self._ends) - 1)
-
-
-#: First and last changes of the method that are described.
-_DESCRIBED: Final = 3
 
 
 @dataclass
@@ -151,108 +173,57 @@ class Segment:
     note: str = ""
 
 
-def method_sequence(segments: Sequence[Segment]) -> str:
-    """Return the methods in their order."""
-    methods = [segment.method for segment in segments]
-    return f"{methods[0]} throughout" if len(methods) == 1 else ", then ".join(methods)
-
-
-def describe(segments: Sequence[Segment]) -> str:
-    """Return what was chosen and why."""
-    parts: list[str] = []
-    skipped = len(segments) - 1 - 2 * _DESCRIBED
-    for i, segment in enumerate(segments):
-        if skipped > 0 and _DESCRIBED < i <= _DESCRIBED + skipped:
-            if i == _DESCRIBED + 1:
-                parts.append(f"{skipped} more changes")
-            continue
-        part = segment.method + (" from there" if i else "")
-        until = f" to t = {segments[i + 1].t:.3g} s, {segments[i + 1].why}" if i + 1 < len(segments) else ""
-        parts.append(part + (until or (segment.note and f", {segment.note}")))
-    return method_sequence(segments) if len(segments) == 1 and not segments[0].note else "; ".join(parts)
-
-
-#: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative and 5 on the imaginary
-#: axis; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
-_EDGE: Final = 3.0
-#: h|λ| that rk853 would have, where rodas5 is compared with it.
-_KEPT: Final = 5.0
-#: Time of a try of rodas5 over that of one of rk853.
-_DEARER: Final = 1.2
-#: How much faster rodas5 must be.
-_FASTER: Final = 1.5
-#: First step of rodas5, of what remains: one too long is soon rejected, while growing takes a step for each decade.
-_BEGIN: Final = 1e-3
-#: Fastest rate times duration from which on the tolerance follows the number of steps.
-_MANY: Final = 1000.0
-#: Errors of n steps, in a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most: the limit, in the user's
-#: tolerances. Measured is a third to a three-hundredth of it for rk853, a tenth to a thirtieth for rodas5.
-_SUM: Final = {EXPLICIT: 300.0, IMPLICIT: 1000.0}
-#: Steps to come that count at most, for each step so far.
-_BELIEVED: Final = 64
-#: Above `LEAST`, rounding shows in steps that shrink with this power of the tolerance, not rk853's eighth root.
-_COLLAPSE: Final = 1 / 3
-#: Where rounding keeps steps short: by how much the tolerance is loosened, and up to what.
-_LOOSER: Final = 10.0
-_LOOSEST: Final = 1e-5
-#: Rounding of accelerations is the residual of a cubic through points within this part of a step.
-_NEAR: Final = 0.03
-_AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
-_CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
-_RESIDUAL: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
-_LEFT: Final = len(_AHEAD) - 4
-#: Rounding in a step's estimated error: the length of rk853's weights, and the part that is too much.
-_WEIGHT: Final = 2.0
-_ROUNDED: Final = 0.03
-
-
-def limit_rounds(trials: StepAttempts, controllers: Sequence[SwitchingController]) -> None:
+def limit_rounds(attempts: StepAttempts, controllers: Sequence[SwitchingController]) -> None:
     """Limit the attempts to the next check of any of the trajectories."""
-    if trials.rounds > 1:
-        trials.rounds = max(2, min(ROUNDS, *(controller.missing for controller in controllers)))
+    if attempts.rounds > 1:
+        attempts.rounds = max(2, min(ROUNDS, *(controller.missing for controller in controllers)))
 
 
 class SwitchingController:
     """Stiffness detection and switching for one trajectory, and its adaptive tolerance."""
 
     def __init__(self, context: AutoContext, index: int) -> None:
-        self._context, self._index = context, index
-        self.record = TrajectoryRecord(context.problem, index, context.space)
+        problem = context.problem
+        self._context, self._index, self._user, self._duration = context, index, problem.tolerances, problem.duration
+        self.record = TrajectoryRecord(problem, index, context.space)
         self.doubt = ""
         # The first is the user's or loosened, the second for the number of steps.
-        self._base, self._tolerances = context.tolerances, context.loosest(EXPLICIT, context.tolerances)
-        self._segments = [Segment(EXPLICIT, context.start)]
+        self._base, self._tolerances = self._user, loosest(EXPLICIT, self._user)
+        self._least, self._tightest = LEAST, math.inf
+        self._segments = [Segment(EXPLICIT, problem.start)]
         self._monitor: StepRateMonitor | None = None
-        self._at: tuple[float, Array, Array] = context.start, np.empty(0), np.empty(0)
-        self._tries = 0
-        # At the last check: the tolerance and the steps tried for each second.
-        self._looser = self._tolerances.rtol, 0.0
-        self._tightest = math.inf
-        self._returns = 0
-        self._least = LEAST
+        self._at: tuple[float, Array, Array] = problem.start, np.empty(0), np.empty(0)
+        self._tries = self._returns = 0
         self._next: StepAttempts | None = None
         self._ahead: list[AcceptedSteps] = []
 
     @property
+    def _method(self) -> str:
+        return self._segments[-1].method
+
+    @property
     def missing(self) -> int:
-        """Tries until the next check."""
+        """Attempts until the next check."""
         return self._first if self._monitor is None else max(1, self._monitor.missing)
 
     @property
     def _first(self) -> int:
         # Later after each return, so that the methods do not take turns for ever.
-        returns = self._returns if self._segments[-1].method == EXPLICIT else 0
-        return self._context.costs.first << 2 * returns
+        return self._context.costs.first << 2 * (self._returns if self._method == EXPLICIT else 0)
 
     @property
     def _rest(self) -> float:
-        return self._context.end - self._at[0]
+        return self._context.problem.end - self._at[0]
 
     @property
     def _over(self) -> bool:
-        return self.record.ended != "finished" or self.record.reached >= self._context.end
+        return self.record.ended != "finished" or self.record.reached >= self._context.problem.end
 
-    def leaves(self, trials: StepAttempts, place: int, steps: AcceptedSteps) -> bool:
+    @property
+    def _interval(self) -> int:
+        return int(np.searchsorted(self._context.stops, self._at[0], side="right"))
+
+    def leaves(self, attempts: StepAttempts, place: int, steps: AcceptedSteps) -> bool:
         """Add accepted steps; return whether another method goes on from their end."""
         if self._monitor is None:
             self._monitor = StepRateMonitor(float(steps.t[0]), self._first, self._context.costs.later)
@@ -260,116 +231,93 @@ class SwitchingController:
         self._tries += steps.tried
         self._at = float(steps.t[-1]), steps.q[-1], steps.w[-1]
         if not self._over and self._monitor.due():
-            check = self._check_stiff if self._segments[-1].method == EXPLICIT else self._check_nonstiff
-            check(trials, place, self._monitor)
+            check = self._check_stiff if self._method == EXPLICIT else self._check_nonstiff
+            check(attempts, place, self._monitor)
         return self._next is not None
 
     def alone(self, report: Callable[[], None]) -> None:
         """Go on to the end with the methods that follow."""
         while self._next is not None and not self._over:
-            trials, self._next, self._monitor = self._next, None, None
+            attempts, self._next, self._monitor = self._next, None, None
             ahead, self._ahead = self._ahead, []
-            within = partial(trials.within, 0)
-            if all(self.record.take(steps, within) and not self.leaves(trials, 0, steps) for steps in ahead):
-                limit_rounds(trials, [self])
-                for (_, steps), *_ in march(trials, [self.record], self._context.stops, self._interval):
-                    if self.leaves(trials, 0, steps):
-                        trials.drop(0)
-                    limit_rounds(trials, [self])
+            within = partial(attempts.within, 0)
+            if all(self.record.take(steps, within) and not self.leaves(attempts, 0, steps) for steps in ahead):
+                limit_rounds(attempts, [self])
+                for (_, steps), *_ in march(attempts, [self.record], self._context.stops, self._interval):
+                    if self.leaves(attempts, 0, steps):
+                        attempts.drop(0)
+                    limit_rounds(attempts, [self])
                     report()
-
-    @property
-    def _interval(self) -> int:
-        return int(np.searchsorted(self._context.stops, self._at[0], side="right"))
 
     def _started(self, method: str) -> StepAttempts:
         """Return step attempts of a method that begin here."""
         t, q, w = self._at
-        trials = self._context.make(method, self._loosest(method))
-        trials.start([self._index], q[None], w[None], t, _BEGIN * self._rest if method == IMPLICIT else 0.0)
-        return trials
+        attempts = self._context.make(method, loosest(method, self._base))
+        attempts.start([self._index], q[None], w[None], t, _BEGIN * self._rest if method == IMPLICIT else 0.0)
+        return attempts
 
-    def _loosest(self, method: str) -> Tolerances:
-        """Return the loosest tolerances of a method here."""
-        return self._context.loosest(method, self._base)
+    def _switch(self, method: str, attempts: StepAttempts, why: str) -> None:
+        self._next, self._tolerances = attempts, loosest(method, self._base)
+        self._segments.append(Segment(method, self._at[0], f"where {why}"))
 
-    def _check_stiff(self, trials: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
+    def _check_stiff(self, attempts: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
         """Check whether rodas5 shall take over."""
         rate, step, costs = monitor.rate(), monitor.step(), self._context.costs
         to_come = rate * self._rest
-        if to_come < costs.worth or not step:
-            self._adapt_tolerance(trials, place, monitor.overall() * self._rest)
-            return
-        rates = self._spectrum(trials, place, min(_EDGE / step, _MANY / self._context.duration))
-        if self._rounding_limited(trials, place, step):
-            return
-        held = rates is not None and step * rates.stable >= _EDGE
-        # Where steps are short now, and not only on the average.
-        worth = held or to_come >= costs.guess
-        if worth and self._implicit_is_faster(min(rate, 1 / step)):
-            why = "stability held its steps" if held else "rodas5 got further with a trial"
-            size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
-            self._segments.append(Segment(IMPLICIT, self._at[0], f"where {why}{size}"))
-            return
-        self._detect_tolerance_stall(rate)
+        if to_come >= costs.worth and step:
+            rates = self._spectrum(attempts, place, min(_EDGE / step, _MANY / self._duration))
+            if self._rounding_limited(attempts, place, step):
+                return
+            held = rates is not None and step * rates.stable >= _EDGE
+            # Where steps are short now, and not only on the average.
+            if (held or to_come >= costs.guess) and (trial := self._faster_trial(min(rate, 1 / step))):
+                why = "stability held its steps" if held else "rodas5 got further with a trial"
+                size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
+                self._switch(IMPLICIT, trial, why + size)
+                return
         # By the mean rate, which passing changes hardly touch.
-        self._adapt_tolerance(trials, place, monitor.overall() * self._rest)
+        self._adapt_tolerance(attempts, place, monitor.overall() * self._rest)
 
-    def _implicit_is_faster(self, rate: float) -> bool:
-        """Let rodas5 try some steps, which are the next ones if it is faster."""
-        costs, trials = self._context.costs, self._started(IMPLICIT)
-        monitor, ahead, tried = StepRateMonitor(self._at[0], costs.pilot, costs.later), [], 0
-        if trials.rounds > 1:
-            trials.rounds = costs.pilot
+    def _faster_trial(self, rate: float) -> StepAttempts | None:
+        """Let rodas5 try some steps, which are the next ones if it is faster than this rate."""
+        costs, trial = self._context.costs, self._started(IMPLICIT)
+        monitor, ahead, tried = StepRateMonitor(self._at[0], costs.pilot, costs.later), list[AcceptedSteps](), 0
+        if trial.rounds > 1:
+            trial.rounds = costs.pilot
         try:
-            trials.hold(self._interval, self._context.stops[self._interval])
-            while tried < costs.pilot and (got := trials.advance()):
-                ahead.append(got[0][1])
+            trial.hold(self._interval, self._context.stops[self._interval])
+            while tried < costs.pilot and (accepted := trial.advance()):
+                ahead.append(accepted[0][1])
                 monitor.saw(ahead[-1])
                 tried += ahead[-1].tried
         except FunctionError:
             # At a state that rk853 may never reach.
-            return False
+            return None
         # With the tolerance for so many steps.
         tighter = self._factor(IMPLICIT, monitor.rate() * self._rest) ** (-1 / 5)
-        better = bool(_DEARER * _FASTER * tighter * monitor.rate() < rate)
-        if better:
-            self._next, self._ahead, self._tolerances = trials, ahead, self._loosest(IMPLICIT)
-            self._looser = self._tolerances.rtol, 0.0
-        return better
+        if not _DEARER * _FASTER * tighter * monitor.rate() < rate:
+            return None
+        self._ahead = ahead
+        return trial
 
-    def _check_nonstiff(self, trials: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
+    def _check_nonstiff(self, attempts: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
         """Check whether rk853 shall take over again."""
-        costs, rate = self._context.costs, monitor.rate()
+        rate = monitor.rate()
         # Steps may be growing still.
         to_come = min(rate, 1 / monitor.step() if monitor.step() else math.inf) * self._rest
-        collapsed = self._detect_tolerance_stall(rate)
-        if _DEARER * to_come >= costs.worth and not collapsed:
-            rates = self._spectrum(trials, place, 0.0)
+        if _DEARER * to_come >= self._context.costs.worth:
+            rates = self._spectrum(attempts, place, 0.0)
             if rates is not None and rates.stable / _KEPT < _DEARER * rate:
                 self._returns += 1
-                self._next, self._tolerances = self._started(EXPLICIT), self._loosest(EXPLICIT)
-                self._looser = self._tolerances.rtol, 0.0
-                why = f"where stability no longer held rk853's steps ({rates})"
-                self._segments.append(Segment(EXPLICIT, self._at[0], why))
+                self._switch(EXPLICIT, self._started(EXPLICIT), f"stability no longer held rk853's steps ({rates})")
                 return
-        self._adapt_tolerance(trials, place, to_come)
+        self._adapt_tolerance(attempts, place, to_come)
 
-    def _detect_tolerance_stall(self, rate: float) -> bool:
-        """Return whether steps collapsed when the tolerance was tightened, as where it is below rounding."""
-        before, slower = self._looser
-        collapsed = bool(slower and rate / slower > (before / self._tolerances.rtol) ** _COLLAPSE > 1)
-        if collapsed:
-            # rodas5 needs half the way only: it meets an oscillation of its rounding.
-            self._least = before if self._segments[-1].method == EXPLICIT else 2 * self._tolerances.rtol
-        self._looser = self._tolerances.rtol, rate
-        return collapsed
-
-    def _spectrum(self, trials: StepAttempts, place: int, enough: float) -> Stiffness | None:
+    def _spectrum(self, attempts: StepAttempts, place: int, enough: float) -> Stiffness | None:
         """Return the rates of the linearized motion; None where they are not finite."""
         _, q, w = self._at
         try:
-            J = linearized(self._context.space, q, w, lambda q, w: trials.rates(place, q, w))
+            J = linearized(self._context.space, q, w, partial(attempts.rates, place))
             return stiffness_of(J, enough, exact=False)
         except (NumericalError, FunctionError):
             return None
@@ -377,52 +325,52 @@ class SwitchingController:
     def _factor(self, method: str, to_come: float) -> float:
         """Return the factor of the tolerance with which the errors of all steps to come add up to the allowed sum."""
         steps = max(1.0, min(to_come, _BELIEVED * self._tries))
-        share = self._loosest(method).rtol / self._base.rtol
+        share = loosest(method, self._base).rtol / self._base.rtol
         return min(share, _SUM[method] / (steps * math.sqrt(2 * self._context.space.nv)))
 
-    def _adapt_tolerance(self, trials: StepAttempts, place: int, to_come: float) -> None:
+    def _adapt_tolerance(self, attempts: StepAttempts, place: int, to_come: float) -> None:
         """Adapt the tolerance to the number of steps to come."""
         if not math.isfinite(to_come):
             return
         segment = self._segments[-1]
         factor = max(self._factor(segment.method, to_come), min(1.0, self._least / self._base.rtol))
-        rtol, atol = (x * factor for x in self._base)
+        rtol = factor * self._base.rtol
         # A smaller change hardly changes a step.
         if not 0.5 < rtol / self._tolerances.rtol < 2.0:
-            self._tolerances = Tolerances(rtol, atol)
-            trials.tighten(place, self._tolerances)
-            if rtol < self._loosest(segment.method).rtol and (not segment.note or rtol < self._tightest):
+            self._tolerances = _scaled(self._base, factor)
+            attempts.tighten(place, self._tolerances)
+            if rtol < loosest(segment.method, self._base).rtol and (not segment.note or rtol < self._tightest):
                 self._tightest = rtol
                 segment.note = f"at rtol = {rtol:.0e} at the tightest, as errors of {to_come:.0e} steps add up"
 
-    def _rounding_limited(self, trials: StepAttempts, place: int, step: float) -> bool:
+    def _rounding_limited(self, attempts: StepAttempts, place: int, step: float) -> bool:
         """Return whether rounding holds rk853's steps short, and loosen the tolerance there."""
-        share, noise = self._rounding_noise(trials, place, step, _NEAR)
+        share, noise = self._rounding_noise(attempts, place, step, _NEAR)
         # A smooth function is far smoother within a tenth of the distance.
-        nearer = self._rounding_noise(trials, place, step, _NEAR / 10)[0] if share > _ROUNDED else 0.0
-        if nearer > _ROUNDED:
+        limited = share > _ROUNDED and self._rounding_noise(attempts, place, step, _NEAR / 10)[0] > _ROUNDED
+        loosened = self._base.rtol > self._user.rtol or self._least == math.inf
+        if limited:
             self._loosen(noise)
-            self._adapt_tolerance(trials, place, 0.0)
-            return True
-        wanted = self._context.tolerances
-        loosened = self._base.rtol > wanted.rtol or self._least == math.inf
-        if loosened and share * self._tolerances.rtol / self._context.loosest(EXPLICIT, wanted).rtol < _ROUNDED:
+        elif loosened and share * self._tolerances.rtol / loosest(EXPLICIT, self._user).rtol < _ROUNDED:
             # The noise is passed.
-            self._base, self._least = wanted, LEAST
-            self._adapt_tolerance(trials, place, 0.0)
-        return False
+            self._base, self._least = self._user, LEAST
+        else:
+            return False
+        self._adapt_tolerance(attempts, place, 0.0)
+        return limited
 
-    def _rounding_noise(self, trials: StepAttempts, place: int, step: float, near: float) -> tuple[float, float]:
+    def _rounding_noise(self, attempts: StepAttempts, place: int, step: float, near: float) -> tuple[float, float]:
         """Return the part of rounding in a step's estimated error, beside the tolerance, and in accelerations."""
         (_, q, w), space = self._at, self._context.space
         try:
-            k = trials.rates(place, q[None], w[None])
+            k = attempts.rates(place, q[None], w[None])
             ahead = near * step * _AHEAD
-            found = trials.rates(place, space.move(np.broadcast_to(q, (len(ahead), len(q))), ahead * w), w + ahead * k)
+            moved = space.move(np.broadcast_to(q, (len(ahead), len(q))), ahead * w)
+            rates = attempts.rates(place, moved, w + ahead * k)
         except FunctionError:
             return 0.0, 0.0
         rtol, atol = self._tolerances
-        scatter = np.sqrt(np.sum((_RESIDUAL @ found) ** 2, axis=0) / _LEFT)
+        scatter = np.sqrt(np.sum((_RESIDUAL @ rates) ** 2, axis=0) / _LEFT)
         share = _WEIGHT * step * float(np.sqrt(np.mean((scatter / (atol + rtol * np.abs(w))) ** 2)))
         return share, float(scatter.max() / max(np.abs(k).max(), np.finfo(float).tiny))
 
@@ -432,32 +380,38 @@ class SwitchingController:
             # The user's own may still be possible.
             self._least = math.inf
             return
-        wanted, t = self._context.tolerances.rtol, self._at[0]
         self._base = Tolerances(*(min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base))
         self.doubt = (
-            f"near t = {t:.6g} s accelerations are known to {noise:.0e} of themselves, which is not enough for "
-            f"rtol = {wanted:g}; there it took {self._base.rtol:.0e}. Leave out what has next to no mass, or compute "
-            f"with 34 digits: mbkit.dynamics(model, 'oracle') and method={SERIES_METHOD!r}"
+            f"near t = {self._at[0]:.6g} s accelerations are known to {noise:.0e} of themselves, which is not enough "
+            f"for rtol = {self._user.rtol:g}; there it took {self._base.rtol:.0e}. Leave out what has next to no mass, "
+            f"or compute with 34 digits: mbkit.dynamics(model, 'oracle') and method={SERIES_METHOD!r}"
         )
 
     def method_sequence(self) -> str:
         """Return the methods in their order."""
-        return method_sequence(self._segments)
+        methods = [segment.method for segment in self._segments]
+        return f"{methods[0]} throughout" if len(methods) == 1 else ", then ".join(methods)
 
     def describe(self) -> str:
         """Return what was chosen and why."""
-        return describe(self._segments)
-
-
-#: Sequences of methods in a batch that are described.
-_KINDS: Final = 3
+        segments, parts = self._segments, list[str]()
+        if len(segments) == 1 and not segments[0].note:
+            return self.method_sequence()
+        for i, segment in enumerate(segments):
+            until = f" to t = {segments[i + 1].t:.3g} s, {segments[i + 1].why}" if i + 1 < len(segments) else ""
+            note = f", {segment.note}" if segment.note else ""
+            parts.append(segment.method + (" from there" if i else "") + (until or note))
+        skipped = len(parts) - 1 - 2 * _DESCRIBED
+        if skipped > 0:
+            parts[_DESCRIBED + 1 : -_DESCRIBED] = [f"{skipped} more changes"]
+        return "; ".join(parts)
 
 
 def run_auto(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
     context = AutoContext(problem)
     controllers = [SwitchingController(context, i) for i in range(len(problem.q))]
-    explicit = context.make(EXPLICIT, context.loosest(EXPLICIT, problem.tolerances))
+    explicit = context.make(EXPLICIT, loosest(EXPLICIT, problem.tolerances))
 
     def to_end(group: Sequence[TrajectoryRecord], report: Callable[[], None]) -> None:
         # Explicitly side by side; what leaves that one by one.
@@ -474,7 +428,8 @@ def run_auto(problem: IntegrationProblem) -> SolverResult:
 
     records = [controller.record for controller in controllers]
     run_groups(problem, context.space, explicit, records, to_end)
-    outcome = assemble_result(problem, records, evaluations=context.evaluations, jacobians=context.jacobians)
+    evaluations, jacobians = (sum(getattr(x, name) for x in context.attempts) for name in ("evaluations", "jacobians"))
+    outcome = assemble_result(problem, records, evaluations=evaluations, jacobians=jacobians)
     finished = outcome.ended in ("finished", "event")
     doubts = tuple(dict.fromkeys(controller.doubt for controller in controllers if controller.doubt and finished))
     return replace(outcome, chosen=_chosen(controllers, problem.batch), doubts=(*outcome.doubts, *doubts))
@@ -483,13 +438,13 @@ def run_auto(problem: IntegrationProblem) -> SolverResult:
 def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> str:
     if batch is None:
         return controllers[0].describe()
-    kinds = Counter(controller.method_sequence() for controller in controllers)
-    parts = []
-    for kind, count in kinds.most_common(_KINDS):
-        example = next(i for i, controller in enumerate(controllers) if controller.method_sequence() == kind)
+    sequences = [controller.method_sequence() for controller in controllers]
+    kinds, parts = Counter(sequences), list[str]()
+    for kind, count in kinds.most_common(_DESCRIBED):
+        example = sequences.index(kind)
         text = controllers[example].describe()
         such = "" if text == kind else f", such as trajectory {example}"
         parts.append(f"{count} of {batch}{such}: {text}")
-    if len(kinds) > _KINDS:
-        parts.append(f"and {len(kinds) - _KINDS} more kinds")
+    if len(kinds) > _DESCRIBED:
+        parts.append(f"and {len(kinds) - _DESCRIBED} more kinds")
     return "; ".join(parts)

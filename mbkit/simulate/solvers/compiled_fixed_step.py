@@ -246,7 +246,6 @@ class Chunk(BlockLoop):
         self._begin(parameters, q=q, w=w, squares=np.zeros((len(q), 1)))
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:  # noqa: ARG002  # no time enters
-        """Take some steps."""
         self._hold(steps, dt, torques)
         self._sequence.run(0, steps * self._calls)
         self._taken = steps
@@ -255,7 +254,6 @@ class Chunk(BlockLoop):
             self.good = np.logical_and.accumulate(are_bounded(q, w), axis=1).sum(axis=1)
 
     def leave(self, q: Array, w: Array) -> Array:
-        """Return mbkit's v of states (n, steps, ...)."""
         if self._space.flat:
             return w
         flat = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, w))
@@ -264,7 +262,6 @@ class Chunk(BlockLoop):
             return np.asarray(self._space.leave(*flat).reshape(w.shape))
 
     def again(self) -> None:
-        """Make the last state the first one of the next block."""
         for name in _STATE.values():
             room = self._room[name]
             room[0] = room[self._taken % len(room)]

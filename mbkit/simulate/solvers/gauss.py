@@ -7,9 +7,9 @@ on (q, v) as here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import product
 from math import sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,17 @@ _LEAST: Final = 1e-13
 _UNSOLVED: Final = "the iteration does not solve the equations of the step's stages"
 
 
-@dataclass(frozen=True)
-class _Past:
+class _Start(NamedTuple):
+    """Where a step starts, and what acts on it."""
+
+    t: float
+    h: float
+    q: Array
+    w: Array
+    force: Force
+
+
+class _Past(NamedTuple):
     """The last step: where it ended, the stages' ẇ, its length, and Newton's matrix if there was one."""
 
     q: Array
@@ -57,9 +66,8 @@ class CollocationStep:
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         """Return q and w after a step of h seconds."""
-        past = self._past if self._past is not None and self._past.q is q else None
-        inverse = past.inverse if past is not None and past.h == h else None
-        rates, inverse = self._solved(t, h, q, w, force, self._guess(h, w, past), inverse)
+        start, past = _Start(t, h, q, w, force), self._past if self._past is not None and self._past.q is q else None
+        rates, inverse = self._solved(start, self._guess(h, w, past), past.inverse if past and past.h == h else None)
         moved = _mixed(h * self._b, rates)
         q1 = self._space.move(q, moved[..., : self._nv])
         self._past = _Past(q1, rates[..., self._nv :], h, inverse)
@@ -77,16 +85,12 @@ class CollocationStep:
     def _continued(self, ratio: float) -> Array:
         c, s = self._c, self._s
         out = np.ones((s, s))
-        for i in range(s):
-            for j in range(s):
-                for k in range(s):
-                    if k != j:
-                        out[i, j] *= (1 + ratio * c[i] - c[k]) / (c[j] - c[k])
+        for i, j, k in product(range(s), repeat=3):
+            if k != j:
+                out[i, j] *= (1 + ratio * c[i] - c[k]) / (c[j] - c[k])
         return out
 
-    def _solved(
-        self, t: float, h: float, q: Array, w: Array, force: Force, guess: Array, inverse: Array | None
-    ) -> tuple[Array, Array | None]:
+    def _solved(self, start: _Start, guess: Array, inverse: Array | None) -> tuple[Array, Array | None]:
         """Return the rates, and Newton's matrix if plain iteration was too slow.
 
         Plain iteration, or a matrix of an earlier step, gives way to the matrix at the start of this one, and
@@ -94,20 +98,19 @@ class CollocationStep:
         the step, no other leads there.
         """
         try:
-            return self._iterated(t, h, q, w, force, guess, inverse)
+            return self._iterated(start, guess, inverse)
         except DivergenceError:
-            rates = self._newton(t, h, q, w, force, guess)
+            rates = self._newton(start, guess)
             if rates is None:
                 raise
             return rates, None
 
-    def _iterated(
-        self, t: float, h: float, q: Array, w: Array, force: Force, guess: Array, inverse: Array | None
-    ) -> tuple[Array, Array | None]:
-        rates, last, fresh = guess, np.full(w.shape[:-1], np.inf), False
+    def _iterated(self, start: _Start, guess: Array, inverse: Array | None) -> tuple[Array, Array | None]:
+        unknown = np.full(start.w.shape[:-1], np.inf)
+        rates, last, fresh = guess, unknown, False
         for _ in range(_MOST):
             try:
-                change = self._mapped(t, h, q, w, force, rates) - rates
+                change = self._mapped(start, rates) - rates
             except DivergenceError:
                 # An iteration that runs away is no sign that the motion does.
                 if fresh or rates is guess:
@@ -115,46 +118,49 @@ class CollocationStep:
                 rates, slow = guess, True
             else:
                 change = change if inverse is None else _times(inverse, change)
-                tried, size = rates + change, self._size(h, change)
-                done, slowly = self._judged(h, w, tried, size, last)
+                tried, size = rates + change, self._size(start.h, change)
+                done, slowly = self._judged(start, tried, size, last)
                 if done.all():
                     return tried, inverse
                 slow = bool(slowly[~done].any())
                 rates = guess if slow and not fresh and not (size < last).all() else tried
                 last = size
             if slow and not fresh:
-                inverse, fresh = self._inverse(t, h, q, w, force), True
-                last = np.full(w.shape[:-1], np.inf)
+                J = self._slopes(start, 0.0, np.zeros(start.w.shape), start.w)
+                inverse = _inverse_of(np.einsum("ij,...kl->...ikjl", start.h * self._A, J))
+                fresh, last = True, unknown
         raise DivergenceError(_UNSOLVED)
 
-    def _newton(self, t: float, h: float, q: Array, w: Array, force: Force, rates: Array) -> Array | None:
+    def _newton(self, start: _Start, rates: Array) -> Array | None:
         """Return the rates by Newton's method proper; None where that leads nowhere."""
-        last = np.full(w.shape[:-1], np.inf)
+        last = np.full(start.w.shape[:-1], np.inf)
         for _ in range(_MOST_NEWTON):
             try:
-                change = self._mapped(t, h, q, w, force, rates) - rates
-                change = _times(self._inverse_at(t, h, q, w, force, rates), change)
+                change = self._mapped(start, rates) - rates
+                stages = zip(self._times, *self._stages(start, rates), strict=True)
+                J = np.stack([self._slopes(start, c, u, w) for c, u, w in stages])
+                change = _times(_inverse_of(np.einsum("ij,i...kl->...ikjl", start.h * self._A, J)), change)
             except DivergenceError:
                 return None
-            rates, size = rates + change, self._size(h, change)
-            done, _ = self._judged(h, w, rates, size, last)
+            rates, size = rates + change, self._size(start.h, change)
+            done, _ = self._judged(start, rates, size, last)
             if done.all():
                 return rates
             last = size
         return None
 
     def _judged(
-        self, h: float, w: Array, rates: Array, size: Array, last: Array
+        self, start: _Start, rates: Array, size: Array, last: Array
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return, per state, whether the rates are solved for, and whether that takes too long."""
-        speed = np.maximum(_largest(w), self._size(h, rates))
+        speed = np.maximum(np.abs(start.w).max(axis=-1, initial=0.0), self._size(start.h, rates))
         # The first correction follows from the guess, and tells no factor.
         measurable = np.isfinite(last)
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = size / last
             rest = size * factor / (1 - factor)
         done = (size <= _EPS * speed) | (measurable & (factor < 1) & (rest <= _EPS / 4 * speed))
-        done |= measurable & (factor > 0.5) & ((size <= _ROUNDING * speed) | (h * size <= _LEAST))
+        done |= measurable & (factor > 0.5) & ((size <= _ROUNDING * speed) | (start.h * size <= _LEAST))
         return done, measurable & ~(factor < _SLOW)
 
     def _size(self, h: float, rates: Array) -> Array:
@@ -163,66 +169,52 @@ class CollocationStep:
         weighted[..., self._nv :] *= h
         return np.asarray(weighted.max(axis=(0, -1), initial=0.0))
 
-    def _mapped(self, t: float, h: float, q: Array, w: Array, force: Force, rates: Array) -> Array:
+    def _stages(self, start: _Start, rates: Array) -> tuple[Array, Array]:
+        """Return u and w of the stages that these rates lead to."""
+        moved = _mixed(start.h * self._A, rates)
+        return moved[..., : self._nv], start.w + moved[..., self._nv :]
+
+    def _mapped(self, start: _Start, rates: Array) -> Array:
         """Return the rates at the stages that these rates lead to."""
-        nv, s = self._nv, self._s
-        moved = _mixed(h * self._A, rates)
-        u, w_i = moved[..., :nv], w + moved[..., nv:]
+        u, w = self._stages(start, rates)
         out = np.empty(rates.shape)
-        for i in range(s):
-            self._rates(t + self._times[i] * h, q, u[i], w_i[i], force, out[i])
+        for i, c in enumerate(self._times):
+            self._rates(start, c, u[i], w[i], out[i])
         return out
 
-    def _rates(self, t: float, q: Array, u: Array, w: Array, force: Force, out: Array) -> Array:
+    def _rates(self, start: _Start, c: float, u: Array, w: Array, out: Array) -> None:
         out[..., : self._nv] = self._space.rate(u, w)
-        out[..., self._nv :] = self._field(t, self._space.move(q, u), w, force)
-        return out
+        out[..., self._nv :] = self._field(start.t + c * start.h, self._space.move(start.q, u), w, start.force)
 
-    def _inverse(self, t: float, h: float, q: Array, w: Array, force: Force) -> Array:
-        """Return (1 - h A⊗J)⁻¹ with J = ∂(u̇, ẇ)/∂(u, w) at the start of the step."""
-        J = self._slopes(t, q, np.zeros(w.shape), w, force)
-        return _inverse_of(np.einsum("ij,...kl->...ikjl", h * self._A, J))
-
-    def _inverse_at(self, t: float, h: float, q: Array, w: Array, force: Force, rates: Array) -> Array:
-        """Return (1 - h A⊗J)⁻¹ with J of row i at stage i of these rates."""
-        moved = _mixed(h * self._A, rates)
-        u, w_i = moved[..., : self._nv], w + moved[..., self._nv :]
-        J = np.stack([self._slopes(t + c * h, q, u[i], w_i[i], force) for i, c in enumerate(self._times)])
-        return _inverse_of(np.einsum("ij,i...kl->...ikjl", h * self._A, J))
-
-    def _slopes(self, t: float, q: Array, u: Array, w: Array, force: Force) -> Array:
+    def _slopes(self, start: _Start, c: float, u: Array, w: Array) -> Array:
         """Return J = ∂(u̇, ẇ)/∂(u, w) by differences: half of the digits are enough for the iteration."""
         nv = self._nv
         size = sqrt(_EPS) * max(1.0, float(np.abs(w).max(initial=0.0)))
         J = np.empty((*w.shape[:-1], 2 * nv, 2 * nv))
         there, moved = np.empty(J.shape[:-1]), np.empty(J.shape[:-1])
         y = np.concatenate([u, w], axis=-1)
-        self._rates(t, q, u, w, force, there)
+        self._rates(start, c, u, w, there)
         for k in range(2 * nv):
             y[..., k] += size
-            self._rates(t, q, y[..., :nv], y[..., nv:], force, moved)
+            self._rates(start, c, y[..., :nv], y[..., nv:], moved)
             y[..., k] = (u if k < nv else w)[..., k % nv]
             J[..., k] = (moved - there) / size
         return J
 
 
-def _inverse_of(product: Array) -> Array:
-    """Return (1 - product)⁻¹ of (..., s, m, s, m) as (..., s m, s m)."""
-    rows = product.shape[-1] * product.shape[-2]
-    product = product.reshape(*product.shape[:-4], rows, rows)
+def _inverse_of(coupled: Array) -> Array:
+    """Return (1 - coupled)⁻¹ of (..., s, m, s, m) as (..., s m, s m)."""
+    rows = coupled.shape[-1] * coupled.shape[-2]
+    coupled = coupled.reshape(*coupled.shape[:-4], rows, rows)
     try:
-        return np.asarray(np.linalg.inv(np.eye(rows) - product))
+        return np.asarray(np.linalg.inv(np.eye(rows) - coupled))
     except np.linalg.LinAlgError:
-        raise DivergenceError(_UNSOLVED if np.isfinite(product).all() else DIVERGED) from None
+        raise DivergenceError(_UNSOLVED if np.isfinite(coupled).all() else DIVERGED) from None
 
 
 def _mixed(weights: Array, rates: Array) -> Array:
     """Return sums of the stages' rates."""
     return np.asarray((weights @ rates.reshape(len(rates), -1)).reshape(*weights.shape[:-1], *rates.shape[1:]))
-
-
-def _largest(x: Array) -> Array:
-    return np.asarray(np.abs(x).max(axis=-1, initial=0.0))
 
 
 def _times(inverse: Array, change: Array) -> Array:
@@ -231,5 +223,5 @@ def _times(inverse: Array, change: Array) -> Array:
         return np.asarray(inverse @ change.ravel()).reshape(change.shape)
     s, rows = len(change), change.shape[-1]
     stacked = np.moveaxis(change, 0, -2)
-    product = inverse @ stacked.reshape(*stacked.shape[:-2], s * rows, 1)
-    return np.moveaxis(product.reshape(stacked.shape), -2, 0)
+    changed = inverse @ stacked.reshape(*stacked.shape[:-2], s * rows, 1)
+    return np.moveaxis(changed.reshape(stacked.shape), -2, 0)

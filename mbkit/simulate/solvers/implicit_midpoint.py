@@ -140,24 +140,19 @@ class MidpointStepper:
         self.iterations = 0
 
     def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:
-        """Go on with these members of the batch."""
         self._members = members
         self._last, self._guess = [w[good] for w in self._last], self._guess[good]
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:  # noqa: ARG002
-        """Return the state."""
         return q, w
 
     def leave(self, q: Array, w: Array) -> Array:  # noqa: ARG002
-        """Return the momentum."""
         return w
 
     def reason(self, q: Array, w: Array) -> str:
-        """Return why a step is not solved."""
         return _reason(q, w)
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
-        """Return q and π after a step; NaN where it is not solved."""
         q, pi = np.atleast_2d(q), np.atleast_2d(w)
         velocity, tau, good = self._velocity(t, h, q, pi, force)
         self._last = [velocity, *self._last[:-1]]

@@ -116,7 +116,6 @@ class MidpointChunk(BlockLoop):
                 self._iterations = 2
 
     def again(self) -> None:
-        """Make the last state the first one of the next block."""
         n = self._taken
         if self.block != self._longest:
             self.block, self._iterations = self._longest, 2

@@ -131,16 +131,13 @@ class RungeKuttaAttempts:
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the forward dynamics."""
         return self._field.evaluations
 
     @property
     def jacobians(self) -> int:
-        """Jacobians of the forward dynamics."""
         return 0
 
     def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
-        """Begin at a state."""
         (member,) = which
         if self._batch is not None:
             self._field.only(np.array([member]))
@@ -150,7 +147,6 @@ class RungeKuttaAttempts:
         self._dropped, self._fresh = False, True
 
     def hold(self, k: int, stop: float) -> None:
-        """Go on to a time; where nothing else says so, with a first step."""
         self._force, self._stop, self._fresh = self._of_interval(k), stop, True
         if not self._h and not self._dropped:
             self._h = self._first()
@@ -168,7 +164,6 @@ class RungeKuttaAttempts:
         return max(h if h > 0 else 1e-6 * (self._stop - self._t), 2 * self._least)
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
-        """Attempt one step."""
         if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
             return []
         t = end_of_attempt(SCALARS, self._t, self._h, self._stop)
@@ -228,28 +223,23 @@ class RungeKuttaAttempts:
         return self._tableau.step(self._space, rates, self._stages, t, h, q, w)
 
     def drop(self, place: int) -> None:  # noqa: ARG002  # there is one
-        """Stay here."""
         self._dropped = True
 
     def stuck(self, place: int) -> StoppedError | None:  # noqa: ARG002
-        """Return why the last attempt is too short to go on."""
         if self._h > self._least or self._t >= self._stop:
             return None
         return diverged(self._why) if math.isnan(self._error) else below_rounding(self._wanted)
 
     def tighten(self, place: int, tolerances: Tolerances) -> None:  # noqa: ARG002
-        """Go on with other tolerances."""
         self._tolerances = tolerances
 
     def rates(self, place: int, q: Array, w: Array) -> Array:  # noqa: ARG002
-        """Return ẇ at states."""
         try:
             return np.array([self._field(self._t, *state, self._force) for state in zip(q, w, strict=True)])
         except DivergenceError:
             return np.full(w.shape, np.nan)
 
     def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:  # noqa: ARG002
-        """Return states within steps."""
         ends = [self._within(*row) for row in zip(start.t.tolist(), start.q, start.w, times.tolist(), strict=True)]
         return np.array([q for q, _ in ends]), np.array([w for _, w in ends])
 
@@ -295,16 +285,13 @@ class RosenbrockAttempts(RungeKuttaAttempts):
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the forward dynamics."""
         return self._field.evaluations + self._own_rates.evaluations
 
     @property
     def jacobians(self) -> int:
-        """Jacobians of the forward dynamics."""
         return self._exact.evaluations
 
     def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
-        """Begin at a state."""
         super().start(which, q, w, t, h)
         if self._batch is not None:
             self._own_rates.only(which[0])
@@ -340,7 +327,6 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return self._start
 
     def hold(self, k: int, stop: float) -> None:
-        """Go on to a time, under the force of an interval."""
         self._arrived = None
         super().hold(k, stop)
 
