@@ -82,14 +82,7 @@ class SemiImplicitEuler:
     explicit: ClassVar[bool] = True
 
     def step(
-        self,
-        space: Space,
-        rates: StageRates,
-        stages: Stages,  # noqa: ARG002
-        t: Any,
-        h: Any,
-        q: Any,
-        w: Any,
+        self, space: Space, rates: StageRates, _stages: Stages, t: Any, h: Any, q: Any, w: Any
     ) -> tuple[Any, Any, Any]:
         """Return the new q and w, and u; arguments are those of `mbkit.methods.tableaus.Tableau.step`."""
         _, a = rates(t, q, None, w)

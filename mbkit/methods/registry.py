@@ -84,41 +84,31 @@ class Method:
         Order of the global error, as a function of the step; None where it varies.
     stages : int
         Evaluations of the forward dynamics per step; 0 where that varies.
-    about : str
-        One line, with the source.
+    about, lacks : str
+        One line, with the source; why other engines do not have it, empty for what is an engine's own.
     engines : tuple of str
         Those that have it; any engine with forward dynamics where empty.
-    events : bool
-        Whether a run can stop at an event.
+    events, callables : bool
+        Whether a run can stop at an event; whether the torque may be a function.
     least : float
         The tightest tolerance that it takes.
-    callables : bool
-        Whether the torque may be a function.
-    lacks : str
-        Why other engines do not have it; empty for what is an engine's own.
     formula_source : Formula, callable or None
         The step in mbkit's own code, or a function that constructs it; None for what another program integrates.
-    solver : str
-        ``"module:function"`` below `mbkit.simulate.solvers` that runs it.
-    scheme : str
-        Its name in the program that integrates.
+    solver, scheme : str
+        ``"module:function"`` below `mbkit.simulate.solvers` that runs it; its name in the program that integrates.
     stability : Stability or None
         What a fixed step does to linear systems.
-    jacobian : bool
-        Whether it needs the Jacobian of the forward dynamics.
-    mass_matrix : bool
-        Whether it solves with the mass matrix itself, however the engine computes accelerations.
+    jacobian, mass_matrix : bool
+        Whether it needs the Jacobian of the forward dynamics; whether it solves with the mass matrix itself, however
+        the engine computes accelerations.
     compiled : bool
         Whether the Lagrangian engine runs its steps as machine code.
-    fills_tolerance : bool
-        Whether the error of a step is as large as the tolerance allows; that of other methods is a third to a
-        three-hundredth of it.
-    scaled_by_start : bool
-        Whether the tolerance is relative to the numbers of the start.
-    extended : bool
-        Whether the oracle runs it with 34 digits.
-    multistep : bool
-        Whether its interpolant is as accurate as its steps, and stopping often slows it.
+    fills_tolerance, scaled_by_start : bool
+        Whether the error of a step is as large as the tolerance allows (that of other methods is a third to a
+        three-hundredth of it); whether the tolerance is relative to the numbers of the start.
+    extended, multistep : bool
+        Whether the oracle runs it with 34 digits; whether its interpolant is as accurate as its steps, and stopping
+        often slows it.
     own : str
         Of an engine's integrator: the method of mbkit with the same formula.
     """

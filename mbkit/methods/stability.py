@@ -126,20 +126,13 @@ def _at_matrix(coefficients: Array, Z: Array) -> Array:
 
 @dataclass(frozen=True)
 class _EulerStability:
-    """New velocity v⁺ from a linear system, then x⁺ = x + h v⁺.
+    """New velocity v⁺ from a linear system, then x⁺ = x + h v⁺."""
 
-    Attributes
-    ----------
-    implicit : callable
-        (h, A, B) -> what the unit matrix loses on the left of the velocity's equation.
-    explicit : callable
-        (h, B) -> what v is multiplied by on its right, beside h A x.
-    limit : callable
-        ζ -> largest stable ω h.
-    """
-
+    # (h, A, B) -> what the unit matrix loses on the left of the velocity's equation.
     implicit: Callable[[float, Array, Array], Array]
+    # (h, B) -> what v is multiplied by on its right, beside h A x.
     explicit: Callable[[float, Array], Array]
+    # ζ -> largest stable ω h.
     limit: Callable[[float], float]
 
     def matrix(self, h: float, A: Array, B: Array) -> Array:

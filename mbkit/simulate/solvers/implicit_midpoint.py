@@ -106,8 +106,7 @@ def _in_chunks(
     """
     # These load LLVM, which interpreting never needs.
     from mbkit.codegen.compiled import cores
-    from mbkit.simulate.solvers.compiled_fixed_step import run_blocks, run_parts
-    from mbkit.simulate.solvers.implicit_midpoint_compiled import WIDEST, MidpointChunk
+    from mbkit.simulate.solvers.compiled_fixed_step import WIDEST, MidpointChunk, run_blocks, run_parts
 
     record, grid, values, n = GridRecord(problem), problem.grid, dyn.parameter_values, len(pi0)
     count = -(-n // WIDEST)
