@@ -38,7 +38,7 @@ _ONE_PIECE: Final = 20_000
 # Half of what a core has in its second cache.
 _CACHE: Final = 2**19
 _LANES: Final = 8
-_MOST: Final = 1032
+_MOST_STATES: Final = 1032
 # What a step writes -> what the next one reads.
 _STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares"}
 
@@ -211,7 +211,7 @@ class Plan:
     @property
     def widest(self) -> int:
         """States that the cache holds with all that belongs to them, from 72 to 1032."""
-        return min(max(padded(_CACHE // (8 * sum(self.sizes.values()))), 9 * _LANES), _MOST)
+        return min(max(padded(_CACHE // (8 * sum(self.sizes.values()))), 9 * _LANES), _MOST_STATES)
 
 
 class Chunk(BlockLoop):
@@ -400,13 +400,13 @@ class MidpointChunk(BlockLoop):
         calls = []
         for w, w1 in pairwise(tries):
             given = {**held, "w": w}
-            calls.append(self._call(self._newton.name, self._newton.reads, given, [w1, held["miss"]]))
+            calls.append(self._call(self._newton, given, [w1, held["miss"]]))
         past = {name: at("w", j + self._back - i) for i, name in enumerate(("w", "w_1", "w_2"))}
         outs = [new[name] for name in self._end.writes]
-        return [*calls, self._call(self._end.name, self._end.reads, {**held, **past}, outs)]
+        return [*calls, self._call(self._end, {**held, **past}, outs)]
 
-    def _call(self, name: str, reads: tuple[str, ...], given: dict[str, Array], outs: list[Array]) -> Call:
-        return Call(self._codes[name], [given[n] for n in reads], outs)
+    def _call(self, part: Part, given: dict[str, Array], outs: list[Array]) -> Call:
+        return Call(self._codes[part.name], [given[n] for n in part.reads], outs)
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
         """Take some steps, and count in `good` how many of them are solved."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -23,53 +23,33 @@ from mbkit.simulate.solvers.vector_field import are_bounded, is_bounded
 from mbkit.simulate.time_grid import check_room
 
 
-@runtime_checkable
-class HasRollout(Protocol):
-    """An engine with integrators of its own."""
-
-    def rollout(
-        self,
-        integrator: str,
-        q0: Array,
-        v0: Array,
-        dt: float,
-        tau: Array | None,
-        steps: int,
-        progress: Callable[[float], object] | None = None,
-    ) -> tuple[Array, Array]:
-        """Return q and v after 0, 1, ... steps: (steps + 1, n) or (N, steps + 1, n).
-
-        `progress` gets the fraction done, several times a second.
-        """
-        ...
-
-
 def run_native(problem: IntegrationProblem) -> SolverResult:
     """Run the engine's integrator; nothing is kept after a trajectory's last bounded state."""
     dyn, method, grid, torque = problem.dyn, method_of(problem.method), problem.grid, problem.torque
-    assert isinstance(dyn, HasRollout)
+    # MuJoCo is an extra.
+    from mbkit.engines.mujoco.engine import MujocoDynamics
+
+    assert isinstance(dyn, MujocoDynamics)
     q0, v0 = problem.q0, problem.v0
     check_room((grid.steps + 1) * len(problem.q), q0.shape[-1] + v0.shape[-1])
+    # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
+    whole = grid.steps if grid.last == grid.dt else grid.steps - 1
+    first: dict[str, Any] = {"q0": q0, "v0": v0, "dt": grid.dt, "tau": torque.over(0, whole), "steps": whole}
+    q, v = dyn.rollout(integrator=method.scheme, progress=problem.bar.update, **first)
+    if whole < grid.steps:
+        # A state that diverged stays void; it only must not stop the others.
+        good = np.isfinite(q[..., -1, :]).all(-1, keepdims=True) & np.isfinite(v[..., -1, :]).all(-1, keepdims=True)
+        q1, v1 = np.where(good, q[..., -1, :], q0), np.where(good, v[..., -1, :], v0)
+        tail = torque.over(whole, grid.steps)
+        q1, v1 = dyn.rollout(integrator=method.scheme, q0=q1, v0=v1, dt=grid.last, tau=tail, steps=1)
+        q, v = np.concatenate([q, q1[..., 1:, :]], -2), np.concatenate([v, v1[..., 1:, :]], -2)
+    q, v = (np.asarray(x)[None] if problem.batch is None else np.asarray(x) for x in (q, v))
+    good = are_bounded(q, v)
+    good[:, 0] = True  # the start is the caller's
     record = GridRecord(problem)
-    # mujoco.rollout 4.0.0 does not survive an empty batch.
-    if len(problem.q):
-        # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
-        whole = grid.steps if grid.last == grid.dt else grid.steps - 1
-        first: dict[str, Any] = {"q0": q0, "v0": v0, "dt": grid.dt, "tau": torque.over(0, whole), "steps": whole}
-        q, v = dyn.rollout(integrator=method.scheme, progress=problem.bar.update, **first)
-        if whole < grid.steps:
-            # A state that diverged stays void; it only must not stop the others.
-            good = np.isfinite(q[..., -1, :]).all(-1, keepdims=True) & np.isfinite(v[..., -1, :]).all(-1, keepdims=True)
-            q1, v1 = np.where(good, q[..., -1, :], q0), np.where(good, v[..., -1, :], v0)
-            tail = torque.over(whole, grid.steps)
-            q1, v1 = dyn.rollout(integrator=method.scheme, q0=q1, v0=v1, dt=grid.last, tau=tail, steps=1)
-            q, v = np.concatenate([q, q1[..., 1:, :]], -2), np.concatenate([v, v1[..., 1:, :]], -2)
-        q, v = (np.asarray(x)[None] if problem.batch is None else np.asarray(x) for x in (q, v))
-        good = are_bounded(q, v)
-        good[:, 0] = True  # the start is the caller's
-        # After the first bad state everything is void, even what looks like numbers.
-        record.steps[:] = np.logical_and.accumulate(good, axis=1).sum(1) - 1
-        record.q, record.v = q[:, record.kept], v[:, record.kept]
+    # After the first bad state everything is void, even what looks like numbers.
+    record.steps[:] = np.logical_and.accumulate(good, axis=1).sum(1) - 1
+    record.q, record.v = q[:, record.kept], v[:, record.kept]
     problem.bar.update(1.0)
     return record.result(lambda _: "", int(record.steps.sum()) * method.stages)
 
