@@ -65,7 +65,7 @@ _LEFT: Final = len(_AHEAD) - 4
 #: Rounding in a step's estimated error: the length of rk853's weights, and the part that is too much.
 _WEIGHT: Final = 2.0
 _ROUNDED: Final = 0.03
-#: First and last changes of the method that are described, and sequences of methods in a batch.
+#: Sequences of methods in a batch that are described.
 _DESCRIBED: Final = 3
 
 
@@ -269,8 +269,7 @@ class SwitchingController:
             if self._rounding_limited(attempts, place, step):
                 return
             held = rates is not None and step * rates.stable >= _EDGE
-            # Where steps are short now, and not only on the average.
-            if (held or to_come >= costs.guess) and (trial := self._faster_trial(min(rate, 1 / step))):
+            if (held or to_come >= costs.guess) and (trial := self._faster_trial(rate)):
                 why = "stability held its steps" if held else "rodas5 got further with a trial"
                 size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
                 self._switch(IMPLICIT, trial, why + size)
@@ -303,8 +302,7 @@ class SwitchingController:
     def _check_nonstiff(self, attempts: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
         """Check whether rk853 shall take over again."""
         rate = monitor.rate()
-        # Steps may be growing still.
-        to_come = min(rate, 1 / monitor.step() if monitor.step() else math.inf) * self._rest
+        to_come = rate * self._rest
         if _DEARER * to_come >= self._context.costs.worth:
             rates = self._spectrum(attempts, place, 0.0)
             if rates is not None and rates.stable / _KEPT < _DEARER * rate:
@@ -401,9 +399,6 @@ class SwitchingController:
             until = f" to t = {segments[i + 1].t:.3g} s, {segments[i + 1].why}" if i + 1 < len(segments) else ""
             note = f", {segment.note}" if segment.note else ""
             parts.append(segment.method + (" from there" if i else "") + (until or note))
-        skipped = len(parts) - 1 - 2 * _DESCRIBED
-        if skipped > 0:
-            parts[_DESCRIBED + 1 : -_DESCRIBED] = [f"{skipped} more changes"]
         return "; ".join(parts)
 
 
