@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,33 +85,36 @@ class GridRecord:
         )
 
 
-class Stepper(Protocol):
+class Stepper:
     """Steps of one state or a batch, one at a time; w is the velocity or momentum that the method carries along."""
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         """Return q and w at t + h; NaN where there are none, or `DivergenceError`."""
+        raise NotImplementedError
 
     def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:
         """Go on with these members of the batch, those of the last ones that are good."""
 
-    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """Return the state to go on from."""
+        return q, w
 
-    def leave(self, q: Array, w: Array) -> Array:
+    def leave(self, q: Array, w: Array) -> Array:  # noqa: ARG002
         """Return what is kept of w."""
+        return w
 
-    def reason(self, q: Array, w: Array) -> str:
+    def reason(self, q: Array, w: Array) -> str:  # noqa: ARG002
         """Return why a step from such a state failed."""
+        return DIVERGED
 
 
-class _FieldStepper:
+class _FieldStepper(Stepper):
     """Steps of a method that is made of evaluations of ẇ."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
         self.space = Space(problem.dyn.model)
         self.field = Field(problem.dyn, self.space)
         self._step = make_step(problem.method, self.field, self.space)
-        self.settled, self.leave = self.field.settled, self.space.leave
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         return self._step(t, h, q, w, force)
@@ -119,8 +122,11 @@ class _FieldStepper:
     def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:  # noqa: ARG002
         self.field.only(members)
 
-    def reason(self, q: Array, w: Array) -> str:  # noqa: ARG002
-        return DIVERGED
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+        return self.field.settled(t, q, w)
+
+    def leave(self, q: Array, w: Array) -> Array:
+        return np.asarray(self.space.leave(q, w))
 
 
 def run_fixed(problem: IntegrationProblem) -> SolverResult:

@@ -24,7 +24,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import refuse_constraints
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun
+from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun, Stepper
 from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
@@ -127,7 +127,7 @@ def _in_chunks(
     return record, sum(iterations), reasons.__getitem__
 
 
-class MidpointStepper:
+class MidpointStepper(Stepper):
     """Newton's iteration for trajectories side by side, one step at a time; `iterations` are of all together."""
 
     def __init__(self, dyn: LagrangianDynamics, problem: IntegrationProblem, w0: Array) -> None:
@@ -141,12 +141,6 @@ class MidpointStepper:
     def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:
         self._members = members
         self._last, self._guess = [w[good] for w in self._last], self._guess[good]
-
-    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:  # noqa: ARG002
-        return q, w
-
-    def leave(self, q: Array, w: Array) -> Array:  # noqa: ARG002
-        return w
 
     def reason(self, q: Array, w: Array) -> str:
         return _reason(q, w)
