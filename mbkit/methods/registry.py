@@ -15,13 +15,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.methods.one_step import SemiImplicitEuler
-from mbkit.methods.stability import (
-    IMPLICIT_EULER,
-    IMPLICIT_IN_VELOCITY,
-    SYMPLECTIC_EULER,
-    Stability,
-    TableauStability,
-)
+from mbkit.methods.stability import IMPLICIT_EULER, IMPLICIT_IN_VELOCITY, SYMPLECTIC_EULER, Stability, TableauStability
 from mbkit.methods.tableaus import (
     RK4,
     EmbeddedTableau,

@@ -19,13 +19,7 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model import Model
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.trajectory_record import (
-    StoppedError,
-    TrajectoryRecord,
-    assemble_result,
-    diverged,
-    run_each,
-)
+from mbkit.simulate.solvers.trajectory_record import StoppedError, TrajectoryRecord, assemble_result, diverged, run_each
 from mbkit.simulate.solvers.vector_field import is_bounded
 
 _GRAPH: Final = "_cvodes_graph"

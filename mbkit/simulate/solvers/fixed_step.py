@@ -44,11 +44,7 @@ class GridRecord:
         return slice(*self.kept.searchsorted((first, last + 1)).tolist())
 
     def result(
-        self,
-        why: Callable[[int], str],
-        evaluations: int,
-        jacobians: int = 0,
-        error: FunctionError | None = None,
+        self, why: Callable[[int], str], evaluations: int, jacobians: int = 0, error: FunctionError | None = None
     ) -> SolverResult:
         """Return the result, with NaN behind the good steps; why(i) is why trajectory i diverged, or empty."""
         grid, kept, steps, q, v = self._problem.grid, self.kept, self.steps, self.q, self.v

@@ -12,13 +12,7 @@ from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.fixed_step import GridRecord
-from mbkit.simulate.solvers.trajectory_record import (
-    StoppedError,
-    TrajectoryRecord,
-    assemble_result,
-    diverged,
-    run_each,
-)
+from mbkit.simulate.solvers.trajectory_record import StoppedError, TrajectoryRecord, assemble_result, diverged, run_each
 from mbkit.simulate.solvers.vector_field import are_bounded, is_bounded
 from mbkit.simulate.time_grid import check_room
 
