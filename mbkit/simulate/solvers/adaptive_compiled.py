@@ -157,7 +157,9 @@ class CompiledAttempts:
             tried = count if going[-1] else int(np.argmin(going)) + 1
             self._active[place] = bool(going[-1])
             states = np.concatenate([before[None, :, place], log[:tried, :, place]])
-            accepted = states[np.flatnonzero(np.diff(states[:, self._row["t"]], prepend=-np.inf) > 0)]
+            times, good = states[:, self._row["t"]], np.full(len(states), True)
+            np.greater(times[1:], times[:-1], out=good[1:])
+            accepted = states[good]
             t, q, w = (accepted[:, at] for at in (self._row["t"], self._at["q"], self._at["w"]))
             out.append((place, AcceptedSteps(t, q, w, tried)))
             self.evaluations += self._stages * tried

@@ -100,7 +100,8 @@ class BlockLoop:
     def states(self, name: str, which: Sequence[int] | Indices) -> Array:
         """Return q, w, ... after these many steps of the block, (n, steps, rows)."""
         room = self._room[name]
-        return np.asarray(room[np.asarray(which) % len(room), :, : self._count].transpose(2, 0, 1))
+        places = np.asarray(which) if self._taken < len(room) else np.asarray(which) % len(room)
+        return np.asarray(room[:, :, : self._count][places].transpose(2, 0, 1))
 
 
 def padded(count: int) -> int:
@@ -143,7 +144,7 @@ def run_blocks(
                     last[int(members[m])] = [loop.states(name, [good[m]])[m, 0] for name in loop.carried]
                 alive &= good == n
             yield k + n, last
-            if not alive.any():
+            if last and not alive.any():
                 return
             loop.again()
             k += n

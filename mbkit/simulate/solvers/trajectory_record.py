@@ -164,7 +164,8 @@ class TrajectoryRecord:
         """Keep the wanted states up to a time in the last step; return False, and keep none, if one is unbounded."""
         if self._save is None:
             ends = slice(1, steps + 1 - int(until != made.t[steps]))
-            return self._add(made.t[ends], made.q[ends], made.w[ends])
+            self._add(made.t[ends], made.q[ends], made.w[ends])
+            return True
         first, last = self._save.searchsorted((made.t[0], until), side="right")
         if first == last:
             return True
@@ -173,14 +174,15 @@ class TrajectoryRecord:
         q, w = made.q[after], made.w[after]
         between = np.flatnonzero(made.t[after] != times)
         if len(between):
-            q[between], w[between] = within(made.rows(after[between] - 1), times[between])
-        return self._add(times, q, w)
+            q[between], w[between] = inner = within(made.rows(after[between] - 1), times[between])
+            if not are_bounded(*inner).all():
+                return False
+        self._add(times, q, w)
+        return True
 
-    def _add(self, t: Array, q: Array, w: Array) -> bool:
-        good = bool(are_bounded(q, w).all())
-        if good and len(t):
+    def _add(self, t: Array, q: Array, w: Array) -> None:
+        if len(t):
             self._kept.append((t, *self._state(q, w)))
-        return good
 
     @property
     def states(self) -> tuple[Array, Array, Array]:
