@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,8 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import nearest
-from mbkit.load.xml_reader import Element, Reader
+from mbkit.load.xml_reader import MOST_BYTES, Element, Reader
+from mbkit.model.validation import listed
 
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
@@ -57,11 +58,14 @@ class Compiler:
         """Read every <compiler> of the file; later ones win."""
         merged, meshdir = Element("compiler", {}, mujoco.line), ""
         for element in mujoco.all("compiler"):
-            merged.attributes.update(element.attributes)
-            merged.line, merged.file = element.line, element.file
+            merged = replace(element, attributes={**merged.attributes, **element.attributes})
             # An element's meshdir overrides its assetdir, even where it is empty.
             meshdir = element.attributes.get("meshdir", element.attributes.get("assetdir", meshdir))
         attributes, item = merged.attributes, "the file"
+
+        def flag(name: str, default: str = "false") -> bool:
+            return read.choice(merged, name, (default, "true" if default == "false" else "false")) == "true"
+
         if attributes.get("coordinate", "local") != "local":
             read.fault("compiler coordinate: only 'local' is read; convert the file with MuJoCo 2.3.3", merged)
         if attributes.get("alignfree", "false") != "false":
@@ -70,16 +74,15 @@ class Compiler:
         if len(seq) != 3 or set(seq.lower()) - set("xyz"):
             read.fault(f"compiler eulerseq: expected three of xyzXYZ, got {seq[:20]!r}", merged)
             seq = "xyz"
+        infer = read.choice(merged, "inertiafromgeom", ("auto", "true", "false"))
         low, high = read.numbers(merged, "inertiagrouprange", item, count=2, default=(0.0, 5.0))
         return cls(
-            angle={"degree": np.pi / 180, "radian": 1.0}[read.choice(merged, "angle", ("degree", "radian"))],
+            angle=np.pi / 180 if read.choice(merged, "angle", ("degree", "radian")) == "degree" else 1.0,
             eulerseq=seq,
-            autolimits=read.choice(merged, "autolimits", ("true", "false")) == "true",
-            inertiafromgeom={"auto": None, "true": True, "false": False}[
-                read.choice(merged, "inertiafromgeom", ("auto", "true", "false"))
-            ],
+            autolimits=flag("autolimits", "true"),
+            inertiafromgeom={"auto": None, "true": True, "false": False}[infer],
             groups=(low, high),
-            balanceinertia=read.choice(merged, "balanceinertia", ("false", "true")) == "true",
+            balanceinertia=flag("balanceinertia"),
             boundmass=read.number(merged, "boundmass", item, 0.0),
             boundinertia=read.number(merged, "boundinertia", item, 0.0),
             settotalmass=read.number(merged, "settotalmass", item, -1.0),
@@ -103,6 +106,19 @@ def mesh_name(mesh: Element) -> str:
     """Return the name of a <mesh>."""
     stem = PurePosixPath(mesh.attributes.get("file", "").replace("\\", "/")).stem
     return mesh.attributes.get("name") or stem
+
+
+def read_mesh(path: Path, most: int = MOST_BYTES) -> tuple[bytes, str]:
+    """Return a file's content, and why it cannot be read, if so."""
+    try:
+        # A pipe or a device would be read for ever.
+        if not path.is_file():
+            return b"", f"no such file: {path}"
+        if path.stat().st_size > most:
+            return b"", f"up to {MOST_BYTES} bytes of meshes are read"
+        return path.read_bytes(), ""
+    except (OSError, ValueError) as error:
+        return b"", f"cannot be read ({error})"
 
 
 class Defaults:
@@ -158,13 +174,10 @@ def pose(element: Element, compiler: Compiler, read: Reader, item: str) -> Pose:
         read.fault(f"{item}: {element.tag} has {' and '.join(names)}; keep one orientation", element)
     before = len(read.faults)
     values = np.array(read.numbers(element, names[0], item, count=ORIENTATIONS[names[0]]))
-    if len(read.faults) > before:
-        return Pose(np.eye(3), p)
-    R = _rotation(names[0], values, compiler)
-    if R is None:
+    R = None if len(read.faults) > before else _rotation(names[0], values, compiler)
+    if R is None and len(read.faults) == before:
         read.fault(f"{item}: {element.tag} {names[0]}: expected directions of some length, got zeros", element)
-        R = np.eye(3)
-    return Pose(R, p)
+    return Pose(np.eye(3) if R is None else R, p)
 
 
 def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
@@ -181,11 +194,10 @@ def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
         return R
     if name == "zaxis":
         return z_to(x) if has_length(x) else None
-    first, second = x[:3], x[3:]
-    if not has_length(first):
+    if not has_length(x[:3]):
         return None
-    first = spatial.normalized(first)
-    second = second - first * (first @ second)
+    first = spatial.normalized(x[:3])
+    second = x[3:] - first * (first @ x[3:])
     if not np.linalg.norm(second) > 1e-10:
         return None
     second = spatial.normalized(second)
@@ -225,7 +237,6 @@ _ASIDE: Final = frozenset(
 )
 # These are refused or not read.
 _UNREAD: Final = frozenset({"replicate", "attach", "composite", "flexcomp", "plugin"})
-_MOST_NOTED: Final = 6
 
 
 @dataclass(frozen=True)
@@ -241,10 +252,7 @@ def check_names(mujoco: Element, read: Reader) -> str:
     """Keep a fault for each unknown name that could act on the motion, and return a note about the others."""
     aside: list[str] = []
     _check(mujoco, rules(), read, aside)
-    if not aside:
-        return ""
-    more = f" and {len(aside) - _MOST_NOTED} more" if len(aside) > _MOST_NOTED else ""
-    return f"unknown to MuJoCo's schema, and ignored: {', '.join(aside[:_MOST_NOTED])}{more}"
+    return f"unknown to MuJoCo's schema, and ignored: {listed(aside, 6)}" if aside else ""
 
 
 def _check(element: Element, rule: Rule, read: Reader, aside: list[str], acts: bool = True) -> None:
@@ -274,8 +282,7 @@ def _check(element: Element, rule: Rule, read: Reader, aside: list[str], acts: b
 
 
 def _called(element: Element) -> str:
-    name = element.attributes.get("name", "")
-    return f"{element.tag} {name[:60]!r}" if name else f"<{element.tag}>"
+    return f"{element.tag} {name[:60]!r}" if (name := element.attributes.get("name")) else f"<{element.tag}>"
 
 
 @lru_cache(maxsize=1000)
@@ -293,20 +300,13 @@ def rules() -> Rule:
     # Lines are "name (how often)   attribute attribute", indented by level; longer ones go on below.
     root = Rule()
     open_rules: list[tuple[int, Rule]] = [(-1, root)]
-    entries: list[tuple[int, str, str, list[str]]] = []
-    for line in mujoco.mj_printSchema(False, False).splitlines():
-        start = re.fullmatch(r"( *)(\S+) \((.)\)(.*)", line)
-        if start:
-            indent, tag, often, attributes = start.groups()
-            entries.append((len(indent), tag.removeprefix("(world)"), often, attributes.split()))
-        elif entries:
-            entries[-1][3].extend(line.split())
-    for level, tag, often, names in entries:
-        rule = Rule(frozenset(names), once=often in "!?")
-        while open_rules[-1][0] >= level:
+    text = re.sub(r"\n *(?!.* \(.\))", " ", mujoco.mj_printSchema(False, False))
+    for indent, tag, often, names in re.findall(r"( *)(?:\(world\))?(\S+) \((.)\)(.*)", text):
+        rule = Rule(frozenset(names.split()), once=often in "!?")
+        while open_rules[-1][0] >= len(indent):
             open_rules.pop()
         open_rules[-1][1].children[tag] = rule
-        open_rules.append((level, rule))
+        open_rules.append((len(indent), rule))
         if often == "R":
             rule.children[tag] = rule
     whole = root.children["mujoco"]

@@ -9,18 +9,18 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from mbkit import spatial
-from mbkit.load.mjcf_attributes import mesh_assets
+from mbkit.load.mjcf_attributes import mesh_assets, read_mesh
 from mbkit.load.mjcf_reader import Scene
 from mbkit.load.shapes import Lump
-from mbkit.load.xml_reader import MOST_BYTES, Element
+from mbkit.load.xml_reader import Element, element_text
+from mbkit.model.validation import listed
 
 _BODIES: Final = ("default", "asset", "worldbody")
 _BODIES_AND_FORCES: Final = (*_BODIES, "tendon", "actuator")
@@ -33,13 +33,10 @@ _UNUSED_SETTINGS: Final = frozenset(
 
 
 def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
-    """Give the bodies of ``scene.inferred`` their inertia, and return a note about it.
-
-    Faults are kept in ``scene.read``.
-    """
+    """Give the bodies of ``scene.inferred`` their inertia, and return a note about it."""
     if not scene.inferred or scene.read.faults:
         return ""
-    item = f"the inertia of {listed(scene.inferred)}"
+    item = f"the inertia of {named(scene.inferred)}"
     text = _Text(mujoco, path, scene)
     compiled = text.compiled(_BODIES, item, scaled=False)
     if compiled is None:
@@ -49,28 +46,26 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
             body.lump = _lump(compiled.body(body.name))
     bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
     within = f", within {' and '.join(bounds)}" if bounds else ""
-    files = f"; mesh files read: {listed(text.opened)}" if text.opened else ""
+    files = f"; mesh files read: {named(text.opened)}" if text.opened else ""
     return f"{item} was inferred from meshes or shells by MuJoCo's compiler{within}{files}"
 
 
 def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[float, float]]:
     """Return the stiffness and damping of each joint that has a ``springdamper``.
 
-    They follow from the mass matrix of the whole system, where the file draws it. Faults are kept in ``scene.read``.
+    They follow from the mass matrix of the whole system in the pose of the file.
     """
     joints = []
     for joint in (j for b in scene.bodies for j in b.joints):
         item = f"joint {joint.name!r}"
         values = scene.read.numbers(joint.element, "springdamper", item, count=2, default=(0.0, 0.0))
-        if any(values):
-            joints.append(joint.name)
+        joints += [joint.name] if any(values) else []
         if any(values) and min(values) <= 0:
-            scene.read.fault(
-                f"{item}: springdamper: expected a time constant and a damping ratio above 0", joint.element
-            )
+            expected = "expected a time constant and a damping ratio above 0"
+            scene.read.fault(f"{item}: springdamper: {expected}", joint.element)
     if not joints or scene.read.faults:
         return {}
-    item = f"springdamper of {listed(joints)}"
+    item = f"springdamper of {named(joints)}"
     compiled = _Text(mujoco, path, scene).compiled(_BODIES_AND_FORCES, item, scaled=True)
     if compiled is None:
         return {}
@@ -105,7 +100,7 @@ class _Text:
         unused = _UNUSED_SETTINGS if scaled else _UNUSED_SETTINGS | {"settotalmass"}
         settings = {k: v for k, v in self.settings.items() if k not in unused}
         inside = "".join(self._written(e, None) for e in self.mujoco.children if e.tag in sections)
-        text = f"<mujoco>{_tag('compiler', settings)}{inside}</mujoco>"
+        text = f"<mujoco>{element_text('compiler', settings)}{inside}</mujoco>"
         # Imported late: few files need the compiler.
         import mujoco
 
@@ -135,22 +130,13 @@ class _Text:
             return
         attributes = {**mesh.attributes, "name": name}
         self.needed[id(mesh)] = attributes
-        file = attributes.get("file")
-        if file is None:
+        if "file" not in attributes:
             return
         folder = self.path.parent
-        path = folder / self.scene.compiler.mesh_path(file)
-        try:
-            # A pipe or a device would be read for ever.
-            if not path.is_file():
-                read.fault(f"{item}: no such file: {path}", mesh)
-                return
-            if path.stat().st_size > MOST_BYTES:
-                read.fault(f"{item}: {path}: expected up to {MOST_BYTES} bytes", mesh)
-                return
-            content = path.read_bytes()
-        except (OSError, ValueError) as error:
-            read.fault(f"{item}: {path}: cannot be read ({error})", mesh)
+        path = folder / self.scene.compiler.mesh_path(attributes["file"])
+        content, why = read_mesh(path)
+        if why:
+            read.fault(f"{item}: {path}: {why}", mesh)
             return
         self.opened.append(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
         # MuJoCo caches meshes by name, so a name stands for its content.
@@ -173,17 +159,10 @@ class _Text:
         own |= self.needed.get(id(element), {})
         if id(element) in self.scene.called:
             own["name"] = self.scene.called[id(element)]
-        return _tag(tag, own, "".join(self._written(e, childclass) for e in self._kept(element)))
-
-    def _kept(self, element: Element) -> Iterator[Element]:
-        for child in element.children:
-            unopened = element.tag == "asset" and child.tag == "mesh" and id(child) not in self.needed
-            if child.tag not in _UNUSED and not unopened:
-                yield child
-
-
-def _tag(tag: str, attributes: dict[str, str], inside: str = "") -> str:
-    return f"<{tag}{''.join(f' {k}={quoteattr(v)}' for k, v in attributes.items())}>{inside}</{tag}>"
+        kept = [e for e in element.children if e.tag not in _UNUSED]
+        if tag == "asset":
+            kept = [e for e in kept if e.tag != "mesh" or id(e) in self.needed]
+        return element_text(tag, own, "".join(self._written(e, childclass) for e in kept))
 
 
 def _lump(body: Any) -> Lump:
@@ -193,7 +172,6 @@ def _lump(body: Any) -> Lump:
     return Lump(float(body.mass[0]), np.array(body.ipos), axes @ np.diag(body.inertia) @ axes.T)
 
 
-def listed(names: Iterable[str]) -> str:
+def named(names: Iterable[str]) -> str:
     """Return the first names, and how many more there are."""
-    every = list(names)
-    return ", ".join(map(repr, every[:6])) + (f" and {len(every) - 6} more" if len(every) > 6 else "")
+    return listed([repr(name) for name in names], 6)

@@ -8,16 +8,15 @@ stiffness -b1 and rest length -b0/b1, and a damper -b2.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.load.mjcf_attributes import HERE, pose
-from mbkit.load.mjcf_reader import MjcfJoint, Scene, unfolded
-from mbkit.load.xml_reader import LARGEST, Element, Reader
+from mbkit.load.mjcf_reader import MjcfJoint, Scene
+from mbkit.load.xml_reader import LARGEST, Element, Reader, unused
 from mbkit.model import Joint, JointCoupling, Model, PointSpring
 from mbkit.model.validation import sample_mass_matrix
 
@@ -25,7 +24,7 @@ _ACTUATORS: Final = (
     *("general", "motor", "position", "velocity", "intvelocity", "damper"),
     *("cylinder", "muscle", "adhesion", "dcmotor", "pid", "plugin"),
 )
-#: Nonlinear limits and losses, and the attribute that switches each on.
+#: Nonlinear limits and losses of a tendon, and the attribute that switches each on.
 _TENDON_LIMITS: Final = {
     "range": "limited",
     "frictionloss": "",
@@ -34,6 +33,15 @@ _TENDON_LIMITS: Final = {
 }
 #: Parts that equality constraints bind.
 _ENDS: Final = ("joint", "body", "tendon", "site", "flex")
+#: Attributes that every actuator inherits from its default classes: most and fewest numbers, and their default.
+_INHERITED: Final[Mapping[str, tuple[int, int, tuple[float, ...]]]] = {
+    "gear": (6, 1, (1.0,)),
+    "armature": (1, 1, (0.0,)),
+    "damping": (3, 1, (0.0,)),
+    "group": (1, 1, (0.0,)),
+    "forcerange": (2, 2, ()),
+    "ctrlrange": (2, 2, ()),
+}
 
 
 @dataclass(frozen=True)
@@ -46,67 +54,51 @@ class _Actuator:
 
     tag: str = "general"
     parent: _Actuator | None = None
-    gear: float = 1.0
-    armature: float = 0.0
-    damping: tuple[float, ...] = (0.0,)
     gain: float = 1.0
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gaintype: str = "fixed"
     biastype: str = "none"
-    group: float = 0.0
-    forcerange: tuple[float, ...] = ()
     forcelimited: str = "auto"
-    ctrlrange: tuple[float, ...] = ()
+    numbers: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: {n: x[2] for n, x in _INHERITED.items()})
 
     def with_element(self, element: Element, item: str, read: Reader) -> _Actuator:
         """Return these settings, changed by an element's attributes."""
-        own = element.attributes
+        own, tag = element.attributes, element.tag
 
         def number(name: str, default: float) -> float:
             return read.number(element, name, item, default)
 
         base = self
-        heirs = ("pid",) if element.tag == "pid" else (element.tag, "general")
-        while element.tag != "general" and base.tag not in heirs:
-            base = base.parent or _Actuator(tag=element.tag)
-        out = replace(
-            self,
-            tag=element.tag,
-            gain=base.gain,
-            bias=base.bias,
-            gaintype=base.gaintype,
-            biastype=base.biastype,
-            gear=read.numbers(element, "gear", item, count=6, least=1, default=(self.gear,))[0],
-            armature=number("armature", self.armature),
-            damping=read.numbers(element, "damping", item, count=3, least=1, default=self.damping),
-            group=number("group", self.group),
-            forcerange=read.numbers(element, "forcerange", item, count=2, default=self.forcerange),
-            forcelimited=own.get("forcelimited", self.forcelimited),
-            ctrlrange=read.numbers(element, "ctrlrange", item, count=2, default=self.ctrlrange),
-        )
-        gain, (b0, b1, b2) = out.gain, out.bias
-        if element.tag == "general":
+        while tag != "general" and base.tag not in (("pid",) if tag == "pid" else (tag, "general")):
+            base = base.parent or _Actuator(tag=tag)
+        gain, (b0, b1, b2), gaintype, biastype = base.gain, base.bias, base.gaintype, base.biastype
+        if tag == "general":
             gain = read.numbers(element, "gainprm", item, count=10, least=1, default=(gain,))[0]
-            bias = read.numbers(element, "biasprm", item, count=10, least=1, default=out.bias)[:3]
-            b0, b1, b2 = (*bias, *out.bias[len(bias) :])
-            gaintype, biastype = own.get("gaintype", out.gaintype), own.get("biastype", out.biastype)
-            return replace(out, gain=gain, bias=(b0, b1, b2), gaintype=gaintype, biastype=biastype)
-        if element.tag in ("position", "intvelocity", "pid"):
+            bias = read.numbers(element, "biasprm", item, count=10, least=1, default=base.bias)[:3]
+            b0, b1, b2 = (*bias, *base.bias[len(bias) :])
+            gaintype, biastype = own.get("gaintype", gaintype), own.get("biastype", biastype)
+        elif tag in ("position", "intvelocity", "pid"):
             gain = number("kp", gain)
             # MuJoCo keeps a damping ratio as a positive b2.
-            b2 = number("dampratio", -number("kv", -b2))
-            gaintype = "pid" if element.tag == "pid" else "fixed"
-            return replace(out, gain=gain, bias=(0.0, -gain, b2), gaintype=gaintype, biastype="affine")
-        if element.tag == "velocity":
+            b0, b1, b2 = 0.0, -gain, number("dampratio", -number("kv", -b2))
+            gaintype, biastype = "pid" if tag == "pid" else "fixed", "affine"
+        elif tag == "velocity":
             gain = number("kv", gain)
-            return replace(out, gain=gain, bias=(0.0, 0.0, -gain), gaintype="fixed", biastype="affine")
-        if element.tag == "cylinder":
-            bias = read.numbers(element, "bias", item, count=3, default=out.bias)
-            return replace(out, gain=number("area", gain), bias=(bias[0], bias[1], bias[2]), biastype="affine")
-        if element.tag in ("motor", "damper", "adhesion"):
-            gaintype = "affine" if element.tag == "damper" else "fixed"
-            return replace(out, gain=number("gain", 1.0), bias=(0.0, 0.0, 0.0), gaintype=gaintype, biastype="none")
-        return replace(out, gaintype=element.tag, biastype=element.tag)
+            b0, b1, b2, gaintype, biastype = 0.0, 0.0, -gain, "fixed", "affine"
+        elif tag == "cylinder":
+            b0, b1, b2 = read.numbers(element, "bias", item, count=3, default=base.bias)
+            gain, biastype = number("area", gain), "affine"
+        elif tag in ("motor", "damper", "adhesion"):
+            gain, b0, b1, b2 = number("gain", 1.0), 0.0, 0.0, 0.0
+            gaintype, biastype = "affine" if tag == "damper" else "fixed", "none"
+        else:
+            gaintype = biastype = tag
+        numbers = {
+            name: read.numbers(element, name, item, count=most, least=least, default=self.numbers[name])
+            for name, (most, least, _) in _INHERITED.items()
+        }
+        forcelimited = own.get("forcelimited", self.forcelimited)
+        return _Actuator(tag, self.parent, gain, (b0, b1, b2), gaintype, biastype, forcelimited, numbers)
 
 
 @dataclass
@@ -115,7 +107,7 @@ class _Acting:
 
     item: str  # its name, or its number and its line
     name: str  # of the coupling
-    factors: dict[str, float]  # joint -> dl/dq; empty where l is no sum of coordinates
+    factors: dict[str, float] = field(default_factory=dict)  # joint -> dl/dq; empty where l is no sum of coordinates
     stiffness: float = 0.0
     rest_length: float = 0.0
     damping: float = 0.0
@@ -162,24 +154,31 @@ class Transmissions:
     """Reads the tendons, actuators and equality constraints of a file; its option flags switch `disabled` off."""
 
     def __init__(self, mujoco: Element, scene: Scene, disabled: set[str]) -> None:
-        self._scene, self._read = scene, scene.read
+        self._scene, self._read, self._disabled = scene, scene.read, disabled
         self._joints: dict[str, MjcfJoint] = {j.name: j for body in scene.bodies for j in body.joints}
         self._names: set[str] = set()
-        self._springs, self._dampers = "spring" not in disabled, "damper" not in disabled
-        self._actuation = "actuation" not in disabled
-        self._groups = _disabled_groups(mujoco, scene.read)
+        self._groups: set[float] = set()
+        for option in mujoco.all("option"):
+            self._groups |= {
+                *self._read.numbers(option, "actuatorgroupdisable", "the file", count=31, least=0, default=())
+            }
         self._classes = {"main": _Actuator()}
         for element in mujoco.all("default"):
             self._collect(element, "main")
-        self._sites = {site: (body.name, X.p - body.anchor) for body in scene.bodies for site, X in body.sites}
-        self._sites |= _ground_sites(mujoco, scene)
-        tendons = [e for section in mujoco.all("tendon") for e in section.children]
-        actuators = [e for section in mujoco.all("actuator") for e in section.children]
-        self._tendons = [self._tendon(e, k) for k, e in enumerate(tendons)]
-        self._factors = {e.attributes.get("name", ""): t.factors for e, t in zip(tendons, self._tendons, strict=True)}
-        self._actuators = [self._actuator(e, k) for k, e in enumerate(actuators)]
-        equalities = (e for section in mujoco.all("equality") for e in section.children)
-        self._equalities = [f"{_label(e, k)} ({_connected(e)})" for k, e in enumerate(equalities)]
+        self._sites = {site: ("world", X.p) for site, X in scene.sites}
+        self._sites |= {site: (body.name, X.p - body.anchor) for body in scene.bodies for site, X in body.sites}
+
+        def inside(section: str) -> list[tuple[Element, str]]:
+            elements = (e for s in mujoco.all(section) for e in s.children)
+            return [(e, _label(e, k)) for k, e in enumerate(elements, 1)]
+
+        tendons = inside("tendon")
+        self._tendons = [self._tendon(e, label, k) for k, (e, label) in enumerate(tendons, 1)]
+        self._factors = {
+            e.attributes.get("name", ""): t.factors for (e, _), t in zip(tendons, self._tendons, strict=True)
+        }
+        self._actuators = [self._actuator(e, label, k) for k, (e, label) in enumerate(inside("actuator"), 1)]
+        self._equalities = [f"{label} ({_connected(e)})" for e, label in inside("equality")]
 
     def _collect(self, element: Element, name: str) -> None:
         """Read the actuator defaults of a class and of the classes in it."""
@@ -191,66 +190,51 @@ class Transmissions:
             self._classes[inner] = replace(self._classes[name], parent=self._classes[name])
             self._collect(child, inner)
 
-    def _name(self, element: Element, kind: str, number: int) -> str:
-        name = element.attributes.get("name") or f"{kind}{number + 1}"
-        while name in self._names:
-            name += "_"
+    def _acting(self, element: Element, label: str, kind: str, number: int) -> _Acting:
+        name = unused(element.attributes.get("name") or f"{kind}{number}", self._names)
         self._names.add(name)
-        return name
+        return _Acting(label, name)
 
     # Tendons
 
-    def _tendon(self, element: Element, number: int) -> _Acting:
-        read = self._read
+    def _tendon(self, element: Element, label: str, number: int) -> _Acting:
+        read, item = self._read, f"tendon {label}"
         full = replace(self._scene.defaults.filled(replace(element, tag="tendon"), None), tag=element.tag)
-        item = f"tendon {_label(element, number)}"
-        out = _Acting(_label(element, number), self._name(element, "tendon", number), {})
-        for joint in element.all("joint") if element.tag == "fixed" else []:
-            name = joint.attributes.get("joint", "")
-            if self._scalar(name, item, joint):
-                out.factors[name] = out.factors.get(name, 0.0) + read.number(joint, "coef", item)
-        out.factors = {joint: factor for joint, factor in out.factors.items() if factor}
-        if element.tag == "spatial":
-            out.ends = self._ends(element)
+        out = self._acting(element, label, "tendon", number)
+        factors: dict[str, float] = {}
+        for part in element.all("joint") if element.tag == "fixed" else []:
+            name = part.attributes.get("joint", "")
+            joint = self._joints.get(name)
+            if joint is not None and joint.scalar:
+                factors[name] = factors.get(name, 0.0) + read.number(part, "coef", item)
+                continue
+            what = "is not in the file" if joint is None else f"is a {joint.kind} joint"
+            read.fault(f"{item}: expected the name of a hinge or slide, joint {name!r} {what}", part)
+        out.factors = {joint: factor for joint, factor in factors.items() if factor}
+        if [e.tag for e in element.children] == ["site", "site"]:
+            sites = (self._sites.get(e.attributes.get("site", "")) for e in element.children)
+            ends = tuple(x for x in sites if x is not None)
+            out.ends = ends if len({body for body, _ in ends}) == 2 else ()
         for name in ("stiffness", "damping"):
             first, *higher = read.numbers(full, name, item, count=3, least=1, default=(0.0,))
-            setattr(out, name, first)
+            setattr(out, name, 0.0 if any(higher) else first)
             if any(higher):
-                setattr(out, name, 0.0)
                 out.left_out.append(f"{name} that depends on the length or its rate")
         out.armature = read.number(full, "armature", item, 0.0)
         first, *second = read.numbers(full, "springlength", item, count=2, least=1, default=(-1.0,))
         out.rest_length = first
-        if first == -1.0 and all(x == -1.0 for x in second):
+        if first == -1.0 and all(x == -1.0 for x in second) and not out.ends:
+            # The distance of two points in the pose of the file is not computed.
             out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
-            # The distance in the pose of the file is not computed.
-            out.rest_length = -1.0 if out.ends else out.rest_length
         elif out.stiffness and second and second[0] != first:
             out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {second[0]:g}")
             out.stiffness = 0.0
-        out.stiffness *= self._springs
-        out.damping *= self._dampers
+        out.stiffness *= "spring" not in self._disabled
+        out.damping *= "damper" not in self._disabled
         out.linear()
         own = full.attributes
         out.left_out += [f"{n} {own[n]}" for n, on in _TENDON_LIMITS.items() if n in own and own.get(on) != "false"]
         return out
-
-    def _ends(self, element: Element) -> tuple[tuple[str, Array], ...]:
-        """Return the two points that a tendon goes straight between, if it does."""
-        if [e.tag for e in element.children] != ["site", "site"]:
-            return ()
-        sites = [self._sites.get(e.attributes.get("site", "")) for e in element.children]
-        ends = tuple(x for x in sites if x is not None)
-        return ends if len({body for body, _ in ends}) == 2 else ()
-
-    def _scalar(self, name: str, item: str, element: Element) -> bool:
-        """Return whether a joint has one coordinate; a fault if it has not, or is not there."""
-        joint = self._joints.get(name)
-        if joint is None or joint.kind not in ("hinge", "slide"):
-            what = f"joint {name!r} is not in the file" if joint is None else f"joint {name!r} is a {joint.kind} joint"
-            self._read.fault(f"{item}: expected the name of a hinge or slide, {what}", element)
-            return False
-        return True
 
     def _spring_reference(self, name: str) -> float:
         joint = self._joints[name]
@@ -259,25 +243,24 @@ class Transmissions:
 
     # Actuators
 
-    def _actuator(self, element: Element, number: int) -> _Acting:
-        item = f"actuator {_label(element, number)}"
+    def _actuator(self, element: Element, label: str, number: int) -> _Acting:
+        item = f"actuator {label}"
         class_ = self._scene.defaults.known(element.attributes.get("class"), element) or "main"
         settings = self._classes.get(class_, _Actuator()).with_element(element, item, self._read)
-        out = _Acting(_label(element, number), self._name(element, "actuator", number), {})
-        out.armature = settings.armature
-        lengths = {joint: settings.gear * c for joint, c in self._driven(element, item).items()}
-        out.factors = {joint: factor for joint, factor in lengths.items() if factor}
-        damping, *higher = settings.damping
-        out.damping = damping * self._dampers
+        out = self._acting(element, label, "actuator", number)
+        (out.armature,), (group,) = settings.numbers["armature"], settings.numbers["group"]
+        gear, (damping, *higher) = settings.numbers["gear"][0], settings.numbers["damping"]
+        out.factors = {joint: gear * c for joint, c in self._driven(element, item).items() if gear * c}
         if any(higher):
             out.left_out.append("damping that depends on the rate")
-            out.damping = 0.0
+        elif "damper" not in self._disabled:
+            out.damping = damping
         gain = f"gain {settings.gain:g}" if settings.gaintype == "fixed" else f"{settings.gaintype} gain"
-        limits = f", range {settings.ctrlrange[0]:g} {settings.ctrlrange[1]:g}" if settings.ctrlrange else ""
+        limits = "".join(f" {x:g}" for x in settings.numbers["ctrlrange"])
         at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
-        out.control = f"{out.item} ({element.tag}, {gain}{limits}) on {at}"
-        if self._actuation and settings.group not in self._groups:
-            self._bias(settings, out)
+        out.control = f"{label} ({element.tag}, {gain}{f', range{limits}' if limits else ''}) on {at}"
+        if "actuation" not in self._disabled and group not in self._groups:
+            _add_bias(settings, out)
         out.linear()
         return out
 
@@ -289,32 +272,10 @@ class Transmissions:
             joint = self._joints.get(name)
             if joint is None:
                 self._read.fault(f"{item}: joint {name!r} is not in the file", element)
-            return {name: 1.0} if joint is not None and joint.kind in ("hinge", "slide") else {}
+            return {name: 1.0} if joint is not None and joint.scalar else {}
         if tendon is not None and tendon not in self._factors:
             self._read.fault(f"{item}: tendon {tendon!r} is not in the file", element)
         return self._factors.get(tendon, {}) if tendon is not None else {}
-
-    def _bias(self, settings: _Actuator, out: _Acting) -> None:
-        """Add the force at zero control and activation."""
-        if settings.biastype == "none":
-            return
-        if settings.biastype != "affine":
-            out.left_out.append(f"the force of a {settings.biastype}")
-            return
-        b0, b1, b2 = settings.bias
-        rest = -b0 / b1 if b1 else 0.0
-        if abs(rest) <= LARGEST:
-            out.stiffness, out.rest_length = -b1, rest
-        if b0 and (b1 >= 0 or abs(rest) > LARGEST):
-            out.left_out.append(f"the constant force {b0:g}")
-        if b2 > 0 and settings.gain == -b1 and settings.gaintype in ("fixed", "pid"):
-            out.dampratio = b2
-        elif b2 <= 0:
-            out.damping -= b2
-        else:
-            out.left_out.append(f"the force {b2:g} times the rate")
-        if settings.forcerange and settings.forcelimited != "false" and any((b0, b1, b2)):
-            out.left_out.append(f"force range {' '.join(f'{x:g}' for x in settings.forcerange)}")
 
     # Their effect on the model
 
@@ -341,7 +302,7 @@ class Transmissions:
         """Return the inertia that a coupling's length moves in the pose of the file; 0 where M is singular for it."""
         q = model.neutral()
         for name, joint in self._joints.items():
-            if joint.kind in ("hinge", "slide"):
+            if joint.scalar:
                 q[model.layout.q[name]] = joint.ref
         row = model.layout.coupling_row(coupling) @ model.layout.G
         M = sample_mass_matrix(model, q)
@@ -393,24 +354,28 @@ def coupled(model: Model, couplings: Iterable[JointCoupling]) -> Model:
     return replace(model, joints=tuple(joints.values()), couplings=tuple(kept.values()))
 
 
-def _ground_sites(mujoco: Element, scene: Scene) -> dict[str, tuple[str, Array]]:
-    """Return the sites of the world itself."""
-    out: dict[str, tuple[str, Array]] = {}
-    for world in mujoco.all("worldbody"):
-        for element, X, class_ in unfolded(world, HERE, None, scene, "the world"):
-            site = scene.defaults.filled(element, class_) if element.tag == "site" else element
-            if element.tag == "site" and "fromto" not in site.attributes:
-                place = X @ pose(site, scene.compiler, scene.read, "site in the world")
-                out[element.attributes.get("name", "")] = ("world", place.p)
-    return out
-
-
-def _disabled_groups(mujoco: Element, read: Reader) -> set[float]:
-    out: set[float] = set()
-    for option in mujoco.all("option"):
-        if "actuatorgroupdisable" in option.attributes:
-            out |= set(read.numbers(option, "actuatorgroupdisable", "the file", count=31, least=0))
-    return out
+def _add_bias(settings: _Actuator, out: _Acting) -> None:
+    """Add an actuator's force at zero control and activation."""
+    if settings.biastype == "none":
+        return
+    if settings.biastype != "affine":
+        out.left_out.append(f"the force of a {settings.biastype}")
+        return
+    b0, b1, b2 = settings.bias
+    rest = -b0 / b1 if b1 else 0.0
+    if abs(rest) <= LARGEST:
+        out.stiffness, out.rest_length = -b1, rest
+    if b0 and (b1 >= 0 or abs(rest) > LARGEST):
+        out.left_out.append(f"the constant force {b0:g}")
+    if b2 > 0 and settings.gain == -b1 and settings.gaintype in ("fixed", "pid"):
+        out.dampratio = b2
+    elif b2 <= 0:
+        out.damping -= b2
+    else:
+        out.left_out.append(f"the force {b2:g} times the rate")
+    limits = settings.numbers["forcerange"]
+    if limits and settings.forcelimited != "false" and any((b0, b1, b2)):
+        out.left_out.append(f"force range {' '.join(f'{x:g}' for x in limits)}")
 
 
 def _connected(element: Element) -> str:
@@ -421,4 +386,4 @@ def _connected(element: Element) -> str:
 
 def _label(element: Element, number: int) -> str:
     name = element.attributes.get("name", "")
-    return repr(name) if name else f"number {number + 1} ({element.tag}, {element.place})"
+    return repr(name) if name else f"number {number} ({element.tag}, {element.place})"

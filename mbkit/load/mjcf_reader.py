@@ -1,22 +1,28 @@
-"""The tree of an MJCF: bodies, joints and sites, with defaults and frames resolved."""
+"""The tree of an MJCF: bodies with their inertias, joints and sites, with defaults and frames resolved.
+
+Inertia by MuJoCo's rules: geoms with a group in ``inertiagrouprange`` and more than 1e-14 kg decide where
+``inertiafromgeom`` is "true", or "auto" without an <inertial>; else the <inertial> does. Then ``boundmass`` and
+``boundinertia`` raise smaller numbers, and ``balanceinertia`` replaces an impossible inertia by a sphere's.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.load.mjcf_attributes import HERE, Compiler, Defaults, Pose, has_length, pose
-from mbkit.load.mjcf_mass import body_lump, counts
-from mbkit.load.shapes import NOTHING, Lump
-from mbkit.load.xml_reader import Element, Reader
+from mbkit.load.mjcf_attributes import HERE, ORIENTATIONS, Compiler, Defaults, Pose, has_length, pose, z_to
+from mbkit.load.shapes import NOTHING, SIZES, Lump, solid, together
+from mbkit.load.xml_reader import Element, Reader, unused
 
 KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
 _NAMED: Final = {"body": "body", "joint": "joint", "freejoint": "joint", "site": "site"}
+# MuJoCo 4.0.0 counts geoms above this mass, in kg.
+_LEAST_MASS: Final = 1e-14
 
 
 @dataclass
@@ -29,6 +35,11 @@ class MjcfJoint:
     anchor: Array
     axis: Array
     ref: float  # its coordinate in the pose of the file, rad or m
+
+    @property
+    def scalar(self) -> bool:
+        """Whether it has one coordinate."""
+        return self.kind in ("hinge", "slide")
 
 
 @dataclass
@@ -64,6 +75,8 @@ class Scene:
     inferred: dict[str, list[tuple[Element, str]]] = field(default_factory=dict)
     #: Settings of the compiler that changed a mass or inertia, and the bodies.
     bounded: dict[str, list[str]] = field(default_factory=dict)
+    #: Sites of the world.
+    sites: list[tuple[str, Pose]] = field(default_factory=list)
     #: Parts of the motion that a `Model` does not hold.
     left_out: Counter[str] = field(default_factory=Counter)
 
@@ -88,8 +101,7 @@ class Scene:
 
     def unused(self, kind: str, name: str) -> str:
         """Reserve and return this name, or a longer one that is free."""
-        while name in self.names[kind]:
-            name += "_"
+        name = unused(name, self.names[kind])
         self.names[kind].add(name)
         return name
 
@@ -108,8 +120,30 @@ def unfolded(
         yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, item), inner, scene, item)
 
 
-def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: Scene) -> None:
-    """Read a body and everything below it into the scene."""
+def read_tree(mujoco: Element, scene: Scene) -> None:
+    """Read every body, and the sites of the world, into the scene."""
+    for world in mujoco.all("worldbody"):
+        scene.collect_names(world)
+    for world in mujoco.all("worldbody"):
+        _read_children(list(unfolded(world, HERE, None, scene, "the world")), "world", "the world", scene.sites, scene)
+
+
+def _read_children(
+    parts: list[tuple[Element, Pose, str | None]], owner: str, item: str, sites: list[tuple[str, Pose]], scene: Scene
+) -> None:
+    for element, X, childclass in parts:
+        name = element.attributes.get("name")
+        if element.tag == "site" and name:
+            site = scene.defaults.filled(element, childclass)
+            if "fromto" not in site.attributes:
+                sites.append((name, X @ pose(site, scene.compiler, scene.read, f"site in {item}")))
+        elif element.tag == "body":
+            _read_body(element, owner, X, childclass, scene)
+        elif element.tag == "plugin" and owner != "world":
+            scene.left_out["plugin"] += 1
+
+
+def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, scene: Scene) -> None:
     name = scene.name(element, "body", f"body{len(scene.bodies) + 1}")
     item = f"body {name!r}"
     read, compiler = scene.read, scene.compiler
@@ -121,26 +155,22 @@ def walk(element: Element, parent: str, X: Pose, childclass: str | None, scene: 
         scene.left_out["motion capture"] += 1
     parts = list(unfolded(element, HERE, childclass, scene, item))
     joints = [_joint(e, name, Y, c, scene) for e, Y, c in parts if e.tag in ("joint", "freejoint")]
-    _check_joints(joints, parent, item, read)
+    if any(j.kind == "free" for j in joints):
+        if len(joints) > 1:
+            read.fault(f"{item}: a free joint and others; a free body has no other joint")
+        if parent != "world":
+            read.fault(f"{item}: a free joint below {parent!r}; only bodies of the world may be free")
     inertials = [(e, Y) for e, Y, _ in parts if e.tag == "inertial"]
     geoms = [(e, scene.defaults.filled(e, c), Y) for e, Y, c in parts if e.tag == "geom"]
     geoms = [(e, full, Y) for e, full, Y in geoms if counts(full, compiler, read, item)]
-    lump, changed = body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, item)
+    lump, changed = _body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, item)
     if lump is None:
         scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
     for setting in changed:
         scene.bounded.setdefault(setting, []).append(name)
     body = MjcfBody(name, parent, X @ own, joints, lump or NOTHING, [])
     scene.bodies.append(body)
-    for e, Y, c in parts:
-        if e.tag == "site":
-            site = scene.defaults.filled(e, c)
-            if e.attributes.get("name") and "fromto" not in site.attributes:
-                body.sites.append((e.attributes["name"], Y @ pose(site, compiler, read, f"site in {item}")))
-        elif e.tag == "body":
-            walk(e, name, Y, c, scene)
-        elif e.tag == "plugin":
-            scene.left_out["plugin"] += 1
+    _read_children(parts, name, item, body.sites, scene)
 
 
 def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: Scene) -> MjcfJoint:
@@ -152,25 +182,143 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
     type_ = "free" if free else full.attributes.get("type", "hinge")
     if type_ not in KINDS:
         read.fault(f"{item}: type {type_[:40]!r}; expected one of {', '.join(KINDS)}", element)
-        type_ = "hinge"
     if free and element.attributes.get("align") == "true":
         read.fault(f"{item}: align moves the body's frame; set it to false", element)
-    anchor, axis, ref = np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0
-    if type_ != "free":
-        anchor = X.p + X.R @ np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0)))
-    if type_ in ("hinge", "slide"):
+    joint = MjcfJoint(name, full, type_ if type_ in KINDS else "hinge", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
+    if joint.kind != "free":
+        joint.anchor = X.p + X.R @ np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0)))
+    if joint.scalar:
         axis = np.array(read.numbers(full, "axis", item, count=3, default=(0, 0, 1)))
         if not has_length(axis):
             read.fault(f"{item}: axis is zero; expected a direction, such as 0 0 1", element)
-            axis = np.array([0.0, 0.0, 1.0])
-        axis = X.R @ axis
-        ref = read.number(full, "ref", item, 0.0) * (scene.compiler.angle if type_ == "hinge" else 1.0)
-    return MjcfJoint(name, full, type_, anchor, axis, ref)
+            axis = joint.axis
+        joint.axis = X.R @ axis
+        joint.ref = read.number(full, "ref", item, 0.0) * (scene.compiler.angle if joint.kind == "hinge" else 1.0)
+    return joint
 
 
-def _check_joints(joints: list[MjcfJoint], parent: str, item: str, read: Reader) -> None:
-    kinds = [j.kind for j in joints]
-    if "free" in kinds and len(kinds) > 1:
-        read.fault(f"{item}: a free joint and others; a free body has no other joint")
-    if "free" in kinds and parent != "world":
-        read.fault(f"{item}: a free joint below {parent!r}; only bodies of the world may be free")
+# Mass and inertia
+
+
+def _body_lump(
+    inertials: list[tuple[Element, Pose]],
+    geoms: list[tuple[Element, Pose]],
+    place: Array,
+    compiler: Compiler,
+    read: Reader,
+    item: str,
+) -> tuple[Lump | None, list[str]]:
+    """Return a body's inertia in its own axes, and the settings that changed it; None where it is a mesh's or shell's.
+
+    Elements have their defaults and the pose of their <frame>; geoms are those for which `counts` is true. `place`
+    is the body's written position.
+    """
+    if len(inertials) > 1:
+        read.fault(f"{item}: {len(inertials)} <inertial> elements; keep one", inertials[1][0])
+    infer = compiler.inertiafromgeom
+    if infer or (infer is None and not inertials):
+        lumps = [_geom(e, X, compiler, read, item) for e, X in geoms]
+        if any(x is None for x in lumps):
+            return None, []
+        heavy = [x for x in lumps if x and x.mass > _LEAST_MASS]
+        if heavy:
+            # A flat body's A + B and C differ by rounding.
+            return _bounded(together(heavy), compiler, slack=1e-14)
+    if not inertials:
+        lump, changed = _bounded(NOTHING, compiler)
+        # MuJoCo takes that place for the centre of mass in the body.
+        return replace(lump, com=place) if changed else lump, changed
+    principal, X = _written(*inertials[0], compiler, read, item)
+    lump, changed = _bounded(principal, compiler, slack=1e-14 if "fullinertia" in inertials[0][0].attributes else 0.0)
+    return lump.moved(X.R, X.p), changed
+
+
+def _bounded(lump: Lump, compiler: Compiler, slack: float = 0.0) -> tuple[Lump, list[str]]:
+    """Return a lump after the compiler's bounds, and the settings that changed it; moments have a relative `slack`."""
+    mass, inertia, changed = lump.mass, lump.inertia, list[str]()
+    if mass < compiler.boundmass > 0:
+        mass = compiler.boundmass
+        changed.append("boundmass")
+    moments, axes = np.linalg.eigh(inertia)
+    if moments[0] < compiler.boundinertia > 0:
+        moments = np.maximum(moments, compiler.boundinertia)
+        inertia = axes @ np.diag(moments) @ axes.T
+        changed.append("boundinertia")
+    if compiler.balanceinertia and moments[0] + moments[1] < moments[2] * (1 - slack):
+        inertia = float(np.mean(moments)) * np.eye(3)
+        changed.append("balanceinertia")
+    return (Lump(mass, lump.com, inertia) if changed else lump), changed
+
+
+def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> tuple[Lump, Pose]:
+    """Return an <inertial> about its own centre, and its pose in the body."""
+    mass = read.number(element, "mass", item)
+    if mass < 0:
+        read.fault(f"{item}: mass {mass:g} kg is negative; expected 0 or more", element)
+    if "pos" not in element.attributes:
+        read.fault(f"{item}: <inertial> has no pos; write the centre of mass", element)
+    placed = X @ pose(element, compiler, read, item)
+    if "fullinertia" in element.attributes:
+        if "diaginertia" in element.attributes or ORIENTATIONS.keys() & element.attributes.keys():
+            read.fault(f"{item}: <inertial> has fullinertia and diaginertia or an orientation; keep one", element)
+        xx, yy, zz, xy, xz, yz = read.numbers(element, "fullinertia", item, count=6)
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    else:
+        inertia = np.diag(read.numbers(element, "diaginertia", item, count=3, default=(0, 0, 0)))
+    return Lump(mass, np.zeros(3), inertia), placed
+
+
+def counts(geom: Element, compiler: Compiler, read: Reader, item: str) -> bool:
+    """Return whether a geom, with its defaults filled in, may give its body mass."""
+    first, last = compiler.groups
+    # A number that cannot be read is a fault where it is used.
+    amount = Reader().number(geom, "mass" if "mass" in geom.attributes else "density", item, 1000.0)
+    inside = first <= read.number(geom, "group", item, 0.0) <= last
+    return inside and amount != 0 and geom.attributes.get("type", "sphere") not in ("plane", "hfield")
+
+
+def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> Lump | None:
+    """Return what a geom adds to its body; None for a mesh or a shell."""
+    own = element.attributes
+    amount = read.number(element, "mass" if "mass" in own else "density", item, 1000.0)
+    if amount < 0:
+        read.fault(f"{item}: a geom's mass or density is negative; expected 0 or more", element)
+        return NOTHING
+    shape = own.get("type", "sphere")
+    if shape in ("mesh", "sdf") or "mesh" in own or own.get("shellinertia", "false") != "false":
+        return None
+    if shape not in SIZES:
+        read.fault(f"{item}: geom type {shape[:40]!r}; expected one of {', '.join((*SIZES, 'mesh'))}", element)
+        return NOTHING
+    before = len(read.faults)
+    size, own_pose = _sized(element, shape, compiler, read, item)
+    if len(read.faults) > before:
+        return NOTHING
+    lump, placed = solid(shape, size), X @ own_pose
+    return lump.scaled(amount / lump.mass if "mass" in own else amount).moved(placed.R, placed.p)
+
+
+def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, item: str) -> tuple[tuple[float, ...], Pose]:
+    """Return the sizes of a geom and its pose; two end points may stand for length and pose."""
+    needed = SIZES[shape]
+    if "fromto" not in element.attributes:
+        size = read.numbers(element, "size", item, count=3, least=needed)[:needed]
+        placed = pose(element, compiler, read, item)
+    else:
+        ends = np.array(read.numbers(element, "fromto", item, count=6))
+        size = read.numbers(element, "size", item, count=3, least=1)
+        if shape == "sphere":
+            read.fault(f"{item}: a sphere has no fromto; use pos", element)
+        if "pos" in element.attributes:
+            read.fault(f"{item}: a geom has pos and fromto; keep one", element)
+        along = ends[3:] - ends[:3]
+        if not has_length(along):
+            read.fault(f"{item}: a geom's fromto has no length", element)
+            return size, Pose(np.eye(3), ends[:3])
+        half = float(np.linalg.norm(along)) / 2
+        size = (size[0], half) if needed == 2 else (size[0], size[0], half)
+        placed = Pose(z_to(along), (ends[:3] + ends[3:]) / 2)
+    if min(size) <= 0:
+        listing = " ".join(f"{x:g}" for x in size)
+        read.fault(f"{item}: a {shape} of size {listing}; expected sizes above 0", element)
+    return size, placed

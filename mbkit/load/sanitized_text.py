@@ -11,14 +11,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Final
-from xml.sax.saxutils import escape, quoteattr
+from xml.sax.saxutils import escape
 
 from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
-from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name
-from mbkit.load.mjcf_mass import counts
+from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name, read_mesh
+from mbkit.load.mjcf_reader import counts
 from mbkit.load.urdf_links import floated, with_base
-from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, expanded
+from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, expanded
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
 #: Elements that name other files, or mean nothing without one that does.
@@ -76,17 +76,9 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
     meshes = _Meshes(root, path) if format_ == "mjcf" else None
     writer = _Writer(format_, meshes)
     writer.write(root)
-    return Stripped(
-        path=path,
-        format=format_,
-        root=root,
-        text="".join(writer.parts) + "\n",
-        gone=tuple(sorted(writer.gone.items())),
-        renamed=renamed,
-        shapeless=tuple(dict.fromkeys(writer.shapeless)),
-        meshes=meshes.files if meshes else {},
-        unread=tuple(dict.fromkeys(meshes.unread)) if meshes else (),
-    )
+    text, gone = "".join(writer.parts) + "\n", tuple(sorted(writer.gone.items()))
+    files, unread = (meshes.files, tuple(dict.fromkeys(meshes.unread))) if meshes else ({}, ())
+    return Stripped(path, format_, root, text, gone, renamed, tuple(dict.fromkeys(writer.shapeless)), files, unread)
 
 
 class _Meshes:
@@ -100,31 +92,19 @@ class _Meshes:
         self.files: dict[str, bytes] = {}
         self.unread: list[str] = []
         #: Asset's name -> file's name in `files`, empty where its vertices stand in the MJCF; None: not readable.
-        self._passed: dict[str, str | None] = {}
+        self.passed: dict[str, str | None] = {}
         #: Geoms that need a file and are removed, by identity; and whether their body loses mass by that.
-        self._lost: dict[int, bool] = {}
+        self.lost: dict[int, bool] = {}
         for world in mujoco.all("worldbody"):
             self._body(world, None)
 
-    def lost(self, geom: Element) -> bool:
-        """Return whether a geom is removed."""
-        return id(geom) in self._lost
-
-    def heavy(self, geom: Element) -> bool:
-        """Return whether a removed geom would have given its body mass."""
-        return self._lost.get(id(geom), False)
-
-    def written(self, asset: Element) -> dict[str, str] | None:
+    def attributes(self, asset: Element) -> dict[str, str] | None:
         """Return the attributes of a mesh that is passed on, else None."""
         name = mesh_name(asset)
-        file = self._passed.get(name)
+        file = self.passed.get(name)
         if file is None or self._assets.get(name) is not asset:
             return None
         return {**asset.attributes, "name": name, "file": file} if file else asset.attributes
-
-    def has(self, name: str) -> bool:
-        """Return whether a mesh of this name is passed on."""
-        return self._passed.get(name) is not None
 
     def _body(self, owner: Element, childclass: str | None) -> None:
         childclass = owner.attributes.get("childclass", childclass)
@@ -138,7 +118,7 @@ class _Meshes:
                 # Faults are the parsers' to report.
                 needed = bool(owner.tag == "body" and inferred and counts(full, self._compiler, Reader(), ""))
                 if not (needed and self._read(full.attributes.get("mesh", ""))):
-                    self._lost[id(geom)] = needed
+                    self.lost[id(geom)] = needed
         for body, within in parts:
             if body.tag == "body":
                 self._body(body, within)
@@ -146,27 +126,18 @@ class _Meshes:
     def _read(self, name: str) -> bool:
         """Read a mesh for the parsers; return whether they can have it."""
         asset = self._assets.get(name)
-        if name not in self._passed:
+        if name not in self.passed:
             # The parsers report a mesh that is not declared.
-            self._passed[name] = self._content(asset) if asset and "file" in asset.attributes else ""
-        return self._passed[name] is not None
+            self.passed[name] = self._content(asset) if asset and "file" in asset.attributes else ""
+        return self.passed[name] is not None
 
     def _content(self, asset: Element) -> str | None:
         """Read a mesh into `files` and return its name there, or None and a sentence in `unread`."""
         relative = self._compiler.mesh_path(asset.attributes["file"])
-        path = self._folder / relative
-        content, why = b"", ""
-        try:
-            if relative.is_absolute() or PureWindowsPath(str(relative)).drive:
-                why = "an absolute path is not followed"
-            elif not path.is_file():
-                why = f"no such file in {path.parent}"
-            elif sum(map(len, self.files.values())) + path.stat().st_size > MOST_BYTES:
-                why = f"up to {MOST_BYTES} bytes of meshes are read"
-            else:
-                content = path.read_bytes()
-        except (OSError, ValueError) as error:
-            why = f"cannot be read ({error})"
+        if relative.is_absolute() or PureWindowsPath(str(relative)).drive:
+            content, why = b"", "an absolute path is not followed"
+        else:
+            content, why = read_mesh(self._folder / relative, MOST_BYTES - sum(map(len, self.files.values())))
         if why:
             file = asset.attributes["file"].replace("\\", "/")
             self.unread.append(f"mesh {file[:200]!r} ({asset.place}): {why}")
@@ -208,12 +179,12 @@ class _Writer:
         if below > 0:
             self.parts.append("\n" * below)
             self._line += below
-        listing = "".join(f" {k}={quoteattr(v)}" for k, v in self._attributes(element).items())
+        head = element_text(element.tag, self._attributes(element))
         inside = escape(" ".join(element.text.split()))
         if not inside and not kept:
-            self.parts.append(f"<{element.tag}{listing}/>")
+            self.parts.append(head)
             return
-        self.parts.append(f"<{element.tag}{listing}>{inside}")
+        self.parts.append(f"{head.removesuffix('/>')}>{inside}")
         for child in kept:
             self.write(child)
         self.parts.append(f"</{element.tag}>")
@@ -221,7 +192,7 @@ class _Writer:
     def _shapeless(self, element: Element, kept: list[Element]) -> bool:
         """Return whether a body has lost shapes from which MuJoCo would have taken its inertia."""
         if self._meshes is not None:
-            return element.tag == "body" and any(self._meshes.heavy(e) for e in element.all("geom"))
+            return element.tag == "body" and any(self._meshes.lost.get(id(e)) for e in element.all("geom"))
         lost = any(e.tag in ("collision", "visual") and e not in kept for e in element.children)
         return element.tag == "link" and element.first("inertial") is None and lost
 
@@ -233,8 +204,8 @@ class _Writer:
         if element.tag == "compiler":
             left_out |= {"meshdir", "assetdir", "texturedir"}
         elif element.tag == "mesh":
-            own = self._meshes.written(element) or own
-        elif element.tag == "geom" and not self._meshes.has(own.get("mesh", "")):
+            own = self._meshes.attributes(element) or own
+        elif element.tag == "geom" and self._meshes.passed.get(own.get("mesh", "")) is None:
             left_out |= {"mesh", "hfield"}
         return {k: v for k, v in own.items() if k not in left_out}
 
@@ -250,8 +221,8 @@ class _Writer:
             if element.tag == "asset":
                 return all(self._must_go(e, element) for e in element.children)
             if owner.tag == "asset":
-                return element.tag != "mesh" or self._meshes.written(element) is None
-            return element.tag == "geom" and self._meshes.lost(element)
+                return element.tag != "mesh" or self._meshes.attributes(element) is None
+            return element.tag == "geom" and id(element) in self._meshes.lost
         if element.tag == "transmission":
             # Drake 1.51 ends the process over one without a type.
             type_ = element.first("type")

@@ -11,13 +11,12 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import ModelError, Suggestions
-from mbkit.load.xml_reader import Element, Reader, misspelt
+from mbkit.load.xml_reader import Element, Reader, element_text, misspelt
 from mbkit.model import Body, Mimic
 from mbkit.model.validation import body_fault, listed, repeated_names
 
@@ -119,7 +118,7 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
         raise ModelError(source, read.faults)
     return UrdfFile(
         name,
-        _written("robot", {"name": name}, texts),
+        element_text("robot", {"name": name}, texts),
         root,
         tuple(link for link, _ in links),
         tuple(followed),
@@ -218,13 +217,10 @@ def _why_lost(leader: str, by_name: Mapping[str, UrdfJoint], suggestions: Sugges
 # not read ' 1.5 ', and drops the link's inertia).
 
 
-def _written(tag: str, attributes: Mapping[str, str], inside: str = "") -> str:
-    head = tag + "".join(f" {k}={quoteattr(v)}" for k, v in attributes.items())
-    return f"<{head}>{inside}</{tag}>" if inside else f"<{head}/>"
-
-
 def _copied(element: Element, *names: str) -> str:
-    return _written(element.tag, {n: " ".join(element.attributes[n].split()) for n in names if n in element.attributes})
+    return element_text(
+        element.tag, {n: " ".join(element.attributes[n].split()) for n in names if n in element.attributes}
+    )
 
 
 def _origin(owner: Element, item: str, read: Reader) -> tuple[_Numbers, _Numbers, str]:
@@ -241,7 +237,7 @@ def _link(link: Element, read: Reader, odd: dict[str, str]) -> tuple[UrdfLink, s
     item = f"link {name!r}"
     inertial = read.only(link, "inertial", item)
     if inertial is None:
-        return UrdfLink(name), _written("link", {"name": name})
+        return UrdfLink(name), element_text("link", {"name": name})
     before = len(read.faults)
     com, rpy, text = _origin(inertial, item, read)
     mass, moments = (read.only(inertial, tag, item) for tag in ("mass", "inertia"))
@@ -258,8 +254,8 @@ def _link(link: Element, read: Reader, odd: dict[str, str]) -> tuple[UrdfLink, s
     if len(read.faults) == before:
         why = body_fault(Body(name, kg, np.zeros(3), inertia), point_masses=False)
         odd |= {name: why} if why else {}
-    text = _written("inertial", {}, text + _copied(mass, "value") + _copied(moments, *_MOMENTS))
-    return UrdfLink(name, kg, com, rpy, inertia), _written("link", {"name": name}, text)
+    text = element_text("inertial", {}, text + _copied(mass, "value") + _copied(moments, *_MOMENTS))
+    return UrdfLink(name, kg, com, rpy, inertia), element_text("link", {"name": name}, text)
 
 
 def _joint(joint: Element, read: Reader) -> tuple[UrdfJoint, str]:
@@ -271,7 +267,7 @@ def _joint(joint: Element, read: Reader) -> tuple[UrdfJoint, str]:
         read.fault(f"{item}: type {type_!r}; expected one of {', '.join(_KINDS)}", joint)
     xyz, rpy, text = _origin(joint, item, read)
     ends = {tag: _end(joint, tag, item, read) for tag in ("parent", "child")}
-    text += "".join(_written(tag, {"link": link}) for tag, link in ends.items())
+    text += "".join(element_text(tag, {"link": link}) for tag, link in ends.items())
     numbers: dict[str, Any] = {}
     for part in (_axis, _limit, _dynamics):
         values, inside = part(joint, kind, item, read)
@@ -282,7 +278,7 @@ def _joint(joint: Element, read: Reader) -> tuple[UrdfJoint, str]:
     if follows is not None:
         ratio, offset = (read.number(follows, n, item, x) for n, x in (("multiplier", 1.0), ("offset", 0.0)))
         mimic = Mimic(read.name(follows, "joint", item), ratio, offset)
-    text = _written("joint", {"name": name, "type": type_}, text)
+    text = element_text("joint", {"name": name, "type": type_}, text)
     return UrdfJoint(name, kind, ends["parent"], ends["child"], xyz, rpy, mimic, numbers), text
 
 

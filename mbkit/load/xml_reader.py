@@ -9,11 +9,12 @@ import difflib
 import itertools
 import math
 import re
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Final, NoReturn
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 from mbkit.errors import LoadError
 
@@ -207,6 +208,12 @@ def _unexpected(content: bytes, at: int) -> str:
     elif not line:
         hint = "; expected <"
     return f"unexpected {character!r}{after}{hint}"
+
+
+def element_text(tag: str, attributes: Mapping[str, str], inside: str = "") -> str:
+    """Return an element as XML."""
+    head = tag + "".join(f" {k}={quoteattr(v)}" for k, v in attributes.items())
+    return f"<{head}>{inside}</{tag}>" if inside else f"<{head}/>"
 
 
 # Numbers and names in attributes
