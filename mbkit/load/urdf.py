@@ -63,6 +63,7 @@ class Snapper:
 
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
 _ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous", "H": "helical"}
+_LIMITS: Final = ("velocity_limit", "effort_limit", "lower", "upper")
 _UNALIGNED: Final = {
     "RevoluteUnaligned": "revolute",
     "RevoluteUnboundedUnaligned": "continuous",
@@ -89,6 +90,17 @@ def joint_kind(joint: Any) -> tuple[str, Array | None]:
     data = joint.createData()
     motion = np.ravel(data.S)
     return kind, motion[:3] if kind == "prismatic" else motion[3:]
+
+
+def joint_numbers(raw: Any, joint: Any) -> dict[str, Any]:
+    """Return the constants and limits of one of Pinocchio's joints, as `ModelBuilder.add_joint` takes them."""
+    q, v = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
+    out = {"armature": raw.armature[v], "damping": raw.damping[v], "friction": raw.upperDryFrictionLimit[v]}
+    if joint.nv == 1:
+        out |= {"velocity_limit": raw.upperVelocityLimit[v], "effort_limit": raw.upperEffortLimit[v]}
+        if joint.nq == 1:
+            out |= {"lower": raw.lowerPositionLimit[q], "upper": raw.upperPositionLimit[q]}
+    return {name: np.array(unbounded(x) if name in _LIMITS else x) for name, x in out.items()}
 
 
 def model_of(
@@ -197,14 +209,6 @@ class _Conversion:
         body = self._body_name(own.child if own else self.urdf.root)
         self._add_body(body, raw.inertias[index])
         self.bodies.append(body)
-        v = slice(joint.idx_v, joint.idx_v + joint.nv)
-        limits: dict[str, Any] = {}
-        if kind in ("revolute", "prismatic"):
-            limits["lower"] = unbounded(raw.lowerPositionLimit[joint.idx_q])
-            limits["upper"] = unbounded(raw.upperPositionLimit[joint.idx_q])
-        if joint.nv == 1:
-            limits["velocity_limit"] = unbounded(raw.upperVelocityLimit[joint.idx_v])
-            limits["effort_limit"] = unbounded(raw.upperEffortLimit[joint.idx_v])
         self.b.add_joint(
             name,
             kind,
@@ -214,11 +218,8 @@ class _Conversion:
             translation=X.translation,
             rotation=self.snap(X.rotation),
             axis=None if axis is None else self.snap(axis),
-            armature=raw.armature[v],
-            damping=raw.damping[v],
-            friction=raw.upperDryFrictionLimit[v],
             mimic=own.mimic if own and self.mimic == "reduce" else None,
-            **limits,
+            **joint_numbers(raw, joint),
         )
 
     def _add_frames(self) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.errors import ModelError, Suggestions
@@ -317,7 +318,7 @@ def _limit(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[str
             read.fault(f"{item}: a {kind} joint needs {needed}{remedy}", joint)
         return {}, ""
     lower, upper = (read.number(limit, a, item, 0.0, bounded=False) for a in ("lower", "upper"))
-    numbers = {}
+    numbers: dict[str, Any] = {}
     for name in ("effort", "velocity"):
         value = read.number(limit, name, item, None if bounded else 0.0, bounded=False)
         if value < 0:
@@ -351,9 +352,9 @@ def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[
     return numbers, _copied(dynamics, *numbers)
 
 
-def unbounded(limit: float) -> float:
-    """Return a limit, infinite where it is a parser's largest double."""
-    return limit if abs(limit) < 1e300 else math.copysign(math.inf, limit)
+def unbounded(limit: ArrayLike) -> Array:
+    """Return limits, infinite where the largest double of a parser stands for none."""
+    return np.where(np.abs(limit) < 1e300, limit, np.copysign(np.inf, limit))
 
 
 # Unknown names

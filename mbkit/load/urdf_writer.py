@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from textwrap import indent
 from typing import Any, Final
 
 import numpy as np
@@ -11,16 +12,10 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
 from mbkit.errors import UnsupportedError
+from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Joint, Model
 
-_TYPES: Final = {
-    "fixed": "fixed",
-    "revolute": "revolute",
-    "continuous": "continuous",
-    "prismatic": "prismatic",
-    "planar": "planar",
-    "free": "floating",
-}
+_TYPES: Final = {k: k for k in ("fixed", "revolute", "continuous", "prismatic", "planar")} | {"free": "floating"}
 # Stands for no limit: the largest number that every reader reads.
 _OPEN: Final = 1e308
 
@@ -30,34 +25,25 @@ def urdf_text(model: Model, comment: str) -> str:
     faults = list(_unsupported(model))
     if faults:
         raise UnsupportedError(f"URDF cannot say of {model.name}: {'; '.join(faults)}")
-    lines = [
-        f"<robot name={xml_attribute(model.name)}>",
-        f"  <!-- {xml_comment(comment)} -->",
-        '  <link name="world"/>',
-    ]
-    for body in model.bodies:
-        lines += _link(body)
-    for joint in model.joints:
-        lines += _joint(joint)
-    links = {b.name for b in model.bodies} | {"world"}
     joints = {j.name for j in model.joints}
+    parts = [_element("link", {"name": "world"}), *map(_link, model.bodies), *map(_joint, model.joints)]
     for frame in model.frames:
         # Here a body's own frame cannot be another one.
-        if frame.name in links:
+        if frame.name == "world" or any(frame.name == b.name for b in model.bodies):
             continue
-        name = f"{frame.name}_fixed"
-        while name in joints:
-            name += "_"
+        name = unused(f"{frame.name}_fixed", joints)
         joints.add(name)
-        lines += [
-            f"  <link name={xml_attribute(frame.name)}/>",
-            f'  <joint name={xml_attribute(name)} type="fixed">',
-            f"    {_origin(frame.rotation, frame.translation)}",
-            f"    <parent link={xml_attribute(frame.body)}/>",
-            f"    <child link={xml_attribute(frame.name)}/>",
-            "  </joint>",
-        ]
-    return "\n".join([*lines, "</robot>"]) + "\n"
+        ends = _ends(frame.rotation, frame.translation, frame.body, frame.name)
+        parts += [_element("link", {"name": frame.name}), _element("joint", {"name": name, "type": "fixed"}, *ends)]
+    return _element("robot", {"name": model.name}, f"<!-- {xml_comment(comment)} -->", *parts) + "\n"
+
+
+def _element(tag: str, attributes: Mapping[str, Any], *inside: str) -> str:
+    """Return an element, with what is inside on lines of its own; values are texts or numbers."""
+    texts = {k: v if isinstance(v, str) else _numbers(v) for k, v in attributes.items()}
+    head = tag + "".join(f" {k}={xml_attribute(v)}" for k, v in texts.items())
+    lines = "".join(indent(text, "  ") + "\n" for text in inside)
+    return f"<{head}>\n{lines}</{tag}>" if inside else f"<{head}/>"
 
 
 def _unsupported(model: Model) -> Iterator[str]:
@@ -80,57 +66,39 @@ def _unsupported(model: Model) -> Iterator[str]:
     yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
 
 
-def _numbers(*values: Any) -> str:
+def _numbers(values: Any) -> str:
     return " ".join(repr(float(x) + 0.0) for x in np.ravel(values))
 
 
-def _origin(R: Array, p: Array) -> str:
-    rpy = spatial.rpy_from_matrix(R)
-    return f'<origin xyz="{_numbers(p)}" rpy="{_numbers(rpy)}"/>'
+def _ends(R: Array, p: Array, parent: str, child: str) -> list[str]:
+    origin = _element("origin", {"xyz": p, "rpy": spatial.rpy_from_matrix(R)})
+    return [origin, _element("parent", {"link": parent}), _element("child", {"link": child})]
 
 
-def _link(body: Body) -> list[str]:
-    head = f"  <link name={xml_attribute(body.name)}"
+def _link(body: Body) -> str:
     if not body.mass and not body.inertia.any():
-        return [f"{head}/>"]
+        return _element("link", {"name": body.name})
     moments = {f"i{'xyz'[i]}{'xyz'[j]}": body.inertia[i, j] for i in range(3) for j in range(i, 3)}
-    listing = " ".join(f'{k}="{_numbers(x)}"' for k, x in moments.items())
-    return [
-        f"{head}>",
-        "    <inertial>",
-        f'      <origin xyz="{_numbers(body.com)}"/>',
-        f'      <mass value="{_numbers(body.mass)}"/>',
-        f"      <inertia {listing}/>",
-        "    </inertial>",
-        "  </link>",
-    ]
+    parts = _element("origin", {"xyz": body.com}), _element("mass", {"value": body.mass}), _element("inertia", moments)
+    return _element("link", {"name": body.name}, _element("inertial", {}, *parts))
 
 
-def _joint(joint: Joint) -> list[str]:
+def _joint(joint: Joint) -> str:
     bounded = joint.kind == "prismatic" or (joint.kind == "revolute" and np.isfinite([joint.lower, joint.upper]).any())
     type_ = _TYPES[joint.kind] if joint.kind != "revolute" or bounded else "continuous"
-    out = [
-        f'  <joint name={xml_attribute(joint.name)} type="{type_}">',
-        f"    {_origin(joint.rotation, joint.translation)}",
-        f"    <parent link={xml_attribute(joint.parent)}/>",
-        f"    <child link={xml_attribute(joint.child)}/>",
-    ]
+    out = _ends(joint.rotation, joint.translation, joint.parent, joint.child)
     if joint.kind == "planar":
-        out.append('    <axis xyz="0 0 1"/>')
+        out.append(_element("axis", {"xyz": "0 0 1"}))
     if joint.type.nv == 1:
-        out.append(f'    <axis xyz="{_numbers(joint.axes[0])}"/>')
-        limits = {"effort": joint.effort_limit[0], "velocity": joint.velocity_limit[0]}
+        out.append(_element("axis", {"xyz": joint.axes[0]}))
+        limits = {"effort": joint.effort_limit, "velocity": joint.velocity_limit}
         if bounded:
-            limits = {"lower": joint.lower[0], "upper": joint.upper[0]} | limits
+            limits = {"lower": joint.lower, "upper": joint.upper} | limits
         if bounded or np.isfinite(list(limits.values())).any():
-            listing = " ".join(f'{k}="{_numbers(np.clip(x, -_OPEN, _OPEN))}"' for k, x in limits.items())
-            out.append(f"    <limit {listing}/>")
-        dynamics = {k: float(getattr(joint, k)[0]) for k in ("damping", "friction") if getattr(joint, k).any()}
-        if dynamics:
-            listing = " ".join(f'{k}="{_numbers(x)}"' for k, x in dynamics.items())
-            out.append(f"    <dynamics {listing}/>")
+            out.append(_element("limit", {k: np.clip(x, -_OPEN, _OPEN) for k, x in limits.items()}))
+        dynamics = {k: x for k, x in (("damping", joint.damping), ("friction", joint.friction)) if x.any()}
+        out += [_element("dynamics", dynamics)] if dynamics else []
     if joint.mimic is not None:
         m = joint.mimic
-        listing = f'multiplier="{_numbers(m.ratio)}" offset="{_numbers(m.offset)}"'
-        out.append(f"    <mimic joint={xml_attribute(m.joint)} {listing}/>")
-    return [*out, "  </joint>"]
+        out.append(_element("mimic", {"joint": m.joint, "multiplier": m.ratio, "offset": m.offset}))
+    return _element("joint", {"name": joint.name, "type": type_}, *out)

@@ -43,8 +43,7 @@ def digest(*parts: Any) -> str:
 class Needs:
     """One flag per feature; True where the description has it.
 
-    Friction, limits (of coordinates, and of efforts and velocities) and loops are kept
-    as data and named here; the smooth terms of every engine leave friction and limits out.
+    Friction, limits and loops are data; the smooth terms of every engine leave friction and limits out.
     """
 
     gravity: bool
@@ -74,8 +73,7 @@ class Needs:
 
         `bound` names the attributes with parameters: a zero may have another value when it is evaluated.
         """
-        joints, bound = tuple(joints), frozenset(bound)
-        couplings = tuple(couplings)
+        joints, couplings, bound = tuple(joints), tuple(couplings), frozenset(bound)
         between = *joints, *springs, *couplings
 
         def present(name: str, parts: Iterable[Any]) -> bool:
@@ -100,9 +98,8 @@ class Needs:
         return asdict(self)
 
     def __str__(self) -> str:
-        present = [k for k, on in self.as_dict().items() if on]
-        absent = [k for k, on in self.as_dict().items() if not on]
-        return f"has {', '.join(present) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
+        there, absent = (", ".join(k for k, x in self.as_dict().items() if x is on) for on in (True, False))
+        return f"has {there or 'nothing'}; without {absent or 'nothing'}"
 
 
 @dataclass(frozen=True)
@@ -147,13 +144,9 @@ class Layout:
     @cached_property
     def sizes(self) -> tuple[int, int, int, int]:
         """(nq, nv, full nq, full nv)."""
-        free = [j for j in self.joints if not j.mimic]
-        return (
-            sum(j.type.nq for j in free),
-            sum(j.type.nv for j in free),
-            sum(j.type.nq for j in self.joints),
-            sum(j.type.nv for j in self.joints),
-        )
+        free = [j.type for j in self.joints if not j.mimic]
+        every = [j.type for j in self.joints]
+        return sum(t.nq for t in free), sum(t.nv for t in free), sum(t.nq for t in every), sum(t.nv for t in every)
 
     @cached_property
     def reduced(self) -> bool:
@@ -183,10 +176,10 @@ class Layout:
     def _matrix(self, rows: dict[str, slice], columns: dict[str, slice], n: int, k: int) -> Array:
         G = np.zeros((n, k))
         for j in self.joints:
+            part = rows[j.name]
             if j.mimic:
-                G[rows[j.name], columns[j.mimic.joint]] = j.mimic.ratio
+                G[part, columns[j.mimic.joint]] = j.mimic.ratio
             else:
-                part = rows[j.name]
                 G[part, columns[j.name]] = np.eye(part.stop - part.start)
         G.setflags(write=False)
         return G
@@ -296,13 +289,7 @@ class Description:
 
     @property
     def mass(self) -> float:
-        """Total mass, kg.
-
-        Raises
-        ------
-        InputError
-            It depends on a parameter without a value.
-        """
+        """Total mass, kg; `InputError` where it depends on a parameter without a value."""
         if any(np.isnan(b.mass) for b in self.bodies):
             self.require_values("mass")
         return float(sum(b.mass for b in self.bodies))
@@ -316,11 +303,9 @@ class Description:
         """Raise `InputError` that names the parameters without a value, if there are any."""
         missing = [name for name, value in self.parameters.items() if value is None]
         if missing:
-            listing = ", ".join(repr(n) for n in missing)
-            raise InputError(
-                f"{what}: {self.name}: no value for parameter {listing}; "
-                f"give it with model.with_parameters({', '.join(f'{n}=...' for n in missing)})"
-            )
+            give = f"give it with model.with_parameters({', '.join(f'{n}=...' for n in missing)})"
+            names = ", ".join(map(repr, missing))
+            raise InputError(f"{what}: {self.name}: no value for parameter {names}; {give}")
 
     @cached_property
     def needs(self) -> Needs:
@@ -331,19 +316,10 @@ class Description:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over every name, number and parameter of the description (not the notes)."""
-        return digest(
-            self.name,
-            self.gravity,
-            self.bodies,
-            self.joints,
-            self.frames,
-            self.springs,
-            self.loops,
-            self.prescribed,
-            *self.couplings,
-            *self.bindings,
-            *(KINDS[kind].digest for kind in sorted({j.kind for j in self.joints}) if not KINDS[kind].built_in),
-        )
+        names = ("name", "gravity", "bodies", "joints", "frames", "springs", "loops", "prescribed")
+        parts = [getattr(self, name) for name in names]
+        types = [KINDS[kind] for kind in sorted({j.kind for j in self.joints})]
+        return digest(*parts, *self.couplings, *self.bindings, *(t.digest for t in types if not t.built_in))
 
     @cached_property
     def form_digest(self) -> str:
@@ -408,11 +384,7 @@ class Description:
         return _by_name("joint", self.joints, name)
 
     def frame(self, name: str) -> Frame:
-        """Return the frame of this name.
-
-        A body's own frame has the body's name, and the ground's is ``"world"``. A
-        declared frame of a body's name goes before it.
-        """
+        """Return the frame of this name: a declared one, else a body's own, or ``"world"``, the ground's."""
         expect_name("frame", name)
         for frame in self.frames:
             if frame.name == name:

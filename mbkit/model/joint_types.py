@@ -23,7 +23,12 @@ from mbkit.errors import InputError, UnsupportedError
 
 Scalars = Sequence[Any]
 Rows = list[list[Any]]
+#: R_JC and p_JC_J.
+Placement = tuple[Rows, list[Any]]
+#: Linear and angular velocity.
+Twist = tuple[list[Any], list[Any]]
 _IDENTITY: Final[Rows] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+_ZERO: Final = [0.0, 0.0, 0.0]
 
 
 def cross3(a: Scalars, b: Scalars) -> list[Any]:
@@ -48,12 +53,8 @@ def _matmul(A: Rows, B: Rows) -> Rows:
     return [[sum(A[i][k] * B[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
 
 
-def _times(R: Rows, x: Scalars) -> list[Any]:
-    return [sum(R[i][k] * x[k] for k in range(3)) for i in range(3)]
-
-
-def _times_transposed(R: Rows, x: Scalars) -> list[Any]:
-    return [sum(R[k][i] * x[k] for k in range(3)) for i in range(3)]
+def _times(R: Rows, x: Scalars, transposed: bool = False) -> list[Any]:
+    return [sum((R[k][i] if transposed else R[i][k]) * x[k] for k in range(3)) for i in range(3)]
 
 
 def _from_quaternion(q: Scalars) -> Rows:
@@ -162,23 +163,16 @@ class JointType:
         for seed in range(3):
             joint, q, v = _sample(self, seed)
             R, p = self.placement(_REAL, joint, q)
-            values = [
-                *R,
-                p,
-                *self.twist(_REAL, joint, q, v),
-                self.qdot(q, v),
-                self.pullback(q, q),
-                self.hamel(v, v[::-1]),
-            ]
-            for x in values:
+            rates = self.qdot(q, v), self.pullback(q, q), self.hamel(v, v[::-1])
+            for x in (*R, p, *self.twist(_REAL, joint, q, v), *rates):
                 total.update(np.array(x, dtype=np.float64).tobytes())
         return total.hexdigest()
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         """Return R_JC and p_JC_J."""
         raise NotImplementedError
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
         """Return the linear and angular velocity of C's origin relative to J, in C's axes."""
         raise NotImplementedError
 
@@ -229,21 +223,21 @@ JointKind = JointType
 class _Fixed(JointType):
     name, nq, nv, suffixes, velocity_suffixes = "fixed", 0, 0, (), ()
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
-        return _IDENTITY, [0.0, 0.0, 0.0]
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
+        return _IDENTITY, _ZERO
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        return [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
+        return _ZERO, _ZERO
 
 
 class _Revolute(JointType):
     name, nq, nv, n_axes, angular, axial = "revolute", 1, 1, 1, (0,), True
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
-        return _about(m, joint.axes[0], q[0]), [0.0, 0.0, 0.0]
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
+        return _about(m, joint.axes[0], q[0]), _ZERO
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        return [0.0, 0.0, 0.0], [a * v[0] for a in joint.axes[0]]
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
+        return _ZERO, [a * v[0] for a in joint.axes[0]]
 
 
 class _Continuous(_Revolute):
@@ -253,11 +247,11 @@ class _Continuous(_Revolute):
 class _Prismatic(JointType):
     name, nq, nv, n_axes, lengths, axial = "prismatic", 1, 1, 1, (0,), True
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _IDENTITY, [a * q[0] for a in joint.axes[0]]
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        return [a * v[0] for a in joint.axes[0]], [0.0, 0.0, 0.0]
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
+        return [a * v[0] for a in joint.axes[0]], _ZERO
 
 
 class _Helical(_Revolute):
@@ -265,10 +259,10 @@ class _Helical(_Revolute):
     # components in J and in C.
     name, pitched, screws = "helical", True, (0,)
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _about(m, joint.axes[0], q[0]), [joint.pitch * a * q[0] for a in joint.axes[0]]
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
         return [joint.pitch * a * v[0] for a in joint.axes[0]], [a * v[0] for a in joint.axes[0]]
 
 
@@ -276,50 +270,46 @@ class _Universal(JointType):
     name, nq, nv, n_axes, angular = "universal", 2, 2, 2, (0, 1)
     suffixes = velocity_suffixes = ("1", "2")
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
-        return _matmul(_about(m, joint.axes[0], q[0]), _about(m, joint.axes[1], q[1])), [0.0, 0.0, 0.0]
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
+        return _matmul(_about(m, joint.axes[0], q[0]), _about(m, joint.axes[1], q[1])), _ZERO
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        first = _times_transposed(_about(m, joint.axes[1], q[1]), joint.axes[0])
-        return [0.0, 0.0, 0.0], [first[i] * v[0] + joint.axes[1][i] * v[1] for i in range(3)]
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
+        first = _times(_about(m, joint.axes[1], q[1]), joint.axes[0], transposed=True)
+        return _ZERO, [first[i] * v[0] + joint.axes[1][i] * v[1] for i in range(3)]
 
 
 class _SphericalZYX(JointType):
     name, nq, nv, angular, gimbal = "spherical_zyx", 3, 3, (0, 1, 2), 1
     suffixes = velocity_suffixes = ("z", "y", "x")
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         zy = _matmul(_about(m, (0, 0, 1), q[0]), _about(m, (0, 1, 0), q[1]))
-        return _matmul(zy, _about(m, (1, 0, 0), q[2])), [0.0, 0.0, 0.0]
+        return _matmul(zy, _about(m, (1, 0, 0), q[2])), _ZERO
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
         s1, c1, s2, c2 = m.sin(q[1]), m.cos(q[1]), m.sin(q[2]), m.cos(q[2])
-        return [0.0, 0.0, 0.0], [
-            v[2] - s1 * v[0],
-            c1 * s2 * v[0] + c2 * v[1],
-            c1 * c2 * v[0] - s2 * v[1],
-        ]
+        return _ZERO, [v[2] - s1 * v[0], c1 * s2 * v[0] + c2 * v[1], c1 * c2 * v[0] - s2 * v[1]]
 
 
 class _Ball(JointType):
     name, nq, nv, quaternion = "ball", 4, 3, 0
     suffixes, velocity_suffixes = ("qx", "qy", "qz", "qw"), ("wx", "wy", "wz")
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
-        return _from_quaternion(q), [0.0, 0.0, 0.0]
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
+        return _from_quaternion(q), _ZERO
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
-        return [0.0, 0.0, 0.0], list(v)
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
+        return _ZERO, list(v)
 
 
 class _Planar(JointType):
     name, nq, nv, lengths, angular = "planar", 3, 3, (0, 1), (2,)
     suffixes = velocity_suffixes = ("x", "y", "theta")
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _about(m, (0, 0, 1), q[2]), [q[0], q[1], 0.0]
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
         c, s = m.cos(q[2]), m.sin(q[2])
         return [c * v[0] + s * v[1], c * v[1] - s * v[0], 0.0], [0.0, 0.0, v[2]]
 
@@ -329,17 +319,17 @@ class _Free(JointType):
     suffixes = ("x", "y", "z", "qx", "qy", "qz", "qw")
     velocity_suffixes = ("vx", "vy", "vz", "wx", "wy", "wz")
 
-    def placement(self, m: Any, joint: Any, q: Scalars) -> tuple[Rows, list[Any]]:
+    def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _from_quaternion(q[3:]), list(q[:3])
 
-    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> tuple[list[Any], list[Any]]:
+    def twist(self, m: Any, joint: Any, q: Scalars, v: Scalars) -> Twist:
         return list(v[:3]), list(v[3:])
 
     def qdot(self, q: Scalars, v: Scalars) -> list[Any]:
         return _times(_from_quaternion(q[3:]), v[:3]) + _quaternion_rate(q[3:], v[3:])
 
     def pullback(self, q: Scalars, g: Scalars) -> list[Any]:
-        return _times_transposed(_from_quaternion(q[3:]), g[:3]) + _quaternion_pullback(q[3:], g[3:])
+        return _times(_from_quaternion(q[3:]), g[:3], transposed=True) + _quaternion_pullback(q[3:], g[3:])
 
     def hamel(self, v: Scalars, p: Scalars) -> list[Any]:
         # Kirchhoff's equations (Lamb 1932, art. 124): the coadjoint action on (p, l).
@@ -367,34 +357,19 @@ FREE: Final = _Free()
 KINDS: Final[dict[str, JointType]] = {
     joint_type.name: joint_type
     for joint_type in (
-        FIXED,
-        _Revolute(),
-        _Continuous(),
-        PRISMATIC,
-        _Helical(),
-        _Universal(),
-        _SphericalZYX(),
-        _Ball(),
-        _Planar(),
-        FREE,
+        *(FIXED, _Revolute(), _Continuous(), PRISMATIC, _Helical()),
+        *(_Universal(), _SphericalZYX(), _Ball(), _Planar(), FREE),
     )
 }
 
 
 def kind_of(name: str) -> JointType:
-    """Return the joint type of this name.
-
-    Raises
-    ------
-    UnsupportedError
-        No such type is registered in this process.
-    """
+    """Return the joint type of this name; `UnsupportedError` where none is registered in this process."""
     try:
         return KINDS[name]
     except KeyError:
-        raise UnsupportedError(
-            f"joint type {name!r} is not registered in this process; call mbkit.model.register_joint_type first"
-        ) from None
+        call = "call mbkit.model.register_joint_type first"
+        raise UnsupportedError(f"joint type {name!r} is not registered in this process; {call}") from None
 
 
 # Joint types of one's own
@@ -407,21 +382,11 @@ _ROUNDING: Final = 1e-11
 
 
 def register_joint_type(joint_type: JointType) -> JointType:
-    """Make a joint type known, so that `ModelBuilder.add_joint` and the description's readers take its name.
+    """Make an instance of a subclass of `JointType` known by its name, and return it.
 
-    The lagrangian engine, the oracle, `mbkit.lagrangian.from_model` (where v = q̇), simulation and studies take it;
-    other engines and file formats refuse it by name. A process that unpickles a model with such joints imports the
-    class, so the class has to stand in an importable module.
-
-    Parameters
-    ----------
-    joint_type : JointType
-        An instance of a subclass. Its class is not to change after registration.
-
-    Returns
-    -------
-    JointType
-        The same.
+    `ModelBuilder.add_joint`, the lagrangian engine, the oracle, `mbkit.lagrangian.from_model` (where v = q̇), simulation
+    and studies take it; other engines and file formats refuse it by name. A process that unpickles a model with such
+    joints imports the class, so the class has to stand in an importable module. It is not to change afterwards.
 
     Raises
     ------
@@ -451,12 +416,10 @@ def register_joint_type(joint_type: JointType) -> JointType:
     faults = list(_attribute_faults(joint_type)) or list(_formula_faults(joint_type))
     if faults:
         raise InputError(f"joint type {getattr(joint_type, 'name', '')!r}: {'; '.join(faults)}")
-    known = KINDS.get(joint_type.name)
-    if known is not None and (known.built_in or known.digest != joint_type.digest):
-        raise InputError(
-            f"joint type {joint_type.name!r}: the name is registered with other formulas; use another name"
-        )
-    return KINDS.setdefault(joint_type.name, joint_type)
+    known = KINDS.setdefault(joint_type.name, joint_type)
+    if known is not joint_type and (known.built_in or known.digest != joint_type.digest):
+        raise InputError(f"joint type {known.name!r}: the name is registered with other formulas; use another name")
+    return known
 
 
 def _attribute_faults(joint_type: JointType) -> Iterator[str]:
@@ -468,18 +431,13 @@ def _attribute_faults(joint_type: JointType) -> Iterator[str]:
     if not isinstance(name, str) or not name.isidentifier():
         yield f"name: expected a word of letters, digits and underscores, got {name!r}"
     sizes = (("nq", nq, 1, 7), ("nv", nv, 1, 6), ("n_axes", joint_type.n_axes, 0, 2))
-    wrong = [
-        f"{n}: expected an integer of {a} to {b}, got {x!r}"
-        for n, x, a, b in sizes
-        if type(x) is not int or not a <= x <= b
-    ]
-    yield from wrong
+    wrong = [x for x in sizes if type(x[1]) is not int or not x[2] <= x[1] <= x[3]]
+    yield from (f"{n}: expected an integer of {a} to {b}, got {x!r}" for n, x, a, b in wrong)
     if wrong:
         return
     if nq != nv + (k is not None) or (k is not None and k != nq - 4):
-        yield (
-            f"nq {nq}, nv {nv}, quaternion {k}: expected nq = nv, or nq = nv + 1 and a quaternion that starts at nq - 4"
-        )
+        expected = "expected nq = nv, or nq = nv + 1 and a quaternion that starts at nq - 4"
+        yield f"nq {nq}, nv {nv}, quaternion {k}: {expected}"
     for n, size in (("suffixes", nq), ("velocity_suffixes", nv)):
         texts = getattr(joint_type, n)
         if not isinstance(texts, tuple) or len(texts) != size or len({x for x in texts if isinstance(x, str)}) != size:
@@ -488,9 +446,8 @@ def _attribute_faults(joint_type: JointType) -> Iterator[str]:
     for n in ("angular", "lengths", "screws"):
         if not isinstance(getattr(joint_type, n), tuple) or not {*getattr(joint_type, n)} <= {*range(plain)}:
             yield f"{n}: expected a tuple of indices below {plain}, got {getattr(joint_type, n)!r}"
-    if {*joint_type.angular} | {*joint_type.lengths} != {*range(plain)} or {*joint_type.angular} & {
-        *joint_type.lengths
-    }:
+    angles, lengths = {*joint_type.angular}, {*joint_type.lengths}
+    if angles | lengths != {*range(plain)} or angles & lengths:
         yield "angular and lengths: expected each coordinate outside a quaternion in one of them"
     if joint_type.gimbal is not None and joint_type.gimbal not in joint_type.angular:
         yield f"gimbal: expected one of the angles {joint_type.angular}, got {joint_type.gimbal!r}"
@@ -540,32 +497,25 @@ def _formula_faults(joint_type: JointType) -> Iterator[str]:
         yield f"a formula fails: {type(error).__name__}: {error}; use + - * / and m.sin and m.cos alone"
         return
     if shapes != ((nq, nv), (3, 3), (3,), (3,), (3,), (nv,), (nv,)):
-        yield (
-            "a formula returns another size: expected qdot, R, p, linear, angular, pullback and hamel of "
-            f"nq = {nq} and nv = {nv}, got shapes {shapes}"
-        )
+        expected = f"expected qdot, R, p, linear, angular, pullback and hamel of nq = {nq} and nv = {nv}"
+        yield f"a formula returns another size: {expected}, got shapes {shapes}"
         return
-    off = np.abs(R.real @ R.real.T - np.eye(3)).max()
-    if not off < _ROUNDING or not np.linalg.det(R.real) > 0:
+    if not np.abs(R.real @ R.real.T - np.eye(3)).max() < _ROUNDING or not np.linalg.det(R.real) > 0:
         yield "placement: R is not a rotation matrix"
     rate, spin = R.real.T @ p.imag / _STEP, R.real.T @ R.imag / _STEP
     turning = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
     if not np.abs([linear - rate, angular - turning]).max() < _ROUNDING:
-        yield (
-            f"twist: expected the rate of the placement, linear {rate.round(6).tolist()} and angular "
-            f"{turning.round(6).tolist()} at q = {np.round(q, 6).tolist()}, got {linear.round(6).tolist()} and "
-            f"{angular.round(6).tolist()}"
-        )
+        x = [np.round(y, 6).tolist() for y in (rate, turning, q, linear, angular)]
+        expected = f"expected the rate of the placement, linear {x[0]} and angular {x[1]} at q = {x[2]}"
+        yield f"twist: {expected}, got {x[3]} and {x[4]}"
     if k is None and not np.array_equal(D, np.eye(nv)):
         yield "qdot: expected v, for a type without a quaternion"
     if not np.abs(pulled - D.T @ g).max() < _ROUNDING * nq:
         yield "pullback: expected D(q)ᵀ g, with D of qdot"
-    expected = np.einsum("ijk,j,k->i", _structure(joint_type, q, D), v, momentum)
-    if not np.abs(hamel - expected).max() < _ROUNDING * nq:
-        yield (
-            f"hamel: expected {expected.round(6).tolist()}, by the brackets of D's columns, "
-            f"got {hamel.round(6).tolist()}"
-        )
+    brackets = np.einsum("ijk,j,k->i", _structure(joint_type, q, D), v, momentum)
+    if not np.abs(hamel - brackets).max() < _ROUNDING * nq:
+        x = [y.round(6).tolist() for y in (brackets, hamel)]
+        yield f"hamel: expected {x[0]}, by the brackets of D's columns, got {x[1]}"
     opaque = {i for i in joint_type.angular if i not in joint_type.screws}
     angles = [_Angle(x) if i in opaque else x for i, x in enumerate(q)]
     try:
@@ -578,15 +528,12 @@ def _formula_faults(joint_type: JointType) -> Iterator[str]:
 def _structure(joint_type: JointType, q: list[float], D: Array) -> Array:
     """Return c of [D_i, D_j] = Σ c_ijk D_k."""
     nv, units = joint_type.nv, np.eye(joint_type.nv).tolist()
-    # slopes[i, j]: the derivative of column j along column i
-    slopes = np.array(
-        [
-            [
-                np.imag(joint_type.qdot([x + 1j * _STEP * r for x, r in zip(q, D[:, i], strict=True)], e)) / _STEP
-                for e in units
-            ]
-            for i in range(nv)
-        ]
-    )
+
+    def slope(direction: Array, unit: list[float]) -> Array:
+        """Return the derivative of a column along a direction."""
+        moved = [x + 1j * _STEP * r for x, r in zip(q, direction, strict=True)]
+        return np.asarray(np.imag(joint_type.qdot(moved, unit)) / _STEP)
+
+    slopes = np.array([[slope(D[:, i], e) for e in units] for i in range(nv)])
     brackets = slopes - slopes.transpose(1, 0, 2)
     return np.asarray((brackets.reshape(nv * nv, -1) @ np.linalg.pinv(D).T).reshape(nv, nv, nv))

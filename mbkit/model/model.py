@@ -18,12 +18,7 @@ from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
 from mbkit.model.validation import check_substituted
 
-_PER_VELOCITY: Final = {
-    "damping": "damping",
-    "springs": "stiffness",
-    "armature": "armature",
-    "friction": "friction",
-}
+_PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
 #: Elements between joints or points, and the numbers that make them act.
 _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
 _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed")
@@ -32,8 +27,7 @@ _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed")
 class Model(Description):
     """A multibody system: a tree of bodies and what acts on it.
 
-    Made by `ModelBuilder.build` or `mbkit.load`; not meant to be called directly,
-    because the builder holds the checks. Its attributes are those of `Description`.
+    `ModelBuilder.build` and `mbkit.load` make and check it. Its attributes are those of `Description`.
     """
 
     # Questions to every model, of bodies or of energies
@@ -82,10 +76,7 @@ class Model(Description):
     # Configurations
 
     def neutral(self) -> Array:
-        """Return the zero configuration with identity quaternions, shape (nq,).
-
-        It may lie outside the limits.
-        """
+        """Return the zero configuration with identity quaternions, shape (nq,); it may lie outside the limits."""
         return manifold.neutral(self)
 
     def random_state(self, rng: np.random.Generator | int, size: int | None = None) -> tuple[Array, Array]:
@@ -101,8 +92,7 @@ class Model(Description):
         Returns
         -------
         q : (nq,) or (size, nq) array
-            Uniform within the limits, clipped to ±π rad; ±1 m where a length has
-            none; uniform rotations.
+            Uniform within the limits, clipped to ±π rad; ±1 m where a length has none; uniform rotations.
         v : (nv,) or (size, nv) array
             Standard normal.
         """
@@ -128,8 +118,7 @@ class Model(Description):
         ----------
         q : (nq,) or (N, nq) array
         dq : (nv,) or (N, nv) array
-            A displacement in the space of v; for a free joint a twist in body
-            axes, whose exponential is SE(3)'s.
+            A displacement in the space of v; for a free joint a twist in body axes, whose exponential is SE(3)'s.
 
         Returns
         -------
@@ -142,8 +131,7 @@ class Model(Description):
     def difference(self, q0: ArrayLike, q1: ArrayLike) -> Array:
         """Return the dq with ``integrate(q0, dq) = q1``, shape (nv,) or (N, nv).
 
-        Rotations take the shorter way round, so an angle of a ball or free joint
-        is at most π.
+        Rotations take the shorter way round: an angle of a ball or free joint is at most π.
         """
         q0, q1 = self.check_q(q0, "q0"), self.check_q(q1, "q1")
         batch_of(q0=q0, q1=q1)
@@ -157,16 +145,14 @@ class Model(Description):
         Parameters
         ----------
         *features : str
-            Any of damping, springs, armature, friction, gravity, limits, loops,
-            prescribed. Springs and damping cover joints, point-to-point
-            elements and couplings alike, armature joints and couplings.
+            Any of damping, springs, armature, friction, gravity, limits, loops, prescribed. Springs and damping are
+            those of joints, point-to-point elements and couplings, armature that of joints and couplings.
         """
+        model = self
         for feature in features:
             expect_name("feature", feature)
             if feature not in _FEATURES:
                 raise UnknownNameError("feature", feature, _FEATURES)
-        model = self
-        for feature in features:
             model = model._without(feature)
         return model
 

@@ -13,60 +13,41 @@ from mbkit._check import real, shown
 from mbkit.errors import InputError
 from mbkit.model.parts import Joint
 
-_OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "neg": operator.neg,
+#: Operation and sign by name.
+_OPERATIONS: Final[dict[str, tuple[Callable[..., Any], str]]] = {
+    "add": (operator.add, "+"),
+    "sub": (operator.sub, "-"),
+    "mul": (operator.mul, "*"),
+    "div": (operator.truediv, "/"),
+    "neg": (operator.neg, "-"),
 }
+_Operator = Callable[["Expression", Any], "Expression"]
+
+
+def _operators(name: str) -> tuple[_Operator, _Operator]:
+    """Return an operator and its reflection."""
+    return lambda self, other: _combined(name, self, other), lambda self, other: _combined(name, other, self)
 
 
 class Expression:
     """A number that depends on named parameters.
 
-    Sums, differences, products, quotients and powers of expressions and numbers
-    are expressions; so a catalog's formulas take them like floats. The exponent
-    of a power is a whole number or one half.
+    Sums, differences, products, quotients and powers of expressions and numbers are expressions; so a catalog's
+    formulas take them like floats. The exponent of a power is a whole number or one half.
     """
 
     def evaluate(self, parameter: Callable[[Parameter], Any], number: Callable[[float], Any]) -> Any:
-        """Return the value with scalars of any kind.
-
-        Parameters
-        ----------
-        parameter, number : callable
-            What stands for a parameter and for a plain number.
-        """
+        """Return the value with scalars of any kind: those that two functions return for a parameter and a number."""
         raise NotImplementedError
 
     def parameters(self) -> Iterator[Parameter]:
         """Iterate over the parameters in the order in which they stand, repeated where they are."""
         raise NotImplementedError
 
-    def __add__(self, other: Any) -> Expression:
-        return _combined("add", self, other)
-
-    def __radd__(self, other: Any) -> Expression:
-        return _combined("add", other, self)
-
-    def __sub__(self, other: Any) -> Expression:
-        return _combined("sub", self, other)
-
-    def __rsub__(self, other: Any) -> Expression:
-        return _combined("sub", other, self)
-
-    def __mul__(self, other: Any) -> Expression:
-        return _combined("mul", self, other)
-
-    def __rmul__(self, other: Any) -> Expression:
-        return _combined("mul", other, self)
-
-    def __truediv__(self, other: Any) -> Expression:
-        return _combined("div", self, other)
-
-    def __rtruediv__(self, other: Any) -> Expression:
-        return _combined("div", other, self)
+    __add__, __radd__ = _operators("add")
+    __sub__, __rsub__ = _operators("sub")
+    __mul__, __rmul__ = _operators("mul")
+    __truediv__, __rtruediv__ = _operators("div")
 
     def __neg__(self) -> Expression:
         return _Operation("neg", (self,))
@@ -90,17 +71,16 @@ Number = float | Expression
 class Parameter(Expression):
     """A named number of a description, such as a mass that a study varies.
 
-    It may stand wherever the builder or the catalog takes a mass, a centre of mass,
-    an inertia, a length, a spring's or damper's constant, armature, a mimic joint's
-    ratio and offset, a number of a prescribed motion, or gravity. Not for orientations, axes and limits.
+    It may stand for a mass, a centre of mass, an inertia, a length, a spring's or damper's constant, armature, a mimic
+    joint's ratio and offset, a number of a prescribed motion, or gravity. Not for orientations, axes and limits.
 
     Parameters
     ----------
     name : str
         One name is one parameter throughout a model.
     value : float, optional
-        Its nominal value. Without one the model can be built, and evaluated once
-        `Dynamics.at` or `Model.with_parameters` gives it.
+        Its nominal value. Without one the model can be built, and evaluated once `Dynamics.at` or
+        `Model.with_parameters` gives it.
 
     Examples
     --------
@@ -143,7 +123,7 @@ class _Operation(Expression):
 
     def evaluate(self, parameter: Callable[[Parameter], Any], number: Callable[[float], Any]) -> Any:
         values = [x.evaluate(parameter, number) if isinstance(x, Expression) else number(x) for x in self.operands]
-        return _OPERATIONS[self.name](*values)
+        return _OPERATIONS[self.name][0](*values)
 
     def parameters(self) -> Iterator[Parameter]:
         for x in self.operands:
@@ -151,11 +131,9 @@ class _Operation(Expression):
                 yield from x.parameters()
 
     def __str__(self) -> str:
-        listing = [str(x) if isinstance(x, Expression) else f"{x:g}" for x in self.operands]
-        if self.name == "neg":
-            return f"(-{listing[0]})"
-        sign = {"add": "+", "sub": "-", "mul": "*", "div": "/"}[self.name]
-        return f"({listing[0]} {sign} {listing[1]})"
+        texts = [str(x) if isinstance(x, Expression) else f"{x:g}" for x in self.operands]
+        sign = _OPERATIONS[self.name][1]
+        return f"({sign}{texts[0]})" if self.name == "neg" else f"({texts[0]} {sign} {texts[1]})"
 
 
 @dataclass(frozen=True)

@@ -84,20 +84,17 @@ class Joint(_Frozen):
     Attributes
     ----------
     kind : str
-        Name of a joint type: fixed, revolute, continuous, prismatic, helical, universal,
-        spherical_zyx, ball, planar, free, or one of `register_joint_type`.
+        Name of a joint type: a key of `KINDS`.
     rotation, translation : (3, 3) and (3,) arrays
         R_PJ and p_PJ_P, the joint's fixed frame in the parent's.
     axes : (k, 3) array
-        Unit axes in the joint's frame; two for a universal joint (the second
-        one turns with the first), none where the kind has its own.
+        Unit axes in the joint's frame; the second of a universal joint turns with the first.
     pitch : float
         Advance of a helical joint, metres per radian.
     lower, upper : (nq,) arrays
         Limits of the coordinates, infinite where there are none.
     velocity_limit, effort_limit, armature, damping, friction, stiffness, rest : (nv,) arrays
-        Per velocity. `stiffness` acts on q - `rest`, `damping` on v; dry
-        `friction` and the limits are data only.
+        Per velocity. `stiffness` acts on q - `rest`, `damping` on v; dry `friction` and the limits are data only.
     mimic : Mimic or None
         The joint that this one follows; its coordinate is then not free.
     """
@@ -157,12 +154,9 @@ class Frame(_Frozen):
 class PointSpring(_Frozen):
     """A spring and viscous damper along the line between two points.
 
-    The pull is stiffness * (l - rest_length) + damping * dl/dt, with l the
-    distance. Points are in body axes; a body may be ``"world"``.
-
-    Where l = 0 the line has no direction. A spring without damping and rest length
-    pulls with zero force there; the force of any other one is not defined, and every
-    engine raises `NumericalError` for the quantities that contain it.
+    The pull is stiffness * (l - rest_length) + damping * dl/dt, with l the distance. Points are in body axes; a body
+    may be ``"world"``. Where l = 0 a spring without damping and rest length has zero force; the force of any other one
+    is not defined, and every engine raises `NumericalError` for the quantities that contain it.
     """
 
     name: str
@@ -187,17 +181,8 @@ _OF_COUPLING: Final = ("stiffness", "rest_length", "damping", "armature")
 class JointCoupling(_Frozen):
     """A spring, a viscous damper and a rotor on a sum of joint coordinates: MuJoCo's fixed tendon.
 
-    With the length l = Σ factor q it has the potential energy ½ stiffness (l - rest_length)², dissipates
-    damping (dl/dt)² and has the kinetic energy ½ armature (dl/dt)².
-
-    Attributes
-    ----------
-    name : str
-    joints : tuple of str
-        Joints of one velocity.
-    factors : (k,) array
-        One for each joint.
-    stiffness, rest_length, damping, armature : float
+    With the length l = Σ factor q over `joints` of one velocity it has the potential energy
+    ½ stiffness (l - rest_length)², dissipates damping (dl/dt)² and has the kinetic energy ½ armature (dl/dt)².
     """
 
     name: str
@@ -221,15 +206,7 @@ class JointCoupling(_Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Loop(_Frozen):
-    """A loop closure: two points, or two frames, that stay together.
-
-    Attributes
-    ----------
-    kind : str
-        ``"point"`` (3 equations) or ``"frame"`` (6).
-    rotation_a, translation_a, rotation_b, translation_b : arrays
-        The two frames in the axes of their bodies.
-    """
+    """A loop closure: two points (`kind` "point", 3 equations) or frames ("frame", 6) of two bodies stay together."""
 
     name: str
     kind: str

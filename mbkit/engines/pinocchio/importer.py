@@ -15,10 +15,9 @@ import pinocchio as pin
 from mbkit._check import Array
 from mbkit.engines.imported import Imported, checked, joint_of, stacked, unused, written
 from mbkit.errors import UnsupportedError
-from mbkit.load.urdf import joint_kind
+from mbkit.load.urdf import joint_kind, joint_numbers
 from mbkit.load.urdf_links import BASE_JOINT
 from mbkit.model import Body, Joint, Model
-from mbkit.model.joint_types import kind_of
 
 
 def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
@@ -138,18 +137,5 @@ def _joint(
     if kind == "helical":
         numbers["pitch"] = float(getattr(joint, "pitch", 0.0))
     if raw is not None:
-        v = slice(joint.idx_v, joint.idx_v + joint.nv)
-        for ours, theirs in (("armature", "armature"), ("damping", "damping"), ("friction", "upperDryFrictionLimit")):
-            numbers[ours] = np.array(getattr(raw, theirs)[v])
-        if kind_of(kind).nv == 1:
-            numbers["velocity_limit"] = _open(raw.upperVelocityLimit[v])
-            numbers["effort_limit"] = _open(raw.upperEffortLimit[v])
-            if joint.nq == 1:
-                q = slice(joint.idx_q, joint.idx_q + 1)
-                numbers["lower"], numbers["upper"] = _open(raw.lowerPositionLimit[q]), _open(raw.upperPositionLimit[q])
+        numbers |= joint_numbers(raw, joint)
     return joint_of(name, kind, parent, child, np.array(X.rotation), np.array(X.translation), **numbers)
-
-
-def _open(x: Array) -> Array:
-    """Return limits, infinite where the largest double stands for none."""
-    return np.where(np.abs(x) < 1e300, x, np.copysign(np.inf, x))
