@@ -16,9 +16,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import mbkit as mb
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import Lagrangian
-from mbkit.lagrangian.trig.from_sympy import forms
-from mbkit.lagrangian.trig.simplify import tidy
-from mbkit.lagrangian.trig.zero_test import is_zero
+from mbkit.lagrangian.trig.simplify import forms, is_zero, tidy
 from mbkit.simulate import METHODS as METHODS_OF
 
 EPS = np.finfo(float).eps

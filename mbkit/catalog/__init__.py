@@ -10,53 +10,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mbkit.catalog.mechanisms import acrobot, cart_pole, furuta_pendulum, slider_crank
-from mbkit.catalog.pendulums import chain, double_pendulum, elastic_pendulum, pendulum, spherical_pendulum
-from mbkit.catalog.rigid_bodies import free_body, gyroscope, heavy_top
-from mbkit.catalog.spacecraft import clamped_beam, flexible_spacecraft, spacecraft_with_wheels
+from mbkit.catalog._system import SYSTEMS
+from mbkit.catalog.mechanisms import (
+    acrobot,
+    cart_pole,
+    chain,
+    double_pendulum,
+    elastic_pendulum,
+    furuta_pendulum,
+    pendulum,
+    slider_crank,
+    spherical_pendulum,
+)
+from mbkit.catalog.rigid_bodies import (
+    clamped_beam,
+    flexible_spacecraft,
+    free_body,
+    gyroscope,
+    heavy_top,
+    spacecraft_with_wheels,
+)
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 
-__all__ = [
-    "acrobot",
-    "cart_pole",
-    "chain",
-    "clamped_beam",
-    "double_pendulum",
-    "elastic_pendulum",
-    "flexible_spacecraft",
-    "free_body",
-    "furuta_pendulum",
-    "get",
-    "gyroscope",
-    "heavy_top",
-    "pendulum",
-    "slider_crank",
-    "spacecraft_with_wheels",
-    "spherical_pendulum",
-    "systems",
-]
-
-_SYSTEMS: dict[str, Callable[..., Model]] = {
-    f.__name__: f
-    for f in (
-        pendulum,
-        double_pendulum,
-        cart_pole,
-        spherical_pendulum,
-        elastic_pendulum,
-        acrobot,
-        furuta_pendulum,
-        chain,
-        heavy_top,
-        gyroscope,
-        free_body,
-        spacecraft_with_wheels,
-        clamped_beam,
-        flexible_spacecraft,
-        slider_crank,
-    )
-}
+__all__ = ["acrobot", "cart_pole", "chain", "clamped_beam", "double_pendulum", "elastic_pendulum"]
+__all__ += ["flexible_spacecraft", "free_body", "furuta_pendulum", "get", "gyroscope", "heavy_top", "pendulum"]
+__all__ += ["slider_crank", "spacecraft_with_wheels", "spherical_pendulum", "systems"]
 
 
 def systems() -> dict[str, Callable[..., Model]]:
@@ -68,7 +47,7 @@ def systems() -> dict[str, Callable[..., Model]]:
     >>> list(mb.catalog.systems())[:4]
     ['pendulum', 'double_pendulum', 'cart_pole', 'spherical_pendulum']
     """
-    return dict(_SYSTEMS)
+    return dict(SYSTEMS)
 
 
 def get(name: str) -> Callable[..., Model]:
@@ -79,9 +58,9 @@ def get(name: str) -> Callable[..., Model]:
     UnknownNameError
         With near names.
     """
-    if name not in _SYSTEMS:
-        raise UnknownNameError("system", str(name), _SYSTEMS)
-    return _SYSTEMS[name]
+    if name not in SYSTEMS:
+        raise UnknownNameError("system", str(name), SYSTEMS)
+    return SYSTEMS[name]
 
 
 def __dir__() -> list[str]:

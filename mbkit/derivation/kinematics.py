@@ -40,7 +40,13 @@ def constant_transposed_times(A: list[Vector], x: Vector) -> Vector:
 
 
 class Kinematics:
-    """Symbols q and v, the model's reduced coordinates and velocities, and what moves with them."""
+    """Symbols q and v, the model's reduced coordinates and velocities, and what moves with them.
+
+    `formulas` has the sine and cosine of this arithmetic, and `zero` its zero: `mbkit.lagrangian` has another one.
+    """
+
+    formulas: Any = model_values
+    zero: Any = ca.SX(0)
 
     def __init__(self, model: Model, constants: Constants = "literal") -> None:
         self.model = model
@@ -81,7 +87,7 @@ class Kinematics:
     def placements(self) -> dict[str, tuple[Any, Vector]]:
         """(R_JC, p_JC_J) of every joint."""
         return {
-            j.name: j.type.placement(model_values, self.values.joints[j.name], self._q_of[j.name])
+            j.name: j.type.placement(self.formulas, self.values.joints[j.name], self._q_of[j.name])
             for j in self.model.tree
         }
 
@@ -96,7 +102,7 @@ class Kinematics:
             R, p = self.placements[joint.name]
             angular_J = constant_transposed_times(values.rotation, angular)
             linear_J = add(constant_transposed_times(values.rotation, at_joint), cross3(angular_J, p))
-            own = joint.type.twist(model_values, values, self._q_of[joint.name], self._v_of[joint.name])
+            own = joint.type.twist(self.formulas, values, self._q_of[joint.name], self._v_of[joint.name])
             out[joint.child] = (
                 add(_transposed_times(R, linear_J), own[0]),
                 add(_transposed_times(R, angular_J), own[1]),
@@ -156,7 +162,7 @@ def _transposed_times(R: Any, x: Vector) -> Vector:
 
 def kinetic_energy(kin: Kinematics) -> Any:
     """Return T = Σ ½ m |v_com|² + ½ ωᵀ I ω (König's theorem) + ½ Σ armature v² + ½ Σ armature (dl/dt)²."""
-    total: Any = ca.SX(0)
+    total = kin.zero
     for body in kin.model.bodies:
         linear, angular = kin.twists[body.name]
         values = kin.values.bodies[body.name]
@@ -190,7 +196,7 @@ def gravity_energy(kin: Kinematics) -> Any:
             moments[joint.parent], kin.to_parent(joint, moments[joint.child], masses[joint.child])
         )
         masses[joint.parent] += masses[joint.child]
-    return ca.SX(0) - dot3(kin.values.gravity, moments["world"])
+    return kin.zero - dot3(kin.values.gravity, moments["world"])
 
 
 def spring_energy(kin: Kinematics) -> Any:

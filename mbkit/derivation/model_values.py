@@ -149,6 +149,9 @@ class Values:
             (b.where, b.part, b.field, b.index): b.expression.evaluate(lambda p: named[p.name], self._scalar)
             for b in model.bindings
         }
+        self._read_parts(model)
+
+    def _read_parts(self, model: Model) -> None:
         self.gravity = self._read("gravity", "", model, ("gravity",)).gravity
         self.bodies = {b.name: self._read("bodies", b.name, b, _BODY) for b in model.bodies}
         self.joints = {j.name: self._joint(j) for j in model.joints}

@@ -13,6 +13,8 @@ import numpy as np
 import sympy as sp
 
 from mbkit._check import Array
+from mbkit.derivation.kinematics import Kinematics, dot3, gravity_energy, kinetic_energy
+from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
@@ -23,18 +25,9 @@ from mbkit.model.parts import Loop, Prescribed
 Vector = list[Any]
 #: The joints from a body down to one that carries it.
 _Way = list[Joint]
-#: (linear, angular) velocity per unit of one velocity.
-Column = tuple[Vector, Vector]
-#: What enters the formulas of joints and energies; springs and dampers are kept as they are written.
-_FIELDS: Final = {
-    "bodies": ("mass", "com", "inertia"),
-    "joints": ("rotation", "translation", "axes", "pitch", "armature"),
-    "springs": ("point_a", "point_b"),
-    "couplings": ("factors", "armature"),
-    "loops": ("rotation_a", "translation_a", "rotation_b", "translation_b"),
-}
 #: Relative size of a zero term that rounded rotations leave.
 _DUST: Final = Fraction(1, 10**15)
+_LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b")
 
 
 def instead_of_writing(model: Model) -> str:
@@ -49,8 +42,21 @@ def instead_of_writing(model: Model) -> str:
     )
 
 
-class SymbolicKinematics:
-    """Mass matrix, V and dissipation of a model, with loops open and prescribed coordinates free."""
+class _ExactValues(Values):
+    """Every number of a model that enters its equations, as a sum that has one term."""
+
+    def __init__(self, model: Model, space: TrigRing, bound: dict[Any, sp.Expr]) -> None:
+        self._space = space
+        self._bound = {place: space.of(x) for place, x in bound.items()}
+        self._read_parts(model)
+        self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
+
+    def _scalar(self, value: float, direction: bool = False) -> TrigPolynomial:  # noqa: ARG002
+        return self._space.of(exact(value))
+
+
+class SymbolicKinematics(Kinematics):
+    """A model's kinematics in exact sums, with loops open and prescribed coordinates free; its energies in SymPy."""
 
     def __init__(
         self,
@@ -60,7 +66,7 @@ class SymbolicKinematics:
         parameters: dict[str, sp.Symbol],
         progress: Callable[[float, str], None],
     ) -> None:
-        self.model, self.velocities, self._progress = model, velocities, progress
+        self.model, self.symbols, self.rates, self._progress = model, coordinates, velocities, progress
         bound = {
             # The exponent one half is the only float that comes this way.
             (b.where, b.part, b.field, b.index): sp.nsimplify(
@@ -78,18 +84,18 @@ class SymbolicKinematics:
             s for j in model.joints for i, x in enumerate(self._q[j.name]) if _advances(j, i) for s in x.free_symbols
         }
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
-        self.coordinates = coordinates
-        self.space = TrigRing(model.name, angles, generators, instead=instead_of_writing(model))
-        self.values = {
-            (where, part.name): self._read(where, part, fields)
-            for where, fields in _FIELDS.items()
-            for part in getattr(model, where)
-        }
-        self._placements = {j.name: self._placement(j) for j in model.tree}
-        self._carrier = {j.child: j for j in model.joints}
         self._lengths = [i for i, g in enumerate(generators) if g in lengths]
-
-    # Numbers
+        self.formulas = space = TrigRing(
+            model.name, angles, [*generators, *velocities], instead=instead_of_writing(model)
+        )
+        self.zero = space.number(0)
+        self.values = _ExactValues(model, space, self._bound)
+        self._q_of = {
+            j.name: [space.of(x) if _advances(j, i) else SimpleNamespace(expression=x) for i, x in enumerate(q)]
+            for j, q in zip(model.joints, self._q.values(), strict=True)
+        }
+        self._v_of = {name: [space.of(x) for x in v] for name, v in self._v.items()}
+        self._carrier = {j.child: j for j in model.joints}
 
     def value(self, where: str, part: str, field: str, source: Any, *index: int) -> sp.Expr:
         """Return a number of a part, exactly, or the expression of parameters that it stands for."""
@@ -98,14 +104,6 @@ class SymbolicKinematics:
         x = getattr(source, field)
         return exact(float(x[index] if index else x))
 
-    def _read(self, where: str, part: Any, fields: tuple[str, ...]) -> SimpleNamespace:
-        def entries(field: str, x: Any, *index: int) -> Any:
-            if getattr(x, "ndim", 0):
-                return [entries(field, y, *index, i) for i, y in enumerate(x)]
-            return self.space.of(self.value(where, part.name, field, part, *index))
-
-        return SimpleNamespace(**{f: entries(f, getattr(part, f)) for f in fields})
-
     def _own(self, joint: Joint, symbols: list[sp.Symbol], layout: Any, *, still: bool = False) -> list[sp.Expr]:
         """Return a joint's coordinates or velocities; those of a mimic joint from its leader's."""
         if not joint.mimic:
@@ -113,48 +111,6 @@ class SymbolicKinematics:
         (leader,) = symbols[layout[joint.mimic.joint]]
         ratio, offset = (self.value("joints", joint.name, f, joint.mimic) for f in ("ratio", "offset"))
         return [ratio * leader + (0 if still else offset)]
-
-    # Kinematics
-
-    def _arguments(self, joint: Joint) -> list[Any]:
-        """Return a joint's coordinates as its formulas take them."""
-        q = self._q[joint.name]
-        return [self.space.of(x) if _advances(joint, i) else SimpleNamespace(expression=x) for i, x in enumerate(q)]
-
-    def _placement(self, joint: Joint) -> tuple[Any, Vector]:
-        q = self._arguments(joint)
-        return joint.type.placement(self.space, self.values["joints", joint.name], q)
-
-    def _columns(self) -> dict[str, dict[int, Column]]:
-        """Return each body's velocity in its own axes per unit of each velocity that moves it."""
-        out: dict[str, dict[int, Column]] = {"world": {}}
-        for joint in self.model.tree:
-            values = self.values["joints", joint.name]
-            R, p = self._placements[joint.name]
-            moved = {}
-            for i, (linear, angular) in out[joint.parent].items():
-                at_joint = _add(linear, cross3(angular, values.translation))
-                turned = _transposed_times(values.rotation, angular)
-                along = _add(_transposed_times(values.rotation, at_joint), cross3(turned, p))
-                moved[i] = (_transposed_times(R, along), _transposed_times(R, turned))
-            for i, column in self._own_columns(joint):
-                moved[i] = tuple(map(_add, moved[i], column)) if i in moved else column  # type: ignore[assignment]
-            out[joint.child] = moved
-        return out
-
-    def _own_columns(self, joint: Joint) -> Iterator[tuple[int, Column]]:
-        q = self._arguments(joint)
-        for k in range(joint.type.nv):
-            unit = [self.space.number(int(i == k)) for i in range(joint.type.nv)]
-            values = self.values["joints", joint.name]
-            linear, angular = joint.type.twist(self.space, values, q, unit)
-            i, ratio = self._velocity(joint, k)
-            yield i, ([ratio * x for x in linear], [ratio * x for x in angular])
-
-    def _velocity(self, joint: Joint, k: int) -> tuple[int, TrigPolynomial]:
-        """Return the index of a joint's velocity, its leader's if it mimics, and the ratio to it."""
-        at = self.model.layout.v[joint.mimic.joint if joint.mimic else joint.name].start + k
-        return at, self.space.of(self._v[joint.name][k] / self.velocities[at])
 
     def carried(self, way: _Way, x: Vector, weight: int) -> Vector:
         """Return a point (weight 1) or a direction (0) of a way's first body in the axes of its last."""
@@ -170,66 +126,30 @@ class SymbolicKinematics:
             body = out[-1].parent
         return out
 
-    def to_parent(self, joint: Joint, x: Vector, weight: Any) -> Vector:
-        """Return a point (weight 1) or a direction (0) of a joint's child in the parent's axes, or a moment of mass."""
-        R, p = self._placements[joint.name]
-        values = self.values["joints", joint.name]
-        in_J = _add(_times(R, x), [weight * c for c in p])
-        return _add(_times(values.rotation, in_J), [weight * c for c in values.translation])
-
     # Energies
 
     @cached_property
     def mass_matrix(self) -> list[list[sp.Expr]]:
         """M of T = ½ vᵀ M v."""
-        n = self.model.nv
-        M: list[list[Any]] = [[self.space.number(0)] * n for _ in range(n)]
-        columns = self._columns()
-        for done, body in enumerate(self.model.bodies):
-            self._progress(0.5 * done / len(self.model.bodies), f"kinetic energy of {body.name}")
-            values = self.values["bodies", body.name]
-            own = columns.get(body.name, {})
-            at_com = {i: _add(linear, cross3(angular, values.com)) for i, (linear, angular) in own.items()}
-            spun = {i: _times(values.inertia, angular) for i, (_, angular) in own.items()}
-            for i in own:
-                for j in own:
-                    if i <= j:
-                        M[i][j] = M[i][j] + values.mass * _dot(at_com[i], at_com[j]) + _dot(own[i][1], spun[j])
-        for joint in self.model.joints:
-            for k, rotor in enumerate(self.values["joints", joint.name].armature):
-                i, ratio = self._velocity(joint, k)
-                M[i][i] = M[i][i] + rotor * ratio * ratio
-        for coupling in self.model.couplings:
-            values = self.values["couplings", coupling.name]
-            moved = [self._velocity(self.model.joint(name), 0) for name in coupling.joints]
-            rates = [(i, c * ratio) for (i, ratio), c in zip(moved, values.factors, strict=True)]
-            for i, x in rates:
-                for j, y in rates:
-                    if i <= j:
-                        M[i][j] = M[i][j] + values.armature * x * y
-        self.drop_dust([x for row in M for x in row])
+        n, space = self.model.nv, self.formulas
+        self._progress(0.0, "kinetic energy")
+        M = {(i, j): space.number(0) for i in range(n) for j in range(i, n)}
+        first = len(space.generators) - n
+        for (kind, turns, powers), value in kinetic_energy(self).terms.items():
+            i, j = (k for k, power in enumerate(powers[first:]) for _ in range(power))
+            M[i, j].terms[kind, turns, (*powers[:first], *(0,) * n)] = 2 * value if i == j else value
+        self.drop_dust(list(M.values()))
         entries: dict[tuple[int, int], sp.Expr] = {}
-        for i in range(n):
-            self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
-            entries.update({(i, j): self.shown(M[i][j]) for j in range(i, n)})
+        for (i, j), x in M.items():
+            if i == j:
+                self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
+            entries[i, j] = self.shown(x)
         return [[entries[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
 
     @cached_property
     def gravity_energy(self) -> sp.Expr:
         """-Σ m g · p_com."""
-        model = self.model
-        masses: dict[str, Any] = {"world": self.space.number(0)}
-        moments: dict[str, Vector] = {"world": [self.space.number(0)] * 3}
-        for body in model.bodies:
-            values = self.values["bodies", body.name]
-            masses[body.name] = values.mass
-            moments[body.name] = [values.mass * c for c in values.com]
-        for joint in reversed(model.tree):
-            up = self.to_parent(joint, moments[joint.child], masses[joint.child])
-            moments[joint.parent] = _add(moments[joint.parent], up)
-            masses[joint.parent] = masses[joint.parent] + masses[joint.child]
-        gravity = [self.space.of(self.value("gravity", "", "gravity", model, i)) for i in range(3)]
-        total = -_dot(gravity, moments["world"])
+        total = gravity_energy(self)
         self.drop_dust([total])
         # Height by height rather than with g before them all, so that forces read term by term.
         return self._back(shortest_form(total, whole=False))
@@ -262,7 +182,7 @@ class SymbolicKinematics:
         for spring, square in self._squares():
             damping = self.written("springs", spring, "damping")
             if damping != 0:
-                pairs = zip(self.coordinates, self.velocities, strict=True)
+                pairs = zip(self.symbols, self.rates, strict=True)
                 rate = sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / 2
                 total += damping * rate**2 / square / 2
         return total
@@ -277,15 +197,14 @@ class SymbolicKinematics:
     def _squares(self) -> Iterator[tuple[Any, sp.Expr]]:
         """Yield each spring between points with the square of its length."""
         for spring in self.model.springs:
-            values = self.values["springs", spring.name]
-            a = self.carried(self.way(spring.body_a), values.point_a, 1)
-            b = self.carried(self.way(spring.body_b), values.point_b, 1)
-            gap = [y - x for x, y in zip(a, b, strict=True)]
-            yield spring, self.shown(_dot(gap, gap))
+            values = self.values.springs[spring.name]
+            ends = (self.to_world(spring.body_a, values.point_a), self.to_world(spring.body_b, values.point_b))
+            gap = [y - x for x, y in zip(*ends, strict=True)]
+            yield spring, self.shown(dot3(gap, gap))
 
-    def coordinates_of(self, joint: Joint) -> list[sp.Expr]:
-        """Return a joint's coordinates, those of a mimic joint by its leader's."""
-        return [self._back(x) for x in self._q[joint.name]]
+    def turns(self, joint: Joint) -> list[sp.Expr]:
+        """Return a joint's coordinates that turn, those of a mimic joint by its leader's."""
+        return [self._back(self._q[joint.name][i]) for i in joint.type.angular]
 
     def written(self, where: str, part: Any, field: str, *index: int) -> sp.Expr:
         """Return a number of a part as the equations show it."""
@@ -341,22 +260,6 @@ def _turn(angle: sp.Expr) -> sp.Expr:
     """Return an angle to take cosines of: a coordinate where the angle is a whole multiple of it."""
     value, rest = sp.expand(angle).as_coeff_Mul()
     return rest if value.is_Integer and rest.is_Symbol else sp.expand(angle)
-
-
-def _add(a: Vector, b: Vector) -> Vector:
-    return [x + y for x, y in zip(a, b, strict=True)]
-
-
-def _dot(a: Vector, b: Vector) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _times(R: Any, x: Vector) -> Vector:
-    return [_dot(R[i], x) for i in range(3)]
-
-
-def _transposed_times(R: Any, x: Vector) -> Vector:
-    return _times(list(zip(*R, strict=True)), x)
 
 
 # Coordinates that are moved in time, as expressions of it.
@@ -421,7 +324,7 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
 
 
 def _meeting(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
-    values = kin.values["loops", loop.name]
+    values = kin.values.loops[loop.name]
     a, b = kin.carried(ends[0], values.translation_a, 1), kin.carried(ends[1], values.translation_b, 1)
     gap = [x - y for x, y in zip(a, b, strict=True)]
     return _independent(kin, gap, f"loop {loop.name!r}: its points never meet")
@@ -432,12 +335,12 @@ def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> li
     axes = [axis for way in ends for axis in _axes(way)]
     if all(np.linalg.norm(np.cross(axis, axes[0])) < _DEPENDENT for axis in axes):
         return _in_plane(kin, loop, ends, axes[0] if axes else None, message)
-    values = kin.values["loops", loop.name]
+    values = kin.values.loops[loop.name]
     frames = [
         [kin.carried(way, [row[k] for row in R], 0) for k in range(3)]
         for way, R in zip(ends, (values.rotation_a, values.rotation_b), strict=True)
     ]
-    half = kin.space.number(Fraction(1, 2))
+    half = kin.formulas.number(Fraction(1, 2))
     turned = [cross3(y, x) for x, y in zip(*frames, strict=True)]
     return _independent(kin, [half * (turned[0][i] + turned[1][i] + turned[2][i]) for i in range(3)], message)
 
@@ -459,10 +362,10 @@ def _in_plane(
     for sign, way in zip((1, -1), ends, strict=True):
         # An axis that points the other way turns back.
         signs = [int(np.sign(x @ axis)) for x in _axes(way)]
-        angles = [kin.coordinates_of(joint)[i] for joint in way for i in joint.type.angular]
+        angles = [x for joint in way for x in kin.turns(joint)]
         total += sp.Add(*(sign * s * x for s, x in zip(signs, angles, strict=True)))
     total = sp.expand(total)
-    if not total.free_symbols & set(kin.coordinates):
+    if not total.free_symbols & set(kin.symbols):
         if abs(sp.sin(total / 2).evalf()) < _MEETS:
             return []
         raise InputError(f"{kin.model.name}: {message}: between them stays an angle of {total}")
@@ -503,7 +406,7 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], message: s
         weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
         left = A[i] - weights @ A[kept]
         if np.abs(left[~moving]).max(initial=0.0) > _MEETS * largest:
-            rest = kin.shown(TrigPolynomial(kin.space, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
+            rest = kin.shown(TrigPolynomial(kin.formulas, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
             why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
             raise InputError(f"{kin.model.name}: {message}, whatever the joints do{'' if weights.any() else why}")
     return [kin.shown(sums[i]) for i in kept]

@@ -92,7 +92,10 @@ class Lagrangian(EnergyForm):
     l**2*m*omegadot + g*l*m*sin(theta) = tau
     """
 
-    # The parts
+    @property
+    def _in_rates(self) -> Lagrangian:
+        """The system in its coordinates' rates."""
+        return self
 
     def kinetic_split(self) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
         """Return T2, T1 and T0: T's parts of second, first and zeroth degree in the velocities."""
@@ -115,7 +118,9 @@ class Lagrangian(EnergyForm):
 
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
         """Return the constants of every motion: those momenta, and the energy or Jacobi's integral."""
-        return conserved.conserved_quantities(self, self.conserved_momenta(), self.energy_function, self.velocities)
+        return conserved.conserved_quantities(
+            self._in_rates, self.conserved_momenta(), self.energy_function, self.velocities
+        )
 
     @property
     def energy_function(self) -> sp.Expr:
@@ -130,7 +135,7 @@ class Lagrangian(EnergyForm):
         InputError
             One is not cyclic or a force acts along it; none is, or none would remain.
         """
-        return routhian(self, cyclic)
+        return routhian(self._in_rates, cyclic)
 
     def hamiltonian(self) -> Hamiltonian:
         """Return Hamilton's function H(q, p, t) with its canonical equations.
@@ -140,7 +145,7 @@ class Lagrangian(EnergyForm):
         UnsupportedError
             Constraints act on the system.
         """
-        return self._hamiltonian
+        return self._in_rates._hamiltonian
 
     @cached_property
     def _hamiltonian(self) -> Hamiltonian:
@@ -350,64 +355,43 @@ class QuasiLagrangian(Lagrangian):
 
     # Reductions in coordinates' rates
 
-    def cyclic_coordinates(self) -> tuple[sp.Symbol, ...]:
-        """Return those of `system`."""
-        return self.system.cyclic_coordinates()
+    @property
+    def _in_rates(self) -> Lagrangian:
+        return self.system
 
-    def forced_cyclic_coordinates(self) -> dict[sp.Symbol, sp.Expr]:
-        """Return those of `system`."""
-        return self.system.forced_cyclic_coordinates()
+    @cached_property
+    def _ignorable(self) -> dict[sp.Symbol, sp.Expr]:
+        return self.system._ignorable
 
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return the momentum Wᵀ p of each cyclic coordinate, in quasi-velocities."""
         p, kept = self.W.T * self.momenta, self.system.cyclic_coordinates()
         return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
 
-    def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
-        """Return the constants of every motion, in quasi-velocities."""
-        return conserved.conserved_quantities(
-            self.system, self.conserved_momenta(), self.energy_function, self.velocities
-        )
-
-    def routhian(self, cyclic: Any = None) -> Routhian[Lagrangian]:
-        """Return Routh's reduction of `system`."""
-        return self.system.routhian(cyclic)
-
-    def hamiltonian(self) -> Hamiltonian:
-        """Return Hamilton's function of `system`."""
-        return self.system.hamiltonian()
-
     # Numbers
 
     @cached_property
-    def _maps(self) -> Numeric:
-        return Numeric(sp.Matrix.vstack(self.D, self.W), self.coordinates, tuple(self.parameters))
+    def _maps(self) -> dict[str, Numeric]:
+        arguments = self.coordinates, tuple(self.parameters)
+        return {name: Numeric(A, *arguments) for name, A in (("w", self.D), ("v", self.W), ("tau", self.D.T))}
 
-    def _map(self, name: str, q: ArrayLike, x: ArrayLike, values: dict[str, float]) -> tuple[Array, Array, Array]:
-        n = len(self.coordinates)
+    def _mapped(self, name: str, q: ArrayLike, x: ArrayLike, values: dict[str, float]) -> Array:
+        n, held = len(self.coordinates), self.D.free_symbols & set(self.parameters)
         q, x = rows("q", q, n, self.name, "nq"), rows(name, x, n, self.name, "nv")
-        numbers = (
-            parameter_values(self, values, name)
-            if self.D.free_symbols & set(self.parameters)
-            else np.zeros(len(self.parameters))
-        )
-        both = self._maps(q, numbers)
-        return both[..., :n, :], both[..., n:, :], x
+        numbers = parameter_values(self, values, name) if held else np.zeros(len(self.parameters))
+        return np.asarray(np.einsum("...ij,...j->...i", self._maps[name](q, numbers), x))
 
     def to_velocity(self, q: ArrayLike, w: ArrayLike, **values: float) -> Array:
         """Return the coordinates' rates D w in numbers, (n,) or (N, n)."""
-        D, _, w = self._map("w", q, w, values)
-        return np.asarray(np.einsum("...ij,...j->...i", D, w))
+        return self._mapped("w", q, w, values)
 
     def to_quasi_velocity(self, q: ArrayLike, v: ArrayLike, **values: float) -> Array:
         """Return w = D⁻¹ v of the coordinates' rates in numbers, (n,) or (N, n)."""
-        _, W, v = self._map("v", q, v, values)
-        return np.asarray(np.einsum("...ij,...j->...i", W, v))
+        return self._mapped("v", q, v, values)
 
     def to_force(self, q: ArrayLike, tau: ArrayLike, **values: float) -> Array:
         """Return the forces Dᵀ τ on w of those on the coordinates in numbers, (n,) or (N, n)."""
-        D, _, tau = self._map("tau", q, tau, values)
-        return np.asarray(np.einsum("...ij,...i->...j", D, tau))
+        return self._mapped("tau", q, tau, values)
 
     def __repr__(self) -> str:
         return one_line(f"<QuasiLagrangian {self.name!r}: quasi-velocities {', '.join(map(str, self.velocities))}>")

@@ -27,8 +27,7 @@ from mbkit.lagrangian.energies.symbols import (
     plain,
     velocity_of,
 )
-from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
-from mbkit.lagrangian.trig.zero_test import is_zero
+from mbkit.lagrangian.trig.simplify import is_zero, tidy, tidy_matrix
 
 
 class EnergyForm:

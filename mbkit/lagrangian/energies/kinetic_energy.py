@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import permutations, product
 from typing import Any, Final
 
 import mpmath
@@ -14,8 +14,7 @@ import sympy as sp
 
 from mbkit.errors import InputError
 from mbkit.lagrangian.trig.shortest_form import complexity
-from mbkit.lagrangian.trig.simplify import LARGE, tidy
-from mbkit.lagrangian.trig.zero_test import DIGITS, RandomEvaluation
+from mbkit.lagrangian.trig.simplify import DIGITS, LARGE, RandomEvaluation, tidy
 
 #: Lines through the velocities, and places on each.
 _LINES: Final = 4
@@ -123,21 +122,17 @@ def require_inertia(
             return
         with mpmath.workdps(DIGITS):
             A = mpmath.matrix(n, n)
-            for i in range(n):
-                for j in range(n):
-                    pulls = (mpmath.conj(values[k + i]) * values[k + j] for k in range(n * n, len(values), n))
-                    A[i, j] = values[n * i + j] + mpmath.fsum(pulls)
+            for i, j in product(range(n), repeat=2):
+                pulls = (mpmath.conj(values[k + i]) * values[k + j] for k in range(n * n, len(values), n))
+                A[i, j] = values[n * i + j] + mpmath.fsum(pulls)
             rows = [mpmath.norm(A[i, :]) for i in range(n)]
-            if any(x == 0 for x in rows):
-                continue
-            # Masses may differ by any number of decades.
-            scaled = mpmath.matrix(n, n)
-            for i in range(n):
-                for j in range(n):
-                    scaled[i, j] = A[i, j] / mpmath.sqrt(rows[i] * rows[j])
-            sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
-            if abs(mpmath.det(scaled)) > _ROUNDED * mpmath.fprod(sizes):
-                return
+            if all(rows):
+                # Masses may differ by any number of decades.
+                scale = mpmath.diag([1 / mpmath.sqrt(x) for x in rows])
+                scaled = scale * A * scale
+                sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
+                if abs(mpmath.det(scaled)) > _ROUNDED * mpmath.fprod(sizes):
+                    return
     matrix = f" {M.tolist()}" if len(str(M)) <= _SHOWN else ""
     raise InputError(
         f"T: its mass matrix{matrix} is singular everywhere: {_unmoved(A, velocities)} can change without kinetic "

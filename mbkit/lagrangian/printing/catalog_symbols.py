@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import count
 from typing import Any, Final
 
@@ -37,6 +37,8 @@ _LETTERS: Final = {
 }
 _LETTER: Final = re.compile(r"([A-Za-z]|alpha|beta|gamma|delta|theta|phi|psi)(_?\d+)?")
 _USUAL: Final = {"gravity": "g", "mass": "m", "length": "l", "stiffness": "k", "damping": "d", "inertia": "J"}
+#: What no equation of motion holds.
+_LEFT_OUT: Final = ("lower", "upper", "velocity_limit", "effort_limit", "friction")
 #: Two descriptions are the same where their numbers differ by rounding only.
 _SAME: Final = 1e-13
 
@@ -49,18 +51,19 @@ def in_symbols(model: Model) -> Model | None:
     system = next((n for n in catalog.systems() if model.name == n or _numbered(model.name, n)), None)
     if system is None or model.parameters:
         return None
+    names, numbers = _content(model)
     for size in range(1, model.nv + 1):
-        try:
+        # A system may have another size, or take no parameters; values solved for may be no system's.
+        with suppress(MbkitError, TypeError):
             symbolic = _with_parameters(system, size)
-        except (MbkitError, TypeError):
-            # A system of another size, or one that takes no parameters.
-            continue
-        if _form(symbolic) == _form(model):
+            if _content(symbolic)[0] != names:
+                continue
             values = _solved(symbolic, model)
-            with suppress(MbkitError):
-                moved = symbolic.with_nominal(values)
+            moved = symbolic.with_nominal(values)
+            pairs = zip(_content(moved)[1], numbers, strict=True)
+            if all(np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0))) for x, y in pairs):
                 zeros = {name: 0.0 for name, x in values.items() if x == 0.0}
-                return (moved.with_parameters(**zeros) if zeros else moved) if _same(moved, model) else None
+                return moved.with_parameters(**zeros) if zeros else moved
             return None
     return None
 
@@ -118,15 +121,16 @@ def _usual(name: str) -> str:
     return _USUAL.get(stem, stem) + name[len(stem) :]
 
 
-def _form(model: Model) -> Any:
-    """Return a description's structure, without numbers."""
-    joints = [(j.name, j.kind, j.parent, j.child, j.mimic is None) for j in model.joints]
-    return (
-        [b.name for b in model.bodies],
-        joints,
-        [*(s.name for s in model.springs), *(c.name for c in model.couplings)],
-        [(x.name, x.kind, x.body_a, x.body_b) for x in model.loops],
-    )
+def _content(model: Model) -> tuple[list[Any], list[Any]]:
+    """Return the names, and apart from them the numbers, of what a description's equations hold."""
+    names: list[Any] = []
+    numbers: list[Any] = [model.gravity]
+    for where in ("bodies", "joints", "springs", "couplings", "loops"):
+        for part in getattr(model, where):
+            held = {f.name: getattr(part, f.name) for f in fields(part) if f.name not in _LEFT_OUT}
+            numbers += [x for x in held.values() if isinstance(x, (float, np.ndarray))]
+            names += [(where, f, x) for f, x in held.items() if isinstance(x, (str, tuple)) or x is None]
+    return names, numbers
 
 
 def _solved(symbolic: Model, model: Model) -> dict[str, float]:
@@ -168,26 +172,3 @@ def _number(model: Model, binding: Any) -> float:
         part = next(p for p in getattr(model, binding.where) if p.name == binding.part)
     value = getattr(part, binding.field)
     return float(value[binding.index] if binding.index else value)
-
-
-#: Numbers of each kind of part that two descriptions share if they are the same.
-_NUMBERS: Final = {
-    "bodies": ("mass", "com", "inertia"),
-    "joints": ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness", "rest"),
-    "springs": ("point_a", "point_b", "stiffness", "rest_length", "damping"),
-    "couplings": ("factors", "stiffness", "rest_length", "damping", "armature"),
-    "loops": ("rotation_a", "translation_a", "rotation_b", "translation_b"),
-}
-
-
-def _same(a: Model, b: Model) -> bool:
-    """Return whether all numbers of two descriptions of one form are equal to rounding."""
-    pairs = [(getattr(x, f), getattr(y, f)) for w, fs in _NUMBERS.items() for x, y in _parts(a, b, w) for f in fs]
-    return all(
-        np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0)))
-        for x, y in [(a.gravity, b.gravity), *pairs]
-    )
-
-
-def _parts(a: Model, b: Model, where: str) -> Iterator[tuple[Any, Any]]:
-    return zip(getattr(a, where), getattr(b, where), strict=True)

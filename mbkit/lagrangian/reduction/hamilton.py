@@ -36,8 +36,7 @@ from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction import conserved
 from mbkit.lagrangian.reduction.conserved import ConservedQuantity
-from mbkit.lagrangian.trig.simplify import slope, tidy
-from mbkit.lagrangian.trig.zero_test import is_zero
+from mbkit.lagrangian.trig.simplify import is_zero, slope, tidy
 
 # Canonical momenta as symbols, and Poisson's bracket on coordinates and momenta.
 

@@ -1,4 +1,4 @@
-"""Checks of the systems' parameters, and the decorator that makes them."""
+"""The decorator of the systems' functions, and checks of their parameters."""
 
 from __future__ import annotations
 
@@ -18,14 +18,21 @@ from mbkit.model import Expression, Model, Number, known, nominal
 #: Three numbers.
 Vector = ArrayLike | Sequence[Number]
 
-#: Axis of planar hinges: a positive turn about -y swings what hangs down towards +x.
-SWING: Final = (0.0, -1.0, 0.0)
+P = ParamSpec("P")
+
+#: Function of each system by its name.
+SYSTEMS: Final[dict[str, Callable[..., Model]]] = {}
 
 # Rods and segments; `ModelBuilder.build` has a similar limit.
 _MAX_COUNT: Final = 2000
-
-
-P = ParamSpec("P")
+#: Unit of a parameter by the last word of its name; lengths are in m.
+_UNITS: Final = {
+    "mass": "kg",
+    **dict.fromkeys(("inertia", "axial", "across"), "kg m²"),
+    "stiffness": "N/m",
+    "bending_stiffness": "N m²",
+    "gravity": "m/s², along -z",
+}
 _RAISES: Final = """Raises
 ------
 InputError
@@ -39,7 +46,7 @@ def system(make: Callable[P, Model], /) -> Callable[P, Model]: ...
 @overload
 def system(**rules: Callable[[str, Any], Any]) -> Callable[[Callable[P, Model]], Callable[P, Model]]: ...
 def system(make: Callable[..., Model] | None = None, /, **rules: Callable[[str, Any], Any]) -> Any:
-    """Check the parameters of a system's function before it runs, and document the error.
+    """Register a system's function, check its parameters before it runs, and document their units and the error.
 
     Parameters
     ----------
@@ -61,9 +68,22 @@ def system(make: Callable[..., Model] | None = None, /, **rules: Callable[[str, 
         return make(**{n: (rules.get(n) or usual.get(n, lambda _, x: x))(n, x) for n, x in values.items()})
 
     doc = inspect.cleandoc(make.__doc__ or "")
-    next_section = "Notes\n-----" if "Notes\n-----" in doc else "References\n-----"
-    checked.__doc__ = doc.replace(next_section, _RAISES + next_section)
+    section = "Notes\n-----" if "Notes\n-----" in doc else "References\n-----"
+    added = _RAISES if "Parameters\n---" in doc else f"Parameters\n----------\n{_parameters(defaults)}\n{_RAISES}"
+    checked.__doc__ = doc.replace(section, added + section)
+    SYSTEMS[make.__name__] = checked
     return checked
+
+
+def _parameters(defaults: dict[str, Any]) -> str:
+    """Return the entries of a docstring's section of parameters."""
+    kinds = {int: "int", float: "float or Parameter"}
+    units = {n: _UNITS.get(n) or _UNITS.get(n.rstrip("0123456789").rpartition("_")[2], "m") for n in defaults}
+    lines = (
+        f"{name} : {kinds.get(type(x), '(3,) array_like')}\n    {'Number of parts' if type(x) is int else units[name]}."
+        for name, x in defaults.items()
+    )
+    return "\n".join(lines) + "\n"
 
 
 def positive(name: str, value: Number) -> Number:
