@@ -129,9 +129,9 @@ class SymbolicKinematics(Kinematics):
     # Energies
 
     @cached_property
-    def mass_matrix(self) -> list[list[sp.Expr]]:
-        """M of T = ½ vᵀ M v."""
-        n, space = self.model.nv, self.formulas
+    def kinetic_energy(self) -> sp.Expr:
+        """½ vᵀ M v, entry by entry of M."""
+        n, space, v = self.model.nv, self.formulas, self.rates
         self._progress(0.0, "kinetic energy")
         M = {(i, j): space.number(0) for i in range(n) for j in range(i, n)}
         first = len(space.generators) - n
@@ -139,12 +139,12 @@ class SymbolicKinematics(Kinematics):
             i, j = (k for k, power in enumerate(powers[first:]) for _ in range(power))
             M[i, j].terms[kind, turns, (*powers[:first], *(0,) * n)] = 2 * value if i == j else value
         self.drop_dust(list(M.values()))
-        entries: dict[tuple[int, int], sp.Expr] = {}
-        for (i, j), x in M.items():
-            if i == j:
-                self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
-            entries[i, j] = self.shown(x)
-        return [[entries[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
+        total = []
+        for (i, j), entry in M.items():
+            self._progress(0.5 + 0.5 * i / n, f"mass matrix, row {i + 1} of {n}")
+            half = sp.Rational(1, 2) if i == j else sp.Integer(1)
+            total.append(sp.Mul(half, self.shown(entry), v[i], v[j]))
+        return sp.Add(*total)
 
     @cached_property
     def gravity_energy(self) -> sp.Expr:
@@ -312,7 +312,10 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
     while a and b and a[-1] is b[-1]:
         a.pop()
         b.pop()
-    rows = _meeting(kin, loop, ends)
+    values = kin.values.loops[loop.name]
+    points = (kin.carried(a, values.translation_a, 1), kin.carried(b, values.translation_b, 1))
+    gap = [x - y for x, y in zip(*points, strict=True)]
+    rows = _independent(kin, gap, f"loop {loop.name!r}: its points never meet")
     if loop.kind == "frame":
         rows += _aligned(kin, loop, ends)
     if not rows:
@@ -321,13 +324,6 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
             "leave it out"
         )
     return rows
-
-
-def _meeting(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
-    values = kin.values.loops[loop.name]
-    a, b = kin.carried(ends[0], values.translation_a, 1), kin.carried(ends[1], values.translation_b, 1)
-    gap = [x - y for x, y in zip(a, b, strict=True)]
-    return _independent(kin, gap, f"loop {loop.name!r}: its points never meet")
 
 
 def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:

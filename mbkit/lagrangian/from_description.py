@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, count
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import sympy as sp
 
@@ -111,8 +111,8 @@ def from_model(
     if clash:
         raise InputError(f"coordinates: {clash[0]!r} is a parameter of {model.name}; give coordinates=... other names")
     v = [velocity_of(s) for s in q]
-    kin = SymbolicKinematics(source, q, v, parameters, progress or _silent)
-    T, V, R = _kinetic(kin.mass_matrix, v), kin.gravity_energy + kin.spring_energy, kin.dissipation
+    kin = SymbolicKinematics(source, q, v, parameters, progress or (lambda *_: None))
+    T, V, R = kin.kinetic_energy, kin.gravity_energy + kin.spring_energy, kin.dissipation
     t = _time({*parameters, *(s.name for s in (*q, *v))})
     moved = {model.coordinate_names.index(p.joint): motion(kin, p, t) for p in model.prescribed}
     rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
@@ -138,10 +138,6 @@ def from_model(
         parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used},
         name=model.name,
     )
-
-
-def _silent(_fraction: float, _text: str) -> None:
-    pass
 
 
 def _check(model: Model) -> None:
@@ -188,10 +184,3 @@ def _coordinates(model: Model, names: Sequence[str] | None) -> list[sp.Symbol]:
     if len(chosen) != model.nq or not all(isinstance(n, str) and n for n in chosen) or len(set(chosen)) != len(chosen):
         raise InputError(f"coordinates: expected {model.nq} different names, got {names!r}")
     return [sp.Symbol(n) for n in chosen]
-
-
-def _kinetic(M: list[list[Any]], v: list[sp.Symbol]) -> sp.Expr:
-    n = len(v)
-    terms = [sp.Mul(sp.Rational(1, 2), M[i][i], v[i] ** 2) for i in range(n)]
-    terms += [sp.Mul(M[i][j], v[i], v[j]) for i in range(n) for j in range(i + 1, n)]
-    return sp.Add(*terms)

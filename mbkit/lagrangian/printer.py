@@ -112,17 +112,14 @@ class ExpressionPrinter:
 
     def text_of(self, parts: Iterable[sp.Expr]) -> str:
         """Return a sum on one line, each part in its own order."""
-        return self._joined(self._terms(parts))
+        return self._joined(parts, self._product, "-")
 
-    def _terms(self, parts: Iterable[sp.Expr]) -> list[sp.Expr]:
-        return [term for part in parts if part != 0 for term in self._ordered(sp.Add.make_args(part))]
-
-    def _joined(self, terms: list[sp.Expr]) -> str:
+    def _joined(self, parts: Iterable[sp.Expr], written: Callable[[sp.Expr], str], first_minus: str) -> str:
         out = ""
-        for term in terms:
+        for term in (term for part in parts if part != 0 for term in self._ordered(sp.Add.make_args(part))):
             minus, size = _signed(term)
-            text = self._product(size)
-            out += (("-" if minus else "") + text) if not out else (f" - {text}" if minus else f" + {text}")
+            sign = (" - " if minus else " + ") if out else first_minus * minus
+            out += sign + written(size)
         return out or "0"
 
     def _product(self, x: sp.Expr) -> str:
@@ -183,16 +180,8 @@ class ExpressionPrinter:
 
     def latex_of(self, parts: Iterable[sp.Expr]) -> str:
         """Return a sum in LaTeX, each part in its own order."""
-        return self._latex(self._terms(parts))
-
-    def _latex(self, terms: list[sp.Expr]) -> str:
         printer = _Latex({"order": "none", "full_prec": False, "fold_func_brackets": True})
-        out = ""
-        for term in terms:
-            minus, size = _signed(term)
-            text = printer.doprint(self._arranged(size))
-            out += (("- " if minus else "") + text) if not out else (f" - {text}" if minus else f" + {text}")
-        return out or "0"
+        return self._joined(parts, lambda x: str(printer.doprint(self._arranged(x))), "- ")
 
     def _arranged(self, x: sp.Expr) -> sp.Expr:
         """Return an expression whose sums and products are in order, for a printer that keeps it."""
