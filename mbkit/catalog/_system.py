@@ -32,6 +32,7 @@ _UNITS: Final = {
     "stiffness": "N/m",
     "bending_stiffness": "N m²",
     "gravity": "m/s², along -z",
+    "axes": "Of any length",
 }
 _RAISES: Final = """Raises
 ------
@@ -69,21 +70,20 @@ def system(make: Callable[..., Model] | None = None, /, **rules: Callable[[str, 
 
     doc = inspect.cleandoc(make.__doc__ or "")
     section = "Notes\n-----" if "Notes\n-----" in doc else "References\n-----"
-    added = _RAISES if "Parameters\n---" in doc else f"Parameters\n----------\n{_parameters(defaults)}\n{_RAISES}"
-    checked.__doc__ = doc.replace(section, added + section)
+    parameters = "".join(map(_described, defaults, defaults.values()))
+    checked.__doc__ = doc.replace(section, f"Parameters\n----------\n{parameters}\n{_RAISES}{section}")
     SYSTEMS[make.__name__] = checked
     return checked
 
 
-def _parameters(defaults: dict[str, Any]) -> str:
-    """Return the entries of a docstring's section of parameters."""
-    kinds = {int: "int", float: "float or Parameter"}
-    units = {n: _UNITS.get(n) or _UNITS.get(n.rstrip("0123456789").rpartition("_")[2], "m") for n in defaults}
-    lines = (
-        f"{name} : {kinds.get(type(x), '(3,) array_like')}\n    {'Number of parts' if type(x) is int else units[name]}."
-        for name, x in defaults.items()
-    )
-    return "\n".join(lines) + "\n"
+def _described(name: str, default: Any) -> str:
+    """Return the entry of a parameter in its function's docstring."""
+    if isinstance(default, str):
+        return f"{name} : str\n    Kind of joint.\n"
+    if isinstance(default, int):
+        return f"{name} : int\n    Number of equal parts.\n"
+    unit = _UNITS.get(name) or _UNITS.get(name.rstrip("0123456789").rpartition("_")[2], "m")
+    return f"{name} : {'float or Parameter' if isinstance(default, float) else 'array_like'}\n    {unit}.\n"
 
 
 def positive(name: str, value: Number) -> Number:

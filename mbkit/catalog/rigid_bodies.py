@@ -220,20 +220,9 @@ def spacecraft_with_wheels(
     One free joint, ``base``: q is the hub's centre and the quaternion (x, y, z, w), v the linear then angular velocity
     in body axes; then ``wheel1``, ``wheel2`` ... , the turn of each wheel about its axis. The wheels are thin discs
     about axes through the hub's centre. A wheel's motor torque stands in its own entry of the generalized forces; what
-    acts on the hub is its reaction, by itself.
-
-    Parameters
-    ----------
-    hub_mass, wheel_mass : float or Parameter
-        kg, without the wheels and of each wheel.
-    hub_inertia : (3,) array_like
-        Principal moments of the hub without the wheels about its centre, kg m².
-    wheel_axes : (n, 3) array_like
-        Axes of the wheels in body axes, of any length.
-    wheel_inertia : float or Parameter
-        Of each wheel about its axis, kg m²; across it is half of that.
-    wheel_distance : float or Parameter
-        Of each wheel's centre from the hub's centre, along its axis, m.
+    acts on the hub is its reaction, by itself. Mass and principal moments of the hub are those without the wheels,
+    about its centre. `wheel_axes`, (n, 3) in body axes, may have any length; a wheel's centre lies `wheel_distance`
+    along its axis, and its moment across the axis is half of `wheel_inertia`.
 
     References
     ----------
@@ -266,26 +255,10 @@ def flexible_spacecraft(
     """Return a hub that floats without gravity and carries two cantilevered beams, each lumped as `clamped_beam`.
 
     First the joint ``hub``, planar (x, y and the turn about +z) or free; then ``right1``, ``right2`` ... , the turn
-    of each segment of the beam along +x from the one before, about the hub's +z, and ``left1`` ...
-    of the beam along -x. At zero the hub's centre is at the origin, both beams are straight and their springs at
-    rest. They bend in the hub's x-y plane.
-
-    Parameters
-    ----------
-    segments : int
-        Of each beam.
-    hub : {"planar", "free"}
-        The hub's joint.
-    hub_mass : float or Parameter
-        kg.
-    hub_inertia : (3,) array_like
-        Principal moments of the hub alone about its centre, kg m²; in the plane only the third counts.
-    hub_radius : float or Parameter
-        Distance of the beams' roots from the hub's centre, m.
-    length, mass : float or Parameter
-        Of each beam, m and kg.
-    bending_stiffness : float or Parameter
-        E I of each beam, N m².
+    of each segment of the beam along +x from the one before, about the hub's +z, and ``left1`` ... of the beam along
+    -x. At zero the hub's centre is at the origin, both beams are straight and their springs at rest. They bend in the
+    hub's x-y plane. The hub's principal moments are those of the hub alone about its centre; in the plane only the
+    third counts. The beams begin at `hub_radius`; number of segments, length, mass and E I are those of each beam.
 
     Notes
     -----

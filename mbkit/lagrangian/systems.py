@@ -20,14 +20,13 @@ from mbkit.lagrangian.system import Lagrangian
 Value = float | None
 
 
-def _values(
-    positive: dict[str, tuple[sp.Symbol, Value]], free: dict[str, tuple[sp.Symbol, Value]] | None = None
-) -> dict[sp.Symbol, Value]:
-    """Return values by symbol, of argument -> (symbol, value): those above zero, then those that may be any number."""
+def _values(arguments: dict[str, Value], symbols: str) -> dict[sp.Symbol, Value]:
+    """Return values by symbol, of `argument=symbol` words: those above zero, then, behind a bar, those of any sign."""
     out: dict[sp.Symbol, Value] = {}
-    for group, above in ((positive, True), (free or {}, False)):
-        for name, (symbol, value) in group.items():
-            out[symbol] = None if value is None else real(name, value, positive=above)
+    for group, positive in zip(symbols.split("|"), (True, False), strict=False):
+        for name, symbol in (word.split("=") for word in group.split()):
+            value = arguments[name]
+            out[sp.Symbol(symbol)] = None if value is None else real(name, value, positive=positive)
     return out
 
 
@@ -45,7 +44,7 @@ def pendulum(*, mass: Value = 1.0, length: Value = 1.0, gravity: Value = 9.81) -
     """
     m, l, g, th = sp.symbols("m l g theta")
     w = velocity_of(th)
-    values = _values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})
+    values = _values(locals(), "mass=m length=l | gravity=g")
     return Lagrangian(m * l**2 * w**2 / 2, -m * g * l * sp.cos(th), [th], parameters=values, name="pendulum")
 
 
@@ -65,8 +64,7 @@ def double_pendulum(
     w1, w2 = velocity_of(th1), velocity_of(th2)
     T = (m1 + m2) * l1**2 * w1**2 / 2 + m2 * l2**2 * w2**2 / 2 + m2 * l1 * l2 * w1 * w2 * sp.cos(th1 - th2)
     V = -(m1 + m2) * g * l1 * sp.cos(th1) - m2 * g * l2 * sp.cos(th2)
-    positive = {"mass1": (m1, mass1), "length1": (l1, length1), "mass2": (m2, mass2), "length2": (l2, length2)}
-    values = _values(positive, {"gravity": (g, gravity)})
+    values = _values(locals(), "mass1=m1 length1=l1 mass2=m2 length2=l2 | gravity=g")
     return Lagrangian(T, V, [th1, th2], parameters=values, name="double_pendulum")
 
 
@@ -88,8 +86,7 @@ def elastic_pendulum(
     w, u = velocity_of(th), velocity_of(s)
     T = m * (u**2 + (l + s) ** 2 * w**2) / 2
     V = k * s**2 / 2 - m * g * (l + s) * sp.cos(th)
-    positive = {"mass": (m, mass), "length": (l, length), "stiffness": (k, stiffness)}
-    values = _values(positive, {"gravity": (g, gravity)})
+    values = _values(locals(), "mass=m length=l stiffness=k | gravity=g")
     return Lagrangian(T, V, [th, s], parameters=values, name="elastic_pendulum")
 
 
@@ -107,7 +104,7 @@ def spherical_pendulum(*, mass: Value = 1.0, length: Value = 1.0, gravity: Value
     m, l, g, th, ph = sp.symbols("m l g theta phi")
     w, u = velocity_of(th), velocity_of(ph)
     T = m * l**2 * (w**2 + u**2 * sp.sin(th) ** 2) / 2
-    values = _values({"mass": (m, mass), "length": (l, length)}, {"gravity": (g, gravity)})
+    values = _values(locals(), "mass=m length=l | gravity=g")
     return Lagrangian(T, -m * g * l * sp.cos(th), [th, ph], parameters=values, name="spherical_pendulum")
 
 
@@ -129,8 +126,7 @@ def cart_pole(
     M, m, l, g, F, x, th = sp.symbols("m_c m_p l g F x theta")
     u, w = velocity_of(x), velocity_of(th)
     T = (M + m) * u**2 / 2 + m * l * u * w * sp.cos(th) + m * l**2 * w**2 / 2
-    positive = {"cart_mass": (M, cart_mass), "pole_mass": (m, pole_mass), "length": (l, length)}
-    values = _values(positive, {"gravity": (g, gravity)})
+    values = _values(locals(), "cart_mass=m_c pole_mass=m_p length=l | gravity=g")
     return Lagrangian(T, -m * g * l * sp.cos(th), [x, th], forces={x: F}, parameters=values, name="cart_pole")
 
 
@@ -163,9 +159,7 @@ def acrobot(
     T = (m1 * c1**2 + I1) * w1**2 / 2 + I2 * both**2 / 2
     T += m2 * (l1**2 * w1**2 + c2**2 * both**2 + 2 * l1 * c2 * w1 * both * sp.cos(th2)) / 2
     V = -(m1 * c1 + m2 * l1) * g * sp.cos(th1) - m2 * g * c2 * sp.cos(th1 + th2)
-    positive = {"length1": (l1, length1), "mass1": (m1, mass1), "mass2": (m2, mass2), "com1": (c1, com1)}
-    positive |= {"com2": (c2, com2), "inertia1": (I1, inertia1), "inertia2": (I2, inertia2)}
-    values = _values(positive, {"gravity": (g, gravity)})
+    values = _values(locals(), "length1=l1 mass1=m1 mass2=m2 com1=l_c1 com2=l_c2 inertia1=I1 inertia2=I2 | gravity=g")
     return Lagrangian(T, V, [th1, th2], forces={th2: tau}, parameters=values, name="acrobot")
 
 
@@ -192,9 +186,8 @@ def furuta_pendulum(
     u, w = velocity_of(al), velocity_of(th)
     T = (J + m * L**2 + (I + m * l**2) * sp.sin(th) ** 2) * u**2 / 2 + (I + m * l**2) * w**2 / 2
     T += m * L * l * u * w * sp.cos(th)
-    positive = {"arm_length": (L, arm_length), "arm_inertia": (J, arm_inertia), "pendulum_mass": (m, pendulum_mass)}
-    positive |= {"pendulum_com": (l, pendulum_com), "pendulum_inertia": (I, pendulum_inertia)}
-    values = _values(positive, {"gravity": (g, gravity)})
+    symbols = "arm_length=L arm_inertia=J pendulum_mass=m pendulum_com=l pendulum_inertia=I | gravity=g"
+    values = _values(locals(), symbols)
     return Lagrangian(T, -m * g * l * sp.cos(th), [al, th], forces={al: tau}, parameters=values, name="furuta_pendulum")
 
 
@@ -213,7 +206,7 @@ def kepler(*, mass: Value = 1.0, strength: Value = 1.0) -> Lagrangian:
     """
     m, k, r, ph = sp.symbols("m k r phi")
     u, w = velocity_of(r), velocity_of(ph)
-    values = _values({"mass": (m, mass)}, {"strength": (k, strength)})
+    values = _values(locals(), "mass=m | strength=k")
     return Lagrangian(m * (u**2 + r**2 * w**2) / 2, -k / r, [r, ph], parameters=values, name="kepler")
 
 
@@ -233,7 +226,7 @@ def bead_on_hoop(*, mass: Value = 1.0, radius: Value = 1.0, speed: Value = 4.0, 
     m, R, Om, g, th = sp.symbols("m R Omega g theta")
     w = velocity_of(th)
     T = m * R**2 * (w**2 + Om**2 * sp.sin(th) ** 2) / 2
-    values = _values({"mass": (m, mass), "radius": (R, radius)}, {"speed": (Om, speed), "gravity": (g, gravity)})
+    values = _values(locals(), "mass=m radius=R | speed=Omega gravity=g")
     return Lagrangian(T, -m * g * R * sp.cos(th), [th], parameters=values, name="bead_on_hoop")
 
 
@@ -254,9 +247,8 @@ def driven_pendulum(
     rise = -a * Om * sp.sin(Om * t)
     T = m * (l**2 * w**2 + 2 * l * rise * w * sp.sin(th) + rise**2) / 2
     V = m * g * (a * sp.cos(Om * t) - l * sp.cos(th))
-    positive = {"mass": (m, mass), "length": (l, length)}
-    free = {"amplitude": (a, amplitude), "frequency": (Om, frequency), "gravity": (g, gravity)}
-    return Lagrangian(T, V, [th], time=t, parameters=_values(positive, free), name="driven_pendulum")
+    values = _values(locals(), "mass=m length=l | amplitude=a frequency=Omega gravity=g")
+    return Lagrangian(T, V, [th], time=t, parameters=values, name="driven_pendulum")
 
 
 # One degree of freedom: J(q) q̈ + ½ J′(q) q̇² + V′(q) = Q
@@ -327,8 +319,7 @@ def slider_crank(
     m, r, l, tau, F, th = sp.symbols("m r l tau F theta")
     # sin(θ + φ)/cos φ, without the angle φ: l cos φ is the root.
     lever = sp.sin(th) * (1 + r * sp.cos(th) / sp.sqrt(l**2 - r**2 * sp.sin(th) ** 2))
-    positive = {"mass": (m, mass), "crank": (r, crank), "rod": (l, rod)}
-    values = _values(positive, {"torque": (tau, torque), "force": (F, force)})
+    values = _values(locals(), "mass=m crank=r rod=l | torque=tau force=F")
     J, Q = m * r**2 * lever**2, tau + F * r * lever
     return one_degree(J, 0, Q, coordinate=th, parameters=values, name="slider_crank")
 
@@ -362,9 +353,7 @@ def rigid_slider_crank(
     slide = -L1 * s * (1 + L1 * c / root)
     middle = -L1 * s * (1 + L1 * c / (2 * root))
     J = m1 * L1**2 / 3 + m2 * (middle**2 + (L1 * c / 2) ** 2) + m2 * L2**2 / 12 * turn**2 + m3 * slide**2
-    positive = {"crank": (L1, crank), "rod": (L2, rod), "crank_mass": (m1, crank_mass)}
-    positive |= {"rod_mass": (m2, rod_mass), "piston_mass": (m3, piston_mass)}
-    values = _values(positive, {"torque": (tau, torque)})
+    values = _values(locals(), "crank=L1 rod=L2 crank_mass=m1 rod_mass=m2 piston_mass=m3 | torque=tau")
     return one_degree(J, 0, tau, coordinate=th, parameters=values, name="rigid_slider_crank")
 
 
@@ -383,8 +372,7 @@ def sliding_block(
     """
     m, al, mu, v0, g, x = sp.symbols("m alpha mu v_0 g x")
     u = velocity_of(x)
-    positive = {"mass": (m, mass), "creep": (v0, creep)}
-    values = _values(positive, {"slope": (al, slope), "friction": (mu, friction), "gravity": (g, gravity)})
+    values = _values(locals(), "mass=m creep=v_0 | slope=alpha friction=mu gravity=g")
     V, Q = -m * g * x * sp.sin(al), -mu * m * g * sp.cos(al) * sp.tanh(u / v0)
     return one_degree(m, V, Q, coordinate=x, parameters=values, name="sliding_block")
 
@@ -400,7 +388,7 @@ def falling_body(*, mass: Value = 1.0, drag: Value = 0.25, gravity: Value = 9.81
     """
     m, c, g, z = sp.symbols("m c g z")
     u = velocity_of(z)
-    values = _values({"mass": (m, mass)}, {"drag": (c, drag), "gravity": (g, gravity)})
+    values = _values(locals(), "mass=m | drag=c gravity=g")
     return one_degree(m, m * g * z, -c * u * sp.Abs(u), coordinate=z, parameters=values, name="falling_body")
 
 
@@ -426,8 +414,7 @@ def heavy_top(
     m, l, A, C, g, ph, th, ps = sp.symbols("m l A C g phi theta psi")
     u, w, s = velocity_of(ph), velocity_of(th), velocity_of(ps)
     T = A * (w**2 + u**2 * sp.sin(th) ** 2) / 2 + C * (s + u * sp.cos(th)) ** 2 / 2
-    positive = {"mass": (m, mass), "length": (l, length), "across": (A, across), "axial": (C, axial)}
-    values = _values(positive, {"gravity": (g, gravity)})
+    values = _values(locals(), "mass=m length=l across=A axial=C | gravity=g")
     return Lagrangian(T, m * g * l * sp.cos(th), [ph, th, ps], parameters=values, name="heavy_top")
 
 
@@ -460,10 +447,9 @@ def gyroscope(
     u, w, s = map(velocity_of, (al, be, ga))
     T = (A + Ai + m * l**2) * w**2 / 2 + C * (s + u * sp.sin(be)) ** 2 / 2
     T += (Jo + (A + Ci + m * l**2) * sp.cos(be) ** 2 + Bi * sp.sin(be) ** 2) * u**2 / 2
-    positive = {"rotor_mass": (m, rotor_mass), "rotor_axial": (C, rotor_axial), "rotor_across": (A, rotor_across)}
-    free = {"offset": (l, offset), "inner_hinge": (Ai, inner_hinge), "inner_axial": (Bi, inner_axial)}
-    free |= {"inner_across": (Ci, inner_across), "outer_inertia": (Jo, outer_inertia), "gravity": (g, gravity)}
-    return Lagrangian(T, m * g * l * sp.sin(be), [al, be, ga], parameters=_values(positive, free), name="gyroscope")
+    symbols = "rotor_mass=m rotor_axial=C rotor_across=A | offset=l inner_hinge=A_i inner_axial=B_i inner_across=C_i"
+    values = _values(locals(), f"{symbols} outer_inertia=J_o gravity=g")
+    return Lagrangian(T, m * g * l * sp.sin(be), [al, be, ga], parameters=values, name="gyroscope")
 
 
 def rigid_body(*, A: Value = 1.0, B: Value = 2.0, C: Value = 2.5) -> Lagrangian:
@@ -483,7 +469,7 @@ def rigid_body(*, A: Value = 1.0, B: Value = 2.0, C: Value = 2.5) -> Lagrangian:
     second = -w * sp.sin(ps) + u * sp.sin(th) * sp.cos(ps)
     third = s + u * sp.cos(th)
     T = (a * first**2 + b * second**2 + c * third**2) / 2
-    values = _values({"A": (a, A), "B": (b, B), "C": (c, C)})
+    values = _values(locals(), "A=A B=B C=C")
     return Lagrangian(T, 0, [ph, th, ps], parameters=values, name="rigid_body")
 
 
