@@ -15,6 +15,7 @@ from mbkit.derivation import model_values
 from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
 from mbkit.model import Joint, JointCoupling, Model
 from mbkit.model.joint_types import cross3
+from mbkit.model.parts import PointSpring
 
 Vector = list[Any]
 
@@ -42,11 +43,12 @@ def constant_transposed_times(A: list[Vector], x: Vector) -> Vector:
 class Kinematics:
     """Symbols q and v, the model's reduced coordinates and velocities, and what moves with them.
 
-    `formulas` has the sine and cosine of this arithmetic, and `zero` its zero: `mbkit.lagrangian` has another one.
+    `formulas` has the sine and cosine of this arithmetic: `mbkit.lagrangian` has others.
     """
 
     formulas: Any = model_values
     zero: Any = ca.SX(0)
+    half: Any = 0.5
 
     def __init__(self, model: Model, constants: Constants = "literal") -> None:
         self.model = model
@@ -130,6 +132,24 @@ class Kinematics:
             body = joint.parent
         return x
 
+    def squared_length(self, spring: PointSpring) -> Any:
+        """Return |p_AB|² of the points that a spring joins."""
+        values = self.values.springs[spring.name]
+        a = self.to_world(spring.body_a, values.point_a)
+        b = self.to_world(spring.body_b, values.point_b)
+        gap = [y - x for x, y in zip(a, b, strict=True)]
+        return dot3(gap, gap)
+
+    def length(self, square: Any) -> Any:
+        """Return the root of a squared length."""
+        # CasADi makes |x| of the root of x², with the derivative 0 at x = 0, where a length has none.
+        # The factor, which rounds nothing, prevents that: the derivative is NaN there.
+        return 0.5 * ca.sqrt(4.0 * square)
+
+    def length_rate(self, square: Any) -> Any:
+        """Return the rate of the length of which the square is given."""
+        return ca.jtimes(self.length(square), self.q, self.qdot)
+
     @cached_property
     def qdot(self) -> ca.SX:
         """D(q) v."""
@@ -201,57 +221,48 @@ def gravity_energy(kin: Kinematics) -> Any:
 
 def spring_energy(kin: Kinematics) -> Any:
     """Return the energy stored in the springs of joints, of couplings and between points."""
-    total: Any = ca.SX(0)
+    total = kin.zero
     for joint in kin.model.joints:
         values = kin.values.joints[joint.name]
         for k, stiffness in enumerate(values.stiffness):
             if not is_zero(stiffness):
                 stretch = kin.coordinates(joint)[k] - values.rest[k]
-                total += 0.5 * stiffness * stretch * stretch
+                total += kin.half * stiffness * stretch * stretch
     for coupling in kin.model.couplings:
         values = kin.values.couplings[coupling.name]
         if not is_zero(values.stiffness):
             stretch = kin.coupled(coupling)[0] - values.rest_length
-            total += 0.5 * values.stiffness * stretch * stretch
-    for spring, gap in _gaps(kin):
-        if is_zero(spring.stiffness):
+            total += kin.half * values.stiffness * stretch * stretch
+    for spring in kin.model.springs:
+        values = kin.values.springs[spring.name]
+        if is_zero(values.stiffness):
             continue
-        if is_zero(spring.rest_length):
-            total += 0.5 * spring.stiffness * dot3(gap, gap)
+        square = kin.squared_length(spring)
+        if is_zero(values.rest_length):
+            total += kin.half * values.stiffness * square
         else:
-            stretch = _length(gap) - spring.rest_length
-            total += 0.5 * spring.stiffness * stretch * stretch
+            stretch = kin.length(square) - values.rest_length
+            total += kin.half * values.stiffness * stretch * stretch
+    return total
+
+
+def dissipation(kin: Kinematics) -> Any:
+    """Return Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
+    total = kin.zero
+    for joint in kin.model.joints:
+        for damping, rate in zip(kin.values.joints[joint.name].damping, kin.velocities(joint), strict=True):
+            total += kin.half * damping * rate * rate
+    for coupling in kin.model.couplings:
+        _, rate = kin.coupled(coupling)
+        total += kin.half * kin.values.couplings[coupling.name].damping * rate * rate
+    for spring in kin.model.springs:
+        damping = kin.values.springs[spring.name].damping
+        if not is_zero(damping):
+            rate = kin.length_rate(kin.squared_length(spring))
+            total += kin.half * damping * rate * rate
     return total
 
 
 def damping_forces(kin: Kinematics) -> Any:
-    """Return -∂R/∂v for Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
-    dissipation: Any = ca.SX(0)
-    for joint in kin.model.joints:
-        for damping, rate in zip(kin.values.joints[joint.name].damping, kin.velocities(joint), strict=True):
-            dissipation += 0.5 * damping * rate * rate
-    for coupling in kin.model.couplings:
-        _, rate = kin.coupled(coupling)
-        dissipation += 0.5 * kin.values.couplings[coupling.name].damping * rate * rate
-    for spring, gap in _gaps(kin):
-        if not is_zero(spring.damping):
-            rate = ca.jtimes(_length(gap), kin.q, kin.qdot)
-            dissipation += 0.5 * spring.damping * rate * rate
-    return -ca.gradient(dissipation, kin.v)
-
-
-def _length(gap: list[Any]) -> Any:
-    # CasADi makes |x| of the root of x², with the derivative 0 at x = 0, where a length has none.
-    # The factor, which rounds nothing, prevents that: the derivative is NaN there.
-    return 0.5 * ca.sqrt(4.0 * dot3(gap, gap))
-
-
-def _gaps(kin: Kinematics) -> list[tuple[Any, list[Any]]]:
-    """Return each point spring's numbers, and the vector between its ends in the world."""
-    out = []
-    for spring in kin.model.springs:
-        values = kin.values.springs[spring.name]
-        a = kin.to_world(spring.body_a, values.point_a)
-        b = kin.to_world(spring.body_b, values.point_b)
-        out.append((values, [y - x for x, y in zip(a, b, strict=True)]))
-    return out
+    """Return -∂R/∂v."""
+    return -ca.gradient(dissipation(kin), kin.v)

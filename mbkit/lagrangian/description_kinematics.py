@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from fractions import Fraction
 from functools import cached_property
 from math import atan2, pi
@@ -13,14 +13,14 @@ import numpy as np
 import sympy as sp
 
 from mbkit._check import Array
-from mbkit.derivation.kinematics import Kinematics, dot3, gravity_energy, kinetic_energy
+from mbkit.derivation.kinematics import Kinematics, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
-from mbkit.model import Joint, JointCoupling, Model
+from mbkit.model import Joint, Model
 from mbkit.model.joint_types import cross3
-from mbkit.model.parts import Loop, Prescribed
+from mbkit.model.parts import Loop, PointSpring, Prescribed
 
 Vector = list[Any]
 #: The joints from a body down to one that carries it.
@@ -28,6 +28,7 @@ _Way = list[Joint]
 #: Relative size of a zero term that rounded rotations leave.
 _DUST: Final = Fraction(1, 10**15)
 _LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b")
+_MOTION: Final = ("offset", "rate", "amplitude", "frequency", "phase")
 
 
 def instead_of_writing(model: Model) -> str:
@@ -42,21 +43,23 @@ def instead_of_writing(model: Model) -> str:
     )
 
 
-class _ExactValues(Values):
-    """Every number of a model that enters its equations, as a sum that has one term."""
+class _Numbers(Values):
+    """Every number of a model that enters its equations, as an arithmetic has it: `bound` ones, and `read` others."""
 
-    def __init__(self, model: Model, space: TrigRing, bound: dict[Any, sp.Expr]) -> None:
-        self._space = space
-        self._bound = {place: space.of(x) for place, x in bound.items()}
+    def __init__(self, model: Model, bound: dict[Any, Any], read: Callable[[float], Any]) -> None:
+        self._bound, self._number = bound, read
         self._read_parts(model)
         self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
+        self.motions = {x.joint: self._read("prescribed", x.joint, x, _MOTION) for x in model.prescribed}
 
-    def _scalar(self, value: float, direction: bool = False) -> TrigPolynomial:  # noqa: ARG002
-        return self._space.of(exact(value))
+    def _scalar(self, value: float, direction: bool = False) -> Any:  # noqa: ARG002
+        return self._number(value)
 
 
 class SymbolicKinematics(Kinematics):
     """A model's kinematics in exact sums, with loops open and prescribed coordinates free; its energies in SymPy."""
+
+    values: _Numbers
 
     def __init__(
         self,
@@ -76,12 +79,16 @@ class SymbolicKinematics(Kinematics):
         }
         opaque = {x for x in bound.values() if not _is_polynomial(x)}
         self._opaque = {x: sp.Dummy(f"n{i}") for i, x in enumerate(sorted(opaque, key=sp.default_sort_key))}
-        self._bound = {place: self._opaque.get(x, x) for place, x in bound.items()}
-        self._q = {j.name: self._own(j, coordinates, model.layout.q) for j in model.joints}
-        self._v = {j.name: self._own(j, velocities, model.layout.v, still=True) for j in model.joints}
-        angles = list(dict.fromkeys(_turn(self._q[j.name][i]) for j in model.joints for i in j.type.angular))
+        self.bound = {place: self._opaque.get(x, x) for place, x in bound.items()}
+        self.symbols_of = {j.name: self._own(j, coordinates, model.layout.q) for j in model.joints}
+        self.rates_of = {j.name: self._own(j, velocities, model.layout.v, still=True) for j in model.joints}
+        angles = list(dict.fromkeys(_turn(self.symbols_of[j.name][i]) for j in model.joints for i in j.type.angular))
         lengths = {
-            s for j in model.joints for i, x in enumerate(self._q[j.name]) if _advances(j, i) for s in x.free_symbols
+            s
+            for j in model.joints
+            for i, x in enumerate(self.symbols_of[j.name])
+            if _advances(j, i)
+            for s in x.free_symbols
         }
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
         self._lengths = [i for i, g in enumerate(generators) if g in lengths]
@@ -89,27 +96,23 @@ class SymbolicKinematics(Kinematics):
             model.name, angles, [*generators, *velocities], instead=instead_of_writing(model)
         )
         self.zero = space.number(0)
-        self.values = _ExactValues(model, space, self._bound)
+        numbers = {place: space.of(x) for place, x in self.bound.items()}
+        self.values = _Numbers(model, numbers, lambda x: space.of(exact(x)))
         self._q_of = {
             j.name: [space.of(x) if _advances(j, i) else SimpleNamespace(expression=x) for i, x in enumerate(q)]
-            for j, q in zip(model.joints, self._q.values(), strict=True)
+            for j, q in zip(model.joints, self.symbols_of.values(), strict=True)
         }
-        self._v_of = {name: [space.of(x) for x in v] for name, v in self._v.items()}
+        self._v_of = {name: [space.of(x) for x in v] for name, v in self.rates_of.items()}
         self._carrier = {j.child: j for j in model.joints}
-
-    def value(self, where: str, part: str, field: str, source: Any, *index: int) -> sp.Expr:
-        """Return a number of a part, exactly, or the expression of parameters that it stands for."""
-        if (where, part, field, index) in self._bound:
-            return self._bound[where, part, field, index]
-        x = getattr(source, field)
-        return exact(float(x[index] if index else x))
 
     def _own(self, joint: Joint, symbols: list[sp.Symbol], layout: Any, *, still: bool = False) -> list[sp.Expr]:
         """Return a joint's coordinates or velocities; those of a mimic joint from its leader's."""
         if not joint.mimic:
             return symbols[layout[joint.name]] if joint.type.nv else []
         (leader,) = symbols[layout[joint.mimic.joint]]
-        ratio, offset = (self.value("joints", joint.name, f, joint.mimic) for f in ("ratio", "offset"))
+        ratio, offset = (
+            self.bound.get(("joints", joint.name, f, ()), exact(getattr(joint.mimic, f))) for f in ("ratio", "offset")
+        )
         return [ratio * leader + (0 if still else offset)]
 
     def carried(self, way: _Way, x: Vector, weight: int) -> Vector:
@@ -152,75 +155,28 @@ class SymbolicKinematics(Kinematics):
         total = gravity_energy(self)
         self.drop_dust([total])
         # Height by height rather than with g before them all, so that forces read term by term.
-        return self._back(shortest_form(total, whole=False))
-
-    @cached_property
-    def spring_energy(self) -> sp.Expr:
-        """What the springs of joints, of couplings and between points store."""
-        total = sp.Integer(0)
-        for joint in self.model.joints:
-            for k, q in enumerate(self._q[joint.name]):
-                stiffness, rest = (self.written("joints", joint, f, k) for f in ("stiffness", "rest"))
-                total += stiffness * (self._back(q) - rest) ** 2 / 2
-        for coupling in self.model.couplings:
-            stiffness, rest = (self.written("couplings", coupling, f) for f in ("stiffness", "rest_length"))
-            total += stiffness * (self._coupled(coupling, self._q) - rest) ** 2 / 2
-        for spring, square in self._squares():
-            stiffness, rest = (self.written("springs", spring, f) for f in ("stiffness", "rest_length"))
-            total += stiffness * (square if rest == 0 else (sp.sqrt(square) - rest) ** 2) / 2
-        return total
-
-    @cached_property
-    def dissipation(self) -> sp.Expr:
-        """Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
-        total = sp.Integer(0)
-        for joint in self.model.joints:
-            for k, v in enumerate(self._v[joint.name]):
-                total += self.written("joints", joint, "damping", k) * self._back(v) ** 2 / 2
-        for coupling in self.model.couplings:
-            total += self.written("couplings", coupling, "damping") * self._coupled(coupling, self._v) ** 2 / 2
-        for spring, square in self._squares():
-            damping = self.written("springs", spring, "damping")
-            if damping != 0:
-                pairs = zip(self.symbols, self.rates, strict=True)
-                rate = sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / 2
-                total += damping * rate**2 / square / 2
-        return total
-
-    def _coupled(self, coupling: JointCoupling, of: dict[str, list[sp.Expr]]) -> sp.Expr:
-        """Return a coupling's sum of factors times coordinates, or velocities."""
-        factors = (self.written("couplings", coupling, "factors", k) for k in range(len(coupling.joints)))
-        return sum(
-            (c * self._back(of[joint][0]) for c, joint in zip(factors, coupling.joints, strict=True)), sp.Integer(0)
-        )
-
-    def _squares(self) -> Iterator[tuple[Any, sp.Expr]]:
-        """Yield each spring between points with the square of its length."""
-        for spring in self.model.springs:
-            values = self.values.springs[spring.name]
-            ends = (self.to_world(spring.body_a, values.point_a), self.to_world(spring.body_b, values.point_b))
-            gap = [y - x for x, y in zip(*ends, strict=True)]
-            yield spring, self.shown(dot3(gap, gap))
+        return self.back(shortest_form(total, whole=False))
 
     def turns(self, joint: Joint) -> list[sp.Expr]:
         """Return a joint's coordinates that turn, those of a mimic joint by its leader's."""
-        return [self._back(self._q[joint.name][i]) for i in joint.type.angular]
+        return [self.back(self.symbols_of[joint.name][i]) for i in joint.type.angular]
 
-    def written(self, where: str, part: Any, field: str, *index: int) -> sp.Expr:
-        """Return a number of a part as the equations show it."""
-        x = self.value(where, part.name, field, part, *index)
-        return number(Fraction(int(x.p), int(x.q))) if x.is_Rational else self._back(x)
+    @cached_property
+    def written(self) -> WrittenKinematics:
+        """The same model's springs, dampers and prescribed motions, as the equations show them."""
+        return WrittenKinematics(self)
 
     def shown(self, x: Any) -> sp.Expr:
         """Return a sum as it is shown."""
-        return self._back(shortest_form(x))
+        return self.back(shortest_form(x))
 
     def moves(self, key: Key) -> bool:
         """Return whether a term of a sum depends on a coordinate."""
         _, multiples, powers = key
         return any(multiples) or any(powers[i] for i in self._lengths)
 
-    def _back(self, x: sp.Expr) -> sp.Expr:
+    def back(self, x: sp.Expr) -> sp.Expr:
+        """Return an expression with what its placeholders stand for."""
         return x.subs({dummy: e for e, dummy in self._opaque.items()}) if self._opaque else x
 
     def drop_dust(self, sums: list[Any]) -> None:
@@ -232,6 +188,40 @@ class SymbolicKinematics(Kinematics):
         for x in sums:
             for key in [k for k, value in x.terms.items() if abs(value) < _DUST * largest[k[2]]]:
                 del x.terms[key]
+
+
+class WrittenKinematics(Kinematics):
+    """Coordinates, velocities and numbers of a model in SymPy, as the equations show them."""
+
+    values: _Numbers
+    zero, half = sp.Integer(0), sp.Rational(1, 2)
+
+    def __init__(self, exact: SymbolicKinematics) -> None:
+        self._exact, self.model = exact, exact.model
+        self._q_of, self._v_of = (
+            {name: [exact.back(x) for x in own] for name, own in symbols.items()}
+            for symbols in (exact.symbols_of, exact.rates_of)
+        )
+        bound = {place: _shown_number(x) if x.is_Rational else exact.back(x) for place, x in exact.bound.items()}
+        self.values = _Numbers(self.model, bound, _shown_number)
+
+    def squared_length(self, spring: PointSpring) -> sp.Expr:
+        """Return |p_AB|² of the points that a spring joins."""
+        return self._exact.shown(self._exact.squared_length(spring))
+
+    def length(self, square: sp.Expr) -> sp.Expr:
+        """Return the root of a squared length."""
+        return sp.sqrt(square)
+
+    def length_rate(self, square: sp.Expr) -> sp.Expr:
+        """Return the rate of the length of which the square is given."""
+        pairs = zip(self._exact.symbols, self._exact.rates, strict=True)
+        return sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / sp.sqrt(square) / 2
+
+
+def _shown_number(x: Any) -> sp.Expr:
+    """Return a number as the equations show it: the decimal that was written."""
+    return number(Fraction(repr(x)) if isinstance(x, float) else Fraction(int(x.p), int(x.q)))
 
 
 def exact(x: float) -> sp.Rational:
@@ -269,11 +259,10 @@ _EPS: Final = 2.0**-52
 
 def motion(kin: SymbolicKinematics, prescribed: Prescribed, t: sp.Symbol) -> sp.Expr:
     """Return offset + rate t + amplitude sin(frequency t + phase)."""
-    fields = ("offset", "rate", "amplitude", "frequency", "phase")
-    offset, rate, amplitude, frequency, phase = (kin.written("prescribed", prescribed, f) for f in fields)
-    if kin.model.joint(prescribed.joint).type.angular:
-        offset = _read(offset)
-    return offset + rate * t + amplitude * sp.sin(frequency * t + _read(phase))
+    x = kin.written.values.motions[prescribed.joint]
+    turns = bool(kin.model.joint(prescribed.joint).type.angular)
+    offset = _read(x.offset) if turns else x.offset
+    return offset + x.rate * t + x.amplitude * sp.sin(x.frequency * t + _read(x.phase))
 
 
 def angle(x: float) -> sp.Expr:

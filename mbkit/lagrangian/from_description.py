@@ -8,6 +8,7 @@ from typing import Final, cast
 
 import sympy as sp
 
+from mbkit.derivation.kinematics import dissipation, spring_energy
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, instead_of_writing, motion
 from mbkit.lagrangian.energies.symbols import velocity_of
@@ -112,7 +113,7 @@ def from_model(
         raise InputError(f"coordinates: {clash[0]!r} is a parameter of {model.name}; give coordinates=... other names")
     v = [velocity_of(s) for s in q]
     kin = SymbolicKinematics(source, q, v, parameters, progress or (lambda *_: None))
-    T, V, R = kin.kinetic_energy, kin.gravity_energy + kin.spring_energy, kin.dissipation
+    T, V, R = kin.kinetic_energy, kin.gravity_energy + spring_energy(kin.written), dissipation(kin.written)
     t = _time({*parameters, *(s.name for s in (*q, *v))})
     moved = {model.coordinate_names.index(p.joint): motion(kin, p, t) for p in model.prescribed}
     rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]

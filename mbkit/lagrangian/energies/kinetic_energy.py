@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from itertools import permutations, product
+from itertools import product
 from typing import Any, Final
 
 import mpmath
@@ -13,7 +12,6 @@ import numpy as np
 import sympy as sp
 
 from mbkit.errors import InputError
-from mbkit.lagrangian.trig.shortest_form import complexity
 from mbkit.lagrangian.trig.simplify import DIGITS, LARGE, RandomEvaluation, tidy
 
 #: Lines through the velocities, and places on each.
@@ -184,30 +182,20 @@ def blocks(A: sp.Matrix) -> list[list[int]]:
     return out
 
 
-# xᵀ M⁻¹ y of a mass matrix in symbols, in the shortest of several forms.
+# xᵀ M⁻¹ y of a mass matrix in symbols.
 #
 # Completed squares are how books write H and effective potentials: (p_φ - p_ψ cos θ)² / (2 A sin² θ) + p_ψ² / (2 C),
-# where entries of M⁻¹ would be long. Which coordinate is eliminated first makes the difference. Where all squares
-# hold quotients of quotients, the cofactors of M over its determinant are shorter.
+# where entries of M⁻¹ would be long. A pivot that is a product leaves the shortest quotients.
 
-#: Coupled coordinates of which every order is tried.
-_TRIED: Final = 3
-#: Operations of three coupled rows up to which they are.
-_SMALL: Final = 24
 #: Operations up to which a step of an elimination is tidied.
 _LONG: Final = 250
 
 
 class Squares:
-    """The inverse of a symmetric positive definite matrix, each set of coupled coordinates by itself."""
+    """The inverse of a symmetric matrix, each set of coupled coordinates by itself; InputError names a singular one."""
 
     def __init__(self, M: Any, what: str) -> None:
-        self._blocks: list[tuple[list[int], _Eliminated | _Cofactors]] = []
-        for block in blocks(M):
-            part = sp.ImmutableMatrix(M.extract(block, block))
-            p = sp.symbols(f"p0:{len(block)}", cls=sp.Dummy)
-            tried = _tried(part, f"{what} {sp.Matrix(M).tolist()}")
-            self._blocks.append((block, min(tried, key=lambda a: complexity(a.form(p, p)) if len(tried) > 1 else 0)))
+        self._blocks = [(block, _inverse(M.extract(block, block), f"{what} {M.tolist()}")) for block in blocks(M)]
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
         """Return xᵀ M⁻¹ y."""
@@ -223,16 +211,11 @@ class Squares:
         return out
 
 
-def _tried(M: sp.ImmutableMatrix, what: str) -> list[_Eliminated | _Cofactors]:
-    n = M.shape[0]
-    few = n <= _TRIED and (n < _TRIED or sum(x.count_ops() for x in M) <= _SMALL)
-    out: list[_Eliminated | _Cofactors] = []
-    for order in permutations(range(n)) if few else (None,):
-        with suppress(_NoPivotError):
-            out.append(_Eliminated(M, order))
-    if not out or (few and n > 1):
-        out.append(_Cofactors(M, what))
-    return out
+def _inverse(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Cofactors:
+    try:
+        return _Eliminated(M)
+    except _NoPivotError:
+        return _Cofactors(M, what)
 
 
 def _shorter(x: sp.Expr) -> sp.Expr:
@@ -245,29 +228,24 @@ class _NoPivotError(Exception):
 
 
 class _Eliminated:
-    """M = L D Lᵀ, with pivots in an order, or the shortest first."""
+    """M = L D Lᵀ, with pivots of the fewest sums first."""
 
-    def __init__(self, M: sp.ImmutableMatrix, order: Sequence[int] | None = None) -> None:
-        left, entries = list(range(M.shape[0])), {(i, j): M[i, j] for i in range(M.shape[0]) for j in range(i + 1)}
-
-        def entry(i: int, j: int) -> sp.Expr:
-            return entries[max(i, j), min(i, j)]
-
+    def __init__(self, M: sp.ImmutableMatrix) -> None:
+        left = list(range(M.shape[0]))
+        entries = {(i, j): M[i, j] for i in left for j in left}
         #: Of each pivot: its index, its D, and how much of its row goes off each later one.
         self._steps: list[tuple[int, sp.Expr, dict[int, sp.Expr]]] = []
         while left:
-            pivots = {i: entry(i, i) for i in left if entry(i, i) != 0}
+            pivots = {i: entries[i, i] for i in left if entries[i, i] != 0}
             if not pivots:
                 raise _NoPivotError
-            k = min(pivots, key=lambda i: (pivots[i].count_ops(), left.index(i)))
-            if order is not None:
-                k = next(i for i in order if i in pivots)
+            k = min(pivots, key=lambda i: (len(pivots[i].atoms(sp.Add)), pivots[i].count_ops()))
             left.remove(k)
-            factors = {i: _shorter(entry(i, k) / pivots[k]) for i in left if entry(i, k) != 0}
+            factors = {i: _shorter(entries[i, k] / pivots[k]) for i in left if entries[i, k] != 0}
             for i, factor in factors.items():
                 for j in factors:
                     if j <= i:
-                        entries[i, j] = _shorter(entries[i, j] - factor * entry(j, k))
+                        entries[i, j] = entries[j, i] = _shorter(entries[i, j] - factor * entries[j, k])
             self._steps.append((k, pivots[k], factors))
 
     def _lowered(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
