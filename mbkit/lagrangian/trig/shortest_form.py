@@ -116,7 +116,7 @@ class _Writer:
         return out
 
     def expression(self, form: Form) -> sp.Expr:
-        poly = dict(self._term(key, value) for key, value in form.items())
+        poly = paired(dict(self._term(key, value) for key, value in form.items()))
         by_angle = self._by_angle(poly)
         if not self._whole or len(by_angle) == len(poly):
             candidates = [sp.Add(*map(self._written, by_angle))]
@@ -370,3 +370,24 @@ def content(poly: Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, Poly]:
 def _numbers(values: list[Fraction]) -> int:
     """Return how many numbers are written, of which fractions count twice."""
     return sum((abs(x) != 1) + (x.denominator != 1) for x in values)
+
+
+def paired(poly: Poly) -> Poly:
+    """Write c - c cos² a as c sin² a, and c - c sin² a as c cos² a."""
+    out = dict(poly)
+    for atoms, value in poly.items():
+        for a, e in atoms:
+            if e != 2 or not isinstance(a, (sp.sin, sp.cos)) or atoms not in out:
+                continue
+            alone = tuple(x for x in atoms if x[0] != a)
+            if out.get(alone) == -value:
+                other = (sp.cos if isinstance(a, sp.sin) else sp.sin)(*a.args)
+                del out[alone], out[atoms]
+                powers = dict(alone)
+                powers[other] = powers.get(other, 0) + 2
+                # There may be such a term already, with its atoms in another order.
+                place = next((k for k in out if dict(k) == powers), tuple(powers.items()))
+                total = out.pop(place, Fraction(0)) - value
+                if total:
+                    out[place] = total
+    return out
