@@ -203,10 +203,8 @@ def _rational(x: Fraction) -> sp.Rational:
 #: Terms of a quotient that is useful.
 _MOST: Final = 400
 
-#: Exponents of the z's and the generators -> real and imaginary part.
-_Exponents = tuple[int, ...]
-_Complex = tuple[Fraction, Fraction]
-_Exponential = dict[_Exponents, _Complex]
+#: Exponents of the z's and the generators -> a complex number of fractions.
+_Exponential = dict[tuple[int, ...], Any]
 
 
 def quotient(above: TrigPolynomial, below: TrigPolynomial) -> TrigPolynomial | None:
@@ -218,54 +216,43 @@ def quotient(above: TrigPolynomial, below: TrigPolynomial) -> TrigPolynomial | N
     spans = list(zip(zip(*a, strict=True), zip(*b, strict=True), strict=True))
     low, high = [min(x) - min(y) for x, y in spans], [max(x) - max(y) for x, y in spans]
     lead = max(b)
-    real, imaginary = b[lead]
-    size = real**2 + imaginary**2
-    inverse = real / size, -imaginary / size
     out: _Exponential = {}
     while a:
         first = max(a)
         step = tuple(p - q for p, q in zip(first, lead, strict=True))
         if any(not i <= e <= j for i, e, j in zip(low, step, high, strict=True)) or len(out) == _MOST:
             return None
-        out[step] = factor = _times(a[first], inverse)
+        out[step] = factor = a[first] / b[lead]
         for exponents, value in b.items():
-            _subtract(a, tuple(p + q for p, q in zip(exponents, step, strict=True)), _times(factor, value))
+            place = tuple(p + q for p, q in zip(exponents, step, strict=True))
+            left = a.pop(place, sp.QQ_I.zero) - factor * value
+            if left:
+                a[place] = left
     return _sum(above, out)
 
 
 def _exponential(x: TrigPolynomial) -> _Exponential:
     out: _Exponential = {}
     for (kind, turns, powers), value in x.terms.items():
-        if not any(turns):
-            out[(*turns, *powers)] = value, Fraction(0)
-            continue
-        half, back = value / 2, tuple(-k for k in turns)
-        for exponents, sign in (((*turns, *powers), -1), ((*back, *powers), 1)):
-            real, imaginary = out.get(exponents, (Fraction(0), Fraction(0)))
-            out[exponents] = (real, imaginary + sign * half) if kind else (real + half, imaginary)
+        number = sp.QQ_I(sp.QQ(value.numerator, value.denominator), 0)
+        if any(turns):
+            half = number / sp.QQ_I(0, 2) if kind else number / sp.QQ_I(2, 0)
+            back = tuple(-k for k in turns)
+            for exponents, part in (((*turns, *powers), half), ((*back, *powers), -half if kind else half)):
+                out[exponents] = out.get(exponents, sp.QQ_I.zero) + part
+        else:
+            out[(*turns, *powers)] = number
     return out
 
 
 def _sum(like: TrigPolynomial, x: _Exponential) -> TrigPolynomial:
     n, terms = len(like.space.angles), {}
-    for exponents, (real, imaginary) in x.items():
+    for exponents, value in x.items():
         turns, powers = exponents[:n], exponents[n:]
+        real, imaginary = (Fraction(int(y.numerator), int(y.denominator)) for y in (value.x, value.y))
         first = next((k for k in turns if k), 0)
         if not first:
             terms[0, turns, powers] = real
         elif first > 0:
             terms |= {(kind, turns, powers): part for kind, part in ((0, 2 * real), (1, -2 * imaginary)) if part}
     return TrigPolynomial(like.space, terms)
-
-
-def _times(x: _Complex, y: _Complex) -> _Complex:
-    return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
-
-
-def _subtract(out: _Exponential, exponents: _Exponents, value: _Complex) -> None:
-    real, imaginary = out.get(exponents, (Fraction(0), Fraction(0)))
-    left = real - value[0], imaginary - value[1]
-    if any(left):
-        out[exponents] = left
-    else:
-        out.pop(exponents, None)
