@@ -60,17 +60,12 @@ class Lagrangian(EnergyForm):
 
     Attributes
     ----------
-    T, V, dissipation : sympy.Expr
-    coordinates, velocities, accelerations : tuple of sympy.Symbol
-        Plain symbols.
-    time : sympy.Symbol or None
-        Where something depends on it.
+    T, V, dissipation, coordinates, velocities, accelerations, time, parameters, constraints
+        The arguments in plain symbols; `time` is None where nothing depends on it.
     forces : (n, 1) sympy.Matrix
         Without the dissipation.
     inputs : mapping of coordinate to sympy.Symbol
         The symbols that stand for ``tau``.
-    parameters : mapping of sympy.Symbol to float or None
-    constraints : tuple of sympy.Expr
     multiplier_symbols : tuple of sympy.Symbol
         λ of each constraint.
 

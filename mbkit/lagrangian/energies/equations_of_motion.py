@@ -25,26 +25,17 @@ class EquationsOfMotion(Printable):
 
     Attributes
     ----------
-    coordinates, velocities, accelerations : tuple of sympy.Symbol
-    mass_matrix : (n, n) sympy.Matrix
-        M = ∂²T/∂v².
-    coriolis_matrix : (n, n) sympy.Matrix
-        C of Christoffel's symbols, so that Ṁ - 2C is skew.
+    coordinates, velocities, accelerations, multipliers : tuple of sympy.Symbol
+    mass_matrix, coriolis_matrix : (n, n) sympy.Matrix
+        M = ∂²T/∂v², and C of Christoffel's symbols, so that Ṁ - 2C is skew.
     drift : (n, 1) sympy.Matrix
-        d: gyroscopic terms of T1, rates of M and T1 with time, centrifugal ones of T0.
-        Zero where T has neither time nor terms below the second degree.
-    potential_gradient : (n, 1) sympy.Matrix
-        ∂V/∂q.
-    forces : (n, 1) sympy.Matrix
-        Q: generalized forces, Rayleigh's dissipation -∂R/∂v among them.
+        d: gyroscopic terms of T1, rates of M and T1 with time, centrifugal ones of T0; zero where T = T2 without time.
+    potential_gradient, forces : (n, 1) sympy.Matrix
+        ∂V/∂q, and Q: generalized forces, Rayleigh's dissipation -∂R/∂v among them.
     constraint_jacobian : (m, n) sympy.Matrix
         J; no rows without constraints.
-    constraint_acceleration : (m, 1) sympy.Matrix
-        γ: J̇ v and the time's own terms, so that J v̇ + γ = 0.
-    constraints : (m, 1) sympy.Matrix
-        f(q, t), which is zero.
-    multipliers : tuple of sympy.Symbol
-        λ.
+    constraint_acceleration, constraints : (m, 1) sympy.Matrix
+        γ, the terms of J̇ v and of the time, so that J v̇ + γ = 0; and f(q, t), which is zero.
     """
 
     coordinates: tuple[sp.Symbol, ...]
