@@ -78,12 +78,17 @@ class Kinematics:
         """Return the joint's velocities."""
         return self._v_of[joint.name]
 
-    def coupled(self, coupling: JointCoupling) -> tuple[Any, Any]:
-        """Return a coupling's length and its rate."""
+    def coupled_length(self, coupling: JointCoupling) -> Any:
+        """Return the sum of a coupling's factors times coordinates."""
+        return self._coupled(coupling, self._q_of)
+
+    def coupled_rate(self, coupling: JointCoupling) -> Any:
+        """Return the rate of a coupling's length."""
+        return self._coupled(coupling, self._v_of)
+
+    def _coupled(self, coupling: JointCoupling, of: dict[str, Vector]) -> Any:
         factors = self.values.couplings[coupling.name].factors
-        pairs = list(zip(factors, coupling.joints, strict=True))
-        length, rate = (sum((c * of[joint][0] for c, joint in pairs), 0.0) for of in (self._q_of, self._v_of))
-        return length, rate
+        return sum((c * of[joint][0] for c, joint in zip(factors, coupling.joints, strict=True)), 0.0)
 
     @cached_property
     def placements(self) -> dict[str, tuple[Any, Vector]]:
@@ -194,7 +199,7 @@ def kinetic_energy(kin: Kinematics) -> Any:
         for rotor, rate in zip(kin.values.joints[joint.name].armature, kin.velocities(joint), strict=True):
             total += 0.5 * rotor * rate * rate
     for coupling in kin.model.couplings:
-        _, rate = kin.coupled(coupling)
+        rate = kin.coupled_rate(coupling)
         total += 0.5 * kin.values.couplings[coupling.name].armature * rate * rate
     return total
 
@@ -231,7 +236,7 @@ def spring_energy(kin: Kinematics) -> Any:
     for coupling in kin.model.couplings:
         values = kin.values.couplings[coupling.name]
         if not is_zero(values.stiffness):
-            stretch = kin.coupled(coupling)[0] - values.rest_length
+            stretch = kin.coupled_length(coupling) - values.rest_length
             total += kin.half * values.stiffness * stretch * stretch
     for spring in kin.model.springs:
         values = kin.values.springs[spring.name]
@@ -253,7 +258,7 @@ def dissipation(kin: Kinematics) -> Any:
         for damping, rate in zip(kin.values.joints[joint.name].damping, kin.velocities(joint), strict=True):
             total += kin.half * damping * rate * rate
     for coupling in kin.model.couplings:
-        _, rate = kin.coupled(coupling)
+        rate = kin.coupled_rate(coupling)
         total += kin.half * kin.values.couplings[coupling.name].damping * rate * rate
     for spring in kin.model.springs:
         damping = kin.values.springs[spring.name].damping

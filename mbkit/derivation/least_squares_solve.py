@@ -138,7 +138,7 @@ def squares(kin: Kinematics) -> Squares:
         for rotor, rate in zip(kin.values.joints[joint.name].armature, kin.velocities(joint), strict=True):
             rows.row(rotor, rate, 0.0)
     for coupling in kin.model.couplings:
-        rows.row(kin.values.couplings[coupling.name].armature, kin.coupled(coupling)[1], 0.0)
+        rows.row(kin.values.couplings[coupling.name].armature, kin.coupled_rate(coupling), 0.0)
     return rows.finished()
 
 

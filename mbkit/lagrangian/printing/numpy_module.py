@@ -33,7 +33,11 @@ def python_code(system: Lagrangian) -> str:
     written = {s: sp.Symbol(name) for s, name in names.items()}
     upper = [e.mass_matrix[i, j] for i in range(n) for j in range(i, n)]
     clock = ", t=0.0" if system.time else ""
-    take = _lines(system, names)
+    own = [names[s] for s in system.parameters]
+    take = "    unknown = set(parameters) - set(PARAMETERS)\n    if unknown:\n"
+    take += '        raise TypeError(f"no such parameters: {sorted(unknown)}")\n'
+    if own:
+        take += "    given = PARAMETERS | parameters\n" + "".join(f"    {name} = given[{name!r}]\n" for name in own)
     coordinates = python_docstring(", ".join(s.name for s in e.coordinates))
     values = "".join(f"    {names[s]!r}: {x!r},\n" for s, x in system.parameters.items())
     unpack = f"{take}    {', '.join(names[s] for s in e.coordinates)}, = q\n"
@@ -70,28 +74,13 @@ def forward_dynamics(q, v, tau={(0.0,) * n!r}{clock}, **parameters):
 '''
 
 
-def _lines(system: Lagrangian, names: dict[sp.Symbol, str]) -> str:
-    """Return the lines that read the parameters."""
-    own = [names[s] for s in system.parameters]
-    lines = ["    unknown = set(parameters) - set(PARAMETERS)"]
-    lines += ["    if unknown:", '        raise TypeError(f"no such parameters: {sorted(unknown)}")']
-    if own:
-        lines += ["    given = PARAMETERS | parameters"]
-        lines += [f"    {name} = given[{name!r}]" for name in own]
-    return "\n".join(lines) + "\n"
-
-
 def _body(expressions: list[sp.Expr], written: dict[sp.Symbol, sp.Symbol]) -> str:
     used = {s.name for s in written.values()}
     fresh = (s for s in sp.numbered_symbols("x") if s.name not in used)
     shared, out = sp.cse([x.xreplace(written) for x in expressions], symbols=fresh, order="none")
     code: Callable[[Any], str] = NumPyPrinter({"fully_qualified_modules": True}).doprint
-    lines = [f"    {s} = {_short(code(x))}" for s, x in shared]
-    return "\n".join([*lines, f"    out = [{', '.join(_short(code(x)) for x in out)}]"])
-
-
-def _short(code: str) -> str:
-    return code.replace("numpy.", "np.")
+    lines = [f"    {s} = {code(x)}" for s, x in shared]
+    return "\n".join([*lines, f"    out = [{', '.join(map(code, out))}]"]).replace("numpy.", "np.")
 
 
 def _names(system: Lagrangian) -> dict[sp.Symbol, str]:
