@@ -50,7 +50,10 @@ class _Numbers(Values):
         self._bound, self._number = bound, read
         self._read_parts(model)
         self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
-        self.motions = {x.joint: self._read("prescribed", x.joint, x, _MOTION) for x in model.prescribed}
+
+    def motion(self, prescribed: Prescribed) -> Any:
+        """Return the numbers of a motion, which a model of the same form need not have."""
+        return self._read("prescribed", prescribed.joint, prescribed, _MOTION)
 
     def _scalar(self, value: float, direction: bool = False) -> Any:  # noqa: ARG002
         return self._number(value)
@@ -259,7 +262,7 @@ _EPS: Final = 2.0**-52
 
 def motion(kin: SymbolicKinematics, prescribed: Prescribed, t: sp.Symbol) -> sp.Expr:
     """Return offset + rate t + amplitude sin(frequency t + phase)."""
-    x = kin.written.values.motions[prescribed.joint]
+    x = kin.written.values.motion(prescribed)
     turns = bool(kin.model.joint(prescribed.joint).type.angular)
     offset = _read(x.offset) if turns else x.offset
     return offset + x.rate * t + x.amplitude * sp.sin(x.frequency * t + _read(x.phase))
