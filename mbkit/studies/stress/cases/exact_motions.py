@@ -146,18 +146,18 @@ class HangingChain:
 _DIGITS: Final = 50
 
 
-def released(start: float, square: float, rate: float) -> Exact:
-    """Return q of q̈ + 2 a q̇ + ω² q = 0, let go at rest, from ω² and a (Landau, Lifshitz 1976, §25)."""
+def released(square: float, rate: float) -> Exact:
+    """Return q of q̈ + 2 a q̇ + ω² q = 0, let go at rest from 1, from ω² and a (Landau, Lifshitz 1976, §25)."""
     discriminant = square - rate * rate
     if discriminant > 0:
         w = np.sqrt(discriminant)
-        return lambda t: (start * np.exp(-rate * t) * (np.cos(w * t) + rate / w * np.sin(w * t)))[:, None]
+        return lambda t: (np.exp(-rate * t) * (np.cos(w * t) + rate / w * np.sin(w * t)))[:, None]
     if discriminant == 0:
-        return lambda t: (start * (1 + rate * t) * np.exp(-rate * t))[:, None]
+        return lambda t: ((1 + rate * t) * np.exp(-rate * t))[:, None]
     fast = -(rate + np.sqrt(-discriminant))
     # The other root by the product of the two: a difference would cancel.
     slow = square / fast
-    return lambda t: (start * (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow))[:, None]
+    return lambda t: ((fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow))[:, None]
 
 
 def modal(rates: Array, start: Array) -> Exact:
@@ -264,31 +264,24 @@ def turning(axis: Array, speed: float) -> Exact:
 def free_rotor(inertia: Array, spin: Array) -> tuple[Exact, float]:
     """Return quaternions (K, 4) of a torque-free body from the identity, and the period of its angular velocity.
 
-    Three different principal moments, kg m², and a spin about more than one body axis, rad/s. Landau, Lifshitz 1976,
-    §37: with A < B < C, or A > B > C where L² < 2 E B, ω = (a cn, b sn, c dn); the third axis goes round L at φ̇ =
-    (L/C)(1 + (C - A)/A / (1 - n sn²)), an integral of the third kind (Carlson 1979 for it).
+    Principal moments C > B > A about x, y and z, kg m², and a spin with ω_x > 0 and L² > 2 E B, rad/s. Landau, Lifshitz
+    1976, §37: ω = (c dn, b sn, a cn); the x axis goes round L at φ̇ = (L/C)(1 + (C - A)/A / (1 - n sn²)), an integral of
+    the third kind (Carlson 1979 for it).
     """
-    order = np.argsort(inertia)
-    (A, B, C), (x, y, z) = inertia[order], spin[order]
-    # L² - 2 E B, like all that follows of terms that do not cancel.
-    if C * (C - B) * z * z < A * (B - A) * x * x:
-        order = order[::-1]
-        (A, B, C), (x, y, z) = inertia[order], spin[order]
+    (C, B, A), (z, y, x) = inertia, spin
+    # Terms that do not cancel.
     upper = A * (C - A) * x * x + B * (C - B) * y * y  # 2 E C - L²
     lower = B * (B - A) * y * y + C * (C - A) * z * z  # L² - 2 E A
     a, b, c = math.sqrt(upper / (A * (C - A))), math.sqrt(upper / (B * (C - B))), math.sqrt(lower / (C * (C - A)))
     m = (B - A) * upper / ((C - B) * lower)
     rest = (C - A) * (C * (C - B) * z * z - A * (B - A) * x * x) / ((C - B) * lower)  # 1 - m
-    # Euler's equations run backwards in a mirrored frame (an odd order of the axes), and again where the
-    # moments fall instead of rise.
-    even = (order[1] - order[0]) % 3 == 1
-    rate = math.copysign(math.sqrt((C - B) * lower / (A * B * C)), (C - A) * (1 if even else -1))
-    side = math.copysign(1.0, z)
+    # Backwards, for the moments fall from x to z.
+    rate = -math.sqrt((C - B) * lower / (A * B * C))
     momentum = float(np.linalg.norm(inertia * spin))
     n = -((C * c) ** 2) * m * (C - A) / (A * upper)
     quarter = float(ellipkm1(rest))
     whole = 2 * float(_third_kind(n, rest, np.array([1.0]), np.array([0.0]))[0])
-    start = float(ellipkinc(math.atan2(y / b, side * x / a), m))
+    start = float(ellipkinc(math.atan2(y / b, x / a), m))
 
     def jacobi(t: Array) -> tuple[Array, Array]:
         """Return the angular velocity and ∫ dt/(1 - n sn²)."""
@@ -296,17 +289,16 @@ def free_rotor(inertia: Array, spin: Array) -> tuple[Exact, float]:
         turns = np.rint(u / (2 * quarter))
         sn, cn, dn, _ = ellipj(u - 2 * turns * quarter, m)
         sign = (-1.0) ** turns
-        spins = np.empty((len(t), 3))
-        spins[:, order] = np.stack([side * a * sign * cn, b * sign * sn, side * c * dn], axis=-1)
+        spins = np.stack([c * dn, b * sign * sn, a * sign * cn], axis=-1)
         return spins, (turns * whole + _third_kind(n, rest, sn, cn)) / rate
 
-    (_, before), first = jacobi(np.zeros(1)), _momentum_axes(inertia, spin[None], order[2])[0]
+    (_, before), first = jacobi(np.zeros(1)), _momentum_axes(inertia, spin[None])[0]
 
     def motion(t: Array) -> Array:
         spins, poles = jacobi(t)
         turned = momentum / C * (t + (C - A) / A * (poles - before))
         about = Rotation.from_rotvec(np.multiply.outer(turned, [0.0, 0.0, 1.0])).as_matrix()
-        attitude = first @ about @ np.swapaxes(_momentum_axes(inertia, spins, order[2]), 1, 2)
+        attitude = first @ about @ np.swapaxes(_momentum_axes(inertia, spins), 1, 2)
         return np.asarray(Rotation.from_matrix(attitude).as_quat())
 
     return motion, 4 * quarter / abs(rate)
@@ -318,11 +310,11 @@ def _third_kind(n: float, rest: float, sn: Array, cn: Array) -> Array:
     return np.asarray(sn * elliprf(c2, d2, 1.0) + n / 3 * sn**3 * elliprj(c2, d2, 1.0, 1 - n * sn * sn))
 
 
-def _momentum_axes(inertia: Array, spins: Array, axis: int) -> Array:
-    """Return, in body axes, the columns: the third axis' part normal to L, their product, L's direction."""
+def _momentum_axes(inertia: Array, spins: Array) -> Array:
+    """Return, in body axes, the columns: the x axis' part normal to L, their product, L's direction."""
     L = inertia * spins
     third = L / np.linalg.norm(L, axis=1, keepdims=True)
-    first = np.eye(3)[axis] - third * third[:, axis : axis + 1]
+    first = np.array([1.0, 0.0, 0.0]) - third * third[:, :1]
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(third, first), third], axis=-1)
 

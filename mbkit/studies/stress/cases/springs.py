@@ -58,7 +58,7 @@ def _released_hinge(
     b = ModelBuilder("hinge", gravity=(0.0, 0.0, 0.0))
     b.add_body("bob", mass=1.0, com=(0.0, 0.0, -1.0))
     b.add_joint("theta", "continuous", parent="world", child="bob", axis=SWING, stiffness=stiffness, damping=damping)
-    exact, source = released(1.0, stiffness, damping / 2), "damped oscillator, Landau, Lifshitz 1976, §25"
+    exact, source = released(stiffness, damping / 2), "damped oscillator, Landau, Lifshitz 1976, §25"
     return motion(b.build(), np.ones(1), 0.0, duration, exact, floor, source, facts, **more)
 
 
