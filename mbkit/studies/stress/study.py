@@ -74,40 +74,29 @@ def stress(
         rtol and atol of adaptive methods, raised to the least that a method allows.
     bar : float
         A value is held up to this error, relative to the size of the motion or term, unless a case has its own bar.
-    seconds : float, optional
-        Processor time of a run, 2, in a quick study 0.5. Making the problem, deriving and compiling have fifteen times
-        as long.
+    seconds, budget : float, optional
+        Processor time of a run, 2 s, quick 0.5 s; making the problem, deriving and compiling have fifteen times as
+        long. And time of the whole study, 1700 s, quick 100 s; cells beyond it are "not run".
     memory : int, optional
         Bytes of a worker process, 2 GiB when not given; enforced on Linux.
-    budget : float, optional
-        Seconds of the whole study, 1700, in a quick study 100. Cells beyond it are "not run".
     jobs : int, optional
-        Processes side by side; by default one per processor, at most 16. They share memory and caches: run times are
-        those of a busy machine.
+        Processes side by side, by default one per processor, at most 16. Run times are those of a busy machine.
     progress : callable, optional
         Called as ``progress(fraction, text)``. An exception of it ends the study, after `checkpoint` has the result.
     checkpoint : path or callable, optional
-        Receives the result so far every few seconds and at the end: a JSON file, which is whole at any time, or a
-        function.
-
-    Returns
-    -------
-    StressResult
+        Receives the result so far every few seconds and at the end: a JSON file, whole at any time, or a function.
 
     Raises
     ------
-    InputError, UnknownNameError
-        For unusable arguments. Failures of an engine or method are in the result.
-    UnsupportedError
-        Worker processes do not start.
+    InputError, UnknownNameError, UnsupportedError
+        Unusable arguments; worker processes do not start. Failures of an engine or method are in the result.
     InterruptedSweepError
         Upon Ctrl-C: a `KeyboardInterrupt` whose `result` holds the finished cells, as `checkpoint` does.
 
     Notes
     -----
     Every run takes place in a worker process, which is ended when a run takes too long, and replaced when it died; so
-    a crash, an endless loop and too little memory are results. The runs of one worker follow each other in the same
-    memory.
+    a crash, an endless loop and too little memory are results.
 
     The error of a motion is the largest difference of q to its truth over ten times, on the manifold, divided by the
     problem's scale. The truth is a closed form, or the motion on which two independent runs agree;
@@ -115,9 +104,8 @@ def stress(
     a right one not for it. The error of a term is normwise per state, against 34 digits. Run times are processor time
     of the whole run, without compilation.
 
-    After a value at which a row is too slow or its process died, more extreme values are not run: they cost as much,
-    and tell no more. Likewise after two in a row that diverged, were refused or gave NaN. An error above the bar ends
-    no row.
+    After a value at which a row is too slow or its process died, or after two in a row that diverged, were refused or
+    gave NaN, more extreme values are not run. An error above the bar ends no row.
 
     Examples
     --------

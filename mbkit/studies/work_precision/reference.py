@@ -357,8 +357,7 @@ def reference(
     ----------
     model : Model
         Whose named parameters have values.
-    q0 : (nq,) array_like
-    v0 : (nv,) array_like
+    q0, v0 : (nq,) and (nv,) array_like
     duration : float
         s.
     save : (K,) array_like
@@ -371,16 +370,10 @@ def reference(
     progress : bool or callable, optional
         As in `mbkit.simulate`.
 
-    Returns
-    -------
-    Reference
-
     Raises
     ------
-    InputError
-        A wrong shape, state, time or torque.
-    UnsupportedError
-        Neither heyoka nor two engines for this model are at hand, or it has loops or prescribed motions.
+    InputError, UnsupportedError
+        Unusable arguments; neither heyoka nor two engines for this model, or it has loops or prescribed motions.
 
     Notes
     -----

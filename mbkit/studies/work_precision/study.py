@@ -92,41 +92,34 @@ def work_precision(
     repeats : int
         Timings of each setting, in rounds over all of them; fewer of long runs where time is short.
     seconds : float, optional
-        Limit of processor time, with the reference and all compilation. What is left out for it is named first in the
-        repr and the reports. A compilation is never broken off, and a part is always left to the runs. By default
-        `work` alone decides on the settings, and the study ends after five times the usual 60 to 120 s.
+        Limit of processor time, with the reference and all compilation, which is never broken off; a part is always
+        left to the runs. By default `work` alone decides on the settings, and the study ends after five times the usual
+        60 to 120 s.
     work : int, optional
         Limit of evaluations of the forward dynamics in a run with the study's own steps and tolerances; an evaluation
         called from Python counts eight. So the curves do not depend on the machine's speed. By default 200,000, and
         less beyond 8 velocities.
     executor : concurrent.futures.Executor, optional
-        Measures one curve a call: a pool of processes, Dask's or MPI's. Errors do not depend on it. Run times do,
-        because workers share the cores: leave it out for reliable run times.
+        Measures one curve a call: a pool of processes, Dask's or MPI's. Errors do not depend on it; run times do,
+        because workers share the cores.
     reference : Reference or callable, optional
         The motion: from `mbkit.studies.work_precision.reference`, whose times are then the saved ones, or an exact
         function from t to (q, v). By default it is computed.
     progress : callable, optional
-        Called as ``progress(fraction, text)``. Its exception ends the study, after `checkpoint` has got the finished
-        part.
+        Called as ``progress(fraction, text)``. An exception of it ends the study, after `checkpoint` has the result.
     checkpoint : path or callable, optional
-        Receives the result so far every few seconds and at the end: a JSON file, which is whole at any time, or a
-        function.
-
-    Returns
-    -------
-    WorkPrecision
+        Receives the result so far every few seconds and at the end: a JSON file, whole at any time, or a function.
 
     Raises
     ------
-    InputError, UnknownNameError
-        Unusable arguments. The limits of an engine or method are in `refusals`.
-    UnsupportedError
-        Without `reference`, the model has loops or prescribed motions, which engines do not support.
+    InputError, UnknownNameError, UnsupportedError
+        Unusable arguments; loops or prescribed motions, which engines do not support, without `reference`. The limits
+        of an engine or method are in `refusals`.
     NumericalError
         No two computations of this motion agree even at its beginning.
     InterruptedSweepError
-        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is the finished part, which `checkpoint` has got before. While
-        the reference is computed, a plain `KeyboardInterrupt`.
+        Upon Ctrl-C: a `KeyboardInterrupt` whose `result` is the finished part, as `checkpoint` has. While the reference
+        is computed, a plain `KeyboardInterrupt`.
 
     Notes
     -----
