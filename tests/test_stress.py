@@ -27,9 +27,16 @@ from mbkit.errors import InputError, UnknownNameError
 from mbkit.report.stress_view import headline
 from mbkit.studies import InterruptedSweepError, StressResult
 from mbkit.studies.stress import Case, CaseResult, Measurement, Row, stress
-from mbkit.studies.stress.measure import Limits, Prepared, condition_number, measure, prepare
-from mbkit.studies.stress.reference import condition, reference_motion
-from mbkit.studies.stress.sweep import CaseSweep
+from mbkit.studies.stress.measure import (
+    Limits,
+    Prepared,
+    condition,
+    condition_number,
+    measure,
+    prepare,
+    reference_motion,
+)
+from mbkit.studies.stress.study import CaseSweep
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, cpu_limit
 from mbkit.studies.worker import WorkerDiedError, WorkerTimeoutError
 from tests import stress_cases as own

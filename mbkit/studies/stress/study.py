@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import os
 import pickle
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from mbkit._check import count, real
 from mbkit.engines.registry import DERIVED, ENGINES, INDEPENDENT, compared
@@ -19,12 +24,22 @@ from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.measure import Limits
-from mbkit.studies.stress.measurements import BAR
-from mbkit.studies.stress.reference import TERMS
+from mbkit.studies.stress.measure import TERMS, Limits, Prepared, condition_number, measure, prepare
+from mbkit.studies.stress.measurements import BAR, CaseResult, Measurement, Row
 from mbkit.studies.stress.result import StressResult
-from mbkit.studies.stress.sweep import CaseSweep, run_sweeps
-from mbkit.studies.worker import CallError, in_worker, processors
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
+from mbkit.studies.worker import (
+    OUT_OF_MEMORY,
+    CallError,
+    Worker,
+    WorkerClosedError,
+    WorkerDiedError,
+    WorkerStartError,
+    WorkerTimeoutError,
+    describe,
+    in_worker,
+    processors,
+)
 
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}
@@ -35,6 +50,277 @@ _MIN_MEMORY: Final = 2**29
 _MAX_JOBS: Final = 16
 #: Seconds between two looks at how far it is.
 _TICK: Final = 0.2
+#: A run is not begun with less time than this, s.
+_MIN_TIME: Final = 0.1
+#: Runs in a row that did not finish, after which a row is over.
+_MAX_FAILURES: Final = 2
+#: The part of a truth's time that its search gets, and the time for making its engines besides, s.
+_SEARCH: Final = 0.7
+_MIN_TRUTH: Final = 2.0
+#: Terms with 34 digits at one value, for which there is no substitute, s.
+_TERMS: Final = 60.0
+#: Seconds, and the part of a limit, by which the worker may miss it before its process is ended.
+_GRACE: Final = (0.5, 0.25)
+#: Stage of a call -> what to add to the note of a process that ended there.
+_DURING: Final = {
+    "": ", making the problem",
+    "truth": ", searching for its truth",
+    "engine": ", making the engine",
+    "method": ", deriving and compiling",
+}
+
+
+@dataclass
+class _Row:
+    """The cells of one engine and method by the index of their value."""
+
+    engine: str
+    method: str
+    setting: str
+    theory: float | None
+    cells: dict[int, Measurement] = field(default_factory=dict)
+    #: Why no more are computed; empty while more are.
+    stopped: str = ""
+
+    @property
+    def expected(self) -> float:
+        """Seconds of the longest run."""
+        return max((c.seconds for c in self.cells.values() if not math.isnan(c.seconds)), default=0.0)
+
+    def add(self, index: int, cell: Measurement) -> None:
+        """Keep a cell, and decide whether more are worth it."""
+        self.cells[index] = cell
+        last = [c.end for _, c in sorted(self.cells.items())][-_MAX_FAILURES:]
+        if cell.end in ("slow", "died"):
+            # More extreme values cost as much again, and tell no more.
+            self.stopped = f"not run: {cell.end} at {cell.value:g} before"
+        elif len(last) == _MAX_FAILURES and not {"finished", "not run"} & set(last):
+            self.stopped = f"not run: {' and '.join(dict.fromkeys(last))} at milder values before"
+
+
+@dataclass(eq=False)
+class CaseSweep:
+    """A case with its values from mild to extreme, truths and rows of (engine, method)."""
+
+    case: Case
+    values: tuple[float, ...]
+    pairs: Sequence[tuple[str, str]]
+    bar: float
+    limits: Limits
+    report: Callable[[str], object]
+    deadline: float = math.inf
+    clock: Callable[[], float] = time.perf_counter
+
+    def __post_init__(self) -> None:
+        theory = self.case.theory or (lambda _engine, _method: None)
+        self.limits = replace(self.limits, seconds=self.limits.seconds * self.case.patience)
+        #: By the index of the value.
+        self._prepared: dict[int, Prepared] = {}
+        self._rows = [_Row(e, m, self._setting(m), theory(e, m)) for e, m in self.pairs]
+
+    @property
+    def engines(self) -> tuple[str, ...]:
+        """The engines that have a row."""
+        return tuple(dict.fromkeys(row.engine for row in self._rows))
+
+    @property
+    def size(self) -> int:
+        """Number of steps: one for each truth and for each cell."""
+        return len(self.values) * (1 + len(self._rows))
+
+    @property
+    def done(self) -> int:
+        """Number of steps that need no more work."""
+        return len(self._prepared) + sum(len(self.values) if row.stopped else len(row.cells) for row in self._rows)
+
+    def _setting(self, method: str) -> str:
+        if self.case.measure == "terms":
+            return ""
+        kind = METHODS[method]
+        if kind.kind == "adaptive":
+            return f"rtol {max(self.limits.rtol, kind.least):.0e}"
+        return f"dt {self.limits.dt:g} s"
+
+    def _call(
+        self, worker: Worker, value: float, function: Callable[..., Any], *arguments: object, **stage_seconds: float
+    ) -> Any:
+        """Return what a function answers for a value of the case, or the measurement of how the call ended."""
+        try:
+            return worker.call(
+                function,
+                self.case,
+                value,
+                *arguments,
+                cpu_seconds=_with_grace(self.limits.preparation),
+                stage_seconds={stage: _with_grace(seconds) for stage, seconds in stage_seconds.items()},
+                deadline=self.deadline,
+            )
+        except (CallError, WorkerClosedError, WorkerStartError):
+            # No cell can be computed: these end the study.
+            raise
+        except WorkerTimeoutError as error:
+            if self.clock() >= self.deadline:
+                return Measurement(value, "not run", note=OUT_OF_TIME)
+            return Measurement(value, "slow", note=f"{error}{_DURING.get(worker.stage, '')}")
+        except WorkerDiedError as error:
+            return Measurement(value, "died", note=f"{error}{_DURING.get(worker.stage, '')}")
+        except MemoryError as error:
+            # What its process keeps takes memory from the next call.
+            worker.end()
+            return Measurement(value, "died", note=f"{OUT_OF_MEMORY} ({error})" if str(error) else OUT_OF_MEMORY)
+        except Exception as error:
+            return Measurement(value, "slow" if isinstance(error, TooLongError) else "refused", note=describe(error))
+
+    def prepare(self, worker: Worker, until: float) -> bool:
+        """Have the truths computed in order, begin none after `until`, and return whether all are there."""
+        for i, value in enumerate(self.values):
+            if i in self._prepared:
+                continue
+            left = until - self.clock()
+            if left < _MIN_TIME:
+                return False
+            self.report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
+            share = left / (len(self.values) - i)
+            seconds = _TERMS if self.case.measure == "terms" else share + _MIN_TRUTH
+            answer = self._call(worker, value, prepare, self.bar, _SEARCH * share, truth=seconds)
+            if isinstance(answer, Prepared):
+                number = self._call(worker, value, condition_number)
+                if not isinstance(number, Measurement) and math.isfinite(number):
+                    answer = replace(answer, facts={**answer.facts, "cond(M)": answer.facts.get("cond(M)", number)})
+            elif worker.stage:
+                answer = Prepared(f"no truth: {answer.note}")
+            else:
+                answer = Prepared(answer.note, failure=answer)
+            self._prepared[i] = answer
+        return True
+
+    def run(self, engine: str, worker: Worker, until: float) -> bool:
+        """Compute this engine's cells in order, begin none after `until`, and return whether all are there."""
+        rows = [row for row in self._rows if row.engine == engine]
+        for i, value in enumerate(self.values):
+            if i not in self._prepared:
+                return False
+            # The cheapest first, so that most cells are known when the time is over.
+            for row in sorted(rows, key=lambda row: row.expected):
+                if i in row.cells:
+                    continue
+                if failure := self._prepared[i].failure:
+                    row.cells[i] = failure
+                elif row.stopped:
+                    row.cells[i] = Measurement(value, "not run", note=row.stopped)
+                elif until - self.clock() < _MIN_TIME:
+                    return False
+                else:
+                    self.report(f"{self.case.name}: {row.method} on {engine}, {self.case.parameter} = {value:g}")
+                    self._run(row, rows, i, worker)
+        return True
+
+    def _run(self, row: _Row, rows: Sequence[_Row], i: int, worker: Worker) -> None:
+        limits, truth = self.limits, self._prepared[i].truth
+        arguments = (row.engine, row.method, limits, truth)
+        cell = self._call(worker, self.values[i], measure, *arguments, run=limits.seconds)
+        row.add(i, cell)
+        if worker.stage == "engine" and cell.end in ("slow", "died"):
+            # Every other method of this engine would end like this.
+            for other in rows:
+                if not other.stopped and i not in other.cells:
+                    other.add(i, cell)
+
+    def result(self) -> CaseResult:
+        """Return what is known by now."""
+        prepared = [self._prepared.get(i, Prepared(OUT_OF_TIME)) for i in range(len(self.values))]
+        return CaseResult(
+            **(self.case.facts() | {"bar": self.bar}),
+            values=self.values,
+            truths=tuple(p.how for p in prepared),
+            facts=tuple(dict(p.facts) for p in prepared),
+            rows=tuple(self._result_row(row, {p.dt for p in prepared} - {None}) for row in self._rows),
+        )
+
+    def _result_row(self, row: _Row, prescribed: set[float | None]) -> Row:
+        unknown = row.stopped or OUT_OF_TIME
+        cells = (row.cells.get(i, Measurement(value, "not run", note=unknown)) for i, value in enumerate(self.values))
+        setting = row.setting
+        if prescribed and setting.startswith("dt"):
+            setting = f"dt {prescribed.pop():g} s" if len(prescribed) == 1 else "dt of the case"
+        return Row(row.engine, row.method, tuple(cells), setting, row.theory)
+
+
+def _with_grace(seconds: float) -> float:
+    """Return the processor time after which a process is ended that should have stopped by itself."""
+    return seconds * (1 + _GRACE[1]) + _GRACE[0]
+
+
+# All cases side by side
+
+
+@dataclass(eq=False)
+class _Task:
+    """The truths of a case, or one engine on it; `work` takes a worker and a time, and returns whether all is done."""
+
+    work: Callable[[Worker, float], bool]
+    #: Has to be begun before, once more than this one, unless it is done.
+    after: _Task | None = None
+    rounds: int = 0
+    state: Literal["waiting", "running", "done"] = "waiting"
+
+    @property
+    def ready(self) -> bool:
+        before = self.after
+        if (
+            before is not None
+            and before.state != "done"
+            and (before.state == "running" or before.rounds <= self.rounds)
+        ):
+            return False
+        return self.state == "waiting"
+
+
+def run_sweeps(
+    sweeps: Sequence[CaseSweep], home: Path, memory: int, jobs: int, deadline: float, tick: float
+) -> Generator[None]:
+    """Work through the cases with so many workers side by side; yield at least every `tick` seconds.
+
+    Each task gets an equal part of the time left when it begins. The time that it does not need passes on to those
+    after it, and in the end to the tasks that were not done, which go on where they were.
+    """
+    tasks: list[_Task] = []
+    for sweep in sweeps:
+        first = _Task(sweep.prepare)
+        tasks += [first, *(_Task(partial(sweep.run, engine), first) for engine in sweep.engines)]
+    # One thread each: run times are compared. The study has a cache of its own, so that no entries of the user's are
+    # removed for it.
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    caches = {"MBKIT_CACHE_DIR": str(home / "code"), "HEYOKA_CACHE_DIR": str(home / "code-heyoka")}
+    workers = [Worker(home, memory, {**os.environ, **threads, **caches}) for _ in range(jobs)]
+    idle = list(workers)
+    running: dict[Future[bool], tuple[_Task, Worker]] = {}
+    with ExitStack() as stack:
+        for worker in workers:
+            stack.callback(worker.end)
+        pool = stack.enter_context(ThreadPoolExecutor(jobs))
+        for worker in workers:
+            stack.callback(worker.close)
+        while True:
+            while idle and (ready := [task for task in tasks if task.ready]):
+                task, worker = min(ready, key=lambda task: task.rounds), idle.pop()
+                task.rounds, task.state = task.rounds + 1, "running"
+                # Those of this round: the others wait for the time that it leaves.
+                waiting = 1 + sum(t.state == "waiting" and t.rounds < task.rounds for t in tasks)
+                begun = time.perf_counter()
+                left = max(deadline - begun, 0.0)
+                until = begun + min(left, left * jobs / waiting)
+                running[pool.submit(task.work, worker, until)] = task, worker
+            if not running:
+                return
+            for future in wait(running, tick, FIRST_COMPLETED).done:
+                task, worker = running.pop(future)
+                idle.append(worker)
+                task.state = "done" if future.result() or time.perf_counter() >= deadline else "waiting"
+            yield
+
+
+# The study
 
 
 def stress(
