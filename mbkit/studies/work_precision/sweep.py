@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -279,9 +280,10 @@ class CurveMeasurement:
         one = _Run(self._left.pop(0))
         with self._refusing():
             self._run(one, limit)
-            before, self._last = self._last, one
+            before, self._last = self._last or _Run(math.nan), one
+            same = one.steps == before.steps and one.evaluations == before.evaluations > 0
             # Coarse tolerances that lead to the same steps are one point.
-            if before is None or self.settings.required or not _same_steps(before, one):
+            if self.settings.required or not (same and math.isfinite(one.error) and math.isfinite(before.error)):
                 self._runs.append(one)
             if not self.settings.required and self._no_gain():
                 self._left = []
@@ -378,11 +380,6 @@ class CurveMeasurement:
         return Curve(settings.engine, settings.method, points, order, used, expected, self._compile, self._ended)
 
 
-def _same_steps(a: _Run, b: _Run) -> bool:
-    both = math.isfinite(a.error) and math.isfinite(b.error)
-    return both and 0 < a.evaluations == b.evaluations and a.steps == b.steps
-
-
 def repetitions(seconds: Sequence[float], most: int, budget: float) -> list[int]:
     """Return how many times to repeat runs of these lengths within a budget, at most `most` each.
 
@@ -416,47 +413,41 @@ class TimeBudget:
         """Return when a part of `seconds` is over, leaving at least the part `least` from now on."""
         return max(self.begun + part * self.seconds, time.process_time() + least * self.seconds)
 
-    def timed_until(self) -> float:
-        """Return when timing ends, leaving a least part of the usual time from now on."""
-        return max(self.begun + self.usual, time.process_time() + _MIN_PART * self.usual)
-
 
 #: A curve, and why it has no further points.
 Outcome = tuple[Curve | None, Refusal | None]
 
 
+@dataclass(eq=False)
 class Sweep:
     """The measurement of all curves: interleaved in this process, or one curve a call of an executor.
 
     With an executor each curve has its part of the time, however many run side by side.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        settings: Sequence[Settings],
-        repeats: int,
-        seed: int,
-        budget: TimeBudget,
-        executor: Executor | None = None,
-    ) -> None:
-        self._problem, self._settings, self._executor = problem, settings, executor
-        self._repeats, self._seed, self._budget = repeats, seed, budget
-        self._curves = [] if executor else [CurveMeasurement(problem, one) for one in settings]
+    problem: Problem
+    settings: Sequence[Settings]
+    repeats: int
+    seed: int
+    budget: TimeBudget
+    executor: Executor | None = None
+
+    def __post_init__(self) -> None:
+        self._curves = [] if self.executor else [CurveMeasurement(self.problem, one) for one in self.settings]
         self._answers: dict[int, Outcome] = {}
 
     def outcomes(self) -> list[Outcome]:
         """Return the curves and refusals so far."""
-        if self._executor:
-            return [self._answers.get(i, (None, None)) for i in range(len(self._settings))]
+        if self.executor:
+            return [self._answers.get(i, (None, None)) for i in range(len(self.settings))]
         return [(one.curve(), one.refusal) for one in self._curves]
 
     def steps(self) -> Iterator[tuple[float, str]]:
         """Measure; after each small step yield the fraction done and a text."""
-        return self._in_executor(self._executor) if self._executor else self._here()
+        return self._in_executor(self.executor) if self.executor else self._here()
 
     def _here(self) -> Iterator[tuple[float, str]]:
-        until = self._budget.until(_COMPILED, _MIN_PART)
+        until = self.budget.until(_COMPILED, _MIN_PART)
         # Jacobians and series take longest to derive; they come last, so that the others have their time.
         for k, one in enumerate(sorted(self._curves, key=_derivation_cost)):
             yield 0.2 * k / len(self._curves), f"compiling {one.settings.method} on {one.settings.engine}"
@@ -465,13 +456,14 @@ class Sweep:
             elif not one.over:
                 one.compile()
         begun = time.process_time()
-        for one in self._coarse_to_fine(self._budget.until(_EXPLORED, _MIN_PART)):
+        for one in self._coarse_to_fine(self.budget.until(_EXPLORED, _MIN_PART)):
             # Costs grow geometrically, so the root of the time shows the progress.
-            done = ((time.process_time() - begun) / (_EXPLORED * self._budget.usual)) ** 0.5
+            done = ((time.process_time() - begun) / (_EXPLORED * self.budget.usual)) ** 0.5
             yield 0.2 + 0.4 * min(done, 1.0), f"{one.settings.method} on {one.settings.engine}"
         yield 0.6, "timing"
-        for k in self._repeat(self._budget.timed_until()):
-            yield 0.6 + 0.4 * (k + 1) / self._repeats, f"timing, round {k + 1} of {self._repeats}"
+        usual = self.budget.usual
+        for k in self._repeat(max(self.budget.begun + usual, time.process_time() + _MIN_PART * usual)):
+            yield 0.6 + 0.4 * (k + 1) / self.repeats, f"timing, round {k + 1} of {self.repeats}"
 
     def _coarse_to_fine(self, until: float) -> Iterator[CurveMeasurement]:
         """Run each setting once, the cheapest next run of all curves first; begin none that would not end in time."""
@@ -481,7 +473,7 @@ class Sweep:
             if one.expected > left:
                 for other in going:
                     other.give_up(OUT_OF_TIME)
-            elif one.work > self._budget.work and not one.settings.required:
+            elif one.work > self.budget.work and not one.settings.required:
                 one.end("")
             else:
                 # The estimate may be wrong: one run must not take all that is left.
@@ -494,38 +486,37 @@ class Sweep:
         Where time is short, the longest runs are repeated less.
         """
         runs = [x for one in self._curves for x in one.repeatable()]
-        counts = repetitions([max(first, _SHORT) for first, _ in runs], self._repeats, until - time.process_time())
-        rng = np.random.default_rng(self._seed)
-        for k in range(self._repeats):
+        counts = repetitions([max(first, _SHORT) for first, _ in runs], self.repeats, until - time.process_time())
+        rng = np.random.default_rng(self.seed)
+        for k in range(self.repeats):
             for i in rng.permutation(len(runs)):
                 if k < counts[i] and time.process_time() + runs[i][0] < until:
                     runs[i][1]()
             yield k
 
     def _in_executor(self, executor: Executor) -> Iterator[tuple[float, str]]:
-        yield 0.0, f"{len(self._settings)} curves by {type(executor).__name__}"
-        left = self._budget.until(1.0, 2 * _MIN_PART) - time.process_time()
-        each = 1 / max(len(self._settings), 1)
-        part = replace(self._budget, seconds=left * each, usual=min(self._budget.usual, left) * each)
+        yield 0.0, f"{len(self.settings)} curves by {type(executor).__name__}"
+        left = self.budget.until(1.0, 2 * _MIN_PART) - time.process_time()
+        each = 1 / max(len(self.settings), 1)
+        part = replace(self.budget, seconds=left * each, usual=min(self.budget.usual, left) * each)
         calls = {
-            str(i): partial(_measure, self._problem, one, self._repeats, self._seed, part)
-            for i, one in enumerate(self._settings)
+            str(i): partial(_measure, self.problem, one, self.repeats, self.seed, part)
+            for i, one in enumerate(self.settings)
         }
         # Threads that suppress warnings side by side restore each other's filters.
         with warnings.catch_warnings():
             for name, answer in run(calls, executor=executor):
-                one = self._settings[int(name)]
+                one = self.settings[int(name)]
                 if isinstance(answer, Exception):
                     answer = None, Refusal(one.engine, one.method, f"{type(answer).__name__}: {answer}")
                 self._answers[int(name)] = answer
-                yield len(self._answers) / len(self._settings), f"{one.method} on {one.engine}"
+                yield len(self._answers) / len(self.settings), f"{one.method} on {one.engine}"
 
 
 def _measure(problem: Problem, settings: Settings, repeats: int, seed: int, budget: TimeBudget) -> Outcome:
     """Measure one curve in a worker."""
     sweep = Sweep(problem, [settings], repeats, seed, replace(budget, begun=time.process_time()))
-    for _ in sweep.steps():
-        pass
+    deque(sweep.steps(), maxlen=0)
     return sweep.outcomes()[0]
 
 

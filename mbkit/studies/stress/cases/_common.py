@@ -15,6 +15,8 @@ from mbkit.studies.stress.case import Case, Family, Problem
 #: From times (K,) to q (K, nq).
 Exact = Callable[[Array], Array]
 Make = Callable[[float], Problem]
+#: Name with unit -> number, for the report.
+Facts = dict[str, float]
 
 EPS: Final = float(np.finfo(float).eps)
 #: The axis of a hinge about which a body that hangs down swings.
@@ -61,7 +63,7 @@ def motion(
     exact: Exact,
     floor: float,
     source: str,
-    facts: dict[str, float] | None = None,
+    facts: Facts | None = None,
     **more: Any,
 ) -> Problem:
     """Return the problem of a motion with a closed form; 0 for `v` is a start at rest."""
@@ -69,7 +71,7 @@ def motion(
     return Problem(model, np.asarray(q), v, None, duration, exact, floor, source, facts=facts or {}, **more)
 
 
-def terms_at(model: Model, *, samples: int = 8, force: float = 1.0, facts: dict[str, float] | None = None) -> Problem:
+def terms_at(model: Model, *, samples: int = 8, force: float = 1.0, facts: Facts | None = None) -> Problem:
     """Return the problem of a model's terms at its neutral configuration and at random states.
 
     The generalized forces are of the size `force`, N or N m.

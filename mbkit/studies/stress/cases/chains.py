@@ -14,7 +14,7 @@ from mbkit._check import Array
 from mbkit.load import load
 from mbkit.model import Body, Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import SWING, motion, powers, register, terms_at
+from mbkit.studies.stress.cases._common import SWING, Facts, motion, powers, register, terms_at
 from mbkit.studies.stress.cases.exact_motions import HangingChain
 
 CASES: Final[list[Case]] = []
@@ -46,7 +46,7 @@ def _graded(ratio: float) -> tuple[float, ...]:
     return tuple(ratio ** (i / 4 - 0.5) for i in range(5))
 
 
-def _facts(model: Model) -> dict[str, float]:
+def _facts(model: Model) -> Facts:
     masses = [body.mass for body in model.bodies if body.mass > 0]
     return {"heaviest over lightest body": max(masses) / min(masses)}
 

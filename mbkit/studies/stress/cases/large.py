@@ -14,7 +14,7 @@ from mbkit import catalog
 from mbkit.load import load
 from mbkit.model import Model
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import EPS, motion, powers, register, terms_at
+from mbkit.studies.stress.cases._common import EPS, Facts, motion, powers, register, terms_at
 from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum
 from mbkit.studies.stress.cases.rotations import tumbling
 
@@ -68,7 +68,7 @@ def far_base_terms(place: float) -> Problem:
 
 
 def _swing(
-    model: Model, gravity: float, speed: float, duration: float, floor: float, facts: dict[str, float] | None = None
+    model: Model, gravity: float, speed: float, duration: float, floor: float, facts: Facts | None = None
 ) -> Problem:
     """Return a pendulum of 1 m that starts at 1 rad."""
     return motion(model, np.ones(1), speed, duration, pendulum(1.0, speed, gravity), floor, _SOURCE, facts)

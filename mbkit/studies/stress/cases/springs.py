@@ -14,16 +14,8 @@ from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import EPS, SWING, Make, motion, powers, register
-from mbkit.studies.stress.cases.exact_motions import (
-    Residual,
-    cart_pole,
-    modal,
-    released,
-    ringing_spring,
-    slow_motion,
-    slowest_mode,
-)
+from mbkit.studies.stress.cases import exact_motions
+from mbkit.studies.stress.cases._common import EPS, SWING, Facts, Make, motion, powers, register
 
 CASES: Final[list[Case]] = []
 _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
@@ -46,19 +38,19 @@ def stable_steps(duration: float, frequency: float, *, damped: bool = False) -> 
     return max(1.0, float(math.ceil(duration * frequency / _DOP853[damped])))
 
 
-def _facts(frequency: float, duration: float, *, damped: bool = False) -> dict[str, float]:
+def _facts(frequency: float, duration: float, *, damped: bool = False) -> Facts:
     name = "fastest rate, 1/s" if damped else "fastest frequency, rad/s"
     return {name: frequency, "steps of dop853 at the least": stable_steps(duration, frequency, damped=damped)}
 
 
 def _released_hinge(
-    stiffness: float, damping: float, duration: float, floor: float, facts: dict[str, float], **more: Any
+    stiffness: float, damping: float, duration: float, floor: float, facts: Facts, **more: Any
 ) -> Problem:
     """Let a body of 1 kg m² on a hinge with a spring and a damper go from 1 rad at rest, without gravity."""
     b = ModelBuilder("hinge", gravity=(0.0, 0.0, 0.0))
     b.add_body("bob", mass=1.0, com=(0.0, 0.0, -1.0))
     b.add_joint("theta", "continuous", parent="world", child="bob", axis=SWING, stiffness=stiffness, damping=damping)
-    exact, source = released(stiffness, damping / 2), "damped oscillator, Landau, Lifshitz 1976, §25"
+    exact, source = exact_motions.released(stiffness, damping / 2), "damped oscillator, Landau, Lifshitz 1976, §25"
     return motion(b.build(), np.ones(1), 0.0, duration, exact, floor, source, facts, **more)
 
 
@@ -88,24 +80,17 @@ def critically_damped_joint_spring(stiffness: float) -> Problem:
 
 
 def _slow(
-    model: Model,
-    residual: Residual,
-    angle: float,
-    force: tuple[str, float],
-    stiffness: float,
-    duration: float,
-    steps: int,
-    facts: dict[str, float],
+    model: Model, F: exact_motions.Residual, force: tuple[str, float], stiffness: float, duration: float, facts: Facts
 ) -> Problem:
-    """Return a motion in an angle and a coordinate that a spring all but holds, by what the spring carries."""
+    """Return a motion in an angle, from 1 rad, and a coordinate that a spring all but holds, by what that carries."""
     name, carried = force
-    solved = slow_motion(residual, np.array([angle, carried, 0.0, 0.0]), duration, steps)
+    solved = exact_motions.slow_motion(F, np.array([1.0, carried, 0.0, 0.0]), duration, round(100 * duration))
     source = f"collocation in the angle and the spring's {name}, Radau IIA of order 15"
 
     def exact(t: Array) -> Array:
         return np.asarray(solved(t)[:, :2] / [1.0, stiffness])
 
-    q = np.array([angle, carried / stiffness])
+    q = np.array([1.0, carried / stiffness])
     return motion(model, q, 0.0, duration, exact, _SLOW_FLOOR, source, facts)
 
 
@@ -130,7 +115,7 @@ def stiff_joint(stiffness: float) -> Problem:
     # The torque that a rigid joint would carry there, at rest.
     torque = "torque", inertia * g * math.sin(theta)
     facts = _facts(math.sqrt(stiffness / inertia), 1.0, damped=True)
-    return _slow(replace(model, joints=(first, held)), residual, theta, torque, stiffness, 1.0, 100, facts)
+    return _slow(replace(model, joints=(first, held)), residual, torque, stiffness, 1.0, facts)
 
 
 def _conical(stiffness: float, damped: bool) -> Problem:
@@ -189,7 +174,7 @@ def _elastic_pendulum(stiffness: float, damped: bool) -> Problem:
         swing, stretch = model.joints
         model = replace(model, joints=(swing, replace(stretch, damping=np.array([damping]))))
     facts = _facts(math.sqrt(stiffness), duration, damped=damped)
-    return _slow(model, residual, theta, ("force", g * math.cos(theta)), stiffness, duration, 200, facts)
+    return _slow(model, residual, ("force", g * math.cos(theta)), stiffness, duration, facts)
 
 
 @_point
@@ -209,7 +194,7 @@ def ringing_elastic_pendulum(stiffness: float) -> Problem:
     """An elastic pendulum turns without gravity for 2 s; its spring rings with the same energy at any stiffness."""
     push, turn, duration = 0.3, 0.5, 2.0
     radius = stiffness / (stiffness - turn**2)
-    exact, period = ringing_spring(stiffness, radius, push, turn)
+    exact, period = exact_motions.ringing_spring(stiffness, radius, push, turn)
     frequency, amplitude = 2 * math.pi / period, push / math.sqrt(stiffness)
     floor = 16 * EPS * (1 + frequency * duration) * push / math.sqrt(stiffness) + 1e-13
     facts = _facts(frequency, duration) | {"amplitude of the ringing, m": amplitude}
@@ -229,7 +214,7 @@ def stiff_damping(damping: float) -> Problem:
     b.add_joint("x2", "prismatic", parent="first", child="second", axis=along, damping=damping)
     # q̈ = -M⁻¹ (K q + C q̇), M = [[2, 1], [1, 1]].
     rates = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-4, 0, 0, damping], [4, 0, 0, -2 * damping]])
-    exact, facts = modal(rates, np.array([1.0, 0.0, 0.0, 0.0])), _facts(2 * damping, 2.0, damped=True)
+    exact, facts = exact_motions.modal(rates, np.array([1.0, 0.0, 0.0, 0.0])), _facts(2 * damping, 2.0, damped=True)
     return motion(b.build(), [1.0, 0.0], 0.0, 2.0, exact, 16 * EPS, "linear modes with 50 digits", facts)
 
 
@@ -242,7 +227,7 @@ def light_cart_pole(cart: float) -> Problem:
     facts = {"fastest rate, 1/s": peak, "cond(M) below": 2 * (1 + cart) / cart}
     source = "energy and momentum with a quadrature, IFToMM proposal 'light cart-pole'"
     # The error was measured against 40 digits at the lightest cart.
-    exact, floor = cart_pole(theta, cart), 2e-11
+    exact, floor = exact_motions.cart_pole(theta, cart), 2e-11
     return motion(catalog.cart_pole(cart_mass=cart), [0.0, theta], 0.0, 10.0, exact, floor, source, facts)
 
 
@@ -253,7 +238,7 @@ def flexible_appendage(stiffness: float) -> Problem:
     model = catalog.flexible_spacecraft(segments=4, bending_stiffness=stiffness)
     hub = replace(model.joints[0], stiffness=np.array([0.0, 0.0, soft]))
     springs = np.array([soft, *(2 * j.stiffness[0] for j in model.joints[1:5])])
-    frequency, shape, fastest = slowest_mode(_antisymmetric_inertia(model), springs)
+    frequency, shape, fastest = exact_motions.slowest_mode(_antisymmetric_inertia(model), springs)
 
     def exact(t: Array) -> Array:
         bent = np.multiply.outer(np.cos(frequency * t), angle * shape)
@@ -339,7 +324,7 @@ def _step(
     return register(STEP_CASES, "step", "step", "s", values, quick, theory=theory, **more)
 
 
-def _hinge_steps(step: float, frequency: float, damping: float, facts: dict[str, float]) -> Problem:
+def _hinge_steps(step: float, frequency: float, damping: float, facts: Facts) -> Problem:
     stiffness, duration = frequency**2, _STEPS * step
     floor = 16 * EPS * (1 + duration)
     return _released_hinge(stiffness, 2 * damping * frequency, duration, floor, facts, dt=step)
