@@ -144,8 +144,13 @@ def resolved(target: str, baseline: Path) -> str:
 # Which engines are there, and models as any of them takes them.
 
 
-def with_values(model: Model) -> Model:
-    """Return the model with numbers for its named parameters, which not every engine takes."""
+def with_values(model: Model, purpose: str = "") -> Model:
+    """Return the model with numbers for its named parameters, which not every engine takes.
+
+    With a purpose, a parameter without a value is an error.
+    """
+    if purpose:
+        model.require_values(purpose)
     values = {name: x for name, x in model.parameters.items() if x is not None}
     return model.with_parameters(**values) if values else model
 

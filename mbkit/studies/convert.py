@@ -100,9 +100,7 @@ def convert(model: Model, to: str) -> Converted:
     if not model.has_bodies:
         raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
     _check_names(model, to)
-    if model.parameters:
-        model.require_values("convert")
-        model = with_values(model)
+    model = with_values(model, "convert")
     return _to_mjcf(model) if to == "mjcf" else _to_urdf(model)
 
 
@@ -136,7 +134,9 @@ def _to_mjcf(model: Model) -> Converted:
         notes.append("MuJoCo acts on joint limits and dry friction, softly, which mbkit's terms leave out")
     if any(np.isfinite(j.velocity_limit).any() for j in model.joints):
         notes.append("MJCF has no velocity limits")
-    lifted = _degenerate(model)
+    # Bodies whose moments MuJoCo would not take as they are.
+    moments = {b.name: np.linalg.eigvalsh(b.inertia) for b in model.bodies if b.mass}
+    lifted = [repr(name) for name, (low, middle, high) in moments.items() if low < 1e-15 or low + middle < high]
     if lifted:
         notes.append(f"principal moments of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}")
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
@@ -148,16 +148,6 @@ def _to_mjcf(model: Model) -> Converted:
         off = f"{difference.worst:.1e} at {difference.joint}"
         raise MbkitError(f"convert: what was written of {model.name} reads back otherwise: {off}; {why}")
     return Converted(model.name, "mjcf", text, difference.terms, tuple(notes))
-
-
-def _degenerate(model: Model) -> list[str]:
-    """Return the bodies whose moments MuJoCo would not take as they are."""
-    names = []
-    for body in model.bodies:
-        low, middle, high = np.linalg.eigvalsh(body.inertia)
-        if body.mass and (low < 1e-15 or low + middle < high):
-            names.append(repr(body.name))
-    return names
 
 
 def _to_urdf(model: Model) -> Converted:

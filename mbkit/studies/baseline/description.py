@@ -57,7 +57,7 @@ def described(model: Model) -> Description:
         "system": {"": {"name": model.name, "gravity": _plain(model.gravity)}},
         "parameters": {"": parameters},
         "expressions": {
-            "": {f"{b.field}{_at(b.index)} of {b.part}".strip(): str(b.expression) for b in model.bindings}
+            "": {f"{b.field}{list(b.index) or ''} of {b.part}".strip(): str(b.expression) for b in model.bindings}
         },
         "joints": _parts(model.joints),
         "frames": _frames(model),
@@ -83,10 +83,6 @@ def _written(model: Model, parameters: Part) -> Description:
         "parameters": {"": parameters},
         "energies": {"": {name: str(x) for name, x in named.items()}},
     }
-
-
-def _at(index: tuple[int, ...]) -> str:
-    return f"[{', '.join(map(str, index))}]" if index else ""
 
 
 def _parts(parts: Iterable[Any]) -> dict[str, Part]:
@@ -238,7 +234,7 @@ def _fields(section: str, name: str, owner: str, before: Part, after: Part) -> I
         elif section not in FLAT:
             what = f"{what} of {owner}"
         x, y = _numbers(old), _numbers(new)
-        text, rounding = f"{_plain_text(old)} → {_plain_text(new)}", False
+        text, rounding = " → ".join("none" if z in (None, "") else str(z) for z in (old, new)), False
         if x is not None and y is not None and x.shape == y.shape:
             text, rounding = _difference(field, x, y), _only_rounding(field, x, y)
         yield Change(section, name, field, old, new, f"{what}: {text}", rounding)
@@ -246,10 +242,6 @@ def _fields(section: str, name: str, owner: str, before: Part, after: Part) -> I
 
 def _numbers(x: Any) -> Array | None:
     return np.array(x, dtype=np.float64, ndmin=1) if isinstance(x, (int, float, list)) else None
-
-
-def _plain_text(x: Any) -> str:
-    return "none" if x in (None, "") else str(x)
 
 
 def _difference(field: str, old: Array, new: Array) -> str:
@@ -343,12 +335,11 @@ def without_consequences(changed: tuple[Change, ...], old: Description) -> tuple
     if not any(c.section in LINK_SECTIONS for c in changed):
         return changed
     hosts = {frame["body"] for frame in old.get("frames", {}).values() if "body" in frame}
-    return tuple(c for c in changed if not _follows(c, old, hosts))
 
+    def follows(c: Change) -> bool:
+        if c.section == "bodies":
+            return c.part in hosts and c.field != ""
+        moves = c.section == "frames" or (c.section == "joints" and c.part in old.get("places", {}))
+        return moves and c.field in _PLACE
 
-def _follows(change: Change, old: Description, hosts: set[str]) -> bool:
-    if change.section == "frames":
-        return change.field in _PLACE
-    if change.section == "joints":
-        return change.field in _PLACE and change.part in old.get("places", {})
-    return change.section == "bodies" and change.part in hosts and change.field != ""
+    return tuple(c for c in changed if not follows(c))

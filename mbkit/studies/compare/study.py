@@ -6,6 +6,7 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -76,7 +77,7 @@ class Judge:
             except MbkitError as error:
                 self._refuse(name, "power balance", error)
             else:
-                rows.append(self._row("power balance", name, errors, (np.nan, np.nan), self.defects.get(name, "")))
+                rows.append(self._row("power balance", name, errors, self.defects.get(name, "")))
         return rows, self.refusals
 
     def _term(self, term: Term) -> list[Row]:
@@ -108,9 +109,9 @@ class Judge:
         ]
         for name, value in values.items():
             errors = term.errors((value - high) - low, high, self.scales)
-            allowed = self._allowed(term, name, errors)
-            zero = not high.any()
-            rows.append(self._row(term.name, name, errors, times[name], defects[name], allowed, reference, zero))
+            row = self._row(term.name, name, errors, defects[name], self._allowed(term, name, errors))
+            ns, spread = times[name]
+            rows.append(replace(row, reference=reference, ns=ns, ns_spread=spread, zero=not high.any()))
         return rows
 
     def _reference(self, term: Term, values: dict[str, Array]) -> tuple[str, Array, Array]:
@@ -133,39 +134,27 @@ class Judge:
         amplified = self.engines[engine].mass_matrix_rounding(self.at.q[errors.worst])
         return self.tolerance if amplified is None else max(self.tolerance, _ROUNDINGS * _EPS * float(amplified))
 
-    def _row(
-        self,
-        term: str,
-        engine: str,
-        errors: Errors,
-        ns: tuple[float, float],
-        defect: str,
-        allowed: float | None = None,
-        reference: str | None = None,
-        zero: bool = False,
-    ) -> Row:
+    def _row(self, term: str, engine: str, errors: Errors, defect: str, allowed: float | None = None) -> Row:
+        """Return a row against the oracle, not timed."""
         allowed = self.tolerance if allowed is None else allowed
-        worst = errors.worst
+        worst, per = errors.worst, errors.per_velocity
         relative = float(errors.relative[worst])
-        per = errors.per_velocity
         joint = self.joint_of[int(np.argmax(per))] if per.size and per.max() > 0 else ""
         passed = relative <= allowed
         reason = ""
-        if passed and relative > self.tolerance:
+        if not passed:
+            bad = [n for n, e in zip(self.joint_of, per, strict=False) if e > self.tolerance]
+            named = f" at {', '.join(dict.fromkeys(bad)) or 'no single joint'}" if per.size else ""
+            reason = f"differs by {relative:.1e}{named}" + (f"; {defect}" if defect else "")
+        elif relative > self.tolerance:
             reason = (
                 f"{relative:.1e} at {joint} is above {self.tolerance:.0e}, and within the rounding of {engine}'s own "
                 f"formula ({allowed:.0e}): its terms are {allowed / (_ROUNDINGS * _EPS):.0e} times the result"
             )
-        if not passed:
-            bad = [n for n, e in zip(self.joint_of, per, strict=False) if e > self.tolerance] if per.size else []
-            named = ", ".join(dict.fromkeys(bad)) or "no single joint"
-            reason = f"differs by {relative:.1e} at {named}" if per.size else f"differs by {relative:.1e}"
-            if defect:
-                reason += f"; {defect}"
         return Row(
             term=term,
             engine=engine,
-            reference=reference or self.oracle.engine,
+            reference=self.oracle.engine,
             joint=joint,
             max_abs=float(errors.absolute.max()),
             relative=relative,
@@ -175,13 +164,12 @@ class Judge:
             worst_kind=self.at.kinds[worst],
             worst_q=tuple(self.at.q[worst].tolist()),
             worst_v=tuple(self.at.v[worst].tolist()),
-            ns=ns[0],
-            ns_spread=ns[1],
+            ns=np.nan,
+            ns_spread=np.nan,
             passed=passed,
             reason=reason,
             allowed=allowed,
             defect="" if passed else defect.split(_AS_IT_IS)[0],
-            zero=zero,
         )
 
 

@@ -141,9 +141,7 @@ def merge(model: Model) -> MergedModel:
 
     A parameter without a value is an error, the others take their values; frames are left out.
     """
-    if model.parameters:
-        model.require_values("explain")
-        model = with_values(model)
+    model = with_values(model, "explain")
     bodies = {b.name: b for b in model.bodies}
     at = {"world": FrameChange("world")}
     links: dict[str, list[LinkInBody]] = {"world": []}
