@@ -61,7 +61,7 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
             # One step first: compiling it is not run time.
             quiet_simulate(engines[name], q0, v0, STEP, method, STEP)
             ours = quiet_simulate(engines[name], q0, v0, STEP * last, method, STEP)
-            rows.append(_row(model, method, name, native, ours, theirs, condition, last, note))
+            rows.append(_row(model, ours, theirs, condition[: last + 1], last + 1 < len(condition), note))
     if model.needs.damping:
         rows.append(_implicit_damping(model, engines[MUJOCO], q0, v0))
     return tuple(rows)
@@ -86,17 +86,9 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
     return np.asarray(np.maximum.accumulate(off))
 
 
-def _row(
-    model: Model,
-    method: str,
-    engine: str,
-    native: str,
-    ours: Trajectory,
-    theirs: Trajectory,
-    condition: Array,
-    last: int,
-    note: str,
-) -> RolloutRow:
+def _row(model: Model, ours: Trajectory, theirs: Trajectory, condition: Array, beyond: bool, note: str) -> RolloutRow:
+    """Return two runs compared up to the last step of which a condition is given; beyond it may have grown too much."""
+    last = len(condition) - 1
     n = min(len(ours.t), last + 1)
     grown = float(condition[:n].max(initial=0.0))
     tolerance = max(TOLERANCE, _ROUNDINGS * _EPS * grown)
@@ -105,15 +97,15 @@ def _row(
     if n <= last:
         notes.append(f"stopped at t = {ours.t[-1]:.3g} s: {ours.stats.message}")
     if last < round(DURATION / STEP):
-        why = "rounding grows too much" if last + 1 < len(condition) else "MuJoCo's own run diverges"
+        why = "rounding grows too much" if beyond else "MuJoCo's own run diverges"
         notes.append(f"horizon cut to {last * STEP:.3g} s, where {why}")
     judged = last >= _FEWEST
     if not judged:
         notes.append("not judged: too few steps are well conditioned; use a smaller step or a stiff method")
     return RolloutRow(
-        method=method,
-        engine=engine,
-        against=native,
+        method=ours.method,
+        engine=ours.engine,
+        against=theirs.method,
         dt=STEP,
         duration=(n - 1) * STEP,
         error=error,

@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import metadata
 from operator import itemgetter
 from pathlib import Path
@@ -230,22 +230,10 @@ def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str]
     return {k: x[:, v_order][:, :, v_order] if x.ndim == 3 else x[:, v_order] for k, x in terms.items()}
 
 
-@dataclass(frozen=True)
-class OwnTerms:
-    """The content of an engine's own terms."""
-
-    causes: tuple[Cause, ...]  # what acts beside bodies and joints
-    idle: tuple[str, ...]  # what changes no term
-    held: bool  # without these, the terms are those of bodies and joints
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return what is in the model and acts in no term."""
-        return tuple(f"{says}; in no term while controls are zero" for says in self.idle)
-
-
-def own_terms(engine: str, imported: Imported, samples: int, seed: int, tolerance: float) -> OwnTerms:
-    """Measure what acts in an importer's model beside its bodies and joints."""
+def own_terms(
+    engine: str, imported: Imported, samples: int, seed: int, tolerance: float
+) -> tuple[list[Cause], list[str], bool]:
+    """Return what acts in an importer's model beside bodies and joints, what does not, and whether that is all."""
     at = states_of(imported.model, samples, seed)
     owners = velocity_joints(imported.model)
     whole, described = imported.terms(at.q, at.v, ()), model_terms(imported.model, at)
@@ -257,7 +245,7 @@ def own_terms(engine: str, imported: Imported, samples: int, seed: int, toleranc
         part = {name: x - rest[name] for name, x in described.items() if name in rest}
         bare = _with(bare, part)
         if gaps(whole, without, at.v, owners).worst <= tolerance:
-            idle.append(extra.says)
+            idle.append(f"{extra.says}; in no term while controls are zero")
             continue
         apart = gaps(whole, _with(without, part), at.v, owners)
         if not apart.worst <= tolerance:
@@ -268,19 +256,21 @@ def own_terms(engine: str, imported: Imported, samples: int, seed: int, toleranc
     if not held:
         says = f"{engine}: its own terms are not those of its bodies and joints, most at {apart.joint or 'no joint'}"
         causes.append(Cause("own terms", engine, says, None, None, apart.effects, acts=True))
-    return OwnTerms(tuple(causes), tuple(idle), held)
+    return causes, idle, held
 
 
 def _with(a: Values, b: Values) -> Values:
     return {name: x + b[name] if name in b else x for name, x in a.items()}
 
 
-def with_own_terms(explanation: Explanation, stages: tuple[Stage, ...], own: OwnTerms) -> Explanation:
+def with_own_terms(
+    explanation: Explanation, stages: tuple[Stage, ...], own_causes: list[Cause], held: bool
+) -> Explanation:
     """Return an explanation of two descriptions, corrected by the terms that the engine itself computes."""
     terms = [s for s in stages if s.name in TERMS]
     gaps_ = tuple(Gap(s.name, s.worst, s.where) for s in terms)
     same = all(s.same is True for s in terms)
-    if not own.causes:
+    if not own_causes:
         # The terms are those of the descriptions.
         return replace(explanation, gaps=gaps_) if explanation.agree and same else replace(explanation, agree=False)
     if same and not (explanation.only_a or explanation.only_b):
@@ -292,8 +282,8 @@ def with_own_terms(explanation: Explanation, stages: tuple[Stage, ...], own: Own
         agree=False,
         comparable=explanation.comparable and known,
         gaps=gaps_ if known else explanation.gaps,
-        causes=(*explanation.causes, *own.causes),
-        explained=explanation.explained and own.held,
+        causes=(*explanation.causes, *own_causes),
+        explained=explanation.explained and held,
     )
 
 
@@ -417,12 +407,13 @@ def _compared(
         described, imported.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine)
     )
     compared = stages(reference, imported, samples, seed, tolerance)
-    own = own_terms(engine, imported, samples, seed, tolerance)
+    causes, idle, held = own_terms(engine, imported, samples, seed, tolerance)
     if isinstance(reference, Imported):
-        theirs = own_terms(label, reference, samples, seed, tolerance)
-        own = OwnTerms((*theirs.causes, *own.causes), own.idle, own.held and theirs.held)
-    notes = (*explanation.notes, *imported.notes, *own.notes)
-    return Parsed(engine, _version(engine), "", compared, with_own_terms(explanation, compared, own), notes)
+        theirs, _, also = own_terms(label, reference, samples, seed, tolerance)
+        causes, held = [*theirs, *causes], held and also
+    notes = (*explanation.notes, *imported.notes, *idle)
+    explanation = with_own_terms(explanation, compared, causes, held)
+    return Parsed(engine, _version(engine), "", compared, explanation, notes)
 
 
 def written(source: str | os.PathLike[str]) -> Model:
