@@ -106,8 +106,6 @@ def record(
 
     Raises
     ------
-    InputError, UnknownNameError
-        For unusable arguments.
     UnsupportedError
         An engine that was asked for is not installed, or none holds the model.
     OutputError
@@ -176,9 +174,8 @@ def check(
     """Hold a model and the engines against what was recorded of them.
 
     First the description: a parameter that changed is named, with its old and new value, and what it does to the
-    terms. Where there is none, the numbers of every recorded engine, to its own rounding
-    (`mbkit.studies.baseline.study` says how much that is). Where these stand, the versions: new ones alone ask whether
-    to record again.
+    terms. Else the numbers of every recorded engine, to its own rounding (`mbkit.studies.baseline.study` says how much
+    that is). Where these stand, the versions: new ones alone ask whether to record again.
 
     Parameters
     ----------
@@ -201,8 +198,6 @@ def check(
     ------
     BaselineError
         The file is damaged or of another format, or the baseline is another robot's.
-    InputError
-        For unusable arguments.
 
     Examples
     --------
@@ -275,16 +270,7 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
     """Say what the second of two baselines has that the first has not.
 
     Nothing is computed: it reads what was recorded. Numbers are the oracle's, so they tell what became of the robot;
-    engines' own are compared where they were recorded.
-
-    Parameters
-    ----------
-    path_a, path_b : path
-
-    Returns
-    -------
-    BaselineResult
-        With all that differs: parameters, numbers and versions.
+    engines' own are compared where they were recorded. The result has all that differs: parameters, numbers, versions.
 
     Raises
     ------

@@ -1,13 +1,10 @@
 """What `compare` does beyond terms: rollouts, and what a scene does not need.
 
-Rollouts: mbkit's integrators on each engine against MuJoCo's own, step for step.
-
-Two right programs round differently in every step, and a system multiplies that, a
-chaotic one without bound. So each rollout's condition is measured beside it: how far
-q moves when the forces are disturbed in every step, relative to |M||a| + |nle|,
-the size at which any backward-stable program rounds them. Over examples from 1 to
-1e7 two engines differed by 2 to 125 eps times that number. What may differ is a
-multiple of it, and the comparison ends where that would say little.
+Rollouts compare mbkit's integrators on each engine with MuJoCo's own, step for step. Two right programs round
+differently in every step, and a system multiplies that, a chaotic one without bound. So each rollout's condition is
+measured beside it: how far q moves when the forces are disturbed in every step, relative to |M||a| + |nle|, the size
+at which any backward-stable program rounds them. Over examples from 1 to 1e7 two engines differed by 2 to 125 eps times
+that number. What may differ is a multiple of it, and the comparison ends where that would say little.
 """
 
 from __future__ import annotations

@@ -1,17 +1,13 @@
 """How errors are measured: per sample, relative to a scale that does not vanish.
 
-Errors e are an engine's value minus the oracle's, both high and low part, so that
-they are known to many digits however small they are. For a vector x with error e the
-error is ‖e‖ / max(‖x‖, ‖M‖ ‖v‖²): a term that happens to be small is compared with the
-forces at play. Where gravity is among
-them, so is what it could do: |g| √(m M_jj) is the most that it exerts on joint j
-(Cauchy and Schwarz on Σ m_i g · J_ij), and what rounds with it where a pendulum
-hangs straight down. M's error is the largest |e_ij| / √(M_ii M_jj), which no unit
-can change. Forward dynamics loses cond(M) in any arithmetic, so its error is
-divided by that (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 7),
-on a scale that the forces which cancel in M a keep from vanishing; and M e, the
-force that the error amounts to, must be small beside M a whatever cond(M) is. An energy,
-whose zero is arbitrary, is measured by the largest of all samples. Beside each
+Errors e are an engine's value minus the oracle's, both high and low part, so that they are known to many digits
+however small they are. A vector x has the error ‖e‖ / max(‖x‖, ‖M‖ ‖v‖²): a term that happens to be small is compared
+with the forces at play. Where gravity is among them, so is what it could do: |g| √(m M_jj) is the most that it exerts
+on joint j (Cauchy and Schwarz on Σ m_i g · J_ij), and what rounds with it where a pendulum hangs straight down. M's
+error is the largest |e_ij| / √(M_ii M_jj), which no unit can change. Forward dynamics loses cond(M) in any arithmetic,
+so its error is divided by that (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 7), on a scale that
+the forces which cancel in M a keep from vanishing; and M e, the force that the error amounts to, must be small beside
+M a whatever cond(M) is. An energy, whose zero is arbitrary, is measured by the largest of all samples. Beside each
 stands a figure per joint.
 """
 

@@ -273,14 +273,10 @@ class _Engines:
     def _joint_orders(self) -> Iterator[_Trial]:
         model, layout = self.model, self.model.layout
         names = list(model.joint_names)
-        depth = {"world": 0}
-        for joint in model.tree:
-            depth[joint.child] = depth[joint.parent] + 1
-        level = {j.name: depth[j.child] for j in model.joints}
         orders = [
             *(("has the joints in the order of their names", sorted(names, key=key)) for key in (str, str.lower)),
             ("has the joints depth first", [j.name for j in model.tree if j.name in names]),
-            ("has the joints generation by generation", sorted(names, key=level.__getitem__)),
+            ("has the joints generation by generation", sorted(names, key=lambda name: len(model.chains[name]))),
             ("has the joints from last to first", names[::-1]),
         ]
         for a, b in islice(combinations(names, 2), _MAX_SWAPS):

@@ -60,12 +60,9 @@ def match(a: Model, b: Model, near: Tolerances) -> Matching:
             by_structure[name] = name
     if assignment.cost(by_structure) < assignment.cost(to_b):
         to_b = by_structure
+    pairs = [(j.name, to_b[j.name]) for j in a.joints if j.name in to_b]
     return Matching(
-        tuple(
-            Match(j.name, to_b[j.name], "name" if to_b[j.name] == j.name else "structure")
-            for j in a.joints
-            if j.name in to_b
-        ),
+        tuple(Match(x, y, "name" if x == y else "structure") for x, y in pairs),
         tuple(j.name for j in a.joints if j.name not in to_b),
         tuple(j.name for j in b.joints if j.name not in set(to_b.values())),
     )
@@ -83,9 +80,7 @@ class _Tree:
         for joint in model.joints:
             self.children[joint.parent].append(joint)
         #: Number of joints on a body and beyond, and the joint that carries it.
-        self.sizes: dict[str, int] = {}
-        for joint in reversed(model.tree):
-            self.sizes[joint.child] = 1 + sum(self.sizes[c.child] for c in self.children[joint.child])
+        self.sizes = {j.child: sum(j.name in chain for chain in model.chains.values()) for j in model.joints}
         self.levels = [["world"]]
         while self.levels[-1]:
             self.levels.append([j.child for name in self.levels[-1] for j in self.children[name]])
@@ -299,7 +294,7 @@ def reconcile_joint_sets(
         side = 0 if matching.only_a else 1
         model, names = sides[side], matching.only_a or matching.only_b
         name = next(j.name for j in model.tree if j.name in names)
-        below = _subtree(model, name)
+        below = {n for n, chain in model.chains.items() if name in chain}
         options = {True: _held(model, name)}
         if len(below) < len(model.joints):
             options[False] = restricted(model, {j.name for j in model.joints} - below)
@@ -324,15 +319,6 @@ def _held(model: Model, name: str) -> Model:
     return replace(model, joints=joints, couplings=tuple(trimmed_couplings(model, kept)))
 
 
-def _subtree(model: Model, name: str) -> set[str]:
-    joints, bodies = set(), set()
-    for joint in model.tree:
-        if joint.name == name or joint.parent in bodies:
-            joints.add(joint.name)
-            bodies.add(joint.child)
-    return joints
-
-
 def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
     one, other = merge(a), merge(b)
     matching = match(one.model, other.model, near)
@@ -342,10 +328,8 @@ def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
     for joint in one.model.joints:
         if joint.name in own:
             x, y = one.model.body(joint.child), there.model.body(joint.child)
-            count += not near.number(x.mass, y.mass)
-            count += not near.point(x.com, y.com)
-            count += not near.inertia(x.inertia, y.inertia, x.mass)
-            count += _misplaced(joint, own[joint.name], near)
+            same = near.number(x.mass, y.mass), near.point(x.com, y.com), near.inertia(x.inertia, y.inertia, x.mass)
+            count += 3 - sum(same) + _misplaced(joint, own[joint.name], near)
     return count
 
 

@@ -57,10 +57,9 @@ def explain(
     ----------
     a, b : Model or Dynamics
         Descriptions, or engines on a description (`mbkit.dynamics`).
-    samples, seed : int
-        Random states at which terms are compared.
-    tolerance : float
-        Relative difference that counts, of numbers in the descriptions and of terms.
+    samples, seed, tolerance : int, int, float
+        Random states at which terms are compared, and the relative difference that counts, of numbers in the
+        descriptions and of terms.
     names : (str, str), optional
         Names of the two sides; by default those of their models or engines.
 

@@ -171,9 +171,7 @@ def minimal_differing_subtree(model: Model, differs: Callable[[set[str]], bool])
 
     None of them can be left out. Empty where only the whole differs.
     """
-    below: dict[str, set[str]] = {}
-    for joint in reversed(model.tree):
-        below[joint.name] = {joint.name}.union(*(below[c.name] for c in model.joints if c.parent == joint.child))
+    below = {j.name: {n for n, chain in model.chains.items() if j.name in chain} for j in reversed(model.tree)}
     left = next((joints for joints in sorted(below.values(), key=len) if differs(joints)), set[str]())
     for joint in reversed(model.tree):
         # A branch that does not matter goes; the joints above it stay.
