@@ -23,7 +23,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor, as_completed
 from functools import partial
 from math import inf
 from multiprocessing import spawn
@@ -482,11 +482,9 @@ def run(
                     running[executor.submit(call)] = name
                 except RuntimeError:
                     refused.append(name)
-            while running:
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    name = running.pop(future)
-                    result: T | Exception = _result(future)
-                    yield name, result
+            for future in as_completed(running):
+                result: T | Exception = _result(future)
+                yield running.pop(future), result
         finally:
             for future in running:
                 future.cancel()
