@@ -148,13 +148,7 @@ _EPS: Final = float(np.finfo(float).eps)
 _ROUNDINGS: Final = 64
 _XYZ: Final = ("x", "y", "z")
 _ENTRIES: Final = {
-    "com": _XYZ,
-    "translation": _XYZ,
-    "translation_a": _XYZ,
-    "translation_b": _XYZ,
-    "point_a": _XYZ,
-    "point_b": _XYZ,
-    "gravity": _XYZ,
+    **dict.fromkeys(("com", "translation", "translation_a", "translation_b", "point_a", "point_b", "gravity"), _XYZ),
     "inertia": ("xx", "xy", "xz", "yy", "yz", "zz"),
     "axes": (*_XYZ, "x of the second", "y of the second", "z of the second"),
 }
