@@ -7,19 +7,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.studies.results import write_whole
+from mbkit.studies.results import ResultTable, write_whole
 
 
-class _Result(Protocol):
-    def to_json(self) -> str:
-        """Return the result as JSON."""
-        ...
-
-
-R = TypeVar("R", bound=_Result)
+R = TypeVar("R", bound=ResultTable)
 #: progress(fraction, text)
 Progress = Callable[[float, str], object]
 Checkpoint = str | os.PathLike[str] | Callable[[Any], object]
@@ -98,7 +92,7 @@ class Checkpointer:
             raise InterruptedSweepError(whole) from None
         return whole
 
-    def save(self, result: _Result) -> None:
+    def save(self, result: ResultTable) -> None:
         """Save a result; where that fails, a warning says so and the study goes on."""
         message = ""
         if callable(self._checkpoint):
