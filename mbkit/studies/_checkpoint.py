@@ -12,7 +12,6 @@ from typing import Any, Final, TypeVar
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.studies.results import ResultTable, write_whole
 
-
 R = TypeVar("R", bound=ResultTable)
 #: progress(fraction, text)
 Progress = Callable[[float, str], object]
