@@ -18,7 +18,7 @@ from mbkit import errors
 from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
 from mbkit.load import load, xml_reader
 from mbkit.load.loader import find
-from mbkit.load.urdf_links import read_links
+from mbkit.load.urdf_reader import read_links
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'

@@ -36,7 +36,7 @@ from mbkit.load.loader import find
 from mbkit.load.mjcf_attributes import rules as mjcf_rules
 from mbkit.load.sanitized_text import strip
 from mbkit.load.shapes import solid
-from mbkit.load.urdf import Snapper
+from mbkit.load.urdf_reader import Snapper
 from mbkit.model import Mimic
 from mbkit.model.validation import sample_mass_matrix
 from mbkit.studies import compare

@@ -21,7 +21,7 @@ from mbkit.errors import InputError, LoadError, ModelError, UnknownNameError
 from mbkit.load import xml_reader
 from mbkit.load.loader import find
 from mbkit.load.sanitized_text import strip
-from mbkit.load.urdf_links import urdf_links
+from mbkit.load.urdf_reader import urdf_links
 from mbkit.load.xml_reader import Element
 from mbkit.report.explain_view import importers_view, meaning
 from mbkit.report.page import render

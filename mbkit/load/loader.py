@@ -20,7 +20,7 @@ from mbkit._check import shown
 from mbkit._warn import warn
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, ModelError, UnknownNameError
 from mbkit.load import xml_reader
-from mbkit.load.urdf_check import examine
+from mbkit.load.urdf_reader import examine
 from mbkit.model import Model
 from mbkit.model.validation import scale_doubts
 

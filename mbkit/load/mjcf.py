@@ -21,9 +21,8 @@ from mbkit.errors import ModelError
 from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, named
 from mbkit.load.mjcf_couplings import Transmissions
-from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, read_tree
-from mbkit.load.urdf import Snapper
-from mbkit.load.urdf_links import floated
+from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, floated, read_tree
+from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Model, ModelBuilder
 

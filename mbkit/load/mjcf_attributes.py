@@ -130,9 +130,10 @@ class Defaults:
         for element in mujoco.all("default"):
             if element.attributes.get("class", "main") != "main":
                 read.fault("the outermost <default> has another class than 'main'; put a <default> around it", element)
-            self._collect(element, self.classes["main"], "main")
+            self._collect(element, "main")
 
-    def _collect(self, element: Element, values: dict[str, dict[str, str]], name: str) -> None:
+    def _collect(self, element: Element, name: str) -> None:
+        values = self.classes[name]
         for child in element.children:
             if child.tag != "default":
                 values[child.tag] = _over(values.get(child.tag, {}), child.attributes)
@@ -140,15 +141,15 @@ class Defaults:
             inner = self.read.name(child, "class", f"the class inside {name!r}")
             if inner in self.classes:
                 self.read.fault(f"default class {inner!r}: declared twice; names must differ", child)
-            self.classes[inner] = {tag: dict(v) for tag, v in values.items()}
-            self._collect(child, self.classes[inner], inner)
+            self.classes[inner] = dict(values)
+            self._collect(child, inner)
 
     def known(self, name: str | None, element: Element) -> str | None:
         """Return the class name, or None after a fault."""
         if name is None or name in self.classes:
             return name
-        listing = ", ".join(sorted(self.classes)[:20])
-        self.read.fault(f"<{element.tag}>: unknown default class {name!r}; there are: {listing}", element)
+        classes = ", ".join(sorted(self.classes)[:20])
+        self.read.fault(f"<{element.tag}>: unknown default class {name!r}; there are: {classes}", element)
         return None
 
     def filled(self, element: Element, childclass: str | None) -> Element:
@@ -229,11 +230,9 @@ def z_to(direction: Array) -> Array:
 # Names that MuJoCo's schema does not have.
 
 # These do not act on the smooth motion: an unknown name in them is a note.
-_ASIDE: Final = frozenset(
-    {
-        *("visual", "statistic", "size", "sensor", "custom", "keyframe", "extension", "contact"),
-        *("texture", "material", "skin", "hfield", "camera", "light"),
-    }
+_ASIDE: Final = (
+    *("visual", "statistic", "size", "sensor", "custom", "keyframe", "extension", "contact"),
+    *("texture", "material", "skin", "hfield", "camera", "light"),
 )
 # These are refused or not read.
 _UNREAD: Final = frozenset({"replicate", "attach", "composite", "flexcomp", "plugin"})

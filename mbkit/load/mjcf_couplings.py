@@ -288,13 +288,11 @@ class Transmissions:
         for x in acting:
             if x.dampratio:
                 # Relative to the critical damping of the inertia that the actuator moves in the pose of the file.
-                inertia = self._reflected(out, x.coupling())
-                damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * inertia))
+                damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * self._reflected(out, x.coupling())))
                 ratios.append(replace(x.coupling(), stiffness=0.0, armature=0.0, damping=damping))
         out = coupled(out, ratios)
-        branched = ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c))
         notes = [*model.notes, *self._notes()]
-        if branched:
+        if branched := ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c)):
             notes.append(f"the armature of {branched} acts between branches; MuJoCo 4.0 leaves it out of M there")
         return replace(out, notes=tuple(notes))
 

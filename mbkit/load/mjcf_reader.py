@@ -17,9 +17,11 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.load.mjcf_attributes import HERE, ORIENTATIONS, Compiler, Defaults, Pose, has_length, pose, z_to
 from mbkit.load.shapes import NOTHING, SIZES, Lump, solid, together
+from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.load.xml_reader import Element, Reader, unused
 
 KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
+_JOINTS: Final = ("joint", "freejoint")
 _NAMED: Final = {"body": "body", "joint": "joint", "freejoint": "joint", "site": "site"}
 # MuJoCo 4.0.0 counts geoms above this mass, in kg.
 _LEAST_MASS: Final = 1e-14
@@ -120,6 +122,41 @@ def unfolded(
         yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, item), inner, scene, item)
 
 
+def floated(mujoco: Element, read: Reader) -> Element:
+    """Return a <mujoco> element with a free joint for the world's only body, or keep a fault."""
+    tops = [b for world in mujoco.all("worldbody") for b in _parts(world, ("body",))]
+    if not tops:
+        return mujoco
+    joints = [len(list(_parts(b, _JOINTS))) for b in tops]
+    if len(tops) != 1 or joints[0]:
+        names = (repr(b.attributes.get("name", "")) if b.attributes.get("name") else f"({b.place})" for b in tops)
+        there = ", ".join(f"{name} ({n} joints)" for name, n in zip(names, joints, strict=True))
+        read.fault(f"floating_base=True needs one body of the world, without joints; there are: {there}")
+        return mujoco
+    if any(e.tag in _JOINTS and e.attributes.get("name") == BASE_JOINT for e in mujoco.walk()):
+        read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")
+        return mujoco
+    joint = Element("freejoint", {"name": BASE_JOINT}, tops[0].line, file=tops[0].file)
+    return _replaced(mujoco, tops[0], replace(tops[0], children=[joint, *tops[0].children]))
+
+
+def _parts(owner: Element, tags: tuple[str, ...]) -> Iterator[Element]:
+    """Yield the children of these tags, with those of <frame> elements."""
+    for child in owner.children:
+        if child.tag == "frame":
+            yield from _parts(child, tags)
+        elif child.tag in tags:
+            yield child
+
+
+def _replaced(owner: Element, old: Element, new: Element) -> Element:
+    if owner is old:
+        return new
+    if owner.tag not in ("mujoco", "worldbody", "frame"):
+        return owner
+    return replace(owner, children=[_replaced(c, old, new) for c in owner.children])
+
+
 def read_tree(mujoco: Element, scene: Scene) -> None:
     """Read every body, and the sites of the world, into the scene."""
     for world in mujoco.all("worldbody"):
@@ -154,7 +191,7 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
     if element.attributes.get("mocap") == "true":
         scene.left_out["motion capture"] += 1
     parts = list(unfolded(element, HERE, childclass, scene, item))
-    joints = [_joint(e, name, Y, c, scene) for e, Y, c in parts if e.tag in ("joint", "freejoint")]
+    joints = [_joint(e, name, Y, c, scene) for e, Y, c in parts if e.tag in _JOINTS]
     if any(j.kind == "free" for j in joints):
         if len(joints) > 1:
             read.fault(f"{item}: a free joint and others; a free body has no other joint")

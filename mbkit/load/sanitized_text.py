@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 from typing import Final
 from xml.sax.saxutils import escape
@@ -16,9 +16,8 @@ from xml.sax.saxutils import escape
 from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name, read_mesh
-from mbkit.load.mjcf_reader import counts
-from mbkit.load.urdf_links import floated, with_base
-from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, expanded
+from mbkit.load.mjcf_reader import counts, floated
+from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, expanded, unused
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
 #: Elements that name other files, or mean nothing without one that does.
@@ -67,7 +66,7 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
         )
     renamed = ""
     if floating_base and format_ == "urdf":
-        root, renamed = with_base(root)
+        root, renamed = _with_base(root)
     elif floating_base:
         read = Reader()
         root = floated(root, read)
@@ -79,6 +78,25 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
     text, gone = "".join(writer.parts) + "\n", tuple(sorted(writer.gone.items()))
     files, unread = (meshes.files, tuple(dict.fromkeys(meshes.unread))) if meshes else ({}, ())
     return Stripped(path, format_, root, text, gone, renamed, tuple(dict.fromkeys(writer.shapeless)), files, unread)
+
+
+def _with_base(robot: Element) -> tuple[Element, str]:
+    """Return a <robot> whose base link is not called ``world``, the ground's name for parsers, and any new name."""
+    joints = robot.all("joint")
+    links = {e.attributes.get("name") for e in robot.all("link")}
+    if "world" not in links or any(e.attributes.get("link") == "world" for j in joints for e in j.all("child")):
+        return robot, ""
+    name = unused("world_link", links)
+
+    def renamed(element: Element) -> Element:
+        attribute = {"link": "name", "parent": "link"}.get(element.tag, "")
+        if element.attributes.get(attribute) == "world":
+            return replace(element, attributes={**element.attributes, attribute: name})
+        if element.tag != "joint":
+            return element
+        return replace(element, children=[renamed(e) for e in element.children])
+
+    return replace(robot, children=[renamed(e) for e in robot.children]), name
 
 
 class _Meshes:

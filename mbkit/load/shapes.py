@@ -37,14 +37,10 @@ NOTHING: Final = Lump(0.0, np.zeros(3), np.zeros((3, 3)))
 
 def solid(shape: str, size: tuple[float, ...]) -> Lump:
     """Return a shape of density 1 kg/m³ about its centre; half lengths and radii as in MuJoCo, the long axis is z."""
-    if shape == "box":
+    if shape in ("box", "ellipsoid"):
         a, b, c = size
-        mass = 8 * a * b * c
-        moments = [(b * b + c * c) / 3, (a * a + c * c) / 3, (a * a + b * b) / 3]
-    elif shape == "ellipsoid":
-        a, b, c = size
-        mass = 4 / 3 * pi * a * b * c
-        moments = [(b * b + c * c) / 5, (a * a + c * c) / 5, (a * a + b * b) / 5]
+        mass, n = (8 * a * b * c, 3) if shape == "box" else (4 / 3 * pi * a * b * c, 5)
+        moments = [(b * b + c * c) / n, (a * a + c * c) / n, (a * a + b * b) / n]
     elif shape == "sphere":
         (r,) = size
         mass = 4 / 3 * pi * r**3
@@ -54,16 +50,13 @@ def solid(shape: str, size: tuple[float, ...]) -> Lump:
         mass = 2 * pi * r * r * h
         moments = [r * r / 4 + h * h / 3] * 2 + [r * r / 2]
     else:
-        return _capsule(*size)
+        # A cylinder and two half spheres, whose own centres stand 3/8 r beyond its ends.
+        r, h = size
+        tube, ball = 2 * pi * r * r * h, 4 / 3 * pi * r**3
+        along = tube * r * r / 2 + ball * 2 / 5 * r * r
+        across = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
+        return Lump(tube + ball, np.zeros(3), np.diag([across, across, along]))
     return Lump(mass, np.zeros(3), mass * np.diag(moments))
-
-
-def _capsule(r: float, h: float) -> Lump:
-    # A cylinder and two half spheres, whose own centres stand 3/8 r beyond its ends.
-    tube, ball = 2 * pi * r * r * h, 4 / 3 * pi * r**3
-    along = tube * r * r / 2 + ball * 2 / 5 * r * r
-    across = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
-    return Lump(tube + ball, np.zeros(3), np.diag([across, across, along]))
 
 
 def together(lumps: list[Lump]) -> Lump:

@@ -14,52 +14,10 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.errors import LoadError, ModelError, UnsupportedError
-from mbkit.load.urdf_check import UrdfFile, unbounded
+from mbkit.load.urdf_reader import BASE_JOINT, Snapper, UrdfFile, unbounded
 from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Model, ModelBuilder, kind_of
 from mbkit.model.validation import body_fault
-
-# A rotation matrix from a quaternion is off by up to about 5 eps.
-_REACH: Final = 8 * float(np.finfo(float).eps)
-
-
-class Snapper:
-    """Rounds entries of rotations and axes that are within `reach` of 0, 1 or -1, and counts them.
-
-    Half a turn, written 3.141592653589793, gives 6e-17 in place of 0, and terms would not vanish when expressions are
-    derived. Entries farther off, such as -3.67e-6 of the angle 1.5708, stay as written.
-    """
-
-    def __init__(self, reach: float = _REACH) -> None:
-        self._reach = reach
-        self.count = 0
-        self.largest = 0.0
-
-    def __call__(self, entries: Array) -> Array:
-        """Return the entries of a rotation matrix or a unit vector, rounded."""
-        out = np.where(np.abs(entries) <= self._reach, 0.0, entries)
-        # A one is set only where it is alone: beside an angle of 4e-8, whose cosine is
-        # 1 - 8e-16, it would spoil the unit length.
-        alone = np.ones(out.shape, dtype=bool)
-        for axis in range(out.ndim):
-            alone &= np.count_nonzero(out, axis=axis, keepdims=True) == 1
-        near_one = alone & (np.abs(np.abs(out) - 1) <= self._reach)
-        out = np.where(near_one, np.sign(out), out)
-        change = np.abs(out - entries)
-        self.count += int(np.count_nonzero(change))
-        self.largest = max(self.largest, float(change.max()))
-        return out
-
-    @property
-    def note(self) -> str | None:
-        """A sentence on the changes, or None."""
-        if not self.count:
-            return None
-        return (
-            f"{self.count} entries of rotations and axes within {self._reach:.1e} of 0, 1 or -1 were set to it; "
-            f"the largest change was {self.largest:.1e}"
-        )
-
 
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
 _ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous", "H": "helical"}
@@ -114,7 +72,7 @@ def model_of(
     """Parse a checked URDF and return its model."""
     try:
         if floating_base:
-            raw = pin.buildModelFromXML(urdf.text, pin.JointModelFreeFlyer(), "root_joint")
+            raw = pin.buildModelFromXML(urdf.text, pin.JointModelFreeFlyer(), BASE_JOINT)
         else:
             raw = pin.buildModelFromXML(urdf.text)
     except Exception as error:

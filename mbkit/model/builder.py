@@ -270,7 +270,7 @@ class ModelBuilder:
         ----------
         name : str
         mass : float
-            kg; zero for a mere frame.
+            kg; zero for a frame.
         com : (3,) array_like
             Centre of mass in body axes, m.
         inertia : (3, 3) or (3,) array_like, optional
@@ -320,16 +320,12 @@ class ModelBuilder:
             free take none.
         pitch : float
             Helical: metres per radian.
-        lower, upper : float or (nq,) array_like, optional
-            Limits of the coordinates; data, not dynamics.
-        velocity_limit, effort_limit, friction : float or (nv,) array_like
+        lower, upper, velocity_limit, effort_limit, friction : float, (nq,) or (nv,) array_like, optional
             Data, not dynamics.
         armature : float
             Added to M's diagonal, kg m² (kg for a prismatic joint); joints of one velocity only.
-        damping : float or (nv,) array_like
-            N m s/rad (N s/m).
-        stiffness, rest : float or (nv,) array_like
-            Joint spring, torque -stiffness (q - rest); not for ball and free joints.
+        damping, stiffness, rest : float or (nv,) array_like
+            N m s/rad (N s/m), and a spring's torque -stiffness (q - rest), not for ball and free joints.
         mimic : Mimic or (joint, ratio, offset), optional
             The joint that this one follows.
         """
@@ -393,17 +389,12 @@ class ModelBuilder:
 
         Parameters
         ----------
-        name : str
-        body_a, body_b : str
-            Names of bodies, or ``"world"``.
+        name, body_a, body_b : str
+            A body may be ``"world"``.
         point_a, point_b : (3,) array_like
             In the axes of the two bodies, m.
-        stiffness : float
-            N/m.
-        rest_length : float
-            m.
-        damping : float
-            N s/m, on the rate of the distance.
+        stiffness, rest_length, damping : float
+            N/m, m, and N s/m on the rate of the distance.
         """
         ends = {"body_a": body_a, "point_a": point_a, "body_b": body_b, "point_b": point_b}
         numbers = {"stiffness": stiffness, "rest_length": rest_length, "damping": damping}
@@ -426,12 +417,9 @@ class ModelBuilder:
         name : str
         factors : mapping of str to float
             Joint name -> factor; joints of one velocity.
-        stiffness, rest_length : float
-            The potential energy is ½ stiffness (l - rest_length)².
-        damping : float
-            The power lost is damping (dl/dt)².
-        armature : float
-            The kinetic energy is ½ armature (dl/dt)².
+        stiffness, rest_length, damping, armature : float
+            The potential energy is ½ stiffness (l - rest_length)², the power lost damping (dl/dt)², and the kinetic
+            energy ½ armature (dl/dt)².
         """
         value: Any = factors
         if not isinstance(value, Mapping):
@@ -460,11 +448,10 @@ class ModelBuilder:
 
         Parameters
         ----------
-        name : str
+        name, body_a, body_b : str
+            One body may be ``"world"``.
         kind : {"point", "frame"}
             Points that coincide, as in a ball joint (in a plane: a hinge), or frames that do, as if welded.
-        body_a, body_b : str
-            Names of bodies; one of them may be ``"world"``.
         translation_a, translation_b : (3,) array_like
             The points, or the frames' origins, in the axes of the two bodies, m.
         rotation_a, rotation_b : (3, 3) array_like, optional
@@ -510,14 +497,13 @@ class ModelBuilder:
         Parameters
         ----------
         nonphysical : {"error", "warn"}
-            What to do about bodies with an inconsistent inertia (not positive, against the triangle inequality, or
-            joints that move no inertia): raise, or keep them as written and warn. Of a body that is fixed to the
-            world only a negative mass counts; the rest is noted.
+            Raise for bodies with an inconsistent inertia (not positive, against the triangle inequality, or joints
+            that move no inertia), or keep them as written and warn. Of a body that is fixed to the world only a
+            negative mass counts; the rest is noted.
         point_masses : bool
             Whether a mass without inertia is meant that way.
         parts : mapping of str to sequence of (str, str), optional
-            Of bodies that were merged from several links: the links that are at fault, each with the
-            reason. Messages name them instead of the body.
+            Of bodies merged from several links the faulty ones, each with the reason, for messages.
 
         Raises
         ------

@@ -44,8 +44,7 @@ def neutral(model: Description) -> Array:
 def limits_box(model: Description) -> tuple[Array, Array]:
     """Return lower and upper ends of the box that `random_state` draws from.
 
-    The limits of a joint that mimics another bound the one that it follows, as long
-    as that leaves a range.
+    The limits of a joint that mimics another bound the one that it follows, as long as that leaves a range.
     """
     lower, upper = np.array(model.lower), np.array(model.upper)
     for joint in model.layout.joints:
@@ -56,13 +55,9 @@ def limits_box(model: Description) -> tuple[Array, Array]:
             if low < high:
                 lower[k], upper[k] = low, high
     for joint in model.independent_joints:
-        part = model.layout.q[joint.name]
-        for i in joint.type.angular:
-            k = part.start + i
-            lower[k], upper[k] = _clipped(lower[k], upper[k], np.pi)
-        for i in joint.type.lengths:
-            k = part.start + i
-            lower[k], upper[k] = _clipped(lower[k], upper[k], 1.0)
+        for indices, reach in ((joint.type.angular, np.pi), (joint.type.lengths, 1.0)):
+            for k in (model.layout.q[joint.name].start + i for i in indices):
+                lower[k], upper[k] = _clipped(lower[k], upper[k], reach)
     return lower, upper
 
 

@@ -32,12 +32,8 @@ def listed(texts: Sequence[str], most: int = 20) -> str:
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
 
 
-def structure_faults(description: Description) -> list[str]:
-    """Return one sentence per fault: names, the tree, mimics, and the values of joints."""
-    return list(_structure_faults(description))
-
-
-def _structure_faults(description: Description) -> Iterator[str]:
+def structure_faults(description: Description) -> Iterator[str]:
+    """Yield one sentence per fault: names, the tree, mimics, and the values of joints."""
     bodies, joints = description.bodies, description.joints
     if not bodies:
         yield "no bodies; add at least one"
@@ -253,7 +249,7 @@ _D = TypeVar("_D", bound=Description)
 
 def check_substituted(before: _D, after: _D) -> _D:
     """Return a description with other parameter values, or raise `ModelError` for what these make impossible."""
-    faults = structure_faults(after)
+    faults = [*structure_faults(after)]
     # An impossible body that was accepted before stays accepted, but a mass must not become negative.
     accepted = {name for name, _ in before.nonphysical}
     reasons = suspects(after, point_masses=True)
@@ -348,11 +344,11 @@ def scale_doubts(model: Description) -> list[str]:
             far.append(f"{joint.name!r} ({least:.1e} kg m² of {carried[joint.child]:.1e} kg over {extent:.1e} m)")
     root = np.sqrt(diagonal)
     values = np.linalg.eigvalsh(M / root[:, None] / root)
-    out = []
-    if small:
-        out.append(f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero: {listed(small)}")
-    if far:
-        out.append(f"joints whose inertia is lost beside m L² of the whole mechanism: {listed(far)}")
+    causes = (
+        (f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero", small),
+        ("joints whose inertia is lost beside m L² of the whole mechanism", far),
+    )
+    out = [f"{what}: {listed(joints)}" for what, joints in causes if joints]
     if values[0] * _APART * 10 < values[-1]:
         out.append(f"M is nearly singular (eigenvalues {values[0]:.1e} to {values[-1]:.1e}, scaled to a unit diagonal)")
     return out
@@ -415,8 +411,7 @@ def _sample(model: Description, q: Array | None = None) -> _Sample:
         R, p = joint.rotation @ R_JC, joint.translation + joint.rotation @ p_JC
         X = np.block([[R.T, -R.T @ skew(p)], [np.zeros((3, 3)), R.T]])
         S = np.zeros((6, joint.type.nv))
-        for k in range(joint.type.nv):
-            unit = [float(i == k) for i in range(joint.type.nv)]
+        for k, unit in enumerate(np.eye(joint.type.nv).tolist()):
             S[:, k] = np.array([x for half in joint.type.twist(np, joint, at, unit) for x in half], dtype=float)
         steps[joint.name] = X, S, part
         moving, above = jacobians[joint.parent]

@@ -23,7 +23,7 @@ from mbkit.engines.drake.engine import DrakeDynamics
 from mbkit.engines.drake.model import DrakeModel
 from mbkit.engines.imported import Imported, checked, joint_of, unused, written
 from mbkit.errors import UnsupportedError
-from mbkit.load.urdf_links import BASE_JOINT
+from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.model import Body, Joint, Model
 from mbkit.model.joint_types import kind_of
 from mbkit.spatial import skew

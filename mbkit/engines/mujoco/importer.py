@@ -22,7 +22,7 @@ from mbkit.engines.imported import Beside, Imported, checked, joint_of, stacked,
 from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf_couplings import coupled
-from mbkit.load.urdf_links import BASE_JOINT
+from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.model import Body, Joint, JointCoupling, Model, PointSpring
 from mbkit.model.joint_types import kind_of
 

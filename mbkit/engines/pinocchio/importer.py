@@ -16,7 +16,7 @@ from mbkit._check import Array
 from mbkit.engines.imported import Imported, checked, joint_of, stacked, unused, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.urdf import joint_kind, joint_numbers
-from mbkit.load.urdf_links import BASE_JOINT
+from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.model import Body, Joint, Model
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mbkit import catalog
 from mbkit.errors import MbkitError
-from mbkit.load.urdf import Snapper
+from mbkit.load.urdf_reader import Snapper
 from mbkit.model import Expression, Model, Parameter
 
 #: Textbook symbols of arguments whose symbol is not the usual one: argument=symbol, or three symbols of a vector.

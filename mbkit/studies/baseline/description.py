@@ -19,7 +19,7 @@ from mbkit._check import Array
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load import load
 from mbkit.load.loader import find
-from mbkit.load.urdf_links import read_links
+from mbkit.load.urdf_reader import read_links
 from mbkit.model import Model
 from mbkit.studies._targets import resolved
 

@@ -23,7 +23,7 @@ from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError,
 from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
-from mbkit.load.urdf_links import urdf_links
+from mbkit.load.urdf_reader import urdf_links
 from mbkit.model import Model
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import angle_of, number_text

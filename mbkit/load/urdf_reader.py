@@ -1,7 +1,9 @@
-"""URDF read and checked before any parser in C++ sees it.
+"""URDF read and checked before any parser in C++ sees it, and its model link by link without one.
 
 `examine` finds all faults of a file at once. It writes the bodies and joints as plain XML, with the same names and
-numbers, and without meshes, textures, plugins and all else that could point outside the file.
+numbers, and without meshes, textures, plugins and all else that could point outside the file. By the URDF specification
+a joint's frame is its child link's, an inertia is about the centre of mass in the axes of its origin, and rpy are turns
+about fixed x, y and z.
 """
 
 from __future__ import annotations
@@ -10,19 +12,24 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import ModelError, Suggestions
-from mbkit.load.xml_reader import Element, Reader, element_text, misspelt
-from mbkit.model import Body, Mimic
+from mbkit.load import xml_reader
+from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, unused
+from mbkit.model import Body, Mimic, Model, ModelBuilder, kind_of
 from mbkit.model.validation import body_fault, listed, repeated_names
 
 # The parser in C++ recurses over the tree, and its tables grow as the square.
 _MAX_JOINTS: Final = 2000
+#: The joint on which a floating base moves.
+BASE_JOINT: Final = "root_joint"
 # Pinocchio's parser takes this for no limit.
 _OPEN: Final = "1.7976931348623157e308"
 _MAX_LISTED: Final = 40
@@ -113,8 +120,8 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
     texts = "".join(text for _, text in (*links, *joints))
     root = _check_tree([link.name for link, _ in links], [j for j, _ in joints], floating_base, read)
     followed, notes = _check_mimics([j for j, _ in joints], mimic_matters, lenient, read)
-    if floating_base and any(j.name == "root_joint" for j in followed):
-        read.fault("joint 'root_joint': floating_base=True adds a joint of that name; rename yours")
+    if floating_base and any(j.name == BASE_JOINT for j in followed):
+        read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")
     if read.faults:
         raise ModelError(source, read.faults)
     return UrdfFile(
@@ -409,3 +416,81 @@ def _element_hint(owner: str, tag: str, known: frozenset[str]) -> str:
     if meant := misspelt(tag, known):
         return f"did you mean <{meant}>?"
     return f"expected {', '.join(f'<{k}>' for k in sorted(known)) or 'none'}" if owner in _WHOLE else ""
+
+
+# The model, link by link: the measure of importers
+
+
+# A rotation matrix from a quaternion is off by up to about 5 eps.
+_REACH: Final = 8 * float(np.finfo(float).eps)
+
+
+class Snapper:
+    """Rounds entries of rotations and axes that are within `reach` of 0, 1 or -1, and counts them.
+
+    Half a turn, written 3.141592653589793, gives 6e-17 in place of 0, and terms would not vanish when expressions are
+    derived. Entries farther off, such as -3.67e-6 of the angle 1.5708, stay as written.
+    """
+
+    def __init__(self, reach: float = _REACH) -> None:
+        self._reach = reach
+        self.count = 0
+        self.largest = 0.0
+
+    def __call__(self, entries: Array) -> Array:
+        """Return the entries of a rotation matrix or a unit vector, rounded."""
+        out = np.where(np.abs(entries) <= self._reach, 0.0, entries)
+        # A one is set only where it is alone: beside an angle of 4e-8, whose cosine is
+        # 1 - 8e-16, it would spoil the unit length.
+        alone = np.ones(out.shape, dtype=bool)
+        for axis in range(out.ndim):
+            alone &= np.count_nonzero(out, axis=axis, keepdims=True) == 1
+        near_one = alone & (np.abs(np.abs(out) - 1) <= self._reach)
+        out = np.where(near_one, np.sign(out), out)
+        change = np.abs(out - entries)
+        self.count += int(np.count_nonzero(change))
+        self.largest = max(self.largest, float(change.max()))
+        return out
+
+    @property
+    def note(self) -> str | None:
+        """A sentence on the changes, or None."""
+        if not self.count:
+            return None
+        return (
+            f"{self.count} entries of rotations and axes within {self._reach:.1e} of 0, 1 or -1 were set to it; "
+            f"the largest change was {self.largest:.1e}"
+        )
+
+
+def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Model:
+    """Return the model of a <robot> element with one body for each link, or raise `ModelError`.
+
+    The root link is fixed to the world or floats; a root link called ``world`` is the world.
+    """
+    urdf = examine(root, source, floating_base=floating_base, mimic_matters=False, lenient=True)
+    snap, b = Snapper(), ModelBuilder(urdf.name)
+    for link in (x for x in urdf.links if x.name != "world"):
+        if link.inertia is None:
+            b.add_body(link.name)
+            continue
+        R, I = snap(spatial.matrix_from_rpy(*link.rpy)), link.inertia
+        turned = I if np.array_equal(R, np.eye(3)) else R @ I @ R.T
+        b.add_body(link.name, mass=link.mass, com=link.com, inertia=0.5 * (turned + turned.T))
+    if floating_base:
+        b.add_joint(BASE_JOINT, "free", parent="world", child=urdf.root)
+    elif urdf.root != "world":
+        name = unused(f"world_to_{urdf.root}", {j.name for j in urdf.joints})
+        b.add_joint(name, "fixed", parent="world", child=urdf.root)
+    for j in urdf.joints:
+        numbers = {**j.numbers, "mimic": j.mimic} if kind_of(j.kind).nv == 1 else {}
+        R = snap(spatial.matrix_from_rpy(*j.rpy))
+        b.add_joint(j.name, j.kind, parent=j.parent, child=j.child, translation=j.translation, rotation=R, **numbers)
+    for note in urdf.notes:
+        b.note(note)
+    return b.build(nonphysical="warn", point_masses=False)
+
+
+def read_links(path: Path) -> Model:
+    """Return `urdf_links` of a file."""
+    return urdf_links(xml_reader.read(path), str(path))
