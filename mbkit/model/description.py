@@ -17,7 +17,7 @@ from mbkit._check import Array, shown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed, read_only
 
 
 def _plain(value: Any) -> Any:
@@ -160,8 +160,7 @@ class Layout:
         for j in self.joints:
             if j.mimic:
                 c[self.full_q[j.name]] = j.mimic.offset
-        c.setflags(write=False)
-        return c
+        return read_only(c)
 
     @cached_property
     def G_q(self) -> Array:
@@ -181,8 +180,7 @@ class Layout:
                 G[part, columns[j.mimic.joint]] = j.mimic.ratio
             else:
                 G[part, columns[j.name]] = np.eye(part.stop - part.start)
-        G.setflags(write=False)
-        return G
+        return read_only(G)
 
     def coupling_row(self, coupling: JointCoupling) -> Array:
         """Return the row c of a coupling's rate dl/dt = c v_full, shape (full nv,)."""
@@ -241,9 +239,7 @@ class Description:
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        gravity = np.array(self.gravity, dtype=np.float64)
-        gravity.setflags(write=False)
-        object.__setattr__(self, "gravity", gravity)
+        object.__setattr__(self, "gravity", read_only(np.array(self.gravity, dtype=np.float64)))
         object.__setattr__(self, "layout", Layout(self.joints))
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
@@ -428,9 +424,7 @@ def expect_name(what: str, name: object) -> None:
 
 
 def _joined(parts: list[Array]) -> Array:
-    out = np.concatenate([np.empty(0), *parts])
-    out.setflags(write=False)
-    return out
+    return read_only(np.concatenate([np.empty(0), *parts]))
 
 
 def _named(joint: str, suffix: str) -> str:

@@ -27,21 +27,16 @@ class Space:
             q, v = model.layout.q[joint.name], model.layout.v[joint.name]
             start = joint.type.quaternion
             plain = joint.type.nq if start is None else start
-            self._add(slice(q.start, q.start + plain), slice(v.start, v.start + plain))
+            last = self._sums[-1] if self._sums else None
+            if last and last[0].stop == q.start and last[1].stop == v.start and plain:
+                self._sums[-1] = slice(last[0].start, q.start + plain), slice(last[1].start, v.start + plain)
+            elif plain:
+                self._sums.append((slice(q.start, q.start + plain), slice(v.start, v.start + plain)))
             if start is not None:
                 turn = slice(q.start + start, q.stop), slice(v.start + start, v.stop)
                 self._turns.append(turn)
                 if joint.type.floating:
                     self._free.append((turn[0], slice(v.start, v.start + start), turn[1]))
-
-    def _add(self, q: slice, v: slice) -> None:
-        if q.start == q.stop:
-            return
-        last = self._sums[-1] if self._sums else None
-        if last and last[0].stop == q.start and last[1].stop == v.start:
-            self._sums[-1] = slice(last[0].start, q.stop), slice(last[1].start, v.stop)
-        else:
-            self._sums.append((q, v))
 
     def move(self, q: Any, u: Any) -> Any:
         """Return q moved by u: positions add, rotations turn by exp(u) in body axes."""
@@ -75,27 +70,19 @@ class Space:
 
     def enter(self, q: Any, v: Any) -> Any:
         """Return w of mbkit's v."""
-        if self._rates is not None:
-            return self._rates.enter(q, v)
-        return self._changed(q, v, rotation.rotate)
+        return self._changed(q, v, rotation.rotate) if self._rates is None else self._rates.enter(q, v)
 
     def leave(self, q: Any, w: Any) -> Any:
         """Return mbkit's v of w."""
-        if self._rates is not None:
-            return self._rates.leave(q, w)
-        return self._changed(q, w, rotation.rotate_back)
+        return self._changed(q, w, rotation.rotate_back) if self._rates is None else self._rates.leave(q, w)
 
     def enter_force(self, q: Any, f: Any) -> Any:
         """Return the momentum or force on w of one on mbkit's v; on free joints they turn as velocities do."""
-        if self._rates is not None:
-            return self._rates.enter_force(q, f)
-        return self.enter(q, f)
+        return self.enter(q, f) if self._rates is None else self._rates.enter_force(q, f)
 
     def leave_force(self, q: Any, f: Any) -> Any:
         """Return the momentum or force on mbkit's v of one on w."""
-        if self._rates is not None:
-            return self._rates.leave_force(q, f)
-        return self.leave(q, f)
+        return self.leave(q, f) if self._rates is None else self._rates.leave_force(q, f)
 
     def _changed(self, q: Any, v: Any, change: Any) -> Any:
         if not self._free:

@@ -58,14 +58,9 @@ class Model(Description):
         return False
 
     def require_independent(self, q: Array, *, once: bool = False) -> None:
-        """Refuse constraints that depend on each other at a configuration, with the rows.
+        """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows.
 
-        Parameters
-        ----------
-        q : (nq,) or (N, nq) array
-            Of which the first is judged.
-        once : bool
-            Whether constraints that were independent at some configuration are taken to be so everywhere.
+        With `once`, constraints that were independent at some configuration are taken to be so everywhere.
         """
 
     # Earlier names of the same, for scripts.
@@ -157,12 +152,7 @@ class Model(Description):
         return model
 
     def with_parameters(self, /, **values: float) -> Model:
-        """Return the same description with plain numbers for some or all parameters.
-
-        Parameters
-        ----------
-        **values : float
-            By the parameters' names.
+        """Return the same description with plain numbers, by name, for some or all parameters.
 
         Raises
         ------
@@ -214,8 +204,7 @@ class Model(Description):
         return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._mass_text()}; {self.needs}{between}>"
 
     def _mass_text(self) -> str:
-        unknown = any(np.isnan(b.mass) for b in self.bodies)
-        return "mass not given yet" if unknown else f"{self.mass:.4g} kg"
+        return "mass not given yet" if any(np.isnan(b.mass) for b in self.bodies) else f"{self.mass:.4g} kg"
 
     def _repr_html_(self) -> str:
         cells = "".join(

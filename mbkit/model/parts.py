@@ -14,6 +14,12 @@ from mbkit._check import Array
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 
 
+def read_only(array: Array) -> Array:
+    """Return an array that refuses to be written to: itself."""
+    array.setflags(write=False)
+    return array
+
+
 class _Frozen:
     """Read-only arrays, equality by content, and pickling that keeps both."""
 
@@ -22,9 +28,7 @@ class _Frozen:
             value = getattr(self, f.name)
             if isinstance(value, np.ndarray):
                 # + 0.0 makes one of the two zeros, which are equal and hash apart.
-                value = np.array(value, dtype=np.float64) + 0.0
-                value.setflags(write=False)
-                object.__setattr__(self, f.name, value)
+                object.__setattr__(self, f.name, read_only(np.array(value, dtype=np.float64) + 0.0))
             elif f.type == "float":
                 object.__setattr__(self, f.name, float(value) + 0.0)
 
