@@ -129,7 +129,7 @@ def load(
     ):
         if not isinstance(value, (str, bool, np.bool_, NoneType)) or value not in allowed:
             raise InputError(f"{name}: expected {expected}, got {shown(value)}")
-    path, by_name = _resolved(source)
+    path, by_name = _locate(source)
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml_reader.read(path)
     if root.tag == "robot":
@@ -143,7 +143,7 @@ def load(
     elif root.tag == "mujoco":
         from mbkit.load.mjcf import model_of_mjcf
 
-        whole = xml_reader.expanded(root, path)
+        whole = xml_reader.with_includes(root, path)
         model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes)
     else:
         raise xml_reader.unknown_root(path, root)
@@ -153,7 +153,7 @@ def load(
     return replace(model, notes=(*root.notes, *model.notes)) if root.notes else model
 
 
-def _resolved(source: str | os.PathLike[str]) -> tuple[Path, bool]:
+def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:
     """Return the file, and whether the source is a robot's name."""
     if not isinstance(source, (str, os.PathLike)):
         raise InputError(f"source: expected a robot's name or a path, got {shown(source)}")

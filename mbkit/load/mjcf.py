@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.errors import ModelError
 from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
-from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, named
+from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
 from mbkit.load.mjcf_couplings import Transmissions
-from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, floated, read_tree
+from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, read_tree, with_free_base
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Model, ModelBuilder
@@ -56,7 +56,7 @@ def model_of_mjcf(
             read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
     misspelt = check_names(mujoco, read)
     if floating_base:
-        mujoco = floated(mujoco, read)
+        mujoco = with_free_base(mujoco, read)
     scene = Scene(Compiler.of(mujoco, read), Defaults(mujoco, read), read)
     read_tree(mujoco, scene)
     flags: dict[str, str] = {}
@@ -90,7 +90,7 @@ def model_of_mjcf(
     transmissions = Transmissions(mujoco, scene, off)
     if read.faults:
         raise ModelError(str(path), read.faults)
-    sprung = f"stiffness and damping of springdamper are from MuJoCo's compiler: {named(springs)}" if springs else ""
+    sprung = f"stiffness and damping from MuJoCo's compiler (springdamper): {name_list(springs)}" if springs else ""
     for note in (*_notes(mujoco, path, scene, flags, scale), inferred, sprung, misspelt, snap.note):
         if note:
             b.note(note)
@@ -221,11 +221,11 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
     if unnamed := " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items())):
         yield f"names were generated for elements without one ({unnamed})"
     for setting, bodies in scene.bounded.items():
-        yield f"compiler {setting} changed the {'mass' if setting == 'boundmass' else 'inertia'} of {named(bodies)}"
+        yield f"compiler {setting} changed the {'mass' if setting == 'boundmass' else 'inertia'} of {name_list(bodies)}"
     if scale != 1:
         yield f"compiler settotalmass: all masses and inertias times {scale:.9g}"
     moved = [b for b in scene.bodies if np.any(b.pose.p) or not np.array_equal(b.pose.R, np.eye(3))]
     if free := [b.name for b in moved if b.joints and b.joints[0].kind == "free"]:
-        yield f"q of a free body is its pose in the world; its pose in the file was left out: {named(free)}"
+        yield f"q of a free body is its pose in the world; its pose in the file was left out: {name_list(free)}"
     if stacked := [b.name for b in scene.bodies if len(b.joints) > 1]:
-        yield f"massless bodies stand between the joints of bodies with several: {named(stacked)}"
+        yield f"massless bodies stand between the joints of bodies with several: {name_list(stacked)}"

@@ -18,7 +18,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import nearest
 from mbkit.load.xml_reader import MOST_BYTES, Element, Reader
-from mbkit.model.validation import listed
+from mbkit.model.validation import listing
 
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
@@ -251,7 +251,7 @@ def check_names(mujoco: Element, read: Reader) -> str:
     """Keep a fault for each unknown name that could act on the motion, and return a note about the others."""
     aside: list[str] = []
     _check(mujoco, rules(), read, aside)
-    return f"unknown to MuJoCo's schema, and ignored: {listed(aside, 6)}" if aside else ""
+    return f"unknown to MuJoCo's schema, and ignored: {listing(aside, 6)}" if aside else ""
 
 
 def _check(element: Element, rule: Rule, read: Reader, aside: list[str], acts: bool = True) -> None:

@@ -20,7 +20,7 @@ from mbkit.load.mjcf_attributes import mesh_assets, read_mesh
 from mbkit.load.mjcf_reader import Scene
 from mbkit.load.shapes import Lump
 from mbkit.load.xml_reader import Element, element_text
-from mbkit.model.validation import listed
+from mbkit.model.validation import listing
 
 _BODIES: Final = ("default", "asset", "worldbody")
 _BODIES_AND_FORCES: Final = (*_BODIES, "tendon", "actuator")
@@ -36,7 +36,7 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
     """Give the bodies of ``scene.inferred`` their inertia, and return a note about it."""
     if not scene.inferred or scene.read.faults:
         return ""
-    item = f"the inertia of {named(scene.inferred)}"
+    item = f"the inertia of {name_list(scene.inferred)}"
     text = _Text(mujoco, path, scene)
     compiled = text.compiled(_BODIES, item, scaled=False)
     if compiled is None:
@@ -46,7 +46,7 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
             body.lump = _lump(compiled.body(body.name))
     bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
     within = f", within {' and '.join(bounds)}" if bounds else ""
-    files = f"; mesh files read: {named(text.opened)}" if text.opened else ""
+    files = f"; mesh files read: {name_list(text.opened)}" if text.opened else ""
     return f"{item} was inferred from meshes or shells by MuJoCo's compiler{within}{files}"
 
 
@@ -65,7 +65,7 @@ def infer_springs(mujoco: Element, path: Path, scene: Scene) -> dict[str, tuple[
             scene.read.fault(f"{item}: springdamper: {expected}", joint.element)
     if not joints or scene.read.faults:
         return {}
-    item = f"springdamper of {named(joints)}"
+    item = f"springdamper of {name_list(joints)}"
     compiled = _Text(mujoco, path, scene).compiled(_BODIES_AND_FORCES, item, scaled=True)
     if compiled is None:
         return {}
@@ -172,6 +172,6 @@ def _lump(body: Any) -> Lump:
     return Lump(float(body.mass[0]), np.array(body.ipos), axes @ np.diag(body.inertia) @ axes.T)
 
 
-def named(names: Iterable[str]) -> str:
+def name_list(names: Iterable[str]) -> str:
     """Return the first names, and how many more there are."""
-    return listed([repr(name) for name in names], 6)
+    return listing([repr(name) for name in names], 6)

@@ -178,7 +178,7 @@ class Transmissions:
             e.attributes.get("name", ""): t.factors for (e, _), t in zip(tendons, self._tendons, strict=True)
         }
         self._actuators = [self._actuator(e, label, k) for k, (e, label) in enumerate(inside("actuator"), 1)]
-        self._equalities = [f"{label} ({_connected(e)})" for e, label in inside("equality")]
+        self._equalities = [f"{label} ({_bound_parts(e)})" for e, label in inside("equality")]
 
     def _collect(self, element: Element, name: str) -> None:
         """Read the actuator defaults of a class and of the classes in it."""
@@ -283,14 +283,14 @@ class Transmissions:
         """Return the model with these springs, dampers and rotors, and with notes on them and on parts left out."""
         acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
         springs = tuple(x.point_spring() for x in acting if x.ends)
-        out = coupled(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
+        out = with_couplings(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
         ratios = []
         for x in acting:
             if x.dampratio:
                 # Relative to the critical damping of the inertia that the actuator moves in the pose of the file.
                 damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * self._reflected(out, x.coupling())))
                 ratios.append(replace(x.coupling(), stiffness=0.0, armature=0.0, damping=damping))
-        out = coupled(out, ratios)
+        out = with_couplings(out, ratios)
         notes = [*model.notes, *self._notes()]
         if branched := ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c)):
             notes.append(f"the armature of {branched} acts between branches; MuJoCo 4.0 leaves it out of M there")
@@ -327,7 +327,7 @@ class Transmissions:
             yield f"equality constraints left out: {'; '.join(self._equalities)}"
 
 
-def coupled(model: Model, couplings: Iterable[JointCoupling]) -> Model:
+def with_couplings(model: Model, couplings: Iterable[JointCoupling]) -> Model:
     """Return the model with more couplings; one of a single joint becomes numbers of that joint.
 
     Dampings of couplings of one name add. Two springs on one joint become one; a constant energy is left out.
@@ -376,7 +376,7 @@ def _add_bias(settings: _Actuator, out: _Acting) -> None:
         out.left_out.append(f"force range {' '.join(f'{x:g}' for x in limits)}")
 
 
-def _connected(element: Element) -> str:
+def _bound_parts(element: Element) -> str:
     """Return the parts that an equality constraint binds."""
     ends = (f"{k} {v!r}" for k, v in element.attributes.items() if k.rstrip("12") in _ENDS)
     return ", ".join([element.tag, *ends])

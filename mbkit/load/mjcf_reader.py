@@ -108,7 +108,7 @@ class Scene:
         return name
 
 
-def unfolded(
+def frame_contents(
     owner: Element, X: Pose, childclass: str | None, scene: Scene, item: str
 ) -> Iterator[tuple[Element, Pose, str | None]]:
     """Yield the children of a body, with those of its <frame> elements, their pose and their class."""
@@ -119,10 +119,10 @@ def unfolded(
         # MuJoCo takes a frame's class for its childclass.
         own = child.attributes.get("childclass", child.attributes.get("class"))
         inner = scene.defaults.known(own, child) or childclass
-        yield from unfolded(child, X @ pose(child, scene.compiler, scene.read, item), inner, scene, item)
+        yield from frame_contents(child, X @ pose(child, scene.compiler, scene.read, item), inner, scene, item)
 
 
-def floated(mujoco: Element, read: Reader) -> Element:
+def with_free_base(mujoco: Element, read: Reader) -> Element:
     """Return a <mujoco> element with a free joint for the world's only body, or keep a fault."""
     tops = [b for world in mujoco.all("worldbody") for b in _parts(world, ("body",))]
     if not tops:
@@ -162,7 +162,9 @@ def read_tree(mujoco: Element, scene: Scene) -> None:
     for world in mujoco.all("worldbody"):
         scene.collect_names(world)
     for world in mujoco.all("worldbody"):
-        _read_children(list(unfolded(world, HERE, None, scene, "the world")), "world", "the world", scene.sites, scene)
+        _read_children(
+            list(frame_contents(world, HERE, None, scene, "the world")), "world", "the world", scene.sites, scene
+        )
 
 
 def _read_children(
@@ -190,7 +192,7 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
         scene.left_out["gravity compensation"] += 1
     if element.attributes.get("mocap") == "true":
         scene.left_out["motion capture"] += 1
-    parts = list(unfolded(element, HERE, childclass, scene, item))
+    parts = list(frame_contents(element, HERE, childclass, scene, item))
     joints = [_joint(e, name, Y, c, scene) for e, Y, c in parts if e.tag in _JOINTS]
     if any(j.kind == "free" for j in joints):
         if len(joints) > 1:

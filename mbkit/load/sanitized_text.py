@@ -16,8 +16,8 @@ from xml.sax.saxutils import escape
 from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name, read_mesh
-from mbkit.load.mjcf_reader import counts, floated
-from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, expanded, unused
+from mbkit.load.mjcf_reader import counts, with_free_base
+from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, unused, with_includes
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
 #: Elements that name other files, or mean nothing without one that does.
@@ -57,7 +57,7 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
     if format_ is None:
         raise xml_reader.unknown_root(path, root)
     if format_ == "mjcf":
-        root = expanded(root, path)
+        root = with_includes(root, path)
     foreign = [e for e in root.walk() if e.tag in _FOREIGN]
     if foreign:
         raise LoadError(
@@ -69,7 +69,7 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
         root, renamed = _with_base(root)
     elif floating_base:
         read = Reader()
-        root = floated(root, read)
+        root = with_free_base(root, read)
         if read.faults:
             raise ModelError(str(path), read.faults)
     meshes = _Meshes(root, path) if format_ == "mjcf" else None

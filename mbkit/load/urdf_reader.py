@@ -24,7 +24,7 @@ from mbkit.errors import ModelError, Suggestions
 from mbkit.load import xml_reader
 from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, unused
 from mbkit.model import Body, Mimic, Model, ModelBuilder, kind_of
-from mbkit.model.validation import body_fault, listed, repeated_names
+from mbkit.model.validation import body_fault, listing, repeated_names
 
 # The parser in C++ recurses over the tree, and its tables grow as the square.
 _MAX_JOINTS: Final = 2000
@@ -225,7 +225,7 @@ def _why_lost(leader: str, by_name: Mapping[str, UrdfJoint], suggestions: Sugges
 # not read ' 1.5 ', and drops the link's inertia).
 
 
-def _copied(element: Element, *names: str) -> str:
+def _copy(element: Element, *names: str) -> str:
     return element_text(
         element.tag, {n: " ".join(element.attributes[n].split()) for n in names if n in element.attributes}
     )
@@ -237,7 +237,7 @@ def _origin(owner: Element, item: str, read: Reader) -> tuple[_Numbers, _Numbers
     if origin is None:
         return zeros, zeros, ""
     xyz, rpy = (read.numbers(origin, name, item, count=3, default=zeros) for name in ("xyz", "rpy"))
-    return xyz, rpy, _copied(origin, "xyz", "rpy")
+    return xyz, rpy, _copy(origin, "xyz", "rpy")
 
 
 def _link(link: Element, read: Reader, odd: dict[str, str]) -> tuple[UrdfLink, str]:
@@ -262,7 +262,7 @@ def _link(link: Element, read: Reader, odd: dict[str, str]) -> tuple[UrdfLink, s
     if len(read.faults) == before:
         why = body_fault(Body(name, kg, np.zeros(3), inertia), point_masses=False)
         odd |= {name: why} if why else {}
-    text = element_text("inertial", {}, text + _copied(mass, "value") + _copied(moments, *_MOMENTS))
+    text = element_text("inertial", {}, text + _copy(mass, "value") + _copy(moments, *_MOMENTS))
     return UrdfLink(name, kg, com, rpy, inertia), element_text("link", {"name": name}, text)
 
 
@@ -312,7 +312,7 @@ def _axis(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[str,
             'turn the joint by <origin rpy="..."/> and write <axis xyz="0 0 1"/>',
             axis or joint,
         )
-    return ({}, "") if kind == "planar" else ({"axis": vector}, _copied(axis, "xyz") if axis else "")
+    return ({}, "") if kind == "planar" else ({"axis": vector}, _copy(axis, "xyz") if axis else "")
 
 
 def _limit(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[str, Any], str]:
@@ -341,7 +341,7 @@ def _limit(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[str
         lower, upper = -math.inf, math.inf
     if bounded:
         numbers |= {"lower": unbounded(lower), "upper": unbounded(upper)}
-    return numbers, _copied(limit, "lower", "upper", "effort", "velocity")
+    return numbers, _copy(limit, "lower", "upper", "effort", "velocity")
 
 
 def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[str, Any], str]:
@@ -356,7 +356,7 @@ def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[
         read.fault(f"{item}: damping or friction on a {type_} joint, which URDF parsers drop; remove it", dynamics)
     if kind in ("", "fixed", "free", "planar") or not numbers.keys() & dynamics.attributes.keys():
         return {}, ""
-    return numbers, _copied(dynamics, *numbers)
+    return numbers, _copy(dynamics, *numbers)
 
 
 def unbounded(limit: ArrayLike) -> Array:
@@ -389,7 +389,7 @@ def _unread(robot: Element, read: Reader) -> list[str]:
                 elements[child.tag[:40]] += 1
         stack.extend(c for c in reversed(element.children) if c.tag in children)
     return [
-        f"{what}: {listed([f'{n} {tag}' for tag, n in sorted(counts.items())], _MAX_LISTED)}"
+        f"{what}: {listing([f'{n} {tag}' for tag, n in sorted(counts.items())], _MAX_LISTED)}"
         for what, counts in (
             ("left out of the file, with every path in it", elements),
             ("attributes that URDF does not define, left out", attributes),

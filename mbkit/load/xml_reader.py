@@ -355,7 +355,7 @@ def unused(name: str, names: Container[object]) -> str:
 _TAG: Final = "include"
 
 
-def expanded(mujoco: Element, path: Path) -> Element:
+def with_includes(mujoco: Element, path: Path) -> Element:
     """Return the <mujoco> element of a file with the files that it includes, or raise `LoadError`."""
     if all(e.tag != _TAG for e in mujoco.walk()):
         return mujoco

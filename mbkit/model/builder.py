@@ -18,7 +18,7 @@ from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
-from mbkit.model.validation import body_faults, grouped, static_bodies, structure_faults, suspects
+from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
 # The squares of sums of such lengths still fit a double.
 _LONGEST: Final = 1e150
@@ -523,20 +523,20 @@ class ModelBuilder:
         inconsistent = body_faults(bodies, point_masses=point_masses)
         if not faults:
             # Mimic joints without leaders, and joints that move nothing, are for a connected tree only.
-            model = self._assemble(*_resolved(joints, self._bindings))
+            model = self._assemble(*_resolve(joints, self._bindings))
             inconsistent = suspects(model, point_masses=point_masses)
         negative = {b.name for b in bodies if b.mass < 0}
         static = static_bodies(joints) - negative
-        idle = grouped([(n, why) for n, why in inconsistent if n in static], parts)
+        idle = fault_sentences([(n, why) for n, why in inconsistent if n in static], parts)
         inconsistent = tuple((n, why) for n, why in inconsistent if n not in static)
         if nonphysical == "error" and (refused := [(n, why) for n, why in inconsistent if n not in negative]):
-            faults += grouped(refused, parts)
+            faults += fault_sentences(refused, parts)
             faults[-1] += '; correct it, or take it as written with nonphysical="warn"'
-        faults += grouped([(n, why) for n, why in inconsistent if n in negative], parts)
+        faults += fault_sentences([(n, why) for n, why in inconsistent if n in negative], parts)
         if faults:
             raise ModelError(self._name, faults)
         if inconsistent:
-            impossible = "; ".join(grouped(inconsistent, parts))
+            impossible = "; ".join(fault_sentences(inconsistent, parts))
             message = f"{self._name}: physically impossible, used as written: {impossible}"
             warnings.warn(message, NonPhysicalWarning, stacklevel=2)
         notes = (*model.notes, *(f"never moves, so this cannot act: {text}" for text in idle))
@@ -578,7 +578,7 @@ class ModelBuilder:
         )
 
 
-def _resolved(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tuple[Joint, ...], tuple[Binding, ...]]:
+def _resolve(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tuple[Joint, ...], tuple[Binding, ...]]:
     """Let every mimic joint point at a joint that is free itself."""
     by_name = {j.name: j for j in joints}
     bound: dict[tuple[str, str], Number] = {(b.part, b.field): b.expression for b in bindings if b.where == "joints"}
@@ -587,9 +587,9 @@ def _resolved(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tup
     for joint in by_name.values():
         if joint.mimic is None:
             continue
-        at, ratio, offset = _followed(joint.name, joint.mimic, bound)
+        at, ratio, offset = _leader_of(joint.name, joint.mimic, bound)
         while (further := by_name[at].mimic) is not None:
-            at, r, o = _followed(at, further, bound)
+            at, r, o = _leader_of(at, further, bound)
             ratio, offset = ratio * r, ratio * o + offset
         numbers, new = split("joints", joint.name, {"ratio": ratio, "offset": offset})
         changed[joint.name] = replace(joint, mimic=Mimic(at, **numbers))
@@ -598,7 +598,7 @@ def _resolved(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tup
     return tuple(changed.get(j.name, j) for j in by_name.values()), tuple(kept)
 
 
-def _followed(joint: str, mimic: Mimic, bound: Mapping[tuple[str, str], Number]) -> tuple[str, Number, Number]:
+def _leader_of(joint: str, mimic: Mimic, bound: Mapping[tuple[str, str], Number]) -> tuple[str, Number, Number]:
     return mimic.joint, bound.get((joint, "ratio"), mimic.ratio), bound.get((joint, "offset"), mimic.offset)
 
 

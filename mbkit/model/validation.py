@@ -27,7 +27,7 @@ def repeated_names(what: str, names: Iterable[str]) -> list[str]:
     return [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
 
 
-def listed(texts: Sequence[str], most: int = 20) -> str:
+def listing(texts: Sequence[str], most: int = 20) -> str:
     """Return the first texts, and how many more there are."""
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
 
@@ -135,7 +135,7 @@ def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> Iterator[st
             yield (
                 f"body {name!r}: carried by {len(several)} joints ({names}); keep one and close the loop with add_loop"
             )
-    reached = _reached(carried)
+    reached = _connected_bodies(carried)
     for body in bodies:
         if body.name not in reached and body.name in carriers:
             yield f"body {body.name!r}: not connected to the world; its joints form a cycle or hang in the air"
@@ -143,7 +143,7 @@ def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> Iterator[st
             yield f"body {body.name!r}: no joint carries it; add a joint with child={body.name!r}"
 
 
-def _reached(carried: Mapping[str, Sequence[Joint]]) -> set[str]:
+def _connected_bodies(carried: Mapping[str, Sequence[Joint]]) -> set[str]:
     """Return the world and all bodies that joints connect to it, by the joints of each parent."""
     out, stack = {"world"}, ["world"]
     while stack:
@@ -159,7 +159,7 @@ def static_bodies(joints: Iterable[Joint]) -> set[str]:
     for joint in joints:
         if not joint.type.nv:
             carried.setdefault(joint.parent, []).append(joint)
-    return _reached(carried) - {"world"}
+    return _connected_bodies(carried) - {"world"}
 
 
 def _mimic_faults(joints: Sequence[Joint]) -> Iterator[str]:
@@ -259,7 +259,7 @@ def check_substituted(before: _D, after: _D) -> _D:
     return after
 
 
-def grouped(reasons: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
+def fault_sentences(reasons: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tuple[str, str]]]) -> list[str]:
     """Return one sentence for each kind of fault of bodies, with all their names or those of their faulty `parts`."""
     kinds: dict[str, list[tuple[str, str, str, str]]] = {}
     for body, why in reasons:
@@ -280,7 +280,7 @@ def grouped(reasons: Iterable[tuple[str, str]], parts: Mapping[str, Sequence[tup
             continue
         plural = "links" if all(what == "link" for what, *_ in members) else "bodies"
         names = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members]
-        out.append(f"{len(members)} {plural}: {sentence}: {listed(names)}")
+        out.append(f"{len(members)} {plural}: {sentence}: {listing(names)}")
     return out
 
 
@@ -348,7 +348,7 @@ def scale_doubts(model: Description) -> list[str]:
         (f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero", small),
         ("joints whose inertia is lost beside m L² of the whole mechanism", far),
     )
-    out = [f"{what}: {listed(joints)}" for what, joints in causes if joints]
+    out = [f"{what}: {listing(joints)}" for what, joints in causes if joints]
     if values[0] * _APART * 10 < values[-1]:
         out.append(f"M is nearly singular (eigenvalues {values[0]:.1e} to {values[-1]:.1e}, scaled to a unit diagonal)")
     return out

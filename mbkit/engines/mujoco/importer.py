@@ -21,7 +21,7 @@ from mbkit._check import Array
 from mbkit.engines.imported import Beside, Imported, checked, joint_of, stacked, unused
 from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings
 from mbkit.errors import UnsupportedError
-from mbkit.load.mjcf_couplings import coupled
+from mbkit.load.mjcf_couplings import with_couplings
 from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.model import Body, Joint, JointCoupling, Model, PointSpring
 from mbkit.model.joint_types import kind_of
@@ -264,7 +264,7 @@ class _Description:
         """Return the description less what it has of one tendon or actuator."""
         kept = [part for name, part in self.parts.items() if name != key]
         springs = tuple(x for x in kept if isinstance(x, PointSpring))
-        return coupled(replace(self._tree, springs=springs), [x for x in kept if isinstance(x, JointCoupling)])
+        return with_couplings(replace(self._tree, springs=springs), [x for x in kept if isinstance(x, JointCoupling)])
 
     def _off(self, flag: str) -> bool:
         return bool(self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))
