@@ -172,9 +172,10 @@ class _Tree:
                     read.fault(
                         f"{item}: {name} {value:g} on a {joint.kind} joint; expected {why}; set it to 0", element
                     )
+        yields = read.number(element, "springyield", item, 0.0)
         if values.get("stiffness"):
             values["rest"] = rest
-            scene.left_out["yield of a spring"] += bool(read.number(element, "springyield", item, 0.0))
+            scene.left_out["yield of a spring"] += bool(yields)
         friction = read.number(element, "frictionloss", item, 0.0)
         kind, R = KINDS[joint.kind], self.snap(R)
         self.b.add_joint(
