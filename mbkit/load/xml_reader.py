@@ -33,8 +33,6 @@ _BLANK: Final = b" \t\r\n\xef\xbb\xbf"
 
 #: expat's "syntax error" and "not well-formed (invalid token)" do not name the character.
 _VAGUE: Final = (2, 4)
-#: Length of the part of a line in a message.
-_MAX_SHOWN: Final = 30
 
 
 @dataclass(eq=False, slots=True)
@@ -75,20 +73,19 @@ class Element:
 def read(path: Path) -> Element:
     """Return the root element of a file, or raise `LoadError`."""
     try:
-        if not path.exists():
-            raise LoadError(f"{path}: no such file")
-        if not path.is_file():
-            what = f"a folder{_descriptions(path)}" if path.is_dir() else "not a regular file"
-            raise LoadError(f"{path}: expected a URDF or MJCF file, this is {what}")
-        size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise LoadError(f"{path}: expected a description of up to {MOST_BYTES} bytes, got {size} bytes")
-        content = path.read_bytes()
-    except LoadError:
-        raise
+        exists, is_file = path.exists(), path.is_file()
+        size = path.stat().st_size if exists else 0
+        content = path.read_bytes() if is_file and size <= MOST_BYTES else b""
     except (OSError, ValueError) as error:
         # ValueError: a null character in the name.
         raise LoadError(f"{path!s}: cannot be read ({error})") from None
+    if not exists:
+        raise LoadError(f"{path}: no such file")
+    if not is_file:
+        what = f"a folder{_descriptions(path)}" if path.is_dir() else "not a regular file"
+        raise LoadError(f"{path}: expected a URDF or MJCF file, this is {what}")
+    if size > MOST_BYTES:
+        raise LoadError(f"{path}: expected a description of up to {MOST_BYTES} bytes, got {size} bytes")
     return parse(content, str(path))
 
 
@@ -195,18 +192,14 @@ def _unexpected(content: bytes, at: int) -> str:
         character = content[at : at + 4].decode("utf-8", "ignore")[:1] if byte < 0x80 else content[at:].decode()[:1]
     except UnicodeDecodeError:
         return f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8"
-    before = content[:at].splitlines()[-1:] if content[:at][-1:] not in (b"\n", b"\r") else []
-    line = b"".join(before).decode("utf-8", "replace").replace("\0", "").lstrip()[-_MAX_SHOWN:]
+    before = re.split(rb"[\r\n]", content[:at])[-1]
+    line = before.decode("utf-8", "replace").replace("\0", "").lstrip()[-30:]
     after = f" after {line!r}" if line else ""
     if not character.isprintable() and not character.isspace():
         return f"control character 0x{byte:02x}{after}; remove it"
-    hint = ""
-    if line.endswith("&"):
-        hint = "; write &amp; for &"
-    elif character == "<":
-        hint = "; write &lt; for < in a value"
-    elif not line:
-        hint = "; expected <"
+    hint = "" if line else "; expected <"
+    if line.endswith("&") or character == "<":
+        hint = "; write &amp; for &" if line.endswith("&") else "; write &lt; for < in a value"
     return f"unexpected {character!r}{after}{hint}"
 
 

@@ -152,10 +152,10 @@ class ArgumentReader:
             return spatial.matrix_from_rpy(*self.array(f"{item}: rpy", rpy, (3,)))
         return self.rotation(f"{item}: rotation", rotation)
 
-    def axes(self, item: str, type_: JointType, *given: ArrayLike | None) -> Array:
+    def axes(self, item: str, type_: JointType, *vectors: ArrayLike | None) -> Array:
         """Return the unit axes of a joint of this type."""
         n = type_.n_axes
-        axes: list[ArrayLike] = [a for a in given if a is not None]
+        axes: list[ArrayLike] = [a for a in vectors if a is not None]
         if len(axes) != n:
             names = ("no axis", "axis", "axis and axis2")[n]
             self.faults.append(f"{item}: a {type_.name} joint takes {names}; {len(axes)} given")
