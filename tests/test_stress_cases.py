@@ -18,9 +18,8 @@ from mbkit.simulate import METHODS, simulate
 from mbkit.studies.stress import cases
 from mbkit.studies.stress.case import Case, problem_of, times_of
 from mbkit.studies.stress.cases import exact_motions
-from mbkit.studies.stress.cases.chains import straight_inertia
 from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum, precession
-from mbkit.studies.stress.cases.rotations import box_spin
+from mbkit.studies.stress.cases.rigid import box_spin, straight_inertia
 from mbkit.studies.stress.cases.springs import largest_step, stable_steps
 from mbkit.studies.work_precision.reference import gap
 from validation import closed_forms, elliptic

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from mbkit._check import Array
 
+T = TypeVar("T")
 #: Errors below so many times the reference's floor, or the rounding level, are not in the regression.
 _ABOVE_ROUNDING: Final = 100.0
 #: Errors above this part of the motion are pre-asymptotic.
@@ -95,6 +96,15 @@ class Curve:
     def reach(self, error: float) -> PrecisionPoint | None:
         """Return the fastest point with at most this error, if there is one."""
         return min((p for p in self.points if p.error <= error), key=lambda p: p.seconds, default=None)
+
+
+def pareto_front(items: Iterable[T], place: Callable[[T], tuple[float, float]], floor: float) -> list[T]:
+    """Return what none beats in both run time and error, fastest first; below the floor all errors are equal."""
+    front: list[T] = []
+    for item in sorted(items, key=place):
+        if not front or max(place(item)[1], floor) < max(place(front[-1])[1], floor):
+            front.append(item)
+    return front
 
 
 class ObservedOrder(NamedTuple):

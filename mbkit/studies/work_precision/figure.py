@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mbkit._escape import one_line
 from mbkit.methods.registry import METHODS
 from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, log_ticks, style
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,12 +114,7 @@ def _xy(places: Sequence[_Place]) -> tuple[list[float], list[float]]:
 
 
 def _front(places: Sequence[_Place], floor: float) -> list[_Place]:
-    """Return the points that none beats in both error and run time, fastest first; below the floor all are equal."""
-    front: list[_Place] = []
-    for place in sorted(places, key=lambda place: place[:2]):
-        if not front or max(place[1], floor) < max(front[-1][1], floor):
-            front.append(place)
-    return front
+    return pareto_front(places, lambda place: place[:2], floor)
 
 
 def _draw_front(ax: Axes, places: Sequence[_Place], floor: float, palette: Palette, width: float) -> list[_Place]:

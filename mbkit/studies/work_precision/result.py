@@ -9,7 +9,7 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, block_html
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
+from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
 from mbkit.studies.work_precision.figure import figure
 
 if TYPE_CHECKING:
@@ -104,13 +104,8 @@ class WorkPrecision(ResultTable):
     @property
     def front(self) -> tuple[tuple[Curve, PrecisionPoint], ...]:
         """The Pareto front: points that none beats in both error and run time, fastest first."""
-        out: list[tuple[Curve, PrecisionPoint]] = []
         known = [(c, p) for c, p in self.rows() if math.isfinite(p.error) and math.isfinite(p.seconds)]
-        for curve, point in sorted(known, key=lambda item: (item[1].seconds, item[1].error)):
-            # What is below the reference's own floor is no better than the floor.
-            if not out or max(point.error, self.floor) < max(out[-1][1].error, self.floor):
-                out.append((curve, point))
-        return tuple(out)
+        return tuple(pareto_front(known, lambda item: (item[1].seconds, item[1].error), self.floor))
 
     def fastest(self, error: float) -> tuple[Curve, PrecisionPoint] | None:
         """Return the curve and point that reach this error in the least time, None if no point does."""

@@ -6,13 +6,13 @@ from typing import Final
 
 from mbkit.errors import UnknownNameError
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.cases import chains, large, rotations, springs
+from mbkit.studies.stress.cases import rigid, springs
 
 __all__ = ["CASES", "get", "names"]
 
 _FAMILIES: Final = (
-    *(springs.CASES, chains.CASES, chains.LENGTH_CASES, rotations.SPIN_CASES, rotations.SINGULAR_CASES),
-    *(large.CASES, springs.STEP_CASES, springs.LONG_CASES),
+    *(springs.CASES, rigid.MASS_CASES, rigid.LENGTH_CASES, rigid.SPIN_CASES, rigid.SINGULAR_CASES),
+    *(rigid.LARGE_CASES, springs.STEP_CASES, springs.LONG_CASES),
 )
 #: Name -> case: stiff ones first, those that take longest last.
 CASES: Final[dict[str, Case]] = {case.name: case for family in _FAMILIES for case in family}
