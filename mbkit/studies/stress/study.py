@@ -267,19 +267,12 @@ class _Task:
     @property
     def ready(self) -> bool:
         before = self.after
-        if (
-            before is not None
-            and before.state != "done"
-            and (before.state == "running" or before.rounds <= self.rounds)
-        ):
-            return False
-        return self.state == "waiting"
+        first = before is None or before.state == "done" or (before.state == "waiting" and before.rounds > self.rounds)
+        return first and self.state == "waiting"
 
 
-def run_sweeps(
-    sweeps: Sequence[CaseSweep], home: Path, memory: int, jobs: int, deadline: float, tick: float
-) -> Generator[None]:
-    """Work through the cases with so many workers side by side; yield at least every `tick` seconds.
+def run_sweeps(sweeps: Sequence[CaseSweep], home: Path, memory: int, jobs: int, deadline: float) -> Generator[None]:
+    """Work through the cases with so many workers side by side; yield every now and then.
 
     Each task gets an equal part of the time left when it begins. The time that it does not need passes on to those
     after it, and in the end to the tasks that were not done, which go on where they were.
@@ -313,7 +306,7 @@ def run_sweeps(
                 running[pool.submit(task.work, worker, until)] = task, worker
             if not running:
                 return
-            for future in wait(running, tick, FIRST_COMPLETED).done:
+            for future in wait(running, _TICK, FIRST_COMPLETED).done:
                 task, worker = running.pop(future)
                 idle.append(worker)
                 task.state = "done" if future.result() or time.perf_counter() >= deadline else "waiting"
@@ -452,7 +445,7 @@ def stress(
     try:
         with (
             tempfile.TemporaryDirectory(prefix="mbkit-stress-", ignore_cleanup_errors=True) as home,
-            closing(run_sweeps(sweeps, Path(home), memory, width, deadline, _TICK)) as ticks,
+            closing(run_sweeps(sweeps, Path(home), memory, width, deadline)) as ticks,
         ):
             steps = ((sum(sweep.done for sweep in sweeps) / size, doing[-1]) for _ in ticks)
             return checkpoints.run(steps, result)
