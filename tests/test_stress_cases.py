@@ -239,7 +239,7 @@ def test_theory_is_where_the_roots_leave_the_unit_circle(name: str) -> None:
     case, (frequency, zeta) = cases.get(name), LINEAR[name]
     for method in case.methods:
         limit = case.theory("any", method)
-        assert limit == largest_step(method, frequency, zeta)
+        assert limit == largest_step("any", method, frequency=frequency, damping=zeta)
         if math.isinf(limit):
             assert all(amplification(method, frequency * h, zeta) < 1 + 1e-12 for h in (0.1, 10, 1e3, 1e6))
             continue

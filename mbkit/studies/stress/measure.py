@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, Final
 
+import mpmath as mp
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.codegen.extended_precision import arithmetic, solve
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
@@ -145,8 +145,8 @@ def _rounding(q: Array) -> float:
 TERMS: Final = {"mass_matrix": ("q",), "inverse_dynamics": ("q", "v", "a"), "forward_dynamics": ("q", "v", "tau")}
 #: Beyond this condition number doubles do not know the smallest eigenvalue of a matrix.
 _MAX_DOUBLE_CONDITION: Final = 1e15
-#: Columns of an inverse that are computed side by side.
-_BLOCK: Final = 16
+#: Digits of their singular values.
+_DIGITS: Final = 40
 #: The largest error that a result holds, for JSON has no infinity.
 _MAX_ERROR: Final = 1e300
 
@@ -220,19 +220,10 @@ def condition(oracle: OracleDynamics, q: Array) -> float:
     if not (numbers >= _MAX_DOUBLE_CONDITION).any():
         return float(numbers.max())
     k = int(np.argmax(numbers))
-    return float(np.linalg.norm(high[k], 2)) * _norm_of_inverse(high[k], low[k])
-
-
-def _norm_of_inverse(high: Array, low: Array) -> float:
-    """Return the 2-norm of the inverse of a matrix with 34 digits, NaN where there is none."""
-    own, n = arithmetic(), len(high)
-    M, pattern = own.from_pair(high, low), (high != 0) | (low != 0)
-    columns = []
-    for rows in np.array_split(np.eye(n), range(_BLOCK, n, _BLOCK)):
-        many = np.broadcast_to(M, (len(rows), n, n))
-        columns.append(own.pair(solve(many, own.array(rows), pattern, range(n), own))[0])
-    inverse = np.concatenate(columns)
-    return float(np.linalg.norm(inverse, 2)) if np.isfinite(inverse).all() else np.nan
+    with mp.workdps(_DIGITS):
+        values = mp.svd_r(mp.matrix(high[k].tolist()) + mp.matrix(low[k].tolist()), compute_uv=False)
+        least, largest = min(values), max(values)
+        return float(largest / least) if least > largest * 10.0**-_DIGITS else np.nan
 
 
 # Cells

@@ -286,7 +286,7 @@ _UNLIMITED: Final = ("implicit_midpoint", "gauss4", "gauss6", "mujoco_discrete")
 _FIXED: Final = ("rk4", "mujoco_rk4", *_EXPLICIT, *_DAMPER_IMPLICIT, *_UNLIMITED)
 
 
-def largest_step(method: str, frequency: float, damping: float) -> float | None:
+def largest_step(_engine: str, method: str, *, frequency: float, damping: float) -> float | None:
     """Return the largest stable step, s, at ω and ζ (0, or at least 1); infinite where none, None without a step."""
     if method in _EXPLICIT:
         return 2 * (math.sqrt(damping**2 + 1) - damping) / frequency
@@ -297,10 +297,6 @@ def largest_step(method: str, frequency: float, damping: float) -> float | None:
             return _RK4_IMAGINARY / frequency
         return _RK4_REAL / (frequency * (damping + math.sqrt(damping**2 - 1)))
     return math.inf if method in _UNLIMITED else None
-
-
-def _limit(_engine: str, method: str, *, frequency: float, damping: float) -> float | None:
-    return largest_step(method, frequency, damping)
 
 
 STEP_CASES: Final[list[Case]] = []
@@ -320,7 +316,7 @@ def _step(
     """Return the decorator of a case whose linear theory is that of an oscillator with this ω and ζ."""
     why = "growth is asked for, not accuracy: what is stable stays near its start, what is not grows in each step"
     more: dict[str, Any] = {"bar": 100.0, "why": why, "methods": _FIXED}
-    theory = partial(_limit, frequency=frequency, damping=damping)
+    theory = partial(largest_step, frequency=frequency, damping=damping)
     return register(STEP_CASES, "step", "step", "s", values, quick, theory=theory, **more)
 
 
