@@ -154,16 +154,16 @@ class CompiledAttempts:
         out = []
         for place in np.flatnonzero(self._active).tolist():
             going = log[:count, self._row["go"], place] != 0
-            tried = count if going[-1] else int(np.argmin(going)) + 1
+            attempts = count if going[-1] else int(np.argmin(going)) + 1
             self._active[place] = bool(going[-1])
-            states = np.concatenate([before[None, :, place], log[:tried, :, place]])
+            states = np.concatenate([before[None, :, place], log[:attempts, :, place]])
             times, good = states[:, self._row["t"]], np.full(len(states), True)
             np.greater(times[1:], times[:-1], out=good[1:])
             accepted = states[good]
             t, q, w = (accepted[:, at] for at in (self._row["t"], self._at["q"], self._at["w"]))
-            out.append((place, AcceptedSteps(t, q, w, tried)))
-            self.evaluations += self._stages * tried
-            self.jacobians += self._stiff * tried
+            out.append((place, AcceptedSteps(t, q, w, attempts)))
+            self.evaluations += self._stages * attempts
+            self.jacobians += self._stiff * attempts
         return out
 
     def drop(self, place: int) -> None:

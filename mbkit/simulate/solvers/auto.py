@@ -131,9 +131,9 @@ class StepRateMonitor:
     def saw(self, steps: AcceptedSteps) -> None:
         """Count attempts."""
         tries = self._marks[-1][0]
-        if steps.tried > 1:
-            self._marks.append((tries + steps.tried // 2, float(steps.t[len(steps.t) // 2])))
-        self._marks.append((tries + steps.tried, float(steps.t[-1])))
+        if steps.attempts > 1:
+            self._marks.append((tries + steps.attempts // 2, float(steps.t[len(steps.t) // 2])))
+        self._marks.append((tries + steps.attempts, float(steps.t[-1])))
         self._ends = [*self._ends, *steps.t[1:].tolist()][-_RECENT - 1 :]
 
     def due(self) -> bool:
@@ -228,7 +228,7 @@ class SwitchingController:
         if self._monitor is None:
             self._monitor = StepRateMonitor(float(steps.t[0]), self._first, self._context.costs.later)
         self._monitor.saw(steps)
-        self._tries += steps.tried
+        self._tries += steps.attempts
         self._at = float(steps.t[-1]), steps.q[-1], steps.w[-1]
         if not self._over and self._monitor.due():
             check = self._check_stiff if self._method == EXPLICIT else self._check_nonstiff
@@ -280,15 +280,15 @@ class SwitchingController:
     def _faster_trial(self, rate: float) -> StepAttempts | None:
         """Let rodas5 try some steps, which are the next ones if it is faster than this rate."""
         costs, trial = self._context.costs, self._started(IMPLICIT)
-        monitor, ahead, tried = StepRateMonitor(self._at[0], costs.pilot, costs.later), list[AcceptedSteps](), 0
+        monitor, ahead, count = StepRateMonitor(self._at[0], costs.pilot, costs.later), list[AcceptedSteps](), 0
         if trial.rounds > 1:
             trial.rounds = costs.pilot
         try:
             trial.hold(self._interval, self._context.stops[self._interval])
-            while tried < costs.pilot and (accepted := trial.advance()):
+            while count < costs.pilot and (accepted := trial.advance()):
                 ahead.append(accepted[0][1])
                 monitor.saw(ahead[-1])
-                tried += ahead[-1].tried
+                count += ahead[-1].attempts
         except FunctionError:
             # At a state that rk853 may never reach.
             return None

@@ -196,8 +196,8 @@ class Plan:
 
     def __init__(self, dyn: LagrangianDynamics, method: str) -> None:
         def code(part: Part) -> Compiled:
-            made: Compiled = dyn.code(part.name, make=part.make)
-            return made
+            compiled: Compiled = dyn.code(part.name, make=part.make)
+            return compiled
 
         self.parts = march_in_stages(dyn.equations, method)
         forward = next(part for part in self.parts if part.name == "forward_dynamics")
@@ -205,9 +205,9 @@ class Plan:
             self.parts = march(dyn.equations, method)
         self.codes = tuple(code(part) for part in self.parts)
         self.sizes: dict[str, int] = {}
-        for part, made in zip(self.parts, self.codes, strict=True):
-            self.sizes.update(zip(part.reads, made.inputs, strict=True))
-            self.sizes.update(zip(part.writes, (rows for rows, _ in made.shapes), strict=True))
+        for part, own in zip(self.parts, self.codes, strict=True):
+            self.sizes.update(zip(part.reads, own.inputs, strict=True))
+            self.sizes.update(zip(part.writes, (rows for rows, _ in own.shapes), strict=True))
 
     @property
     def widest(self) -> int:
@@ -400,14 +400,14 @@ class MidpointChunk(BlockLoop):
         tries = [at("guess", min(j, 1)), *(at("trial", i) for i in range(iterations - 1)), at("w", j + self._back)]
         calls = []
         for w, w1 in pairwise(tries):
-            given = {**held, "w": w}
-            calls.append(self._call(self._newton, given, [w1, held["miss"]]))
+            arrays = {**held, "w": w}
+            calls.append(self._call(self._newton, arrays, [w1, held["miss"]]))
         past = {name: at("w", j + self._back - i) for i, name in enumerate(("w", "w_1", "w_2"))}
         outs = [new[name] for name in self._end.writes]
         return [*calls, self._call(self._end, {**held, **past}, outs)]
 
-    def _call(self, part: Part, given: dict[str, Array], outs: list[Array]) -> Call:
-        return Call(self._codes[part.name], [given[n] for n in part.reads], outs)
+    def _call(self, part: Part, arrays: dict[str, Array], outs: list[Array]) -> Call:
+        return Call(self._codes[part.name], [arrays[n] for n in part.reads], outs)
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
         """Take some steps, and count in `good` how many of them are solved."""

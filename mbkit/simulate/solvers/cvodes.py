@@ -157,8 +157,8 @@ def _derived(eq: Equations) -> ca.Function:
         rate = ca.substitute(rate, eq.parameters[clock], eq.parameters[clock] + length * s)
     # D is linear in the quaternion: with its length put back, the drift of that length never bends the rotation.
     rate[: model.nq] *= lengths
-    given = ca.vertcat(eq.tau, eq.parameters, length)
-    named = {"t": s, "x": ca.vertcat(q, v), "p": given, "ode": length * ca.densify(rate)}
+    parameters = ca.vertcat(eq.tau, eq.parameters, length)
+    named = {"t": s, "x": ca.vertcat(q, v), "p": parameters, "ode": length * ca.densify(rate)}
     names_in, names_out = ca.dyn_in(), ca.dyn_out()
     ins, outs = ([named.get(name, ca.SX(0, 1)) for name in names] for names in (names_in, names_out))
     return ca.Function("rates", ins, outs, names_in, names_out, {"cse": True})

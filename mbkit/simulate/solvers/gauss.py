@@ -118,12 +118,12 @@ class CollocationStep:
                 rates, slow = guess, True
             else:
                 change = change if inverse is None else _times(inverse, change)
-                tried, size = rates + change, self._size(start.h, change)
-                done, slowly = self._judged(start, tried, size, last)
+                corrected, size = rates + change, self._size(start.h, change)
+                done, slowly = self._judged(start, corrected, size, last)
                 if done.all():
-                    return tried, inverse
+                    return corrected, inverse
                 slow = bool(slowly[~done].any())
-                rates = guess if slow and not fresh and not (size < last).all() else tried
+                rates = guess if slow and not fresh and not (size < last).all() else corrected
                 last = size
             if slow and not fresh:
                 J = self._slopes(start, 0.0, np.zeros(start.w.shape), start.w)

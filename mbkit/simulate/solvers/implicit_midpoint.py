@@ -151,8 +151,8 @@ class MidpointStepper(Stepper):
         self._last = [velocity, *self._last[:-1]]
         zero, step = np.zeros((1, 1)), np.array([[h]])
         members, middle = self._members, t + h / 2
-        given = q, pi, *self._last, tau, step, zero, zero
-        q1, pi1, self._guess, _ = called(self._dyn, self._midpoint.end, members, middle, *given)
+        args = q, pi, *self._last, tau, step, zero, zero
+        q1, pi1, self._guess, _ = called(self._dyn, self._midpoint.end, members, middle, *args)
         q1[~good] = np.nan
         return (q1[0], pi1[0]) if self._single else (q1, pi1)
 

@@ -106,8 +106,8 @@ class _Solve:
         if not self._method.multistep and solver.status == "finished" and solver.step_size < wanted:
             _resize(solver, max(wanted, solver.h_abs))
         if not self._method.jacobian:
-            tried = (self.rates.evaluations - before) // _STAGES
-            record.rejected += max(0, tried - (solver.status != "failed"))
+            attempts = (self.rates.evaluations - before) // _STAGES
+            record.rejected += max(0, attempts - (solver.status != "failed"))
         while self._method.scheme == "LSODA" and solver.status != "failed" and not is_bounded(solver.y):
             # It takes a step into what is no state; the others try a shorter one by themselves.
             first = (solver.t - t) / 4

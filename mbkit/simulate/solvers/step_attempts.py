@@ -169,7 +169,7 @@ class RungeKuttaAttempts:
         t = end_of_attempt(SCALARS, self._t, self._h, self._stop)
         step = t - self._t
         before = [self._t], [self._q], [self._w]
-        q, w, self._error = self._try(step)
+        q, w, self._error = self._checked_attempt(step)
         good = self._error < 1 and step > 0
         self._settle(step, good)
         if good:
@@ -193,16 +193,16 @@ class RungeKuttaAttempts:
         )
         self._h = float(h)
 
-    def _try(self, step: float) -> tuple[Array, Array, float]:
+    def _checked_attempt(self, step: float) -> tuple[Array, Array, float]:
         try:
-            end = self._tried(step)
+            end = self._attempt(step)
         except DivergenceError as error:
             self._why, self._fresh = str(error), True
             return self._q, self._w, math.nan
         self._why, self._fresh = "", False
         return end
 
-    def _tried(self, step: float) -> tuple[Array, Array, float]:
+    def _attempt(self, step: float) -> tuple[Array, Array, float]:
         """Return q and w after a step, and its error in units of the tolerance."""
         q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
         space, (rtol, atol) = self._space, self._tolerances
@@ -281,7 +281,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         # y, ẏ and ∂ẏ/∂y at the start; y and ẏ at the end of the last attempt; its t and y at both ends, and stages.
         self._start: tuple[Array, Array, Array] | None = None
         self._arrived: tuple[Array, Array] | None = None
-        self._last_try: tuple[float, float, Array, Array, Array] | None = None
+        self._last_attempt: tuple[float, float, Array, Array, Array] | None = None
 
     @property
     def evaluations(self) -> int:
@@ -297,12 +297,12 @@ class RosenbrockAttempts(RungeKuttaAttempts):
             self._own_rates.only(which[0])
             self._exact.only(which[0])
 
-    def _tried(self, step: float) -> tuple[Array, Array, float]:
+    def _attempt(self, step: float) -> tuple[Array, Array, float]:
         own, (rtol, atol) = self._own, self._tolerances
         y, there, J = self._known()
         k = self._increments(self._t, y, step, there, J)
         y1, error, t1 = y + own.b @ k, own.error @ k, self._t + step
-        self._last_try = self._t, t1, y, y1, k
+        self._last_attempt = self._t, t1, y, y1, k
         scale = atol + rtol * np.maximum(np.maximum(np.abs(y), np.abs(y1)), self._turning)
         size = _norm(error / scale)
         if size < 1:
@@ -369,7 +369,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return (4 * near - far - 3 * there) / (2 * apart)
 
     def _inner(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
-        last = self._last_try
+        last = self._last_attempt
         if last is not None and last[0] == t and end <= last[1]:
             t0, t1, y0, y1, k = last
             part = (end - t0) / (t1 - t0)

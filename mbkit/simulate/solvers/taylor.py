@@ -172,8 +172,8 @@ class TaylorSteps:
         behind = [rounded(self._behind).copy()] if self._system.rates.n_in() > 3 else []
         if self._system.clock is not None:
             behind[0][self._system.clock] = float(self._integrator.time)
-        found = self._system.rates(state[:nq], state[nq:], force, *behind)
-        rate = np.concatenate([np.asarray(x).ravel() for x in found])
+        outs = self._system.rates(state[:nq], state[nq:], force, *behind)
+        rate = np.concatenate([np.asarray(x).ravel() for x in outs])
         series = rounded(self._integrator.tc)
         powers = np.arange(1, series.shape[1])
         slope = series[:, 1:] @ (powers * h ** (powers - 1))

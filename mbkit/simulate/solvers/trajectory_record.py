@@ -53,7 +53,7 @@ class AcceptedSteps:
     t: Array  # (n + 1,)
     q: Array  # (n + 1, nq)
     w: Array  # (n + 1, nv), of `Space`
-    tried: int = 1  # attempted steps
+    attempts: int = 1
 
     def rows(self, which: Indices) -> AcceptedSteps:
         """Return some of the states."""
@@ -94,30 +94,30 @@ class TrajectoryRecord:
         if self._watch is not None:
             self._watch.start(self.reached, q, v)
 
-    def take(self, made: AcceptedSteps, within: Within) -> bool:
+    def take(self, accepted: AcceptedSteps, within: Within) -> bool:
         """Add steps; return whether to go on."""
-        steps = len(made.t) - 1
-        self.rejected += made.tried - steps
+        steps = len(accepted.t) - 1
+        self.rejected += accepted.attempts - steps
         # A state that is not bounded stays so: the last one tells.
-        lost = not are_bounded(made.q[-1], made.w[-1])
+        lost = not are_bounded(accepted.q[-1], accepted.w[-1])
         if lost:
-            good = are_bounded(made.q[1:], made.w[1:])
+            good = are_bounded(accepted.q[1:], accepted.w[1:])
             steps = int(np.argmin(good)) if len(good) else 0
-        hit = None if self._watch is None else self._first_end(self._watch, made, steps, within)
+        hit = None if self._watch is None else self._first_end(self._watch, accepted, steps, within)
         if hit is not None:
-            steps = int(np.searchsorted(made.t, hit.t))
-        until = float(made.t[steps]) if hit is None else hit.t
-        if not self._keep(made, steps, until, within):
+            steps = int(np.searchsorted(accepted.t, hit.t))
+        until = float(accepted.t[steps]) if hit is None else hit.t
+        if not self._keep(accepted, steps, until, within):
             # A shorter step than one that was good met what is no number.
             steps, hit, lost = 0, None, True
-            until = float(made.t[0])
+            until = float(accepted.t[0])
         self.steps += steps
         self.reached = until
         if steps:
-            self.last = made.q[steps]
+            self.last = accepted.q[steps]
         if self.poses is not None:
             for k in range(1, steps + 1):
-                self.poses.saw(float(made.t[k]), made.q[k])
+                self.poses.saw(float(accepted.t[k]), accepted.q[k])
         if hit is not None:
             self._stop_at(hit)
         elif lost:
@@ -140,41 +140,41 @@ class TrajectoryRecord:
             q = np.array([unit_quaternions(self._model, x)[0] for x in np.atleast_2d(q)]).reshape(q.shape)
         return q, w
 
-    def _first_end(self, watch: Watch, made: AcceptedSteps, steps: int, within: Within) -> Hit | None:
+    def _first_end(self, watch: Watch, accepted: AcceptedSteps, steps: int, within: Within) -> Hit | None:
         """Look for events in the first steps; return the one that ends the run."""
 
         def in_step(k: int) -> State:
             def state(t: float) -> tuple[Array, Array]:
-                if t in (made.t[k], made.t[k + 1]):
-                    at = k + int(t == made.t[k + 1])
-                    return self._state(made.q[at], made.w[at])
-                q, w = within(made.rows(np.array([k])), np.array([t]))
+                if t in (accepted.t[k], accepted.t[k + 1]):
+                    at = k + int(t == accepted.t[k + 1])
+                    return self._state(accepted.q[at], accepted.w[at])
+                q, w = within(accepted.rows(np.array([k])), np.array([t]))
                 return self._state(q[0], w[0])
 
             return state
 
         for k in range(steps):
-            hits, last = watch.look(float(made.t[k + 1]), in_step(k))
+            hits, last = watch.look(float(accepted.t[k + 1]), in_step(k))
             self.events += hits
             if last is not None:
                 return last
         return None
 
-    def _keep(self, made: AcceptedSteps, steps: int, until: float, within: Within) -> bool:
+    def _keep(self, accepted: AcceptedSteps, steps: int, until: float, within: Within) -> bool:
         """Keep the wanted states up to a time in the last step; return False, and keep none, if one is unbounded."""
         if self._save is None:
-            ends = slice(1, steps + 1 - int(until != made.t[steps]))
-            self._add(made.t[ends], made.q[ends], made.w[ends])
+            ends = slice(1, steps + 1 - int(until != accepted.t[steps]))
+            self._add(accepted.t[ends], accepted.q[ends], accepted.w[ends])
             return True
-        first, last = self._save.searchsorted((made.t[0], until), side="right")
+        first, last = self._save.searchsorted((accepted.t[0], until), side="right")
         if first == last:
             return True
         times = self._save[first:last]
-        after = np.searchsorted(made.t, times)
-        q, w = made.q[after], made.w[after]
-        between = np.flatnonzero(made.t[after] != times)
+        after = np.searchsorted(accepted.t, times)
+        q, w = accepted.q[after], accepted.w[after]
+        between = np.flatnonzero(accepted.t[after] != times)
         if len(between):
-            q[between], w[between] = inner = within(made.rows(after[between] - 1), times[between])
+            q[between], w[between] = inner = within(accepted.rows(after[between] - 1), times[between])
             if not are_bounded(*inner).all():
                 return False
         self._add(times, q, w)
@@ -240,8 +240,8 @@ def run_each(
                     record.reach(t1, y1)
                 else:
                     both = np.array([y, y1])
-                    made = AcceptedSteps(np.array([t, t1]), both[:, :nq], both[:, nq:])
-                    if not record.take(made, _by_rows(at, nq)) or record.crawls():
+                    accepted = AcceptedSteps(np.array([t, t1]), both[:, :nq], both[:, nq:])
+                    if not record.take(accepted, _by_rows(at, nq)) or record.crawls():
                         break
                 report(t1)
                 t, y = t1, y1
