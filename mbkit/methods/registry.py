@@ -53,9 +53,7 @@ QUICK_METHODS: Final = (
     EULER_METHOD,
     ADAPTIVE_METHOD,
     SCIPY_METHOD,
-    "mujoco_rk4",
-    "mujoco_euler",
-    "mujoco_implicitfast",
+    *("mujoco_rk4", "mujoco_euler", "mujoco_implicitfast"),
 )
 
 #: With a fixed step, on any engine, for a sentence.

@@ -99,8 +99,8 @@ class TableauStability:
         above, below = (np.pad(x, (0, size - len(x))) for x in squares)
         gap = below - above
         gap[np.abs(gap) <= _ROUNDING * np.maximum(np.abs(above), np.abs(below))] = 0.0
-        found = np.roots(gap[::-1])
-        edges = np.sort(found[(np.abs(found.imag) < 1e-9) & (found.real > 1e-9)].real)
+        roots = np.roots(gap[::-1])
+        edges = np.sort(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-9)].real)
         inside = 0.0
         for edge in (*edges.tolist(), math.inf):
             middle = 2 * inside + 1 if edge == math.inf else (inside + edge) / 2

@@ -229,17 +229,7 @@ def gauss_legendre(stages: int) -> ImplicitTableau:
 class EmbeddedTableau(Tableau):
     """An explicit method with others of lower order on the same stages, which estimate its error.
 
-    Parameters
-    ----------
-    name, A, b, order
-        As of a `Tableau`.
-    lower : sequence of (int, (s,) array_like)
-        Of each other method the order, which is checked too, and b minus its weights.
-
-    Attributes
-    ----------
-    errors : tuple of (s,) arrays
-        b minus the weights of each of the others.
+    `lower` has of each other method the order, which is checked too, and b minus its weights: the `errors`, (s,) each.
     """
 
     errors: tuple[Array, ...]
@@ -249,8 +239,8 @@ class EmbeddedTableau(Tableau):
     ) -> None:
         super().__init__(name, A, b, order)
         errors = []
-        for p, given in lower:
-            error = _numbers(name, f"lower, of order {p}", given)
+        for p, weights in lower:
+            error = _numbers(name, f"lower, of order {p}", weights)
             if error.shape != self.b.shape:
                 raise InputError(f"tableau {name!r}: expected {self.b.shape} errors of order {p}, got {error.shape}")
             _require_order(f"{name}, embedded", self.A, self.A, self.b - error, p)
@@ -327,34 +317,12 @@ _B_3: Final = (0.2440944881889764, 0.7338466882816118, 0.022058823529411766)
 class RosenbrockTableau:
     """A Rosenbrock method with another of lower order on the same stages.
 
-    The constructor checks the shapes and, for both methods, all order conditions
-    (Hairer, Wanner 1996, theorem IV.7.4).
+    The constructor checks the shapes and, for both methods, all order conditions (Hairer, Wanner 1996, theorem IV.7.4).
+    `gamma` is γ, the same in all stages; A and C are strictly lower triangular, (s, s); b are the weights, and error
+    is b minus those of the other method, (s,). The state within a step, at t + θ h and with D = dense k, dense of shape
+    (3, s), is ::
 
-    Parameters
-    ----------
-    name : str
-    gamma : float
-        γ, the same in all stages.
-    A, C : (s, s) array_like
-        Strictly lower triangular.
-    b, error : (s,) array_like
-        Weights, and b minus those of the other method.
-    dense : (3, s) array_like
-        Of the state within a step, at t + θ h and with D = dense k::
-
-            y(θ) = (1 - θ) y + θ (y1 + (1 - θ) (D₁ + θ (D₂ + θ D₃)))
-    order, lower : int
-        The orders that both must have.
-
-    Attributes
-    ----------
-    c, d : (s,) arrays
-        Stage times, and factors of ∂f/∂t, that make a method of y' = f(t, y) out of it.
-
-    Raises
-    ------
-    InputError
-        With the condition that fails.
+        y(θ) = (1 - θ) y + θ (y1 + (1 - θ) (D₁ + θ (D₂ + θ D₃)))
     """
 
     name: str
@@ -373,9 +341,9 @@ class RosenbrockTableau:
         s = self.stages
         shapes = {"A": (s, s), "C": (s, s), "b": (s,), "error": (s,), "dense": (3, s)}
         for name, shape in shapes.items():
-            got = getattr(self, name).shape
-            if got != shape:
-                raise InputError(f"tableau {self.name!r}: {name}: expected shape {shape}, got {got}")
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise InputError(f"tableau {self.name!r}: {name}: expected shape {shape}, got {array.shape}")
         if np.any(np.triu(self.A)) or np.any(np.triu(self.C)):
             raise InputError(f"tableau {self.name!r}: A and C are not strictly lower triangular")
         alpha, coupling = self._alpha, self._coupling
@@ -395,15 +363,15 @@ class RosenbrockTableau:
     @property
     def c(self) -> Array:
         """Stage times as fractions of the step, shape (s,)."""
-        found = np.asarray(self._alpha.sum(axis=1))
+        sums = np.asarray(self._alpha.sum(axis=1))
         # No stage lies behind the end of the step by a rounding.
-        return np.where(np.abs(found - 1.0) < _DIGITS, 1.0, found)
+        return np.where(np.abs(sums - 1.0) < _DIGITS, 1.0, sums)
 
     @property
     def d(self) -> Array:
         """Factors of ∂f/∂t, shape (s,)."""
-        found = np.asarray(self._coupling.sum(axis=1))
-        return np.where(np.abs(found) < _DIGITS, 0.0, found)
+        sums = np.asarray(self._coupling.sum(axis=1))
+        return np.where(np.abs(sums) < _DIGITS, 0.0, sums)
 
     @property
     def _coupling(self) -> Array:

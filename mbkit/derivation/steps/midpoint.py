@@ -154,8 +154,8 @@ class Midpoint:
         kinetic = ca.substitute(eq.kinetic_energy, eq.v, v)
         applied = eq.tau + ca.substitute(eq.damping, eq.v, v)
         f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.enter_force(eq.q, applied)
-        given = [eq.q, w, eq.tau, *eq.trailing.values()]
-        return ca.Function("forces", given, [ca.gradient(kinetic, w), f], {"cse": True})
+        arguments = [eq.q, w, eq.tau, *eq.trailing.values()]
+        return ca.Function("forces", arguments, [ca.gradient(kinetic, w), f], {"cse": True})
 
     def _residual(self) -> Any:
         s = self._s
