@@ -185,3 +185,33 @@ def next_step(
     h1 = m.choose(accepted, grown, m.choose(idle, h, shrunk))
     remembered = m.choose(accepted, larger(m, root, FIRST_ROOT), last)
     return h1, m.choose(accepted, MAX_GROWTH, m.choose(idle, growth, 1.0)), remembered
+
+
+def first_length(
+    space: Space,
+    q: Array,
+    w: Array,
+    k: Array,
+    tolerances: tuple[float, float],
+    probe: Callable[[Array, Array], Array],
+    grows: int = 8,
+) -> Array:
+    """Return the length of the first step from each state, (n,); k is ẇ there, and probe(q, w) is ẇ elsewhere.
+
+    Hairer, Nørsett, Wanner 1993, II.4, as in SciPy. The error of a step grows with its length to the power `grows`.
+    """
+    rtol, atol = tolerances
+    sizes = np.concatenate([space.sizes(q, w), np.abs(w)], axis=-1)
+    scale = atol + rtol * sizes
+
+    def norm(x: Array) -> Array:
+        return np.asarray(np.sqrt(np.sum((x / scale) ** 2, axis=-1) / max(x.shape[-1], 1)))
+
+    d0, d1 = norm(sizes), norm(np.concatenate([w, k], axis=-1))
+    h0 = np.where((d0 < 1e-5) | (d1 < 1e-5), 1e-6, 0.01 * d0 / d1)
+    by = h0[:, None]
+    bent = probe(space.move(q, by * w), w + by * k)
+    d2 = norm(np.concatenate([by * k, bent - k], axis=-1)) / h0
+    steep = np.maximum(d1, d2)
+    h1 = np.where(steep <= 1e-15, np.maximum(1e-6, h0 * 1e-3), (0.01 / steep) ** (1 / grows))
+    return np.asarray(np.minimum(100 * h0, h1))

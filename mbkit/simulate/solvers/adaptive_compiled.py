@@ -13,13 +13,12 @@ from mbkit.codegen.step_loop import CompiledStepLoop, compiled_step_loop, width
 from mbkit.derivation.steps.adaptive import STATE, embedded_parts
 from mbkit.derivation.steps.rosenbrock import rosenbrock_parts
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.methods.one_step import FIRST_ROOT, MAX_GROWTH
+from mbkit.methods.one_step import FIRST_ROOT, MAX_GROWTH, first_length
 from mbkit.methods.registry import ADAPTIVE_METHOD, Tolerances, method_of
 from mbkit.methods.tableaus import EmbeddedTableau, RosenbrockTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.solvers.step_attempts import ROUNDS, first_length
-from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, StoppedError, below_rounding, diverged
+from mbkit.simulate.solvers.trajectory_record import ROUNDS, AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field
 
 #: Larger than any scale or length: no error is seen, and a step is as long as its gap.

@@ -24,9 +24,8 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.diagnostics.linearization import Stiffness, linearized, stiffness_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.adaptive import make_attempts, march, run_groups
-from mbkit.simulate.solvers.step_attempts import ROUNDS, StepAttempts
-from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, TrajectoryRecord, assemble_result
+from mbkit.simulate.solvers.adaptive import StepAttempts, make_attempts, march, run_groups
+from mbkit.simulate.solvers.trajectory_record import ROUNDS, AcceptedSteps, TrajectoryRecord, assemble_result
 
 EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
 #: No tolerance below: rounding would count as error, and steps shrink without end.

@@ -24,6 +24,8 @@ from mbkit.simulate.time_grid import Indices
 #: cover. A run at that pace takes 2e10 steps.
 _ATTEMPTS: Final = 20_000
 _COVERED: Final = 1e-6
+#: Attempts of a trajectory between two looks at them, at most.
+ROUNDS: Final = 256
 
 
 class StoppedError(Exception):
