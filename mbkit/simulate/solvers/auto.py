@@ -340,8 +340,9 @@ class SwitchingController:
 
     def _rounding_limited(self, attempts: StepAttempts, place: int, step: float) -> bool:
         """Return whether rounding holds rk853's steps short, and loosen the tolerance there."""
-        share, noise = self._rounding_noise(attempts, place, step)
-        limited = share > _ROUNDED
+        share, noise = self._rounding_noise(attempts, place, step, _NEAR)
+        # A smooth function is far smoother within a tenth of the distance.
+        limited = share > _ROUNDED and self._rounding_noise(attempts, place, step, _NEAR / 10)[0] > _ROUNDED
         loosened = self._base.rtol > self._user.rtol or self._least == math.inf
         if limited:
             self._loosen(noise)
@@ -353,12 +354,12 @@ class SwitchingController:
         self._adapt_tolerance(attempts, place, 0.0)
         return limited
 
-    def _rounding_noise(self, attempts: StepAttempts, place: int, step: float) -> tuple[float, float]:
+    def _rounding_noise(self, attempts: StepAttempts, place: int, step: float, near: float) -> tuple[float, float]:
         """Return the part of rounding in a step's estimated error, beside the tolerance, and in accelerations."""
         (_, q, w), space = self._at, self._context.space
         try:
             k = attempts.rates(place, q[None], w[None])
-            ahead = _NEAR * step * _AHEAD
+            ahead = near * step * _AHEAD
             moved = space.move(np.broadcast_to(q, (len(ahead), len(q))), ahead * w)
             rates = attempts.rates(place, moved, w + ahead * k)
         except FunctionError:
