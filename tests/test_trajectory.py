@@ -18,8 +18,8 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import METHODS, Trajectory, at_section, simulate
-from mbkit.simulate.along_trajectory import _by_cubics
 from mbkit.simulate.plotting.stick_figure import skeleton
+from mbkit.simulate.run_data import _by_cubics
 from tests.random_trees import off, random_tree, rotation, states
 
 EPS = np.finfo(float).eps

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion as EquationsOfMotion
     from mbkit.lagrangian.from_description import from_model as from_model
     from mbkit.lagrangian.independent_coordinates import Embedded as Embedded
-    from mbkit.lagrangian.reduction.conserved import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
+    from mbkit.lagrangian.reduction.hamilton import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
     from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.reduction.routh import Routhian as Routhian
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "CanonicalEquations": "mbkit.lagrangian.reduction.hamilton",
-    "ConservedQuantity": "mbkit.lagrangian.reduction.conserved",
+    "ConservedQuantity": "mbkit.lagrangian.reduction.hamilton",
     "Embedded": "mbkit.lagrangian.independent_coordinates",
     "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
     "Equilibrium": "mbkit.lagrangian.statics.equilibrium",

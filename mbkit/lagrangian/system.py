@@ -22,9 +22,8 @@ from mbkit.lagrangian.energies.symbols import name_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.energy_model import EnergyModel, energies_latex
 from mbkit.lagrangian.independent_coordinates import Embedded
-from mbkit.lagrangian.reduction import conserved
-from mbkit.lagrangian.reduction.conserved import ConservedQuantity
-from mbkit.lagrangian.reduction.hamilton import Hamiltonian, hamiltonian
+from mbkit.lagrangian.reduction import hamilton
+from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, Hamiltonian, hamiltonian
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
 from mbkit.lagrangian.reduction.routh import Routhian, routhian
 from mbkit.lagrangian.trig.simplify import tidy
@@ -109,18 +108,18 @@ class Lagrangian(EnergyForm):
 
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return p = ∂L/∂v of each cyclic coordinate, by coordinate."""
-        return conserved.conserved_momenta(self)
+        return hamilton.conserved_momenta(self)
 
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
         """Return the constants of every motion: those momenta, and the energy or Jacobi's integral."""
-        return conserved.conserved_quantities(
+        return hamilton.conserved_quantities(
             self._in_rates, self.conserved_momenta(), self.energy_function, self.velocities
         )
 
     @property
     def energy_function(self) -> sp.Expr:
         """h = vᵀ ∂L/∂v - L = T2 - T0 + V: Jacobi's integral, the energy T + V where T = T2."""
-        return conserved.energy_function(self)
+        return hamilton.energy_function(self)
 
     def routhian(self, cyclic: sp.Symbol | Sequence[sp.Symbol] | None = None) -> Routhian[Lagrangian]:
         """Return Routh's reduction: the same system less its cyclic coordinates, or those given.

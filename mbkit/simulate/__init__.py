@@ -7,8 +7,7 @@ from mbkit.simulate.diagnostics.linearization import Stiffness, stiffness
 from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run import simulate
-from mbkit.simulate.run_check import RunCheck
-from mbkit.simulate.trajectory import Trajectory
+from mbkit.simulate.trajectory import RunCheck, Trajectory
 
 __all__ = [
     "METHODS",

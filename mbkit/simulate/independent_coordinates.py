@@ -49,22 +49,21 @@ def _on_charts(method: Method) -> bool:
 
 
 def integrate_on_charts(
-    system: Embedded, q0: ArrayLike, v0: ArrayLike, duration: float, **options: Any
+    system: Embedded, q0: ArrayLike, v0: ArrayLike, duration: float, *options: Any
 ) -> tuple[RunData, FunctionError | None]:
-    """Integrate one state; arguments are those of `mbkit.simulate`, on all coordinates."""
-    run = _Run(system, duration, **options)
+    """Integrate one state; arguments are those of `mbkit.simulate` without `doubt`, on all coordinates."""
+    run = _Run(system, duration, *options)
     return run.data(q0, v0), run.error
 
 
 class _Run:
     """A run so far, on all coordinates."""
 
-    def __init__(
-        self, system: Embedded, duration: float, *, method: str, torque: Any, events: Any, progress: Any, **options: Any
-    ) -> None:
+    def __init__(self, system: Embedded, duration: float, method: str, dt: float | None, *options: Any) -> None:
+        rtol, atol, torque, self._save, progress, events, t0 = options
         self.system, self.model, self._method = system, system.model, method_of(method)
-        self._start, duration, dt = times_of(system.dynamics, self._method, options["t0"], duration, options["dt"])
-        self._end = self._start + duration
+        self._start, duration, dt = times_of(system.dynamics, self._method, t0, duration, dt)
+        self._end, self._duration, self._dt = self._start + duration, duration, dt
         self.events = as_events(events)
         self._bar = Progress(progress, f"{self.model.name}: {method} on independent coordinates")
         if not _on_charts(self._method):
@@ -75,8 +74,7 @@ class _Run:
             )
         self._torque = Torque(torque, self.model, None, None)
         self.force: Any = self._torque.of_member(None)(0)
-        self._duration, self._dt, self._save = duration, dt, options["save"]
-        self._tolerances = {name: options[name] for name in ("rtol", "atol")}
+        self._tolerances = {"rtol": rtol, "atol": atol}
         self.poses = SingularPoses(system.dynamics)
         #: The run goes through singular poses: the choice is open, and nothing is moved in time.
         self.passes = system.independent is None and self.model.time_parameter is None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
@@ -49,70 +49,57 @@ def simulate(
     v0 : (nv,) or (N, nv) array_like
         A single state beside a batch is repeated.
     duration : float
-        s. The run ends exactly there: where it is no multiple of `dt`, the last
-        step is shorter.
+        s. The run ends exactly there: where it is no multiple of `dt`, the last step is shorter.
     method : str
-        With a step: ``"rk4"`` and ``"semi_implicit_euler"``, MuJoCo 4's formulas on
-        any engine; ``"gauss4"`` and ``"gauss6"``, implicit, on any engine;
-        ``"implicit_midpoint"``, symplectic, on the own derivation; ``"mujoco_euler"``,
-        ``"mujoco_rk4"``, ``"mujoco_implicit"``, ``"mujoco_implicitfast"`` and
-        ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance:
-        ``"rk853"``, fastest on the own derivation, and ``"dop853"``, ``"radau"``,
-        ``"bdf"``, ``"lsoda"``, SciPy's, on any engine (the last three are for stiff
-        scenes); ``"taylor"``, heyoka's, and ``"cvodes"``, SUNDIALS', on the own
-        derivation; ``"taylor"`` on the oracle computes with 34 digits.
-        `mbkit.simulate.METHODS` describes them.
+        With a step: ``"rk4"`` and ``"semi_implicit_euler"``, MuJoCo 4's formulas on any engine; ``"gauss4"`` and
+        ``"gauss6"``, implicit, on any engine; ``"implicit_midpoint"``, symplectic, on the own derivation;
+        ``"mujoco_euler"``, ``"mujoco_rk4"``, ``"mujoco_implicit"``, ``"mujoco_implicitfast"`` and
+        ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance: ``"rk853"``, fastest on the own
+        derivation, and ``"dop853"``, ``"radau"``, ``"bdf"``, ``"lsoda"``, SciPy's, on any engine (the last three are
+        for stiff scenes); ``"taylor"``, heyoka's, and ``"cvodes"``, SUNDIALS', on the own derivation; ``"taylor"`` on
+        the oracle computes with 34 digits. `mbkit.simulate.METHODS` describes them.
     dt : float, optional
-        Step of a method with a fixed step, s; 1e-3 when not given. An adaptive method has none.
+        Step of a method with a fixed step, s; 1e-3 by default. An adaptive method has none.
     rtol, atol : float, optional
-        Tolerances of an adaptive method, from ``METHODS[method].least`` upwards;
-        1e-10, and `atol` as `rtol`, when not given. A method with a fixed step has none.
+        Tolerances of an adaptive method, from ``METHODS[method].least`` upwards; by default 1e-10, `atol` as `rtol`.
     torque : array_like or callable, optional
-        Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv),
-        held over each step (for an adaptive method, each interval of `save`, which
-        then runs from `t0` to the end); or a function of (t, q, v) that returns
-        (nv,), called for one state at a time, at each stage.
+        Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv), held over each step (for an adaptive
+        method, each interval of `save`, which then runs from `t0` to the end); or a function of (t, q, v) that
+        returns (nv,), called for one state at a time, at each stage.
     save : int or (K,) array_like, optional
-        Which states to keep: every n-th and the last, or those at these times (for a
-        fixed step, multiples of it after `t0`). Everything when not given. An adaptive method
-        takes times alone; a batch needs them, and so does ``"cvodes"``. Steps of
-        ``"dop853"`` and ``"radau"`` end on them; the others' do not depend on them.
+        Which states to keep: every n-th and the last, or those at these times (for a fixed step, multiples of it after
+        `t0`); by default all. An adaptive method takes times alone; a batch needs them, and so does ``"cvodes"``.
+        Steps of ``"dop853"`` and ``"radau"`` end on them; the others' do not depend on them.
     progress : bool or callable, optional
-        True shows a bar when the run takes more than 2 s; a callable gets the
-        fraction done.
+        True shows a bar when the run takes more than 2 s; a callable gets the fraction done.
     events : Event or sequence of Event, optional
-        What ends the run or is noted on the way, for methods that have events:
-        `mbkit.simulate.at_limits`, `at_energy`, `at_section`, or an `Event` of any
-        function of (t, q, v). What happened is in ``Trajectory.events``. Where one ends
-        a single run, its state is the last one of the trajectory too; each trajectory
-        of a batch ends by itself, is NaN at the saved times after that, and has the
-        event's state in ``Trajectory.events`` alone.
+        What ends the run or is noted on the way, for methods that have events: `mbkit.simulate.at_limits`,
+        `at_energy`, `at_section`, or an `Event` of any function of (t, q, v). ``Trajectory.events`` has those that
+        happened. Where one ends a single run, its state is the last one of the trajectory too; each trajectory of a
+        batch ends by itself, is NaN at the saved times after that, and has the event's state in ``Trajectory.events``
+        alone.
     doubt : bool
-        Whether a finished run is checked for energy from nowhere, a singular mass matrix, coordinates beyond
-        the digits of a double, tolerances that add up and gimbal lock. That takes a few percent of the run, so that
-        runs of machine code with fewer than 4,000 evaluations are not checked for the first two. Signs of an
-        error are warned of, and kept in ``Trajectory.stats.doubts``. `Trajectory.check` does all checks.
+        Whether a finished run is checked for energy from nowhere, a singular mass matrix, coordinates beyond the
+        digits of a double, tolerances that add up and gimbal lock. That takes a few percent of the run, so that runs
+        of machine code with fewer than 4,000 evaluations are not checked for the first two. Signs of an error are
+        warned of, and kept in ``Trajectory.stats.doubts``. `Trajectory.check` does all checks.
     t0 : float, optional
-        Time of the first state, s. When not given, the time that `dyn` holds where time enters the
-        equation of motion (``dyn.at(t=3.0)``), else 0. All times of the run count from the same zero:
-        `save`, those of torque and event functions, ``Trajectory.t``.
+        Time of the first state, s; by default the time that `dyn` holds where time enters the equation of motion
+        (``dyn.at(t=3.0)``), else 0. `save`, torque and event functions and ``Trajectory.t`` count from the same zero.
 
     Returns
     -------
     Trajectory
-        Of a run that diverged, what there is up to then, with `stats.ended`,
-        `stats.reached` and `stats.message`, and an `MbkitWarning`. In a batch the
-        others go on.
+        Of a run that diverged, the states up to then, with `stats.ended`, `stats.reached` and `stats.message`, and an
+        `MbkitWarning`. In a batch the others go on.
 
     Raises
     ------
     InputError
         A wrong shape, state, time, tolerance or torque.
-    TorqueError
-        The torque function raised, or returned something else than (nv,) finite
-        numbers; its `trajectory` is the run up to then.
-    EventError
-        An event's function did; its `trajectory` likewise.
+    TorqueError, EventError
+        The torque function or an event's raised, or returned something else than (nv,) finite numbers or one; the
+        error's `trajectory` is the run up to then.
     UnknownNameError
         No method of this name.
     UnsupportedError
@@ -120,14 +107,12 @@ def simulate(
 
     Notes
     -----
-    On the lagrangian engine, ``"rk4"`` and ``"semi_implicit_euler"`` with no torque or
-    an array run as machine code: the whole step is one function, or, where that would be
-    beyond 20,000 operations, parts around the forward dynamics; chunks of a batch are
-    shared among the cores, and no number depends on how. ``"implicit_midpoint"``, and
-    ``"rk853"`` with the choice of its steps, are machine code too. The first run of a
-    model compiles its step, which is kept on disk. A callable torque, an engine made with
-    ``compile=False``, and models so large that their forward dynamics is not written
-    out are stepped stage by stage, by the same formulas.
+    On the lagrangian engine, ``"rk4"`` and ``"semi_implicit_euler"`` with no torque or an array run as machine code:
+    the whole step is one function, or, beyond 20,000 operations, parts around the forward dynamics. Chunks of a batch
+    are shared among the cores, and no number depends on how. ``"implicit_midpoint"``, and ``"rk853"`` with the choice
+    of its steps, are machine code too. The first run of a model compiles its step, which is kept on disk. A callable
+    torque, an engine made with ``compile=False``, and models too large to be written out are stepped stage by stage,
+    by the same formulas.
 
     Examples
     --------
@@ -139,23 +124,14 @@ def simulate(
     >>> bool(abs(run.energy() - run.energy()[0]).max() < 1e-12)
     True
     """
-    options: dict[str, Any] = {
-        "method": method,
-        "dt": dt,
-        "rtol": rtol,
-        "atol": atol,
-        "torque": torque,
-        "save": save,
-        "t0": t0,
-    }
-    options |= {"progress": progress, "events": events}
+    arguments = (q0, v0, duration, method, dt, rtol, atol, torque, save, progress, events)
     if isinstance(dyn, Dynamics):
-        data, error = integrate(dyn, q0, v0, duration, doubt=doubt, **options)
+        data, error = integrate(dyn, *arguments, doubt, t0)
     elif hasattr(dyn, "chart"):
         # Only where SymPy and CasADi are loaded already.
         from mbkit.simulate.independent_coordinates import integrate_on_charts
 
-        data, error = integrate_on_charts(dyn, q0, v0, duration, **options)
+        data, error = integrate_on_charts(dyn, *arguments, t0)
     else:
         raise no_dynamics(dyn)
     run = Trajectory(**vars(data))

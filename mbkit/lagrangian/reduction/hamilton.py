@@ -1,16 +1,17 @@
-"""Hamilton's function and the canonical equations of a system written as energies.
+"""Conserved quantities, Hamilton's function and the canonical equations of a system written as energies.
 
 With p = ∂T/∂v = M v + b the Legendre transform of L = T2 + T1 + T0 - V is ::
 
     H(q, p, t) = ½ (p - b)ᵀ M⁻¹ (p - b) - T0 + V
     q̇ = ∂H/∂p        ṗ = -∂H/∂q + Q
 
-(Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 8.1).
+(Goldstein, Poole, Safko 2002, Classical Mechanics, ch. 8.1). Conserved are the momenta of cyclic coordinates along
+which nothing acts, and Jacobi's integral (ch. 2.6 and 2.7).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
@@ -29,19 +30,107 @@ from mbkit.lagrangian.energies.energy_form import (
     read_expression,
     symbols_of,
     timed_parameters,
+    vanish,
 )
 from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import free_name, velocity_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
-from mbkit.lagrangian.reduction import conserved
-from mbkit.lagrangian.reduction.conserved import ConservedQuantity
 from mbkit.lagrangian.trig.simplify import is_zero, slope, tidy
-
-# Canonical momenta as symbols, and Poisson's bracket on coordinates and momenta.
 
 # Operations up to which a bracket is tidied.
 _SHORT: Final = 100
+#: Meaning of h where it is not the energy.
+_JACOBI: Final = "Jacobi's integral T2 - T0 + V, not the energy T + V"
+
+
+@dataclass(frozen=True, repr=False)
+class ConservedQuantity(Printable):
+    """A constant of every motion.
+
+    Attributes
+    ----------
+    name : str
+        ``"p_phi"`` for the momentum of ``phi``; ``"E"`` for the energy, ``"h"`` for Jacobi's
+        integral where that is something else.
+    expression : sympy.Expr
+    meaning : str
+        In words.
+    moving : tuple of tuples of sympy.Symbol
+        Coordinates and velocities, or momenta, in the order in which they are written.
+    """
+
+    name: str
+    expression: sp.Expr
+    meaning: str
+    moving: tuple[tuple[sp.Symbol, ...], ...] = field(default=(), repr=False, compare=False)
+
+    def __str__(self) -> str:
+        return terminal(f"{self.name} = {self.expression} ({self.meaning})")
+
+    def latex(self) -> str:
+        """Return name = expression."""
+        board = ExpressionPrinter(*self.moving)
+        return f"{board.latex(sp.Symbol(self.name))} = {board.latex(self.expression)}"
+
+
+def conserved_momenta(system: EnergyForm) -> dict[sp.Symbol, sp.Expr]:
+    """Return ∂L/∂v of each cyclic coordinate along which nothing acts."""
+    free = system.cyclic_coordinates()
+    return {q: p for q, p in zip(system.coordinates, system.momenta, strict=True) if q in free}
+
+
+def energy_function(system: EnergyForm) -> sp.Expr:
+    """Return h = vᵀ ∂L/∂v - L = T2 - T0 + V."""
+    if is_energy(system):
+        # As its author wrote it.
+        return system.T + system.V
+    k = system.kinetic
+    return k.T2 - k.T0 + system.V
+
+
+def is_energy(system: EnergyForm) -> bool:
+    """Return whether h, and with it H, is the energy T + V: where T1 = T0 = 0."""
+    k = system.kinetic
+    return not any(k.b) and k.T0 == 0
+
+
+def keeps_energy(system: EnergyForm) -> bool:
+    """Return whether h is constant: dh/dt = Qᵀ v - ∂L/∂t, and moving constraints do work too."""
+    if system.time is not None:
+        k, t = system.kinetic, system.time
+        if not vanish(sp.diff(x, t) for x in (*k.M, *k.b, k.T0, system.V, *system.constraints)):
+            return False
+    power = sum((x * w for x, w in zip(acting_forces(system), system.velocities, strict=True)), sp.Integer(0))
+    return vanish([power])
+
+
+def conserved_quantities(
+    system: EnergyForm, momenta: Mapping[sp.Symbol, sp.Expr], energy: sp.Expr, moving: tuple[sp.Symbol, ...]
+) -> tuple[ConservedQuantity, ...]:
+    """Return the conserved momenta, and the energy or Jacobi's integral if it is constant, in `moving` velocities."""
+    name = "E" if is_energy(system) else "h"
+    return _kept(system, {q: (f"p_{q.name}", p) for q, p in momenta.items()}, name, energy, moving)
+
+
+def _kept(
+    system: EnergyForm,
+    momenta: Mapping[sp.Symbol, tuple[str, sp.Expr]],
+    name: str,
+    energy: sp.Expr,
+    moving: tuple[sp.Symbol, ...],
+) -> tuple[ConservedQuantity, ...]:
+    symbols = (system.coordinates, moving)
+    out = [ConservedQuantity(p, x, f"momentum of {q.name}, which is cyclic", symbols) for q, (p, x) in momenta.items()]
+    if keeps_energy(system):
+        out.append(ConservedQuantity(name, energy, "energy T + V" if is_energy(system) else _JACOBI, symbols))
+    return tuple(out)
+
+
+def numbers_at(system: EnergyForm, t: float, values: Mapping[str, float], what: str) -> Array:
+    """Return the time, where it enters, and the numbers of the parameters, with some replaced."""
+    numbers = parameter_values(system, values, what)
+    return numbers if system.time is None else np.array([real("t", t), *numbers])
 
 
 def momentum_symbols(system: EnergyForm, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
@@ -138,12 +227,12 @@ class Hamiltonian(Printable):
     @cached_property
     def is_energy(self) -> bool:
         """Whether H is T + V: where T has neither terms linear in the velocities nor terms without them."""
-        return conserved.is_energy(self.system)
+        return is_energy(self.system)
 
     @cached_property
     def is_conserved(self) -> bool:
         """Whether dH/dt = ∂H/∂t + Qᵀ q̇ is zero."""
-        return conserved.keeps_energy(self.system)
+        return keeps_energy(self.system)
 
     @cached_property
     def _equations(self) -> CanonicalEquations:
@@ -190,14 +279,8 @@ class Hamiltonian(Printable):
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
         """Return the momenta of the cyclic coordinates, and H if it is constant, in coordinates and momenta."""
         symbols = dict(zip(self.coordinates, self.momenta, strict=True))
-        moving = (self.coordinates, self.momenta)
-        out = [
-            ConservedQuantity(symbols[q].name, symbols[q], f"momentum of {q.name}, which is cyclic", moving)
-            for q in conserved.conserved_momenta(self.system)
-        ]
-        if self.is_conserved:
-            out.append(ConservedQuantity("H", self.H, "energy T + V" if self.is_energy else conserved.JACOBI, moving))
-        return tuple(out)
+        momenta = {q: (symbols[q].name, symbols[q]) for q in conserved_momenta(self.system)}
+        return _kept(self.system, momenta, "H", self.H, self.momenta)
 
     # Numbers
 
@@ -212,14 +295,10 @@ class Hamiltonian(Printable):
         names = (s.coordinates, self.momenta, (*s.inputs.values(), *timed_parameters(s)))
         return Numeric(sp.Matrix.vstack(eq.qdot, eq.pdot), *names)
 
-    def _behind(self, t: float, values: dict[str, float], what: str) -> Array:
-        numbers = parameter_values(self.system, values, what)
-        return numbers if self.system.time is None else np.array([real("t", t), *numbers])
-
     def _mass(self, q: ArrayLike, other: ArrayLike, name: str, t: float, values: dict[str, float]) -> Any:
         n = len(self.coordinates)
         q, other = rows("q", q, n, self.system.name, "nq"), rows(name, other, n, self.system.name, "nv")
-        both = self._linear(q, self._behind(t, values, name))
+        both = self._linear(q, numbers_at(self.system, t, values, name))
         return both[..., :n], both[..., n], other
 
     def to_momentum(self, q: ArrayLike, v: ArrayLike, *, t: float = 0.0, **values: float) -> Array:

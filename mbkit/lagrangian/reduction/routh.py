@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
-import casadi as ca
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
@@ -25,16 +24,16 @@ from scipy.integrate import solve_ivp
 
 from mbkit._check import Array, finite_array, real, require_finite, rows
 from mbkit._escape import terminal
-from mbkit.codegen.interpreter import Machine
+from mbkit.engines.base import at_times
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
-from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values, require_values, timed_parameters
+from mbkit.lagrangian.energies.energy_form import EnergyForm, require_values, timed_parameters
 from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
-from mbkit.lagrangian.reduction.hamilton import momentum_symbols
+from mbkit.lagrangian.reduction.hamilton import momentum_symbols, numbers_at
 from mbkit.lagrangian.trig.simplify import tidy
 
 FormT = TypeVar("FormT", bound=EnergyForm)
@@ -115,9 +114,7 @@ class Routhian(Printable, Generic[FormT]):
         """
         s, n = self.system, len(self.system.coordinates)
         q, v = rows("q", q, n, s.name, "nq"), rows("v", v, n, s.name, "nv")
-        numbers = parameter_values(s, values, "reduce")
-        behind = numbers if s.time is None else np.array([real("t", t), *numbers])
-        p = self._momenta(q, v, behind)[..., 0]
+        p = self._momenta(q, v, numbers_at(s, t, values, "reduce"))[..., 0]
         kept, _ = self._places
         momenta = {x.name: p[..., k] if p.ndim > 1 else float(p[k]) for k, x in enumerate(self.momenta)}
         return ReducedState(q[..., kept].copy(), v[..., kept].copy(), momenta)
@@ -149,28 +146,39 @@ class Routhian(Printable, Generic[FormT]):
         UnsupportedError
             A torque acted on the run, of which only the saved states know.
         """
-        t, q, v, parameters = _read(self, run, values)
+        t, q, v, numbers = _read(self, run, values)
         kept, ignored = self._places
-        start, rates, n = _start(self, q0, q), _rates(self), len(self.system.coordinates)
-        steps = _increments(self, t, q, v, parameters, rates)
-        whole, speeds = np.empty((len(t), n)), np.empty((len(t), n))
+        start = _start(self, q0, q)
+        steps = _increments(self, t, q, v, numbers)
+        whole, speeds = (np.empty((len(t), len(self.system.coordinates))) for _ in range(2))
         whole[:, kept], speeds[:, kept] = q, v
         whole[:, ignored] = start + np.concatenate([np.zeros((1, len(ignored))), np.cumsum(steps, axis=0)])
-        speeds[:, ignored] = rates(q, v, parameters)[..., 0]
+        speeds[:, ignored] = self._rates(t, q, v, numbers)
         return Motion(t, whole, speeds)
+
+    @cached_property
+    def _rate_numbers(self) -> Numeric:
+        s = self.lagrangian
+        return Numeric(sp.Matrix(list(self.rates.values())), s.coordinates, s.velocities, timed_parameters(s))
+
+    def _rates(self, t: Array, q: Array, v: Array, numbers: Mapping[str, float]) -> Array:
+        """Return the ignored velocities at states, (K, m)."""
+        behind = [np.full(len(t), x) for x in numbers.values()]
+        behind[:0] = [] if self.lagrangian.time is None else [t]
+        return self._rate_numbers(q, v, np.array(behind).reshape(-1, len(t)).T)[..., 0]
+
+    def _pairs(self) -> list[tuple[sp.Expr, sp.Expr]]:
+        named = dict(zip(self.system.coordinates, self.system.velocities, strict=True))
+        return [(sp.Symbol("R"), self.R), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
 
     def latex(self) -> str:
         """Return R, the momenta and the ignored rates as an aligned LaTeX block."""
-        whole, s = self.system, self.lagrangian
+        whole = self.system
         board = ExpressionPrinter(whole.coordinates, whole.velocities, tuple(self.momenta), time=whole.time)
-        named = dict(zip(whole.coordinates, whole.velocities, strict=True))
-        pairs = [(sp.Symbol("R"), s.L), *self.momenta.items(), *((named[q], x) for q, x in self.rates.items())]
-        return aligned((board.latex(left), board.latex(right)) for left, right in pairs)
+        return aligned((board.latex(left), board.latex(right)) for left, right in self._pairs())
 
     def __str__(self) -> str:
-        named = dict(zip(self.system.coordinates, self.system.velocities, strict=True))
-        lines = [f"R = {self.R}", *(f"{p} = {x}" for p, x in self.momenta.items())]
-        return terminal("\n".join(lines + [f"{named[q]} = {x}" for q, x in self.rates.items()]))
+        return terminal("\n".join(f"{left} = {right}" for left, right in self._pairs()))
 
 
 def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
@@ -189,8 +197,9 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
     moved = [x - sum(y * w for y, w in zip(k.M[i, r], v, strict=True)) for x, i in zip(excess, c, strict=True)]
     rates = squares.solve(moved)
     put = {system.velocities[i]: x for i, x in zip(c, rates, strict=True)}
+    squared = [M[i, j] * v[i] * v[j] for i in range(len(v)) for j in range(len(v))]
     reduced = type(system)(
-        T=_quadratic(M, v) / 2 + sum(x * w for x, w in zip(b, v, strict=True)) + k.T0,
+        T=sp.Add(*squared) / 2 + sum(x * w for x, w in zip(b, v, strict=True)) + k.T0,
         V=system.V + squares.form(excess, excess) / 2,
         coordinates=kept,
         velocities=v,
@@ -203,11 +212,6 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
     )
     definitions = dict(zip(symbols, (system.momenta[i] for i in c), strict=True))
     return Routhian(system, reduced, tuple(ignored), definitions, dict(zip(ignored, rates, strict=True)))
-
-
-def _quadratic(M: Any, v: list[sp.Symbol]) -> sp.Expr:
-    terms = (M[i, j] * v[i] * v[j] for i in range(len(v)) for j in range(len(v)))
-    return sum(terms, sp.Integer(0))
 
 
 def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
@@ -277,8 +281,10 @@ _TOLERANCE: Final = 1e-13
 _SAME: Final = 1e-9
 
 
-def _read(routhian: Routhian[Any], run: Any, values: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
-    """Return t, q, v and a row of the reduced model's parameters for each state, the time among them."""
+def _read(
+    routhian: Routhian[Any], run: Any, values: Mapping[str, float]
+) -> tuple[Array, Array, Array, dict[str, float]]:
+    """Return t, q, v and the numbers of the reduced model's parameters without the time."""
     model, held = routhian._model, {}
     if hasattr(run, "tau") and hasattr(run, "model"):
         if np.any(run.tau()):
@@ -300,16 +306,13 @@ def _read(routhian: Routhian[Any], run: Any, values: Mapping[str, float]) -> tup
         raise InputError("run: expected one trajectory, got a batch; reconstruct them one by one")
     require_finite("run: t", t)
     q, v = (finite_array(f"run: {name}", x, (len(t), model.nq)) for name, x in (("q", q), ("v", v)))
-    numbers = {**model.parameters, **{n: x for n, x in held.items() if n in model.parameters}}
+    numbers = {n: held.get(n, x) for n, x in model.parameters.items()}
     for name, x in values.items():
         if name not in numbers:
             raise UnknownNameError("parameter", name, numbers)
         numbers[name] = real(f"parameter {name!r}", x)
     require_values(numbers, "reconstruct")
-    parameters = np.tile(np.array(list(numbers.values()), dtype=np.float64), (len(t), 1))
-    if model.time_parameter is not None:
-        parameters[:, list(numbers).index(model.time_parameter)] = t
-    return t, q, v, parameters
+    return t, q, v, {n: float(x or 0.0) for n, x in numbers.items() if n != model.time_parameter}
 
 
 def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
@@ -331,39 +334,26 @@ def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
     return start[ignored]
 
 
-def _rates(routhian: Routhian[Any]) -> Numeric:
-    s = routhian.lagrangian
-    names = {p.name: p for p in timed_parameters(s)}
-    behind = [names[n] for n in routhian._model.parameters]
-    return Numeric(sp.Matrix(list(routhian.rates.values())), s.coordinates, s.velocities, behind)
-
-
-def _increments(routhian: Routhian[Any], t: Array, q: Array, v: Array, parameters: Array, rates: Numeric) -> Array:
+def _increments(routhian: Routhian[Any], t: Array, q: Array, v: Array, numbers: Mapping[str, float]) -> Array:
     """Return what each interval adds to the ignored coordinates, (K - 1, m)."""
-    spans, m = np.diff(t), len(routhian.cyclic)
+    spans, n, m = np.diff(t), q.shape[1], len(routhian.cyclic)
     if not len(spans):
         return np.empty((0, m))
-    model = routhian._model
-    equations = EnergyEquations(model, routhian.lagrangian)
-    forward = ca.substitute(equations.forward_dynamics, equations.tau, ca.SX.zeros(model.nv))
-    arguments = [equations.q, equations.v, equations.parameters]
-    machine = Machine(ca.Function("reduced", arguments, [ca.densify(forward)], {"cse": True}))
-    clock = None if model.time_parameter is None else list(model.parameters).index(model.time_parameter)
-    r, behind = model.nq, parameters[:-1].copy()
+    dyn = LagrangianDynamics(routhian._model, compile=False)
+    own = dyn.at(**numbers) if numbers else dyn
 
     def field(s: float, y: Array) -> Array:
-        state = y.reshape(len(spans), 2 * r + m)
-        position, speed = np.ascontiguousarray(state[:, :r]), np.ascontiguousarray(state[:, r : 2 * r])
-        if clock is not None:
-            behind[:, clock] = t[:-1] + s * spans
-        a = machine(position, speed, behind)[0][..., 0]
-        moved = rates(position, speed, behind)[..., 0]
-        return np.asarray(spans[:, None] * np.concatenate([speed, a, moved], axis=1)).ravel()
+        state, now = y.reshape(len(spans), 2 * n + m), t[:-1] + s * spans
+        position, speed = np.ascontiguousarray(state[:, :n]), np.ascontiguousarray(state[:, n : 2 * n])
+        a = at_times(own, now).forward_dynamics(position, speed, np.zeros_like(speed))
+        rates = routhian._rates(now, position, speed, numbers)
+        return np.asarray(spans[:, None] * np.concatenate([speed, a, rates], axis=1)).ravel()
 
     start = np.concatenate([q[:-1], v[:-1], np.zeros((len(spans), m))], axis=1).ravel()
     # A mean over N numbers hides one that is √N times as wrong.
     tight = max(_TOLERANCE / np.sqrt(len(spans)), 3e-14)
     solved = solve_ivp(field, (0.0, 1.0), start, "DOP853", t_eval=[1.0], rtol=tight, atol=tight)
     if not solved.success or not np.isfinite(solved.y).all():
-        raise NumericalError(f"{model.name}: the motion between the saved states cannot be followed: {solved.message}")
-    return np.asarray(solved.y[:, -1].reshape(len(spans), 2 * r + m)[:, 2 * r :])
+        name = routhian.lagrangian.name
+        raise NumericalError(f"{name}: the motion between the saved states cannot be followed: {solved.message}")
+    return np.asarray(solved.y[:, -1].reshape(len(spans), 2 * n + m)[:, 2 * n :])

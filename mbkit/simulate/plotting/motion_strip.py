@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from mbkit._check import Array, count
 from mbkit.errors import InputError
 from mbkit.model import Model
-from mbkit.simulate.along_trajectory import moved
 from mbkit.simulate.plotting.stick_figure import Skeleton, direction_name, plane_of, skeleton
 from mbkit.simulate.plotting.time_series import ACCENT, BAD, FAINT, GHOST, INK, MUTED, drawing
-from mbkit.simulate.run_data import RunData
+from mbkit.simulate.run_data import RunData, moved
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
