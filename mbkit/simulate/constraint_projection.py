@@ -9,7 +9,7 @@ value. A projection would spoil the history of multistep methods (BDF, LSODA, CV
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from mbkit.engines.base import at_times
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, IMPLICIT_METHODS, SERIES_METHOD
 from mbkit.simulate.result import SolverResult
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.constraints import Manifold
 
 #: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
 LOOSEST: Final = 1e-9
@@ -32,14 +35,20 @@ _WINDOW: Final = 4
 _TAKES_PART: Final = 0.1
 
 
+def _manifold(dyn: Dynamics, t: float) -> Manifold:
+    # The import loads CasADi.
+    from mbkit.lagrangian.constraints import manifold_of
+
+    return manifold_of(dyn).at(t)
+
+
 def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array, Array]:
     """Return initial states without rounding; an `InputError` where one or the constraints are inconsistent."""
     if not dyn.model.constrained:
         return q, v
-    # These imports load CasADi.
-    from mbkit.lagrangian.constraints import manifold_of, refuse_unreachable, require_independent
+    from mbkit.lagrangian.constraints import refuse_unreachable, require_independent
 
-    manifold = manifold_of(dyn).at(t)
+    manifold = _manifold(dyn, t)
     try:
         manifold.check(q, v)
     except InputError:
@@ -52,16 +61,12 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
 
 def settled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Return the consistent states near the ends of a step."""
-    from mbkit.lagrangian.constraints import manifold_of
-
-    return manifold_of(dyn).at(t).pulled(q, v)
+    return _manifold(dyn, t).pulled(q, v)
 
 
 def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Return the state after one step of Newton's iteration onto the constraints."""
-    from mbkit.lagrangian.constraints import manifold_of
-
-    q, v, *_ = manifold_of(dyn).at(t).call("constraint_step", q, v)
+    q, v, *_ = _manifold(dyn, t).call("constraint_step", q, v)
     return q[..., 0], v[..., 0]
 
 
@@ -77,9 +82,7 @@ class Approach:
 
     def saw(self, dyn: Dynamics, t: float, q: Array) -> None:
         """Take in the end of a step."""
-        from mbkit.lagrangian.constraints import manifold_of
-
-        J = manifold_of(dyn).at(t).jacobian(q)
+        J = _manifold(dyn, t).jacobian(q)
         size = float(np.linalg.svd(J, compute_uv=False)[..., -1].min()) if np.isfinite(J).all() else np.inf
         self.near = not size >= _AHEAD * abs(size - self._size)
         self._size = size
@@ -99,9 +102,7 @@ class SingularPoses:
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step."""
-        from mbkit.lagrangian.constraints import manifold_of
-
-        J = manifold_of(self._dyn).at(t).jacobian(q)
+        J = _manifold(self._dyn, t).jacobian(q)
         J = J.reshape(-1, J.shape[-1])
         if not np.isfinite(J).all():
             return
@@ -127,8 +128,7 @@ class SingularPoses:
         """Return the poses in a sentence; empty where there are none."""
         if not self.times:
             return ""
-        when = ", ".join(f"{t:.4g}" for t in self.times[:3])
-        when += " and later" if len(self.times) > 3 else ""
+        when = ", ".join(f"{t:.4g}" for t in self.times[:3]) + (" and later" if len(self.times) > 3 else "")
         rows = " and ".join(f"constraints[{k}]" for k in self._rows)
         return (
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "

@@ -103,14 +103,14 @@ class Watch:
         """Return the crossings since the last look, in order, up to the first that ends the run, and that one."""
         there = state(t1)
         values = [self._value(event, t1, there) for event in self._events]
-        found: list[tuple[float, int]] = []
+        crossings: list[tuple[float, int]] = []
         for k, (event, before, after) in enumerate(zip(self._events, self._values, values, strict=True)):
-            if _crosses(before, after, event.direction):
-                found.append((self._root(event, state, t1, before, after), k))
+            rises, falls = before < 0 <= after, before > 0 >= after
+            if (rises and event.direction >= 0) or (falls and event.direction <= 0):
+                crossings.append((self._root(event, state, t1, before, after), k))
         hits: list[Hit] = []
-        for t, k in sorted(found):
-            q, v = state(t)
-            hits.append(Hit(self._events[k].name, t, q, v, self._member))
+        for t, k in sorted(crossings):
+            hits.append(Hit(self._events[k].name, t, *state(t), self._member))
             if self._events[k].terminal:
                 return hits, hits[-1]
         self._t, self._values = t1, values
@@ -131,19 +131,12 @@ class Watch:
         # An interpolant may round to another sign at the ends.
         known = {self._t: before, t1: after}
         eps = float(np.finfo(float).eps)
-        root = brentq(
-            lambda t: known[t] if t in known else self._value(event, t, state(t)),
-            self._t,
-            t1,
-            xtol=4 * eps * max(abs(self._t), abs(t1)),
-            rtol=4 * eps,
-        )
-        return float(root)
+        xtol = 4 * eps * max(abs(self._t), abs(t1))
 
+        def value(t: float) -> float:
+            return known[t] if t in known else self._value(event, t, state(t))
 
-def _crosses(before: float, after: float, direction: int) -> bool:
-    rises, falls = before < 0 <= after, before > 0 >= after
-    return (rises and direction >= 0) or (falls and direction <= 0)
+        return float(brentq(value, self._t, t1, xtol=xtol, rtol=4 * eps))
 
 
 def as_events(events: object) -> tuple[Event, ...]:
@@ -154,8 +147,7 @@ def as_events(events: object) -> tuple[Event, ...]:
         events = (events,)
     if not isinstance(events, Sequence) or isinstance(events, (str, bytes)):
         raise InputError(f"events: expected an Event, a function of (t, q, v) or several, got {type(events).__name__}")
-    named = [e if isinstance(e, Event) else Event(e, getattr(e, "__name__", "event")) for e in events]
-    return tuple(named)
+    return tuple(e if isinstance(e, Event) else Event(e, getattr(e, "__name__", "event")) for e in events)
 
 
 def at_limits(model: Model) -> tuple[Event, ...]:
@@ -171,7 +163,8 @@ def at_limits(model: Model) -> tuple[Event, ...]:
     for i, (name, low, high) in enumerate(zip(model.coordinate_names, model.lower, model.upper, strict=True)):
         for limit, side in ((low, -1), (high, 1)):
             if np.isfinite(limit):
-                out.append(_passes(i, float(limit), side, f"{name} {'above' if side > 0 else 'below'} {limit:g}"))
+                text = f"{name} {'above' if side > 0 else 'below'} {limit:g}"
+                out.append(Event(partial(_beyond, i, float(limit)), text, side))
     if not out:
         raise InputError(f"at_limits: {model.name} has no joint limits, so no run would end there")
     return tuple(out)
@@ -204,17 +197,13 @@ def at_section(
     if coordinate not in model.coordinate_names:
         raise UnknownNameError("coordinate", str(coordinate), model.coordinate_names)
     i, value = model.coordinate_names.index(coordinate), real("value", value)
-    return _passes(i, value, direction, f"{coordinate} = {value:g}", terminal)
+    return Event(partial(_beyond, i, value), f"{coordinate} = {value:g}", direction, terminal)
 
 
 def _require(what: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
         makes = "mbkit.load(...)" if kind is Model else "mbkit.dynamics(model, engine)"
         raise InputError(f"{what}: expected a {kind.__name__}, got {type(value).__name__}; {makes} makes one")
-
-
-def _passes(i: int, value: float, direction: int, name: str, terminal: bool = True) -> Event:
-    return Event(partial(_beyond, i, value), name, direction, terminal)
 
 
 # Functions of the module, so that events can be sent to other processes.

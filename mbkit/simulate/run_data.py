@@ -13,7 +13,7 @@ from mbkit.engines import ENGINES, Dynamics, dynamics
 from mbkit.engines.base import at_times
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.methods.registry import Tolerances
-from mbkit.model import Body, Model
+from mbkit.model import Body, Frame, Model
 from mbkit.simulate.events import Hit
 from mbkit.simulate.result import Stats
 from mbkit.simulate.torque import Applied, PiecewiseConstantTorque, SampledTorque, TorqueCallback
@@ -363,10 +363,12 @@ def _momentum(dyn: Dynamics, q: Array, v: Array) -> Array:
     return out
 
 
-def _frame_of(model: Model, body: Body) -> Any:
+def _frame_of(model: Model, body: Body) -> Frame:
     """Return a frame on the body that engines know by its name: its own, unless another goes by that name."""
     own = model.frame(body.name)
-    for frame in (own, *model.frames):
+    if own.body == body.name:
+        return own
+    for frame in model.frames:
         if frame.body == body.name and model.frame(frame.name) is frame:
             return frame
     raise UnsupportedError(

@@ -120,32 +120,17 @@ class Torque:
     def __init__(
         self, torque: ArrayLike | TorqueFunction | None, model: Model, batch: int | None, steps: int | None
     ) -> None:
-        self._nv, self._name = model.nv, model.name
-        self._function: TorqueFunction | None = torque if callable(torque) else None
-        self._zero = np.zeros(self._nv) if batch is None else np.zeros((batch, self._nv))
+        self._nv = model.nv
+        self._callback = TorqueCallback(torque, model.nv) if callable(torque) else None
+        self._constant = np.zeros(model.nv)
         self._rows: Array | None = None
         if torque is not None and not callable(torque):
-            self._read(torque, batch, steps)
-
-    def _read(self, torque: ArrayLike, batch: int | None, steps: int | None) -> None:
-        nv = self._nv
-        shape = _shape(torque)
-        allowed: list[tuple[int, ...]] = [(nv,)]
-        if steps is not None:
-            allowed.append((steps, nv))
-            if batch is not None:
-                allowed.append((batch, steps, nv))
-        if shape not in allowed:
-            hint = "" if steps is not None else "; one row per interval needs save=, times from 0 to the end of the run"
-            raise InputError(
-                f"torque: expected shape {' or '.join(map(str, allowed))}, got {shape}; {self._name} has nv = {nv}"
-                + (f" and the run has {steps} steps" if steps is not None else hint)
-            )
-        array = finite_array("torque", torque, shape)
-        if array.ndim == 1:
-            self._zero = self._zero + array
-        else:
-            self._rows = array
+            array = _read(torque, model, batch, steps)
+            if array.ndim == 1:
+                self._constant = self._constant + array
+            else:
+                self._rows = array
+        self._of_all = self._constant if batch is None else np.tile(self._constant, (batch, 1))
 
     @property
     def held(self) -> bool:
@@ -155,34 +140,31 @@ class Torque:
     @property
     def callable(self) -> bool:
         """Whether the force is a function of the state."""
-        return self._function is not None
+        return self._callback is not None
 
     def during(self, k: int, members: Indices | None) -> Force:
         """Return the force during step k on a single state, or on these members of a batch."""
-        if self._function is not None:
-            callback = TorqueCallback(self._function, self._nv)
+        if self._callback is not None:
+            callback = self._callback
             return callback.one if members is None else lambda t, q, v: callback.many(t, q, v, members)
-        if self._rows is None:
-            return self._zero if members is None else self._zero[members]
-        if self._rows.ndim == 3:
-            return np.asarray(self._rows[members, k])
-        row = self._rows[k]
-        return row if members is None else np.broadcast_to(row, (len(members), self._nv))
+        row = self._of_all if self._rows is None else self._rows[..., k, :]
+        if members is None:
+            return row
+        return row[members] if row.ndim == 2 else np.broadcast_to(row, (len(members), self._nv))
 
     def of_member(self, i: int | None) -> Callable[[int], Force]:
         """Return a function of the step that returns the force on one state (of a batch)."""
         if i is None:
             return lambda k: self.during(k, None)
-        if self._function is not None:
-            callback = TorqueCallback(self._function, self._nv)
-            return lambda _: partial(callback.one, member=i)
+        if self._callback is not None:
+            force = partial(self._callback.one, member=i)
+            return lambda _: force
         return lambda k: np.asarray(self.during(k, np.array([i])))[0]
 
     def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
         """Return an array's rows of steps start to stop for members of a batch: (steps, nv, members or 1)."""
         if self._rows is None:
-            constant = self._zero if self._zero.ndim == 1 else self._zero[:1].sum(axis=0)
-            return np.broadcast_to(constant[:, None], (stop - start, self._nv, 1))
+            return np.broadcast_to(self._constant[:, None], (stop - start, self._nv, 1))
         if self._rows.ndim == 2:
             return self._rows[start:stop, :, None]
         return np.ascontiguousarray(self._rows[members, start:stop].transpose(1, 2, 0))
@@ -191,26 +173,31 @@ class Torque:
         """Return the rows of steps start to stop, (steps, nv) or (N, steps, nv); None where all are zero."""
         if self._rows is not None:
             return self._rows[..., start:stop, :]
-        if not self._zero.any():
-            return None
-        # A constant (nv,) is the same for every member.
-        one = self._zero if self._zero.ndim == 1 else self._zero[0]
-        return np.broadcast_to(one, (stop - start, self._nv)).copy()
+        return np.tile(self._constant, (stop - start, 1)) if self._constant.any() else None
 
     def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | TorqueCallback | None:
         """Return the force of a finished run, whose rows were held between `bounds`, s; None where it was zero."""
-        if self._function is not None:
-            return TorqueCallback(self._function, self._nv)
+        if self._callback is not None:
+            return self._callback
         if self._rows is not None:
             assert bounds is not None  # rows are read only where there are intervals
             return PiecewiseConstantTorque(self._rows, bounds[:-1])
-        if not self._zero.any():
-            return None
-        return PiecewiseConstantTorque(self._zero if self._zero.ndim == 1 else self._zero[0], None)
+        return PiecewiseConstantTorque(self._constant, None) if self._constant.any() else None
 
 
-def _shape(value: Any) -> tuple[int, ...]:
+def _read(torque: ArrayLike, model: Model, batch: int | None, steps: int | None) -> Array:
+    """Return an array of torques, checked."""
     try:
-        return np.shape(value)
+        shape = np.shape(torque)
     except ValueError:
         raise InputError("torque: expected an array or a callable, got rows of different lengths") from None
+    allowed = [(model.nv,), (steps, model.nv), (batch, steps, model.nv)][
+        : 1 if steps is None else 2 + (batch is not None)
+    ]
+    if shape not in allowed:
+        hint = "; one row per interval needs save=, times from 0 to the end of the run"
+        raise InputError(
+            f"torque: expected shape {' or '.join(map(str, allowed))}, got {shape}; {model.name} has nv = {model.nv}"
+            + (hint if steps is None else f" and the run has {steps} steps")
+        )
+    return finite_array("torque", torque, shape)

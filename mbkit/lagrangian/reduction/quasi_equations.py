@@ -152,36 +152,33 @@ def _checked(system: EnergyForm, matrix: Any) -> sp.ImmutableMatrix:
     if D.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
         raise InputError(f"D: expected finite entries, got {D.tolist()}")
     D = D.applyfunc(lambda x: read_expression(system, "D", x, others=True))
+    names = ", ".join(map(str, system.coordinates))
     if system.time is not None and system.time in D.free_symbols:
         raise InputError(f"D: expected coordinates and parameters only, got the time {system.time}")
-    others = {str(x) for x in D.free_symbols - set(system.coordinates) - set(system.parameters)}
-    others |= {str(x) for x in D.atoms(AppliedUndef)}
+    others = D.free_symbols - set(system.coordinates) - set(system.parameters) | D.atoms(AppliedUndef)
     if others:
         raise InputError(
-            f"D: expected the coordinates {', '.join(map(str, system.coordinates))} and parameters only, "
-            f"got {', '.join(sorted(others))}; q̇ = D w with D of q alone"
+            f"D: expected the coordinates {names} and parameters only, got {', '.join(sorted(map(str, others)))}; "
+            "q̇ = D w with D of q alone"
         )
     return D
 
 
 def _named(system: EnergyForm, names: Any) -> list[sp.Symbol]:
     n = len(system.coordinates)
-    if names is None:
-        names = [f"w{i + 1}" for i in range(n)]
     if isinstance(names, str):
         names = names.replace(",", " ").split()
-    symbols: Sequence[Any] = list(names)
+    symbols: Sequence[Any] = [f"w{i + 1}" for i in range(n)] if names is None else list(names)
     if len(symbols) != n:
         raise InputError(f"names: expected {n}, one for each column of D, got {len(symbols)}")
-    out = []
+    out: list[sp.Symbol] = []
+    used = {s.name for s in symbols_of(system)}
     for x in symbols:
         if not isinstance(x, (str, sp.Symbol)) or not str(x):
             raise InputError(f"names: expected names or symbols, got {x!r}")
         out.append(sp.Symbol(x) if isinstance(x, str) else x)
         fits("velocities", out[-1])
-    used = {s.name for s in symbols_of(system)}
-    for s in out:
-        if s.name in used:
-            raise InputError(f"names: {s.name!r} stands for something else already")
-        used.add(s.name)
+        if out[-1].name in used:
+            raise InputError(f"names: {out[-1].name!r} stands for something else already")
+        used.add(out[-1].name)
     return out

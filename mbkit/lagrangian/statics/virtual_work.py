@@ -92,7 +92,7 @@ def check_places(what: str, places: list[tuple[sp.Expr, ...]], into: PlainSymbol
 def vectors(what: str, source: Any, into: PlainSymbols) -> list[tuple[sp.Expr, ...]]:
     """Return vectors of expressions in plain symbols; a single vector is a list of one."""
     try:
-        rows = [list(x) if _several(x) else x for x in source]
+        rows = [list(x) if hasattr(x, "__len__") and not isinstance(x, str) else x for x in source]
     except TypeError:
         raise InputError(f"{what}: expected a list of vectors, got {source!r}") from None
     if rows and not any(isinstance(x, list) for x in rows):
@@ -106,15 +106,11 @@ def vectors(what: str, source: Any, into: PlainSymbols) -> list[tuple[sp.Expr, .
     return out
 
 
-def _several(x: Any) -> bool:
-    return isinstance(x, (list, tuple, sp.Tuple, sp.MatrixBase)) or (hasattr(x, "__len__") and not isinstance(x, str))
-
-
-def _pairs(first: str, a: list[tuple[sp.Expr, ...]], second: str, b: list[tuple[sp.Expr, ...]]) -> None:
+def _pairs(first: str, a: Sequence[Any], second: str, b: Sequence[Any], hint: str = "") -> None:
     if len(a) != len(b):
-        raise InputError(f"{first}: {len(a)} of them for {len(b)} {second}; give one for each")
+        raise InputError(f"{first}: {len(a)} of them for {len(b)} {second}; give one for each{hint}")
     for k, (x, y) in enumerate(zip(a, b, strict=True)):
-        if len(x) != len(y):
+        if isinstance(x, tuple) and len(x) != len(y):
             raise InputError(f"{first}[{k}]: {len(x)} components, but {second}[{k}] has {len(y)}")
 
 
@@ -178,22 +174,23 @@ def from_particles(
     check_places("positions", R, into)
     # A single vector stands for one particle, of which the mass may stand alone.
     m = [into("masses", x) for x in ([masses] if isinstance(masses, (sp.Basic, int, float)) else masses)]
-    if len(m) != len(R):
-        raise InputError(f"masses: {len(m)} of them for {len(R)} positions; give one for each")
-    T, V = [], [into("potential", potential)]
-    for mass, place in zip(m, R, strict=True):
-        T.append(mass * sp.Add(*(_rate(x, into) ** 2 for x in place)) / 2)
+    _pairs("masses", m, "positions", R)
+    T = [mass * sp.Add(*(_rate(x, into) ** 2 for x in place)) / 2 for mass, place in zip(m, R, strict=True)]
+    V = [into("potential", potential)]
     if gravity is not None:
-        ((*down,),) = vectors("gravity", [gravity], into)
+        (down,) = vectors("gravity", [gravity], into)
         for k, (mass, place) in enumerate(zip(m, R, strict=True)):
             if len(down) != len(place):
                 raise InputError(f"gravity: {len(down)} components, but positions[{k}] has {len(place)}")
             V.append(-mass * sp.Add(*(a * x for a, x in zip(down, place, strict=True))))
     Q = {into("generalized", key): into(f"generalized[{key}]", x) for key, x in (generalized or {}).items()}
-    for q, work in _work(forces or [], R, into).items():
+    if forces is not None and len(forces):
+        _pairs("forces", forces, "positions", R, ", or None")
+        rows = [[0] * len(x) if f is None else f for f, x in zip(forces, R, strict=True)]
+        acting = [[into(f"forces[{k}]", x) for x in row] for k, row in enumerate(rows)]
+        work = generalized_force(acting, R, into.coordinates, velocities=into.velocities, time=into.time)
         # A zero must not hide an input that is a force of its own.
-        if work != 0:
-            Q[q] = Q.get(q, 0) + work
+        Q |= {q: Q.get(q, 0) + x for q, x in work.items() if x != 0}
     return Lagrangian(
         tidy(sp.Add(*T)),
         tidy(sp.Add(*V)),
@@ -212,13 +209,3 @@ def _rate(x: sp.Expr, into: PlainSymbols) -> sp.Expr:
     """Return Ṙ's component: along the coordinates' velocities and with the time."""
     along = [sp.diff(x, q) * v for q, v in zip(into.coordinates, into.velocities, strict=True)]
     return sp.Add(*along, sp.diff(x, into.time) if into.time is not None else 0)
-
-
-def _work(forces: Sequence[Any], R: list[tuple[sp.Expr, ...]], into: PlainSymbols) -> dict[Any, sp.Expr]:
-    if not len(forces):
-        return {}
-    if len(forces) != len(R):
-        raise InputError(f"forces: {len(forces)} of them for {len(R)} positions; give one for each, or None")
-    filled = [[0] * len(x) if f is None else f for f, x in zip(forces, R, strict=True)]
-    plain = [[into(f"forces[{k}]", x) for x in f] for k, f in enumerate(filled)]
-    return generalized_force(plain, R, into.coordinates, velocities=into.velocities, time=into.time)
