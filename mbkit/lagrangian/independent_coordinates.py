@@ -216,17 +216,12 @@ class EmbeddedDynamics(Dynamics):
 class Embedded:
     """A system under constraints, to be simulated on independent coordinates: ``mbkit.simulate(embedded, ...)``.
 
-    Parameters
-    ----------
-    manifold : Manifold
-    independent : tuple of str, optional
-        A fixed choice; else the best one, chosen again when it no longer is.
-
     Attributes
     ----------
     dynamics : LagrangianDynamics
         On all coordinates, with multipliers.
     independent : tuple of str or None
+        A fixed choice; else the best one, chosen again when it no longer is.
     degrees : int
         Of freedom.
     """

@@ -1,7 +1,7 @@
 """Events: zero crossings of a function of the state, that end a run or are noted.
 
-A crossing is looked for between the ends of each accepted step, so that one which
-comes and goes within a step is not seen; a smaller tolerance makes smaller steps.
+A crossing is searched between the ends of each accepted step; one that comes and goes within a step is not seen, and a
+smaller tolerance makes smaller steps.
 """
 
 from __future__ import annotations
@@ -151,13 +151,7 @@ def as_events(events: object) -> tuple[Event, ...]:
 
 
 def at_limits(model: Model) -> tuple[Event, ...]:
-    """Return events that end a run where a coordinate passes a limit of its joint.
-
-    Raises
-    ------
-    InputError
-        No joint of the model has a limit, or it is no model.
-    """
+    """Return events that end a run where a coordinate passes a limit of its joint; InputError where none has one."""
     _require("at_limits: model", model, Model)
     out = []
     for i, (name, low, high) in enumerate(zip(model.coordinate_names, model.lower, model.upper, strict=True)):
@@ -180,18 +174,9 @@ def at_energy(dyn: Dynamics, joules: float, *, direction: int = 0) -> Event:
 def at_section(
     model: Model, coordinate: str, value: float = 0.0, *, direction: int = 0, terminal: bool = False
 ) -> Event:
-    """Return an event where a coordinate passes a value: a Poincaré section.
+    """Return an event where one of ``model.coordinate_names`` passes a value (m or rad): a Poincaré section.
 
-    Parameters
-    ----------
-    model : Model
-    coordinate : str
-        One of ``model.coordinate_names``.
-    value : float
-        m or rad.
-    direction : {-1, 0, 1}
-    terminal : bool
-        Whether the run ends there, or goes on and notes it.
+    The run ends there if it is `terminal`; `direction` is that of `Event`.
     """
     _require("at_section: model", model, Model)
     if coordinate not in model.coordinate_names:

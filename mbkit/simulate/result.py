@@ -18,31 +18,27 @@ class Stats:
 
     Attributes
     ----------
-    steps : int
-        Accepted steps, summed over a batch.
-    evaluations : int
-        Evaluations of the forward dynamics, summed over a batch.
+    steps, evaluations : int
+        Accepted steps, and evaluations of the forward dynamics, summed over a batch.
     seconds : float
         Time on the wall.
     ended : {"finished", "event", "diverged", "step_too_small", "function_failed"}
-        ``"event"`` when one asked for the end; ``"diverged"`` when a state or
-        acceleration of any trajectory stopped being finite, or a state passed 1e100;
-        ``"step_too_small"`` when an adaptive method could not go on;
+        ``"event"`` when one asked for the end; ``"diverged"`` when a state or acceleration of any trajectory stopped
+        being finite, or a state passed 1e100; ``"step_too_small"`` when an adaptive method could not go on;
         ``"function_failed"`` when a torque or event function did.
     reached : float or tuple of float
         Time of the last good state, s; one per trajectory of a batch.
     message : str
         Why a run ended early; empty for one that finished.
     rejected : int
-        Steps that an adaptive method tried in vain, where it tells.
+        Steps that an adaptive method rejected, where it reports them.
     jacobians : int
-        Of ``"rodas5"``, ``"radau"``, ``"bdf"``, ``"lsoda"`` and ``"cvodes"``: evaluations of the Jacobian of
-        the forward dynamics, summed over a batch; of ``"implicit_midpoint"``: iterations
-        of Newton's method, each with the exact Jacobian of the step's equations.
+        Of implicit adaptive methods: evaluations of the Jacobian of the forward dynamics, summed over a batch; of
+        ``"implicit_midpoint"``: iterations of Newton's method, each with the exact Jacobian of the step's equations.
     chosen : str
         Of ``"auto"``: which methods ran, from when to when, and why.
     doubts : tuple of str
-        What speaks against a run that finished, each with its measured reason and a remedy.
+        Signs that a finished run is wrong, each with its measured reason and a remedy.
     """
 
     steps: int
@@ -71,9 +67,8 @@ class Stats:
 class SolverResult:
     """Kept states and the figures of a run; `reached` has shape () or (N,).
 
-    `last` is the last good configuration of the first trajectory that could not go on, where the method tells it.
-
-    The `error` of a torque or event function is handed on with what was computed before it.
+    `last` is the last good configuration of the first trajectory that could not go on, where the method reports it;
+    `error` is that of a torque or event function.
     """
 
     t: Array

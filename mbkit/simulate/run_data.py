@@ -84,13 +84,7 @@ class RunData:
     # Energies, work and momenta
 
     def energy(self, engine: str | Dynamics | None = None) -> Array:
-        """Return kinetic plus potential energy in J, shape (K,) or (N, K).
-
-        Parameters
-        ----------
-        engine : str or Dynamics, optional
-            The engine that computes it; the run's own when not given.
-        """
+        """Return kinetic plus potential energy in J, shape (K,) or (N, K), by the run's own engine or another."""
         return self.kinetic_energy(engine) + self.potential_energy(engine)
 
     def kinetic_energy(self, engine: str | Dynamics | None = None) -> Array:
@@ -107,14 +101,9 @@ class RunData:
     def tau(self) -> Array:
         """Return the generalized force that acted at each state, of the shape of v.
 
-        Of an array: the row that acts from there on, at the end the last one. A function is called once
-        more at the saved states (when the trajectory is pickled, then). Where the function ended the run,
-        the last state has NaN.
-
-        Raises
-        ------
-        TorqueError
-            The function fails at a state where it did not before.
+        Of an array: the row that acts from there on, at the end the last one. A function is called once more at the
+        saved states (when the trajectory is pickled, then); TorqueError where it fails now and did not before. Where
+        the function ended the run, the last state has NaN.
         """
         acted = self._acted()
         if acted is None:
@@ -127,19 +116,10 @@ class RunData:
     def work(self, engine: str | Dynamics | None = None) -> Array:
         """Return ∫ (τ + τ_damping)·v dt since the first state in J, shape (K,) or (N, K).
 
-        The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇. On
-        quasi-velocities, for dampers and for a torque function it is a quadrature of fourth order in the
-        distance of the saved states; a torque function that jumps makes it first order.
-
-        Parameters
-        ----------
-        engine : str or Dynamics, optional
-            The engine that computes damping and accelerations.
-
-        Raises
-        ------
-        UnsupportedError
-            The rows of a held torque change between two saved states.
+        The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
+        where its rows change between two saved states. On quasi-velocities, for dampers and for a torque function it
+        is a quadrature of fourth order in the distance of the saved states; a function that jumps makes it first
+        order.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
         if isinstance(force, SampledTorque):
@@ -154,18 +134,16 @@ class RunData:
     def power_balance(self, engine: str | Dynamics | None = None) -> Array:
         """Return E(t) - E(0) - work(t) in J: zero for a run without error, shape (K,) or (N, K).
 
-        It holds the error of the run and that of `work`, a quadrature on the saved states: save every step
-        to make the second small. Without torque or with a constant or held one, on coordinates with v = q̇
-        and no dampers, only the error of the run is left.
+        It holds the error of the run and that of `work`: save every step to make the second small. Without torque or
+        with a constant or held one, on coordinates with v = q̇ and no dampers, only the error of the run is left.
         """
         energy = self.energy(engine)
         return np.asarray(energy - energy[..., :1] - self.work(engine))
 
     def momentum(self, engine: str | Dynamics | None = None) -> Array:
-        """Return the bodies' momentum, shape (K, 6) or (N, K, 6), in world axes.
+        """Return the bodies' linear momentum, kg m/s, and angular one about the world's origin, kg m²/s.
 
-        Linear, kg m/s, then angular about the world's origin, kg m²/s: summed over the bodies with the
-        engine's poses and Jacobians. Armature belongs to no body and is left out.
+        The shape is (K, 6) or (N, K, 6), in world axes; armature belongs to no body and is left out.
         """
         dyn, q, v = self._by(engine), self.q, self.v
         if not self.model.has_bodies:
@@ -212,20 +190,19 @@ class RunData:
 
 
 def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array], *states: Array) -> Array:
-    """Return evaluate(dyn, q, v, ...), of a shape, at states (K, ·) or (N, K, ·); NaN where one is not finite.
-
-    Where time enters the model, `dyn` has one sample for each state (`mbkit.engines.base.at_times`).
-    """
+    """Return evaluate(dyn, q, v, ...), of a shape, at states (K, ·) or (N, K, ·); NaN where one is not finite."""
     lead = states[0].shape[:-1]
     flat = [x.reshape(-1, x.shape[-1]) for x in states]
     good = np.flatnonzero(np.logical_and.reduce([np.isfinite(x).all(-1) for x in flat]))
     out = np.full((int(np.prod(lead)), *shape), np.nan)
     for start in range(0, len(good), _MANY):
         which = good[start : start + _MANY]
+        own = dyn
         if dyn.model.time_parameter is not None:
+            # One sample for each state (`mbkit.engines.base.at_times`).
             own = dyn.of_samples(which)
-        else:
-            own = dyn.of_samples(which // lead[1]) if len(lead) == 2 else dyn
+        elif len(lead) == 2:
+            own = dyn.of_samples(which // lead[1])
         out[which] = evaluate(own, *(x[which] for x in flat))
     return out.reshape(*lead, *shape)
 

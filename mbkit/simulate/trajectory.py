@@ -73,34 +73,23 @@ class Trajectory(RunData):
     ----------
     t : (K,) array
         s.
-    q : (K, nq) or (N, K, nq) array
-    v : (K, nv) or (N, K, nv) array
-        A run that ended early has fewer times; a trajectory that ended before
-        the others of its batch is NaN from there on.
+    q, v : (K, nq) and (K, nv), or (N, K, nq) and (N, K, nv) arrays
+        A run that ended early has fewer times; a trajectory that ended before the others of its batch is NaN from
+        there on.
     model : Model
     method, engine : str
     stats : Stats
-        What it cost, and how it ended.
+        Its cost and end.
     events : tuple of Hit
-        Those that happened.
-
-    Notes
-    -----
-    Derived quantities are computed on request, by the run's own engine or by the one that is given.
     """
 
     def check(self) -> RunCheck:
-        """Look for signs that the run is wrong, also by integrating again.
+        """Return the signs that the run is wrong, also found by integrating again; true where there are none.
 
-        Beside what `simulate` looks for at once (energy from nowhere, a singular mass matrix, coordinates
-        without digits, gimbal lock, tolerances that add up): a step too long for a mode of the linearized
-        motion, and of a method of first order without torque, up to 20,000 steps, the difference from a
-        run with twice the step. That takes up to half as long as the run, and a few ms.
-
-        Returns
-        -------
-        RunCheck
-            True where nothing was found; ``check.doubts`` are the signs, each with its measured reason and a remedy.
+        Beside those that `simulate` finds at once (energy from nowhere, a singular mass matrix, coordinates without
+        digits, gimbal lock, tolerances that add up): a step too long for a mode of the linearized motion, and of a
+        method of first order without torque, up to 20,000 steps, the difference from a run with twice the step. That
+        takes up to half as long as the run, and a few ms.
         """
         title, stats, settings = f"{self.model.name}: {self.method}", self.stats, self._settings
         if not stats.finished:
@@ -119,8 +108,8 @@ class Trajectory(RunData):
     def plot(self) -> Figure:
         """Draw coordinates, velocities, energies and the power balance over time with Matplotlib.
 
-        Lengths, angles and quaternions have a panel each. Of a batch, the first ten
-        trajectories are drawn. Events and the end of a run that diverged are marked.
+        Lengths, angles and quaternions have a panel each; of a batch, the first ten trajectories are drawn. Events and
+        the end of a run that diverged are marked.
         """
         from mbkit.simulate.plotting.time_series import plot
 
@@ -129,20 +118,18 @@ class Trajectory(RunData):
     def picture(self, count: int = 8, view: str | ArrayLike | None = None, member: int = 0) -> Figure:
         """Draw the motion as a strip of stick figures at equal times, with Matplotlib.
 
-        Links run from joint to joint, at the ends to the centre of mass or the last
-        frame; the path of one point is drawn along: the end of the longest branch,
-        or the base of a floating robot.
+        Links run from joint to joint, at the ends to the centre of mass or the last frame; the path of one point is
+        drawn too: the end of the longest branch, or the base of a floating robot.
 
         Parameters
         ----------
         count : int
-            How many figures.
+            Number of figures.
         view : str or (2, 3) array_like, optional
-            The plane: two world axes to the right and upwards, such as ``"xz"``, or two
-            directions. By default upwards is against gravity, and to the right is where
-            the motion is widest.
+            The plane: two world axes to the right and upwards, such as ``"xz"``, or two directions. By default upwards
+            is against gravity, and to the right is where the motion is widest.
         member : int
-            Which trajectory of a batch.
+            Index of the trajectory in a batch.
         """
         from mbkit.simulate.plotting.motion_strip import picture
 
@@ -155,14 +142,9 @@ class Trajectory(RunData):
         return picture(self, model, count, view, member)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write t, q and v with all their digits, one line per state.
+        """Write t, q and v with all their digits, one line per state; OutputError where the file cannot be written.
 
         A batch has a first column with the index of its trajectory.
-
-        Raises
-        ------
-        OutputError
-            The file cannot be written.
         """
         batch = self.q.ndim == 3
         header = [*(["trajectory"] if batch else []), "t"]

@@ -260,10 +260,7 @@ class Hamiltonian(Printable):
         return sp.sympify(out.subs(dict(zip(self.system.velocities, self.velocities, strict=True)), simultaneous=True))
 
     def poisson(self, f: Any, g: Any) -> sp.Expr:
-        """Return Poisson's bracket {f, g} = Σ ∂f/∂q ∂g/∂p - ∂f/∂p ∂g/∂q.
-
-        Velocities in f and g are written in momenta first.
-        """
+        """Return Poisson's bracket {f, g} = Σ ∂f/∂q ∂g/∂p - ∂f/∂p ∂g/∂q, with velocities written in momenta first."""
         return bracket(self.canonical(f), self.canonical(g), self.coordinates, self.momenta)
 
     def time_derivative(self, f: Any) -> sp.Expr:
@@ -307,13 +304,7 @@ class Hamiltonian(Printable):
         return np.asarray((M @ velocity[..., None])[..., 0] + b)
 
     def to_velocity(self, q: ArrayLike, p: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
-        """Return v = M⁻¹ (p - b) in numbers, with the arguments of `to_momentum`.
-
-        Raises
-        ------
-        NumericalError
-            The mass matrix is singular at one of the configurations.
-        """
+        """Return v = M⁻¹ (p - b) in numbers, as `to_momentum`; NumericalError where the mass matrix is singular."""
         M, b, momentum = self._mass(q, p, "p", t, values)
         try:
             out = np.linalg.solve(M, (momentum - b)[..., None])[..., 0]
@@ -326,14 +317,8 @@ class Hamiltonian(Printable):
     def field(self, tau: ArrayLike | None = None, **values: float) -> Callable[[float, ArrayLike], Array]:
         """Return f(t, y) = (q̇, ṗ) with y = (q, p), as SciPy's integrators take it.
 
-        Where the mass matrix is singular the answer is not finite, at which an integrator takes a shorter step.
-
-        Parameters
-        ----------
-        tau : (n,) array_like, optional
-            The inputs, one entry a coordinate; zero by default.
-        **values
-            Of parameters, by name; the others keep theirs.
+        `tau` (n,) are the inputs, one entry a coordinate, zero by default; `values` are those of parameters, by name.
+        Where the mass matrix is singular the result is not finite, at which an integrator takes a shorter step.
         """
         s, n = self.system, len(self.coordinates)
         force = np.zeros(n) if tau is None else rows("tau", tau, n, s.name, "nv")

@@ -120,7 +120,7 @@ class Routhian(Printable, Generic[FormT]):
         return ReducedState(q[..., kept].copy(), v[..., kept].copy(), momenta)
 
     def reconstruct(self, run: Any, q0: ArrayLike, **values: float) -> Motion:
-        """Return the motion of the whole system, with the ignored coordinates by quadrature.
+        """Return the motion t, q, v of the whole system, (K,), (K, n), (K, n); the ignored coordinates by quadrature.
 
         Each interval between saved states is integrated again from its start, to 1e-13, with the ignored rates: the
         result is as accurate as the run, however far apart its states are.
@@ -128,23 +128,11 @@ class Routhian(Printable, Generic[FormT]):
         Parameters
         ----------
         run : Trajectory or (t, q, v)
-            Of the reduced system: one run, (K,), (K, r), (K, r).
+            Of the reduced system: one run, (K,), (K, r), (K, r); not a batch, and without a torque (UnsupportedError).
         q0 : (n,) or (m,) array_like
             The whole configuration at the first time, or its ignored coordinates alone.
         **values
             Of the reduced system's parameters and momenta, by name; a Trajectory brings its own.
-
-        Returns
-        -------
-        Motion
-            t, q, v of the whole system: (K,), (K, n), (K, n).
-
-        Raises
-        ------
-        InputError
-            Shapes that do not fit, a batch, or a parameter without a value.
-        UnsupportedError
-            A torque acted on the run, of which only the saved states know.
         """
         t, q, v, numbers = _read(self, run, values)
         kept, ignored = self._places
@@ -269,10 +257,8 @@ def _need_not(ignored: list[sp.Symbol], x: sp.Expr, what: str) -> None:
         raise InputError(f"cyclic: {what} holds {plain(held)}, which can therefore not be ignored")
 
 
-# The ignored coordinates of a reduced motion, by quadrature along it.
-#
-# The intervals between saved states do not depend on each other: all of them are
-# integrated side by side, as one system on the unit interval, with the rates of the
+# The ignored coordinates of a reduced motion, by quadrature along it. The intervals between saved states do not depend
+# on each other: all of them are integrated side by side, as one system on the unit interval, with the rates of the
 # ignored coordinates as further states. What each adds is then summed.
 
 # SciPy's limit is 100 eps; the norm is a mean over all intervals.

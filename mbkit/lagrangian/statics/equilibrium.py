@@ -139,8 +139,8 @@ def equilibrium(
     Raises
     ------
     InputError
-        Both `tau` or `q0` and `holding`; a wrong shape; forces that depend on the time;
-        a configuration that constraints do not allow.
+        `tau` or `q0` beside `holding`, a wrong shape, forces that depend on the time, or a `holding` that constraints
+        do not allow.
     NumericalError
         No equilibrium found, with the least force that is left over and where.
 

@@ -49,8 +49,7 @@ def generalized_force(
     Raises
     ------
     InputError
-        Other numbers of forces than of points, vectors of other lengths, points that depend on a
-        velocity, or an angular velocity that depends on none.
+        Vectors of other numbers or lengths, points that depend on a velocity, or an angular velocity that does not.
 
     Examples
     --------
@@ -150,14 +149,9 @@ def from_particles(
     forces : sequence of vectors, optional
         f_i on each particle beside gravity, N; None for a particle without.
     generalized : mapping of coordinate to sympy.Expr, optional
-        Generalized forces besides.
+        Further generalized forces.
     dissipation, time, parameters, constraints, name
         As of `Lagrangian`.
-
-    Raises
-    ------
-    InputError
-        Other numbers of masses, positions and forces, or what `Lagrangian` refuses.
 
     Examples
     --------

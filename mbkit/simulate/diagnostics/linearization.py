@@ -251,8 +251,6 @@ def stiffness(
 
     Raises
     ------
-    InputError
-        A state or torque of a wrong shape, or not finite.
     NumericalError
         The engine has no acceleration there.
 
