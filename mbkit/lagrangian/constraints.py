@@ -126,10 +126,7 @@ class Manifold:
         """Refuse an inconsistent state, of one or a batch, with the residuals (InputError)."""
         for k, (one_q, one_v) in enumerate(zip(np.atleast_2d(q), np.atleast_2d(v), strict=True)):
             terms = self.member(k)._terms(one_q, one_v)
-            for name, what, residual, x in (
-                ("q0", "f", terms.f, one_q),
-                ("v0", "J v + ∂f/∂t", terms.rate, one_v),
-            ):
+            for name, what, residual, x in (("q0", "f", terms.f, one_q), ("v0", "J v + ∂f/∂t", terms.rate, one_v)):
                 if not (np.abs(residual) <= _CONSISTENT * terms.scale * max(1.0, float(np.abs(x).max()))).all():
                     where = "" if q.ndim == 1 else f" of state {k}"
                     raise InputError(
@@ -215,14 +212,14 @@ def manifold_of(dyn: Dynamics) -> Manifold:
     return Manifold(vars(dyn)[_TWIN])
 
 
-def _least_change(W: Array, J: Array, wanted: Array) -> Array:
-    """Return the x with J x = wanted that is the least in xᵀ W x; the nearest to it where J has dependent rows."""
+def _least_change(W: Array, J: Array, change: Array) -> Array:
+    """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows."""
     try:
         L = np.linalg.cholesky(W)
     except np.linalg.LinAlgError:
         L = np.eye(len(W))
     A = np.linalg.solve(L, J.T).T
-    y = np.linalg.lstsq(A, wanted, rcond=1e-12)[0]
+    y = np.linalg.lstsq(A, change, rcond=1e-12)[0]
     return np.asarray(np.linalg.solve(L.T, y))
 
 
@@ -278,16 +275,16 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     sizes = np.max([np.linalg.norm(manifold.jacobian(x), axis=1) for x in (q, *beside)], axis=0)
     scale = np.where(sizes > _ROUNDED, sizes, 1.0)
     J = manifold.jacobian(q) / scale[:, None]
-    needless, others = _dependent(J)
+    dependent, others = _dependent(J)
     flat = bool((np.linalg.norm(J, axis=1) < _FLAT)[sizes > _ROUNDED].any())
-    if not len(needless) and not flat:
+    if not len(dependent) and not flat:
         _JUDGED.setdefault(form, set()).add(_values(dyn.model))
         return
     _explain(manifold, [q, *beside], scale, sizes)
-    if everywhere or not len(needless):
+    if everywhere or not len(dependent):
         return
     raise NumericalError(
-        f"q: {dyn.model.name} is at a singular pose, where {_named(needless, form)} "
+        f"q: {dyn.model.name} is at a singular pose, where {_named(dependent, form)} "
         f"{_reason(others, form, 'has no slope')}: forces and accelerations are not determined there; take a pose "
         "beside it"
     )
@@ -334,10 +331,10 @@ def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array
             f"constraints: {_named(flat, form)} has no slope where it holds, here and at the poses found around, so "
             "that no force can hold it; write a square as f = 0 instead of f**2 = 0, or start from another pose"
         )
-    needless, others = min((_dependent(J) for J in slopes), key=lambda pair: len(pair[0]))
-    if len(needless):
+    dependent, others = min((_dependent(J) for J in slopes), key=lambda pair: len(pair[0]))
+    if len(dependent):
         raise InputError(
-            f"constraints: the set is redundant, here and at poses found around; {_named(needless, form)} "
+            f"constraints: the set is redundant, here and at poses found around; {_named(dependent, form)} "
             f"{_reason(others, form, 'holds by itself')}; leave it out, as its multiplier is not determined, or start "
             "from another pose"
         )
@@ -368,12 +365,12 @@ def _dependent(J: Array) -> tuple[Array, Array]:
 
     _, R, order = qr(J.T, mode="economic", pivoting=True)
     rank = int(np.count_nonzero(np.abs(np.diag(R)) > _DEPENDENT))
-    kept, needless = order[:rank], np.sort(order[rank:])
-    if not len(needless) or not rank:
-        return needless, np.empty(0, dtype=int)
+    kept, dependent = order[:rank], np.sort(order[rank:])
+    if not len(dependent) or not rank:
+        return dependent, np.empty(0, dtype=int)
     # As a combination of those that were kept.
-    weights = np.linalg.lstsq(J[kept].T, J[needless].T, rcond=None)[0]
-    return needless, np.sort(kept[np.abs(weights).max(axis=1) > 1e-6])
+    weights = np.linalg.lstsq(J[kept].T, J[dependent].T, rcond=None)[0]
+    return dependent, np.sort(kept[np.abs(weights).max(axis=1) > 1e-6])
 
 
 def _named(which: Iterable[int], form: EnergyForm) -> str:

@@ -191,13 +191,13 @@ class _Run:
         begin, stats = way.begin, part.stats
         name = part.events[-1].name if stats.ended == "event" else ""
         worn = name == _WORN or (name == _NEAR and self.passes)
-        wanted = None if left is None else {s - begin: s for s in left}
+        saved = None if left is None else {s - begin: s for s in left}
         for k, (s, u, w) in enumerate(zip(part.t.tolist(), part.q, part.v, strict=True)):
-            if wanted is None:
+            if saved is None:
                 if k and not (worn and k == len(part.t) - 1):
                     self._states.append((begin + s, *way.state(s, u, w)))
-            elif s in wanted and s > 0:
-                self._states.append((wanted[s], *way.state(s, u, w)))
+            elif s in saved and s > 0:
+                self._states.append((saved[s], *way.state(s, u, w)))
         for hit in part.events:
             if hit.name == _WORN:
                 continue

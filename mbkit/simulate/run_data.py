@@ -207,7 +207,7 @@ def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array],
     return out.reshape(*lead, *shape)
 
 
-def moved(model: Model, q: Array, u: Array) -> Array:
+def integrate_finite(model: Model, q: Array, u: Array) -> Array:
     """Return `model.integrate(q, u)` on any number of leading axes; NaN where a state is not finite."""
     out = np.full(q.shape, np.nan)
     good = np.isfinite(q).all(-1) & np.isfinite(u).all(-1)
@@ -253,7 +253,7 @@ def _damped(dyn: Dynamics, h: Array, q: Array, v: Array, a: Array) -> tuple[Arra
     """Return the power of the dampers, and its rate along the motion."""
 
     def power(s: Array) -> Array:
-        there = (moved(dyn.model, q, s * v), v + s * a) if s.any() else (q, v)
+        there = (integrate_finite(dyn.model, q, s * v), v + s * a) if s.any() else (q, v)
         return np.asarray(np.sum(_damping(dyn, *there) * there[1], axis=-1))
 
     s = _NEAR * h

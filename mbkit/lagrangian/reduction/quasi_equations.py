@@ -120,8 +120,8 @@ def in_quasi_velocities(system: EnergyForm, D: Any, names: Any) -> tuple[dict[st
     M, b = tidy_matrix(D.T * k.M * D), tidy_matrix(D.T * k.b)
     v = sp.Matrix(w)
     T2, T1 = (v.T * M * v)[0] / 2, (b.T * v)[0]
-    put = dict(zip(system.velocities, D * v, strict=True))
-    forces = tidy_matrix(D.T * system.forces.subs(put, simultaneous=True))
+    rates = dict(zip(system.velocities, D * v, strict=True))
+    forces = tidy_matrix(D.T * system.forces.subs(rates, simultaneous=True))
     inputs = [system.inputs.get(q, sp.Integer(0)) for q in system.coordinates]
     arguments = {
         "T": tidy(T2) + T1 + k.T0,
@@ -130,7 +130,7 @@ def in_quasi_velocities(system: EnergyForm, D: Any, names: Any) -> tuple[dict[st
         "velocities": w,
         "time": system.time,
         "forces": dict(zip(system.coordinates, forces, strict=True)),
-        "dissipation": tidy(system.dissipation.subs(put, simultaneous=True)),
+        "dissipation": tidy(system.dissipation.subs(rates, simultaneous=True)),
         "parameters": system.parameters,
         "name": system.name,
     }

@@ -182,9 +182,9 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
     v = [system.velocities[j] for j in r]
     M = sp.Matrix(len(r), len(r), lambda i, j: tidy(k.M[r[i], r[j]] - squares.form(columns[i], columns[j])))
     b = [tidy(k.b[j] + squares.form(column, excess)) for j, column in zip(r, columns, strict=True)]
-    moved = [x - sum(y * w for y, w in zip(k.M[i, r], v, strict=True)) for x, i in zip(excess, c, strict=True)]
-    rates = squares.solve(moved)
-    put = {system.velocities[i]: x for i, x in zip(c, rates, strict=True)}
+    others = [x - sum(y * w for y, w in zip(k.M[i, r], v, strict=True)) for x, i in zip(excess, c, strict=True)]
+    rates = squares.solve(others)
+    eliminated = {system.velocities[i]: x for i, x in zip(c, rates, strict=True)}
     squared = [M[i, j] * v[i] * v[j] for i in range(len(v)) for j in range(len(v))]
     reduced = type(system)(
         T=sp.Add(*squared) / 2 + sum(x * w for x, w in zip(b, v, strict=True)) + k.T0,
@@ -192,8 +192,8 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
         coordinates=kept,
         velocities=v,
         time=system.time,
-        forces=_forces(system, kept, ignored, put),
-        dissipation=_dissipation(system, ignored, put),
+        forces=_forces(system, kept, ignored, eliminated),
+        dissipation=_dissipation(system, ignored, eliminated),
         parameters={**system.parameters, **dict.fromkeys(symbols)},
         constraints=system.constraints,
         name=f"{system.name} less {', '.join(q.name for q in ignored)}",
@@ -207,10 +207,10 @@ def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
     ignorable = system.forced_cyclic_coordinates() | dict.fromkeys(free, sp.Integer(0))
     by_name = {q.name: q for q in system.coordinates}
     out: list[sp.Symbol] = []
-    for wanted in free if cyclic is None else listed("cyclic", cyclic):
-        q = by_name.get(name_of(wanted))
+    for choice in free if cyclic is None else listed("cyclic", cyclic):
+        q = by_name.get(name_of(choice))
         if q is None:
-            raise InputError(f"cyclic: {wanted} is no coordinate; the coordinates are {', '.join(by_name)}")
+            raise InputError(f"cyclic: {choice} is no coordinate; the coordinates are {', '.join(by_name)}")
         if q not in ignorable:
             raise InputError(f"cyclic: L holds {q}; cyclic are {plain(free) or 'none'}")
         if q not in free:
@@ -231,7 +231,7 @@ def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
 
 
 def _forces(
-    system: EnergyForm, kept: list[sp.Symbol], ignored: list[sp.Symbol], put: Mapping[sp.Symbol, sp.Expr]
+    system: EnergyForm, kept: list[sp.Symbol], ignored: list[sp.Symbol], eliminated: Mapping[sp.Symbol, sp.Expr]
 ) -> dict[sp.Symbol, sp.Expr]:
     """Return the forces along the remaining coordinates, without the ignored velocities."""
     out = {}
@@ -239,15 +239,15 @@ def _forces(
         if q in system.inputs:
             force = system.inputs[q]
         if q in kept and force != 0:
-            out[q] = tidy(force.subs(put))
+            out[q] = tidy(force.subs(eliminated))
             _need_not(ignored, out[q], f"the force {force} along {q}")
     return out
 
 
-def _dissipation(system: EnergyForm, ignored: list[sp.Symbol], put: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+def _dissipation(system: EnergyForm, ignored: list[sp.Symbol], eliminated: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
     # Nothing acts along the ignored coordinates: R holds their velocities in form only.
     out = tidy(system.dissipation)
-    _need_not([*ignored, *put], out, f"the dissipation {out}")
+    _need_not([*ignored, *eliminated], out, f"the dissipation {out}")
     return out
 
 
@@ -338,8 +338,8 @@ def _increments(routhian: Routhian[Any], t: Array, q: Array, v: Array, numbers: 
     start = np.concatenate([q[:-1], v[:-1], np.zeros((len(spans), m))], axis=1).ravel()
     # A mean over N numbers hides one that is √N times as wrong.
     tight = max(_TOLERANCE / np.sqrt(len(spans)), 3e-14)
-    solved = solve_ivp(field, (0.0, 1.0), start, "DOP853", t_eval=[1.0], rtol=tight, atol=tight)
-    if not solved.success or not np.isfinite(solved.y).all():
+    solution = solve_ivp(field, (0.0, 1.0), start, "DOP853", t_eval=[1.0], rtol=tight, atol=tight)
+    if not solution.success or not np.isfinite(solution.y).all():
         name = routhian.lagrangian.name
-        raise NumericalError(f"{name}: the motion between the saved states cannot be followed: {solved.message}")
-    return np.asarray(solved.y[:, -1].reshape(len(spans), 2 * n + m)[:, 2 * n :])
+        raise NumericalError(f"{name}: the motion between the saved states cannot be followed: {solution.message}")
+    return np.asarray(solution.y[:, -1].reshape(len(spans), 2 * n + m)[:, 2 * n :])

@@ -118,8 +118,8 @@ def _of_rotation(kind: JointType, q: Array, v: Array, length: float) -> tuple[Ar
     if kind.floating:
         # d(R v) = -R (v × dθ)
         linear = v[:start]
-        moved = np.cross(linear, tangent[start:, start:], axisb=0, axisc=0)
-        rate[:start, start:] = -D[:start, :start] @ moved
+        change = np.cross(linear, tangent[start:, start:], axisb=0, axisc=0)
+        rate[:start, start:] = -D[:start, :start] @ change
     D[start:] *= length
     return rate, D, tangent
 
@@ -154,8 +154,8 @@ def linearized(space: Space, q: Array, w: Array, rates: Callable[[Array, Array],
     changes = np.diag(np.concatenate([length, speed]))
     both = np.concatenate([changes, -changes])
     u, there = both[:, :nv], w + both[:, nv:]
-    moved = space.move(np.broadcast_to(q, (len(u), len(q))), u)
-    slopes = np.concatenate([space.rate(u, there), rates(moved, there)], axis=1)
+    places = space.move(np.broadcast_to(q, (len(u), len(q))), u)
+    slopes = np.concatenate([space.rate(u, there), rates(places, there)], axis=1)
     return np.asarray((slopes[: 2 * nv] - slopes[2 * nv :]).T / (2 * np.diag(changes)))
 
 

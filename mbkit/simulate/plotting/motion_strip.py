@@ -13,7 +13,7 @@ from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.simulate.plotting.stick_figure import Skeleton, direction_name, plane_of, skeleton
 from mbkit.simulate.plotting.time_series import ACCENT, BAD, FAINT, GHOST, INK, MUTED, drawing
-from mbkit.simulate.run_data import RunData, moved
+from mbkit.simulate.run_data import RunData, integrate_finite
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -168,7 +168,7 @@ def _between(model: Model, t: Array, q: Array, v: Array, at: Array) -> Array:
     s = ((at - t[k]) / h)[:, None]
     d = model.difference(q[k], q[k + 1])
     u = d * (3 - 2 * s) * s**2 + h[:, None] * (v[k] * s * (1 - s) ** 2 - v[k + 1] * s**2 * (1 - s))
-    return moved(model, q[k], u)
+    return integrate_finite(model, q[k], u)
 
 
 def _near(points: Array, diverged: bool) -> NDArray[np.bool_]:
