@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mbkit.engines import ENGINES
+from mbkit.simulate.plotting import time_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,23 +50,8 @@ def engine_mark(name: str) -> str:
 
 def style(palette: Palette) -> dict[str, Any]:
     """Return Matplotlib's settings for figures of this package."""
-    return {
-        "svg.fonttype": "none",
-        # A dollar sign in a name does not begin a formula.
-        "text.parse_math": False,
-        "font.family": "sans-serif",
-        **dict.fromkeys(("font.size", "axes.titlesize"), 10.0),
-        **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), palette.ink),
-        **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), palette.muted),
-        **dict.fromkeys(("axes.spines.top", "axes.spines.right"), False),
-        **dict.fromkeys(("axes.linewidth", "grid.linewidth"), 0.8),
-        "axes.axisbelow": True,
-        "grid.color": palette.grid,
-        "lines.linewidth": 1.6,
-        "lines.markersize": 6.0,
-        "legend.frameon": False,
-        "legend.fontsize": 9.5,
-    }
+    sizes = {"font.size": 10.0, "lines.linewidth": 1.6, "lines.markersize": 6.0, "legend.fontsize": 9.5}
+    return time_series.style(palette.ink, palette.muted, palette.grid, **{"svg.fonttype": "none", **sizes})
 
 
 def log_ticks(ax: Axes, most: int = 9) -> None:

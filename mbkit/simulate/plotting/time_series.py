@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -25,39 +23,32 @@ FAINT: Final = "#e3e7eb"
 GHOST: Final = "#c4ccd4"
 ACCENT: Final = "#e8590c"
 BAD: Final = "#c92a2a"
-_STYLE: Final[Any] = {
-    # A dollar sign in a name does not begin a formula.
-    "text.parse_math": False,
-    "font.family": "sans-serif",
-    "font.size": 9.0,
-    "text.color": INK,
-    "axes.titlesize": 10.0,
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "grid.color": FAINT,
-    "grid.linewidth": 0.8,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "lines.linewidth": 1.4,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-}
 
 
-@contextmanager
-def drawing() -> Iterator[None]:
-    """Draw in this style, and leave the user's own as it was."""
+def style(ink: str, muted: str, grid: str, **more: Any) -> dict[str, Any]:
+    """Return Matplotlib's settings for figures of this package, in these colours."""
+    labels = dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), ink)
+    return {
+        # A dollar sign in a name does not begin a formula.
+        "text.parse_math": False,
+        "font.family": "sans-serif",
+        **labels,
+        **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), muted),
+        **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+        **dict.fromkeys(("axes.linewidth", "grid.linewidth"), 0.8),
+        "axes.titlesize": 10.0,
+        "axes.axisbelow": True,
+        "grid.color": grid,
+        **more,
+    }
+
+
+def drawing() -> Any:
+    """Return a context that draws in this style, and leaves the user's own as it was."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_STYLE):
-        yield
+    sizes = {"font.size": 9.0, "lines.linewidth": 1.4, "legend.fontsize": 8.0}
+    return mpl.rc_context(style(INK, MUTED, FAINT, **{"axes.grid": True, **sizes}))
 
 
 #: Trajectories of a batch that are drawn.
