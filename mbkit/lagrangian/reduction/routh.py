@@ -22,12 +22,12 @@ import sympy as sp
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from mbkit._check import Array, finite_array, real, require_finite, rows
+from mbkit._check import Array, finite_array, require_finite, rows
 from mbkit._escape import terminal
 from mbkit.engines.base import at_times
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian.energies.energy_form import EnergyForm, require_values, timed_parameters
+from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values, timed_parameters
 from mbkit.lagrangian.energies.kinetic_energy import Squares
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
@@ -193,7 +193,7 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
         velocities=v,
         time=system.time,
         forces=_forces(system, kept, ignored, eliminated),
-        dissipation=_dissipation(system, ignored, eliminated),
+        dissipation=tidy(system.dissipation),
         parameters={**system.parameters, **dict.fromkeys(symbols)},
         constraints=system.constraints,
         name=f"{system.name} less {', '.join(q.name for q in ignored)}",
@@ -234,20 +234,12 @@ def _forces(
     system: EnergyForm, kept: list[sp.Symbol], ignored: list[sp.Symbol], eliminated: Mapping[sp.Symbol, sp.Expr]
 ) -> dict[sp.Symbol, sp.Expr]:
     """Return the forces along the remaining coordinates, without the ignored velocities."""
-    out = {}
-    for q, force in zip(system.coordinates, system.forces, strict=True):
-        if q in system.inputs:
-            force = system.inputs[q]
-        if q in kept and force != 0:
-            out[q] = tidy(force.subs(eliminated))
-            _need_not(ignored, out[q], f"the force {force} along {q}")
-    return out
-
-
-def _dissipation(system: EnergyForm, ignored: list[sp.Symbol], eliminated: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    forces = {q: system.inputs.get(q, x) for q, x in zip(system.coordinates, system.forces, strict=True)}
+    out = {q: tidy(forces[q].subs(eliminated)) for q in kept if forces[q] != 0}
+    for q, x in out.items():
+        _need_not(ignored, x, f"the force {forces[q]} along {q}")
     # Nothing acts along the ignored coordinates: R holds their velocities in form only.
-    out = tidy(system.dissipation)
-    _need_not([*ignored, *eliminated], out, f"the dissipation {out}")
+    _need_not([*ignored, *eliminated], tidy(system.dissipation), f"the dissipation {system.dissipation}")
     return out
 
 
@@ -292,13 +284,10 @@ def _read(
         raise InputError("run: expected one trajectory, got a batch; reconstruct them one by one")
     require_finite("run: t", t)
     q, v = (finite_array(f"run: {name}", x, (len(t), model.nq)) for name, x in (("q", q), ("v", v)))
-    numbers = {n: held.get(n, x) for n, x in model.parameters.items()}
-    for name, x in values.items():
-        if name not in numbers:
-            raise UnknownNameError("parameter", name, numbers)
-        numbers[name] = real(f"parameter {name!r}", x)
-    require_values(numbers, "reconstruct")
-    return t, q, v, {n: float(x or 0.0) for n, x in numbers.items() if n != model.time_parameter}
+    names = [p.name for p in routhian.lagrangian.parameters]
+    values = {**{n: x for n, x in held.items() if n in names and x is not None}, **values}
+    numbers = parameter_values(routhian.lagrangian, values, "reconstruct")
+    return t, q, v, dict(zip(names, numbers.tolist(), strict=True))
 
 
 def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
