@@ -32,7 +32,7 @@ class Event:
         function(t, q, v) -> float, of one state; q has unit quaternions.
     name : str
     direction : {-1, 0, 1}
-        Whether only a falling or a rising crossing counts, or both.
+        A falling crossing, both, or a rising one.
     terminal : bool
         Whether the run ends there.
     """

@@ -51,11 +51,9 @@ class ConservedQuantity(Printable):
     Attributes
     ----------
     name : str
-        ``"p_phi"`` for the momentum of ``phi``; ``"E"`` for the energy, ``"h"`` for Jacobi's
-        integral where that is something else.
+        ``"p_phi"`` for the momentum of ``phi``; ``"E"`` for the energy, ``"h"`` for Jacobi's integral where it differs.
     expression : sympy.Expr
     meaning : str
-        In words.
     moving : tuple of tuples of sympy.Symbol
         Coordinates and velocities, or momenta, in the order in which they are written.
     """
@@ -164,12 +162,10 @@ class CanonicalEquations(Printable):
 
     Attributes
     ----------
-    coordinates, momenta : tuple of sympy.Symbol
-    velocities, momentum_rates : tuple of sympy.Symbol
-        The left sides, q̇ and ṗ.
-    qdot : (n, 1) sympy.Matrix
-    pdot : (n, 1) sympy.Matrix
-        With the generalized forces, in coordinates and momenta.
+    coordinates, momenta, velocities, momentum_rates : tuple of sympy.Symbol
+        q, p and the left sides, q̇ and ṗ.
+    qdot, pdot : (n, 1) sympy.Matrix
+        In coordinates and momenta, with the generalized forces.
     """
 
     coordinates: tuple[sp.Symbol, ...]

@@ -170,7 +170,7 @@ class Stiffness:
     bound : float
         No rate is larger, 1/s: the fastest, or where eigenvalues were left out a norm.
     exact : bool
-        Whether by derivatives, or by differences, which tell the fastest rates and not the slowest beside them.
+        Whether by derivatives, or by differences, which resolve the fastest rates only.
     member : int or None
         Of a batch, the trajectory whose fastest rate is the largest.
     """
@@ -239,13 +239,13 @@ def stiffness(
     Parameters
     ----------
     dyn : Dynamics
-        The own derivation differentiates exactly; of other engines differences are taken, in one call.
+        The own derivation differentiates exactly; for other engines differences are taken, in one call.
     q, v : (nq,) and (nv,), or (N, nq) and (N, nv) array_like
         Of a batch, the member with the fastest rate counts.
     tau : (nv,) array_like or callable, optional
-        The generalized force; of a function of (t, q, v) the slope counts too.
+        The generalized force; the slope of a function of (t, q, v) counts too.
     t : float
-        Where time enters, s.
+        s.
     enough : float
         Where a norm shows that no rate is above this, 1/s, eigenvalues of large systems are left out.
 
