@@ -48,7 +48,8 @@ def drawing() -> Any:
     import matplotlib as mpl
 
     sizes = {"font.size": 9.0, "lines.linewidth": 1.4, "legend.fontsize": 8.0}
-    return mpl.rc_context(style(INK, MUTED, FAINT, **{"axes.grid": True, **sizes}))
+    settings: Any = style(INK, MUTED, FAINT, **{"axes.grid": True, **sizes})
+    return mpl.rc_context(settings)
 
 
 #: Trajectories of a batch that are drawn.
