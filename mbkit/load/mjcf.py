@@ -21,7 +21,7 @@ from mbkit.errors import ModelError
 from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
 from mbkit.load.mjcf_couplings import Transmissions
-from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, read_tree, with_free_base
+from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, add_free_base, read_tree
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Model, ModelBuilder
@@ -56,7 +56,7 @@ def model_of_mjcf(
             read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
     misspelt = check_names(mujoco, read)
     if floating_base:
-        mujoco = with_free_base(mujoco, read)
+        add_free_base(mujoco, read)
     scene = Scene(Compiler.of(mujoco, read), Defaults(mujoco, read), read)
     read_tree(mujoco, scene)
     flags: dict[str, str] = {}

@@ -122,39 +122,27 @@ def frame_contents(
         yield from frame_contents(child, X @ pose(child, scene.compiler, scene.read, item), inner, scene, item)
 
 
-def with_free_base(mujoco: Element, read: Reader) -> Element:
-    """Return a <mujoco> element with a free joint for the world's only body, or keep a fault."""
-    tops = [b for world in mujoco.all("worldbody") for b in _parts(world, ("body",))]
-    if not tops:
-        return mujoco
-    joints = [len(list(_parts(b, _JOINTS))) for b in tops]
-    if len(tops) != 1 or joints[0]:
+def add_free_base(mujoco: Element, read: Reader) -> None:
+    """Add a free joint to the world's only body, or keep a fault."""
+
+    def parts(owner: Element, tags: tuple[str, ...]) -> Iterator[Element]:
+        for child in owner.children:
+            if child.tag == "frame":
+                yield from parts(child, tags)
+            elif child.tag in tags:
+                yield child
+
+    tops = [b for world in mujoco.all("worldbody") for b in parts(world, ("body",))]
+    joints = [len(list(parts(b, _JOINTS))) for b in tops]
+    if tops and (len(tops) > 1 or joints[0]):
         names = (repr(b.attributes.get("name", "")) if b.attributes.get("name") else f"({b.place})" for b in tops)
         there = ", ".join(f"{name} ({n} joints)" for name, n in zip(names, joints, strict=True))
         read.fault(f"floating_base=True needs one body of the world, without joints; there are: {there}")
-        return mujoco
-    if any(e.tag in _JOINTS and e.attributes.get("name") == BASE_JOINT for e in mujoco.walk()):
+    elif any(e.tag in _JOINTS and e.attributes.get("name") == BASE_JOINT for e in mujoco.walk()):
         read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")
-        return mujoco
-    joint = Element("freejoint", {"name": BASE_JOINT}, tops[0].line, file=tops[0].file)
-    return _replaced(mujoco, tops[0], replace(tops[0], children=[joint, *tops[0].children]))
-
-
-def _parts(owner: Element, tags: tuple[str, ...]) -> Iterator[Element]:
-    """Yield the children of these tags, with those of <frame> elements."""
-    for child in owner.children:
-        if child.tag == "frame":
-            yield from _parts(child, tags)
-        elif child.tag in tags:
-            yield child
-
-
-def _replaced(owner: Element, old: Element, new: Element) -> Element:
-    if owner is old:
-        return new
-    if owner.tag not in ("mujoco", "worldbody", "frame"):
-        return owner
-    return replace(owner, children=[_replaced(c, old, new) for c in owner.children])
+    elif tops:
+        joint = Element("freejoint", {"name": BASE_JOINT}, tops[0].line, file=tops[0].file)
+        tops[0].children.insert(0, joint)
 
 
 def read_tree(mujoco: Element, scene: Scene) -> None:

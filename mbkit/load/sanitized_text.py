@@ -16,7 +16,7 @@ from xml.sax.saxutils import escape
 from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name, read_mesh
-from mbkit.load.mjcf_reader import counts, with_free_base
+from mbkit.load.mjcf_reader import add_free_base, counts
 from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, unused, with_includes
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
@@ -69,7 +69,7 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
         root, renamed = _with_base(root)
     elif floating_base:
         read = Reader()
-        root = with_free_base(root, read)
+        add_free_base(root, read)
         if read.faults:
             raise ModelError(str(path), read.faults)
     meshes = _Meshes(root, path) if format_ == "mjcf" else None
