@@ -81,18 +81,10 @@ def from_model(
 
     A slider-crank is two rods, a piston, and the pin that closes the loop.
 
-    >>> b = mb.ModelBuilder("slider_crank", gravity=(0, 0, 0))
-    >>> b.add_body("crank", mass=1.0, com=(0.1, 0, 0), inertia=(0, 0.01, 0.01))
-    >>> b.add_body("rod", mass=1.0, com=(0.3, 0, 0), inertia=(0, 0.03, 0.03))
-    >>> b.add_body("piston", mass=2.0)
-    >>> b.add_joint("theta", "revolute", parent="world", child="crank", axis=(0, 0, 1))
-    >>> b.add_joint("phi", "revolute", parent="crank", child="rod", axis=(0, 0, 1), translation=(0.2, 0, 0))
-    >>> b.add_joint("x", "prismatic", parent="world", child="piston", axis=(1, 0, 0))
-    >>> b.add_loop("pin", "point", body_a="rod", translation_a=(0.6, 0, 0), body_b="piston")
-    >>> for row in mb.lagrangian.from_model(b.build()).constraints:
+    >>> for row in mb.lagrangian.from_model(mb.catalog.slider_crank()).constraints:
     ...     print(row)
-    -x + 0.2*cos(theta) + 0.6*cos(phi + theta)
-    0.2*sin(theta) + 0.6*sin(phi + theta)
+    L1*(cos(theta) - 1) + L2*(cos(phi + theta) - 1) - x
+    L1*sin(theta) + L2*sin(phi + theta)
     """
     if not isinstance(model, Model):
         raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) gives one")

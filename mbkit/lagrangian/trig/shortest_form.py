@@ -60,63 +60,47 @@ def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = Tru
     """
     if not x:
         return sp.Integer(0)
-    writer = _Writer(x, whole, decimals)
-    if len(x.terms) > _SMALL:
-        return writer.expression(writer.as_it_is())
-    wider = [_Writer(y, whole, decimals) for y in combine_angles(x)]
-    forms = [(writer, form) for form in writer.forms()]
-    forms += [(other, form) for other in wider for form in other.squares()]
+    forms = [(x.space, power_form(x, (), 0))]
+    if len(x.terms) <= _SMALL:
+        forms = [(x.space, form) for form in _forms(x)]
+        last = len(x.space.angles)
+        forms += [(y.space, power_form(y, (last,), kept)) for y in combine_angles(x) for kept in (0, 1)]
     forms.sort(key=lambda pair: len(pair[1]))
-    near = [(w, form) for w, form in forms[:_TRIED] if len(form) <= len(forms[0][1]) + 2]
-    candidates = [w.expression(form) for w, form in near]
-    return min(candidates, key=lambda e: (complexity(e), candidates.index(e)))
+    near = [pair for pair in forms[:_TRIED] if len(pair[1]) <= len(forms[0][1]) + 2]
+    writer = _Writer(whole, decimals)
+    return min((writer.expression(space, form) for space, form in near), key=complexity)
+
+
+def _forms(x: TrigPolynomial) -> list[Form]:
+    """Return a sum with the angles of each subset split off as powers of their own cosine and sine."""
+    present = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
+    sizes = range(len(present) + 1 if len(present) <= 4 else 1)
+    subsets = [subset for n in sizes for subset in combinations(present, n)]
+
+    def split(x: TrigPolynomial) -> list[Form]:
+        # The square that stays, of cosines (0) or sines (1); neither is shorter always.
+        return [power_form(x, subset, kept) for subset in subsets for kept in ((0, 1) if subset else (0,))]
+
+    by_monomial: dict[tuple[int, ...], dict[Key, Fraction]] = {}
+    for key, value in x.terms.items():
+        by_monomial.setdefault(key[2], {})[key] = value
+    mixed: Form = {}
+    for terms in by_monomial.values():
+        mixed |= min(split(TrigPolynomial(x.space, terms)), key=len)
+    forms: list[Form] = []
+    for form in (*split(x), mixed):
+        if form not in forms:
+            forms.append(form)
+    return forms
 
 
 class _Writer:
-    def __init__(self, x: TrigPolynomial, whole: bool, decimals: bool) -> None:
-        self._x, self._whole, self._decimals = x, whole, decimals
+    def __init__(self, whole: bool, decimals: bool) -> None:
+        self._whole, self._decimals = whole, decimals
         self._sums: dict[frozenset[Any], sp.Expr] = {}
 
-    def squares(self) -> list[Form]:
-        """Return the sum with its last angle split off."""
-        last = len(self._x.space.angles) - 1
-        return [power_form(self._x, (last,), kept) for kept in (0, 1)]
-
-    def as_it_is(self) -> Form:
-        return {((), kind, multiples, powers): value for (kind, multiples, powers), value in self._x.terms.items()}
-
-    def forms(self) -> list[Form]:
-        """Return the sum with the angles of each subset split off as powers of their own cosine and sine."""
-        x = self._x
-        present = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
-        subsets: list[tuple[int, ...]] = [()]
-        if len(present) <= 4:
-            subsets = [s for n in range(len(present) + 1) for s in combinations(present, n)]
-        forms: list[Form] = []
-        for subset in subsets:
-            # The square that stays, of cosines (0) or sines (1); neither is shorter always.
-            for kept in (0, 1) if subset else (0,):
-                form = power_form(x, subset, kept)
-                if form not in forms:
-                    forms.append(form)
-        mixed = self._by_monomial(subsets)
-        return forms if mixed in forms else [*forms, mixed]
-
-    def _by_monomial(self, subsets: list[tuple[int, ...]]) -> Form:
-        """Return the sum with the shortest form of what multiplies each product of generators."""
-        groups: dict[tuple[int, ...], dict[Key, Fraction]] = {}
-        for key, value in self._x.terms.items():
-            groups.setdefault(key[2], {})[key] = value
-        out: Form = {}
-        for terms in groups.values():
-            part = TrigPolynomial(self._x.space, terms)
-            tried = [power_form(part, subset, kept) for subset in subsets for kept in ((0, 1) if subset else (0,))]
-            best: Form = min(tried, key=len)
-            out |= best
-        return out
-
-    def expression(self, form: Form) -> sp.Expr:
-        poly = paired(dict(self._term(key, value) for key, value in form.items()))
+    def expression(self, space: TrigRing, form: Form) -> sp.Expr:
+        poly = paired(dict(_term(space, key, value) for key, value in form.items()))
         by_angle = self._by_angle(poly)
         if not self._whole or len(by_angle) == len(poly):
             candidates = [sp.Add(*map(self._written, by_angle))]
@@ -126,7 +110,7 @@ class _Writer:
             candidates = [sp.Mul(self._number(scale), *(a**e for a, e in shared), inside)]
         if self._whole:
             candidates.append(self._written(poly))
-        return min(candidates, key=lambda e: (complexity(e), candidates.index(e)))
+        return min(candidates, key=complexity)
 
     def _by_angle(self, poly: Poly) -> list[Poly]:
         """Return the terms of each cosine and sine."""
@@ -135,21 +119,6 @@ class _Writer:
             turned = tuple(a for a in atoms if isinstance(a[0], (sp.sin, sp.cos)))
             groups.setdefault(turned, {})[atoms] = value
         return list(groups.values())
-
-    def _term(self, key: FormKey, value: Fraction) -> tuple[tuple[tuple[sp.Expr, int], ...], Fraction]:
-        done, kind, rest, powers = key
-        space = self._x.space
-        out = [(g, e) for g, e in zip(space.generators, powers, strict=True) if e]
-        for i, c, s in done:
-            out += [(f(space.angles[i]), e) for f, e in ((sp.sin, s), (sp.cos, c)) if e]
-        if any(rest):
-            angle = sp.Add(*(k * a for k, a in zip(rest, space.angles, strict=True) if k))
-            turned = sp.sin(angle) if kind else sp.cos(angle)
-            if turned.is_Mul:
-                # SymPy writes sin(b - a) as -sin(a - b).
-                turned, value = -turned, -value
-            out.append((turned, 1))
-        return tuple(out), value
 
     def _number(self, x: Fraction) -> sp.Expr:
         return number(x) if self._decimals else sp.Rational(x.numerator, x.denominator)
@@ -182,22 +151,38 @@ class _Writer:
                 counts[a] = counts.get(a, 0) + (e > 0)
         most = max(counts.values(), default=0)
         if len(poly) > _FACTORED:
-            return self._taken(poly, next(a for a in counts if counts[a] == most)) if most > 1 else self._plain(poly)
+            return self._by_atom(poly, next(a for a in counts if counts[a] == most)) if most > 1 else self._plain(poly)
         tried = [self._plain(poly)]
         if len(poly) > 2:
-            tried += [self._taken(poly, a) for a in counts if counts[a] == most > 1]
+            tried += [self._by_atom(poly, a) for a in counts if counts[a] == most > 1]
             tried += product(poly, tried[0])
-        return min(tried, key=lambda e: (complexity(e), -tried.index(e)))
+        # Of equal forms the one that was combined most.
+        return min(reversed(tried), key=complexity)
 
     def _plain(self, poly: Poly) -> sp.Expr:
         return sp.Add(*(self._written({atoms: value}) for atoms, value in poly.items()))
 
-    def _taken(self, poly: Poly, atom: sp.Expr) -> sp.Expr:
+    def _by_atom(self, poly: Poly, atom: sp.Expr) -> sp.Expr:
         with_it = {atoms: value for atoms, value in poly.items() if dict(atoms).get(atom, 0) > 0}
         without = {atoms: value for atoms, value in poly.items() if atoms not in with_it}
         if not without:
             return self._plain(poly)
         return sp.Add(self._written(with_it), self._written(without) if len(without) == 1 else self._sum(without))
+
+
+def _term(space: TrigRing, key: FormKey, value: Fraction) -> tuple[tuple[tuple[sp.Expr, int], ...], Fraction]:
+    done, kind, rest, powers = key
+    out = [(g, e) for g, e in zip(space.generators, powers, strict=True) if e]
+    for i, c, s in done:
+        out += [(f(space.angles[i]), e) for f, e in ((sp.sin, s), (sp.cos, c)) if e]
+    if any(rest):
+        angle = sp.Add(*(k * a for k, a in zip(rest, space.angles, strict=True) if k))
+        turned = sp.sin(angle) if kind else sp.cos(angle)
+        if turned.is_Mul:
+            # SymPy writes sin(b - a) as -sin(a - b).
+            turned, value = -turned, -value
+        out.append((turned, 1))
+    return tuple(out), value
 
 
 # Powers of the cosines and sines of single angles
