@@ -24,8 +24,7 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit import _escape
 from mbkit.cli import cli
-from mbkit.lagrangian.printing.numpy_module import python_code
-from mbkit.lagrangian.printing.summary import SystemSummary
+from mbkit.lagrangian.printing.summary import SystemSummary, python_code
 
 #: Code for every reader of an output, and what a terminal obeys. XML can hold the first of them.
 SEEN = (

@@ -144,7 +144,7 @@ def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
 
 def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
     if form == "python":
-        from mbkit.lagrangian.printing.numpy_module import python_code
+        from mbkit.lagrangian.printing.summary import python_code
 
         bar(0.1, "equations")
         return python_code(lag).rstrip("\n"), ".py"

@@ -18,9 +18,8 @@ from mbkit._escape import html, one_line
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.constraints import Manifold, is_judged, manifold_of, refuse_unreachable, require_independent
-from mbkit.lagrangian.energies.casadi_equations import EnergyEquations
+from mbkit.lagrangian.energies.casadi_equations import EnergyEquations, VelocityMap
 from mbkit.lagrangian.energies.energy_form import EnergyForm
-from mbkit.lagrangian.energies.quasi_velocities import VelocityMap
 from mbkit.lagrangian.energies.symbols import plain
 from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.model import Model

@@ -15,9 +15,8 @@ from mbkit._escape import one_line
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.constraints import Manifold, manifold_of, refuse_unreachable, require_independent
-from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values
+from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, parameter_values
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
-from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities
 from mbkit.lagrangian.energies.symbols import name_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.energy_model import EnergyModel, energies_latex

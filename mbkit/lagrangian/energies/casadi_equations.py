@@ -7,12 +7,15 @@ from types import SimpleNamespace
 from typing import Any, Final
 
 import casadi as ca
+import numpy as np
 
+from mbkit._check import Array
+from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.derivation.model_values import Constants, Values
-from mbkit.errors import UnsupportedError
-from mbkit.lagrangian.energies.energy_form import EnergyForm
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities
 from mbkit.lagrangian.energies.sympy_to_casadi import Conversion
 from mbkit.model import Model
 
@@ -209,3 +212,73 @@ class EnergyEquations(Equations):
 
     def _frame(self, name: str) -> tuple[str, Any]:
         raise UnsupportedError(f"frame {name!r}: {self.model.name} was written as energies and has no frames")
+
+
+class VelocityMap:
+    """q̇ = D(q) v and its consequences, on arrays of one state or a batch and on CasADi's symbols."""
+
+    def __init__(self, quasi: QuasiVelocities) -> None:
+        n = len(quasi.coordinates)
+        q, x, y = (ca.SX.sym(name, n) for name in "qxy")
+        read = Conversion({c: q[i] for i, c in enumerate(quasi.coordinates)}, float)
+        D, W = (ca.reshape(read.matrix(list(A.T)), n, n) for A in (quasi.D, quasi.W))
+        moving = ca.mtimes(D, x)
+        outputs = {
+            "enter": ([q, x], moving),
+            "leave": ([q, x], ca.mtimes(W, x)),
+            "enter_force": ([q, x], ca.mtimes(W.T, x)),
+            "leave_force": ([q, x], ca.mtimes(D.T, x)),
+            "acceleration": ([q, x, y], ca.mtimes(D, y) + ca.jtimes(moving, q, moving)),
+            "linear": ([q, x], ca.horzcat(ca.jacobian(moving, q), D, W)),
+        }
+        self._functions = {
+            name: ca.Function(name, arguments, [ca.densify(out)], {"cse": True})
+            for name, (arguments, out) in outputs.items()
+        }
+        self._machines = {name: Machine(f) for name, f in self._functions.items()}
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        if isinstance(arguments[0], ca.SX):
+            return self._functions[name](*arguments)
+        lead = np.broadcast_shapes(*(x.shape[:-1] for x in arguments))
+        full = (np.ascontiguousarray(np.broadcast_to(x, (*lead, x.shape[-1]))) for x in arguments)
+        return self._machines[name](*full)[0]
+
+    def _column(self, name: str, *arguments: Any) -> Any:
+        out = self._call(name, *arguments)
+        return out if isinstance(out, ca.SX) else out[..., 0]
+
+    def check_start(self, q: Array, v: Array) -> None:
+        """Raise `InputError` where D or its inverse has no value at a state to start from."""
+        q, v = np.atleast_2d(q), np.atleast_2d(v)
+        bad = ~np.isfinite([self._column(name, q, v) for name in ("enter", "leave")]).all(axis=(0, 2))
+        if bad.any():
+            raise InputError(
+                f"q0: D(q) of q̇ = D v is singular at {q[int(np.argmax(bad))].tolist()}; start elsewhere, "
+                "or take other coordinates"
+            )
+
+    def enter(self, q: Any, v: Any) -> Any:
+        """Return q̇ = D v."""
+        return self._column("enter", q, v)
+
+    def leave(self, q: Any, w: Any) -> Any:
+        """Return v = D⁻¹ q̇."""
+        return self._column("leave", q, w)
+
+    def enter_force(self, q: Any, f: Any) -> Any:
+        """Return the force or momentum on q̇ of one on v: D⁻ᵀ f."""
+        return self._column("enter_force", q, f)
+
+    def leave_force(self, q: Any, f: Any) -> Any:
+        """Return the force or momentum on v of one on q̇: Dᵀ f."""
+        return self._column("leave_force", q, f)
+
+    def acceleration(self, q: Any, v: Any, a: Any) -> Any:
+        """Return q̈ = D v̇ + Ḋ v."""
+        return self._column("acceleration", q, v, a)
+
+    def linear(self, q: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return ∂(D v)/∂q, D and D⁻¹ at a state, (n, n) each."""
+        by_q, D, W = np.split(self._call("linear", q, v), 3, axis=-1)
+        return by_q, D, W

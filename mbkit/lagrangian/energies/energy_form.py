@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, Self
@@ -15,7 +16,6 @@ from sympy.core.function import AppliedUndef
 from mbkit._check import Array, real
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split
-from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities
 from mbkit.lagrangian.energies.symbols import (
     PlainSymbols,
     acceleration_of,
@@ -28,6 +28,32 @@ from mbkit.lagrangian.energies.symbols import (
     velocity_of,
 )
 from mbkit.lagrangian.trig.simplify import is_zero, tidy, tidy_matrix
+
+
+@dataclass(frozen=True, eq=False)
+class QuasiVelocities:
+    """q̇ = D w in symbols, with W = D⁻¹; `input_forces` are Dᵀ u of the coordinates' inputs u."""
+
+    D: sp.ImmutableMatrix
+    W: sp.ImmutableMatrix
+    coordinates: tuple[sp.Symbol, ...]
+    rates: tuple[sp.Symbol, ...]
+    input_forces: sp.ImmutableMatrix
+
+    @cached_property
+    def hamel_coefficients(self) -> sp.ImmutableDenseNDimArray:
+        """γ, (n, n, n), of `mbkit.lagrangian.reduction.quasi_equations`; ``hamel_coefficients[k, i, j]`` = γ^k_ij."""
+        q, D, n = sp.Matrix(self.coordinates), self.D, len(self.coordinates)
+        slopes = [D[:, j].jacobian(q) for j in range(n)]
+        out = sp.MutableDenseNDimArray.zeros(n, n, n)
+        for i in range(n):
+            for j in range(i):
+                # [D_i, D_j] in the frame that D's columns are.
+                bracket = self.W * (slopes[j] * D[:, i] - slopes[i] * D[:, j])
+                for k, x in enumerate(bracket):
+                    out[k, i, j] = tidy(x)
+                    out[k, j, i] = -out[k, i, j]
+        return sp.ImmutableDenseNDimArray(out)
 
 
 class EnergyForm:

@@ -64,17 +64,11 @@ class PlainSymbols:
         if time is not None and own is not None and own.name != time.name:
             raise InputError(f"time: {time} is given, but the coordinates are functions of {own}")
         self.time = time if own is None else own
-        self._map: dict[Any, sp.Symbol] = {}
-        own_coordinates = []
         for c in originals:
-            if isinstance(c, AppliedUndef):
-                self._map[c] = sp.Symbol(c.func.__name__)
-                own_coordinates.append(self._map[c])
-            elif isinstance(c, sp.Symbol):
-                own_coordinates.append(c)
-            else:
+            if not isinstance(c, (AppliedUndef, sp.Symbol)):
                 raise InputError(f"coordinates: expected SymPy symbols or dynamicsymbols, got {c!r}")
-        self.coordinates = tuple(own_coordinates)
+        self._map: dict[Any, sp.Symbol] = {c: sp.Symbol(c.func.__name__) for c in functions}
+        self.coordinates = tuple(self._map.get(c, c) for c in originals)
         self.velocities = self._velocities(originals, velocities, among)
         own_time = [self.time] if self.time else []
         _differ((*self.coordinates, *self.velocities, *own_time))

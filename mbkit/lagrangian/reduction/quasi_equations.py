@@ -21,10 +21,9 @@ import sympy as sp
 from sympy.core.function import AppliedUndef
 
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.energies.energy_form import EnergyForm, read_expression, symbols_of
+from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, read_expression, symbols_of
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, inverse
-from mbkit.lagrangian.energies.quasi_velocities import QuasiVelocities
 from mbkit.lagrangian.energies.symbols import fits
 from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
 
