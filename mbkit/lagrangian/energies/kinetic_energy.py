@@ -37,7 +37,7 @@ def split(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> KineticSplit:
     n = len(velocities)
     p = [sp.diff(T, w) for w in velocities]
     seconds = {(i, j): sp.diff(p[i], velocities[j]) for i in range(n) for j in range(i, n)}
-    if any(_moves(x, velocities) for x in seconds.values()):
+    if any(x.free_symbols & set(velocities) for x in seconds.values()):
         _check(T, velocities)
     entries = {place: tidy(_at_rest(x, velocities, sp.Integer(0))) for place, x in seconds.items()}
     M = sp.ImmutableMatrix(n, n, lambda i, j: entries[min(i, j), max(i, j)])
@@ -45,10 +45,6 @@ def split(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> KineticSplit:
     b = sp.ImmutableMatrix(n, 1, [tidy(_at_rest(x, velocities, (M[i, :] * v)[0])) for i, x in enumerate(p)])
     T2, T1 = (v.T * M * v)[0] / 2, (b.T * v)[0]
     return KineticSplit(T2=T2, T1=T1, T0=tidy(_at_rest(T, velocities, T2 + T1)), M=M, b=b)
-
-
-def _moves(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
-    return bool(x.free_symbols & set(velocities))
 
 
 def _at_rest(x: sp.Expr, velocities: Sequence[sp.Symbol], gained: sp.Expr) -> sp.Expr:
@@ -195,7 +191,7 @@ class Squares:
     """The inverse of a symmetric matrix, each set of coupled coordinates by itself; InputError names a singular one."""
 
     def __init__(self, M: Any, what: str) -> None:
-        self._blocks = [(block, _inverse(M.extract(block, block), f"{what} {M.tolist()}")) for block in blocks(M)]
+        self._blocks = [(block, _solver(M.extract(block, block), what)) for block in blocks(M)]
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
         """Return xᵀ M⁻¹ y."""
@@ -211,11 +207,11 @@ class Squares:
         return out
 
 
-def _inverse(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Cofactors:
+def _solver(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Inverted:
     try:
         return _Eliminated(M)
     except _NoPivotError:
-        return _Cofactors(M, what)
+        return _Inverted(M, what)
 
 
 def _shorter(x: sp.Expr) -> sp.Expr:
@@ -267,17 +263,14 @@ class _Eliminated:
         return out
 
 
-class _Cofactors:
-    """M⁻¹ = adj M / det M."""
+class _Inverted:
+    """M⁻¹ entry by entry."""
 
     def __init__(self, M: sp.ImmutableMatrix, what: str) -> None:
-        self._below = tidy(M.det(method="berkowitz"))
-        if self._below == 0:
-            raise InputError(f"{what} is singular everywhere")
-        self._above = M.adjugate(method="berkowitz").applyfunc(tidy)
+        self._inverse = inverse(M, what)
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
-        return tidy((sp.Matrix([x]) * self._above * sp.Matrix(list(y)))[0]) / self._below
+        return sum((a * b for a, b in zip(x, self.solve(y), strict=True)), sp.Integer(0))
 
     def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
-        return [tidy(e) / self._below for e in self._above * sp.Matrix(list(x))]
+        return list(self._inverse * sp.Matrix(list(x)))
