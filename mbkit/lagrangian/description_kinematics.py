@@ -100,7 +100,7 @@ class SymbolicKinematics(Kinematics):
         )
         self.zero = space.number(0)
         numbers = {place: space.of(x) for place, x in self.bound.items()}
-        self.values = _Numbers(model, numbers, lambda x: space.of(exact(x)))
+        self.values = _Numbers(model, numbers, lambda x: space.number(Fraction(repr(x))) if x else 0.0)
         self._q_of = {
             j.name: [space.of(x) if _advances(j, i) else SimpleNamespace(expression=x) for i, x in enumerate(q)]
             for j, q in zip(model.joints, self.symbols_of.values(), strict=True)
@@ -380,6 +380,7 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], message: s
     # This loads SciPy.
     from scipy.linalg import qr
 
+    sums = [kin.zero + x for x in sums]
     kin.drop_dust(sums)
     keys = list(dict.fromkeys(key for x in sums for key in x.terms))
     moving = np.array([kin.moves(key) for key in keys], dtype=bool)

@@ -134,11 +134,12 @@ class TrigPolynomial:
     def __mul__(self, x: Any) -> TrigPolynomial:
         other = self._other(x)
         a, b = (self.terms, other.terms) if len(self.terms) < len(other.terms) else (other.terms, self.terms)
-        self.space.spend(len(a) * len(b))
-        still = self.space.still
+        square, still = other is self, self.space.still
+        self.space.spend(len(a) * (len(b) + 1) // 2 if square else len(a) * len(b))
+        row, doubled = list(b.items()), [(key, 2 * x) for key, x in b.items()] if square else []
         out: dict[Key, Fraction] = {}
-        for (s, k, m), x1 in a.items():
-            for (t, l, n), x2 in b.items():
+        for place, ((s, k, m), x1) in enumerate(a.items()):
+            for (t, l, n), x2 in [row[place], *doubled[place + 1 :]] if square else row:
                 value = x1 * x2
                 powers = tuple(i + j for i, j in zip(m, n, strict=True))
                 if k == still:

@@ -86,7 +86,8 @@ def _forms(x: TrigPolynomial) -> list[Form]:
         by_monomial.setdefault(key[2], {})[key] = value
     mixed: Form = {}
     for terms in by_monomial.values():
-        mixed |= min(split(TrigPolynomial(x.space, terms)), key=len)
+        shortest: Form = min(split(TrigPolynomial(x.space, terms)), key=len)
+        mixed |= shortest
     forms: list[Form] = []
     for form in (*split(x), mixed):
         if form not in forms:
