@@ -1,6 +1,6 @@
 """A pytest plugin: robots and engines as parameters of tests, and comparison with baselines.
 
-pytest finds it where mbkit is installed, and every run loads this file: so mbkit is imported only in fixtures.
+pytest finds it where mbkit is installed, and every run loads this file: so mbkit is imported in fixtures alone.
 
     @pytest.mark.mbkit(robots=["panda", "robots/arm.urdf"], engines=["pinocchio", "mujoco"])
     def test_my_robots(mbkit_model, mbkit_engine): ...
@@ -51,16 +51,9 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", _MARK)
     config.stash[_CACHE] = {}
     if config.getoption("--mbkit-strict"):
-        before = os.environ.get(_STRICT)
-        os.environ[_STRICT] = "1"
-        config.add_cleanup(lambda: _restore(before))
-
-
-def _restore(before: str | None) -> None:
-    if before is None:
-        os.environ.pop(_STRICT, None)
-    else:
-        os.environ[_STRICT] = before
+        environment = pytest.MonkeyPatch()
+        environment.setenv(_STRICT, "1")
+        config.add_cleanup(environment.undo)
 
 
 # Robots and engines as parameters.
@@ -74,7 +67,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         return
     options = _mark_options(metafunc)
     if wants_model:
-        robots = _several(options.get("robots"), "robots")
+        robots = _list_of(options.get("robots", ()), "robots")
         if not robots:
             pytest.fail(
                 f"{metafunc.function.__name__}: mbkit_model wants @pytest.mark.mbkit(robots=[...])", pytrace=False
@@ -83,7 +76,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if wants_engine:
         from mbkit.engines.registry import STANDARD
 
-        engines = _several(options.get("engines", STANDARD), "engines")
+        engines = _list_of(options.get("engines", STANDARD), "engines")
         metafunc.parametrize("mbkit_engine", engines, indirect=True, ids=[str(e) for e in engines])
 
 
@@ -97,12 +90,15 @@ def _mark_options(node: Any) -> dict[str, Any]:
     return out
 
 
-def _several(given: Any, name: str) -> list[Any]:
-    if given is None:
-        return []
-    if isinstance(given, str) or not isinstance(given, Sequence):
-        pytest.fail(f"mark mbkit: {name}: expected a list, got {given!r}", pytrace=False)
-    return list(given)
+def _load_options(node: Any) -> dict[str, Any]:
+    """Return the options of `mbkit.load` among the arguments of a test's markers."""
+    return {k: x for k, x in _mark_options(node).items() if k not in ("robots", "engines")}
+
+
+def _list_of(value: Any, name: str) -> list[Any]:
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        pytest.fail(f"mark mbkit: {name}: expected a list, got {value!r}", pytrace=False)
+    return list(value)
 
 
 def _id(robot: Any) -> str:
@@ -118,24 +114,19 @@ def mbkit_model(request: pytest.FixtureRequest) -> Model:
     """One of the robots of the test's marker."""
     __tracebackhide__ = True
     robot = request.param
-    options = {k: x for k, x in _mark_options(request.node).items() if k not in ("robots", "engines")}
     if not isinstance(robot, (str, os.PathLike)):
         return robot() if callable(robot) else robot  # type: ignore[no-any-return]
-    target = _target(os.fspath(robot), request)
-    return _once(request.config, ("model", target, repr(options)), lambda: _load(target, options))
+    from mbkit.studies._targets import model_of
+
+    target, options = _target(os.fspath(robot), request), _load_options(request.node)
+    key = "model", target, repr(options)
+    return _once(request.config, key, lambda: _without_traceback(lambda: model_of(target, options)))
 
 
 def _target(text: str, request: pytest.FixtureRequest) -> str:
     """Return a robot's name, or the path of a file, which is looked for beside the test first."""
     beside = request.path.parent / text
     return str(beside) if beside.is_file() else text
-
-
-def _load(target: str, options: Mapping[str, Any]) -> Model:
-    __tracebackhide__ = True
-    from mbkit.studies._targets import model_of
-
-    return _without_traceback(lambda: model_of(target, options))
 
 
 @pytest.fixture
@@ -173,12 +164,11 @@ def _without_traceback(call: Callable[[], T], write: Callable[[Exception], str] 
 
 
 def _once(config: pytest.Config, key: Any, make: Callable[[], T]) -> T:
-    """Return a value that is made once in a process."""
+    """Return a value that is computed once in a process."""
     cache = config.stash[_CACHE]
     if key not in cache:
         cache[key] = make()
-    value: T = cache[key]
-    return value
+    return cache[key]  # type: ignore[no-any-return]  # what `make` returned
 
 
 # Baselines.
@@ -187,8 +177,7 @@ def _once(config: pytest.Config, key: Any, make: Callable[[], T]) -> T:
 class MbkitBaseline:
     """Holds a model against its baseline, or records it with ``--mbkit-regen``; a test calls it.
 
-    The file is ``baselines/<test file>/<test>.toml`` beside the test, unless a name is given:
-    then it is ``baselines/<name>.toml``.
+    The file is ``baselines/<test file>/<test>.toml`` beside the test, or ``baselines/<name>.toml`` with a name.
     """
 
     def __init__(self, request: pytest.FixtureRequest) -> None:
@@ -198,9 +187,9 @@ class MbkitBaseline:
     def path(self, name: str | None = None) -> Path:
         """Return the file."""
         folder = self._request.path.parent / "baselines"
-        if name is not None:
-            return folder / f"{_plain(name)}.toml"
-        return folder / self._request.path.stem / f"{_plain(self._request.node.name)}.toml"
+        if name is None:
+            folder, name = folder / self._request.path.stem, self._request.node.name
+        return folder / f"{_plain(name)}.toml"
 
     def __call__(self, model: Model, name: str | None = None, **record: Any) -> Any:
         """Hold a model against its baseline.
@@ -209,7 +198,7 @@ class MbkitBaseline:
         ----------
         model : Model
         name : str, optional
-            Of the file; a test that asks twice gives one.
+            Of the file; a test that calls it twice gives one.
         **record
             Arguments of `mbkit.baseline.record`, such as ``engines``, for when it is recorded.
 
@@ -222,40 +211,38 @@ class MbkitBaseline:
         path = self.path(name)
         if self._used.setdefault(path, model.digest) != model.digest:
             pytest.fail(f"{path}: asked for two models in one test; give each a name", pytrace=False)
+        target, options = self._target(model, path)
         if self._request.config.getoption("--mbkit-regen"):
-            return self._record(model, path, record)
-        return self._check(model, path)
+            # With force: the test may have another robot than before.
+            return self._record(model, path, {"target": target, "options": options, "force": True, **record})
+        return self._check(model, path, target)
 
-    def _record(self, model: Model, path: Path, given: Mapping[str, Any]) -> Any:
+    def _record(self, model: Model, path: Path, arguments: Mapping[str, Any]) -> Any:
         __tracebackhide__ = True
         from mbkit.studies import baseline as baselines
 
-        target, options = self._target(model, path)
-        # With force: the test may have another robot than before.
-        arguments = {"target": target, "options": options, "force": True, **given}
-        made = _without_traceback(lambda: baselines.record(model, path, **arguments))
-        self._tell(f"recorded {self._shown(path)} ({', '.join(made.engines)})")
-        for disagreement in made.disagreements:
-            self._tell(f"{self._shown(path)}: {disagreement}")
-        return made
+        recorded = _without_traceback(lambda: baselines.record(model, path, **arguments))
+        self._report(f"recorded {self._shown(path)} ({', '.join(recorded.engines)})")
+        for disagreement in recorded.disagreements:
+            self._report(f"{self._shown(path)}: {disagreement}")
+        return recorded
 
-    def _check(self, model: Model, path: Path) -> Any:
+    def _check(self, model: Model, path: Path, target: str) -> Any:
         __tracebackhide__ = True
         from mbkit.errors import BaselineError
         from mbkit.testing import assert_baseline
 
         again = f"pytest --mbkit-regen {shlex.quote(self._request.node.nodeid)}"
-        target = self._target(model, path)[0] or None
 
         def write(error: Exception) -> str:
             message = f"{error}\n  To record it: {again}" if isinstance(error, BaselineError) else str(error)
             return message.replace(str(path), self._shown(path))
 
-        result = _without_traceback(lambda: assert_baseline(model, path, target=target, remedy=again), write)
+        result = _without_traceback(lambda: assert_baseline(model, path, target=target or None, remedy=again), write)
         if result.status == "versions":
-            self._tell(f"{self._shown(path)}: {result.verdict} pytest --mbkit-regen")
+            self._report(f"{self._shown(path)}: {result.verdict} pytest --mbkit-regen")
         for refusal in result.skipped:
-            self._tell(f"{self._shown(path)}: {refusal.engine} skipped: {refusal.reason}")
+            self._report(f"{self._shown(path)}: {refusal.engine} skipped: {refusal.reason}")
         return result
 
     def _target(self, model: Model, path: Path) -> tuple[str, dict[str, Any]]:
@@ -265,16 +252,13 @@ class MbkitBaseline:
             return "", {}
         from mbkit.studies._targets import kept
 
-        options = {k: x for k, x in _mark_options(self._request.node).items() if k not in ("robots", "engines")}
-        return kept(_target(os.fspath(robot), self._request), path), options
+        return kept(_target(os.fspath(robot), self._request), path), _load_options(self._request.node)
 
     def _shown(self, path: Path) -> str:
-        try:
-            return str(path.relative_to(self._request.config.rootpath))
-        except ValueError:
-            return str(path)
+        root = self._request.config.rootpath
+        return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         # Reports carry it to the process that prints, with pytest-xdist too.
         self._request.node.user_properties.append((_PROPERTY, text))
 

@@ -1,7 +1,6 @@
 """Asserts for tests of robots and engines, in pytest, unittest or a script.
 
-Each raises AssertionError with what differs, at which joint, and what to do next. With pytest
-there are fixtures too, see `mbkit.pytest_plugin`.
+Each raises AssertionError with the difference, the joint, and what to do next. `mbkit.pytest_plugin` has fixtures too.
 """
 
 from __future__ import annotations
@@ -23,9 +22,8 @@ __all__ = ["STRICT", "assert_baseline", "assert_engines_agree", "assert_same_dyn
 
 #: Set to 1, an engine that is not installed fails a test instead of being skipped.
 STRICT = "MBKIT_TEST_STRICT"
-# A person acts on the first few.
-_MOST = 8
-_SAMPLES = 16
+#: Lines of a list in a message: people act on the first few.
+_MAX_LINES = 8
 
 
 def assert_engines_agree(
@@ -33,7 +31,7 @@ def assert_engines_agree(
     engines: Sequence[str] = STANDARD,
     rtol: float = 1e-12,
     *,
-    samples: int = _SAMPLES,
+    samples: int = 16,
     seed: int = 0,
     strict: bool | None = None,
 ) -> Comparison:
@@ -43,19 +41,13 @@ def assert_engines_agree(
     ----------
     model : Model
     engines : sequence of str
-        At least two. One that is not installed is left out, and with fewer than two left the test is
-        skipped; one that refuses the model fails.
+        At least two. One that is not installed is left out; one that refuses the model fails.
     rtol : float
         Largest error, normwise relative to the forces at play, as `mbkit.compare` measures it.
     samples, seed : int
         Random states, beside which stand neutral, at-limit and near-singular ones.
     strict : bool, optional
-        Whether an engine that is not installed fails; by default what ``MBKIT_TEST_STRICT`` says.
-
-    Returns
-    -------
-    Comparison
-        What `mbkit.compare` returns.
+        Whether an engine that is not installed fails; by default as ``MBKIT_TEST_STRICT`` says.
 
     Raises
     ------
@@ -101,15 +93,10 @@ def assert_same_dynamics(
     ----------
     model_a, model_b : Model
     rtol : float
-        Largest difference, normwise relative to the forces at play. A converted file has as many digits as
-        its converter wrote.
+        Largest difference, normwise relative to the forces at play. A converted file has as many digits as its
+        converter wrote.
     samples, seed : int
         Random states.
-
-    Returns
-    -------
-    Explanation
-        What `mbkit.studies.explain.explain` returns.
 
     Raises
     ------
@@ -127,10 +114,10 @@ def assert_same_dynamics(
     from mbkit.studies.explain import explain
 
     names = (model_a.name, model_b.name) if model_a.name != model_b.name else ("model_a", "model_b")
-    found = explain(model_a, model_b, samples=samples, seed=seed, tolerance=rtol, names=names)
-    if not found.agree:
-        raise AssertionError(_explanation_text(found))
-    return found
+    result = explain(model_a, model_b, samples=samples, seed=seed, tolerance=rtol, names=names)
+    if not result.agree:
+        raise AssertionError(_explanation_text(result))
+    return result
 
 
 def assert_baseline(
@@ -147,18 +134,18 @@ def assert_baseline(
     ----------
     model : Model
     path : path
-        What `mbkit.baseline.record` wrote.
+        Of the file of `mbkit.baseline.record`.
     strict : bool, optional
-        Whether an engine that was recorded and is not installed fails; by default what ``MBKIT_TEST_STRICT`` says.
+        Whether a recorded engine that is not installed fails; by default as ``MBKIT_TEST_STRICT`` says.
     target : str, optional
-        What the model was loaded from, where that is not what was recorded.
+        Where the model was loaded from, if not from the recorded target.
     remedy : str
-        How to record anew, for the message.
+        How to record again, for the message.
 
     Returns
     -------
     BaselineResult
-        Of which the status ``"versions"`` says that it is time to record anew.
+        The status ``"versions"`` says that it is time to record again.
 
     Raises
     ------
@@ -180,17 +167,20 @@ def assert_baseline(
     return result
 
 
-def _strict(asked: bool | None) -> bool:
-    return os.environ.get(STRICT, "0") not in ("", "0") if asked is None else asked
+def _strict(strict: bool | None) -> bool:
+    return os.environ.get(STRICT, "0") not in ("", "0") if strict is None else strict
+
+
+def _first(texts: Sequence[str], rest: str) -> list[str]:
+    more = len(texts) - _MAX_LINES
+    return [f"  {text}" for text in texts[:_MAX_LINES]] + ([f"  and {more} more{rest}"] if more > 0 else [])
 
 
 def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterable[str]) -> str:
     off = f"{len(failed)} of {len(result.rows)} comparisons are off by more than {result.tolerance:.0e}"
     lines = [f"{result.model}: {result.verdict if result.nothing else off}"]
     worst = sorted(failed, key=lambda r: -r.relative)
-    lines += [f"  {r.engine}, {r.term}: {r.reason}" for r in worst[:_MOST]]
-    if len(worst) > _MOST:
-        lines.append(f"  and {len(worst) - _MOST} more")
+    lines += _first([f"{r.engine}, {r.term}: {r.reason}" for r in worst], "")
     lines += [f"  {reason}" for reason in refused]
     if worst and worst[0].worst_q:
         lines.append(f"  worst state ({worst[0].worst_kind}): q = {_numbers(worst[0].worst_q)}")
@@ -203,18 +193,14 @@ def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterabl
     return "\n".join(lines)
 
 
-def _explanation_text(found: Explanation) -> str:
-    lines = [f"{found.verdict} (rtol {found.tolerance:.0e})"]
-    apart = [g for g in found.gaps if g.relative > found.tolerance]
+def _explanation_text(result: Explanation) -> str:
+    apart = [g for g in result.gaps if g.relative > result.tolerance]
+    lines = [f"{result.verdict} (rtol {result.tolerance:.0e})"]
     lines += [f"  {g.term} at {g.joint or 'no single joint'}: off by {g.relative:.1e}" for g in apart]
-    lines += [f"  cause: {c.says}" for c in found.acting[:_MOST]]
-    if len(found.acting) > _MOST:
-        lines.append(f"  and {len(found.acting) - _MOST} more causes")
-    for names, side in ((found.only_a, found.a), (found.only_b, found.b)):
-        if names:
-            lines.append(f"  only in {side}: {', '.join(names)}")
-    lines += [f"  note: {note}" for note in found.notes]
-    return "\n".join(lines)
+    lines += _first([f"cause: {c.says}" for c in result.acting], " causes")
+    sides = ((result.only_a, result.a), (result.only_b, result.b))
+    lines += [f"  only in {side}: {', '.join(names)}" for names, side in sides if names]
+    return "\n".join([*lines, *(f"  note: {note}" for note in result.notes)])
 
 
 def _numbers(x: Sequence[float]) -> str:

@@ -13,7 +13,6 @@ import pytest
 
 import mbkit as mb
 from mbkit import spatial
-from mbkit.engines.base import per_sample
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
@@ -496,12 +495,9 @@ def test_engines_that_are_asked_in_another_convention() -> None:
             return np.eye(3)
 
         def _nle(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-            def one(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-                self._set(q, v)
-                self._velocities()
-                return self._force(self._d.qfrc_bias)
-
-            return per_sample(one, q, v)
+            self._set(q, v)
+            self._velocities()
+            return self._force(self._d.qfrc_bias)
 
     class Unturned(Raw):
         """MuJoCo with forces turned and ω × v forgotten."""

@@ -365,7 +365,7 @@ def test_a_whole_comparison_has_rollouts_run_times_and_omissions():
 
 def test_what_was_left_out_would_show_if_it_mattered():
     """Limits that act at the state, switched on, must change the accelerations."""
-    from mbkit.engines.mujoco.variants import Variant
+    from mbkit.engines.mujoco.engine import Variant
 
     b = mb.ModelBuilder("stopped")
     b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))

@@ -11,9 +11,8 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
-from mbkit.derivation.conditioning import cancellation
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.least_squares_solve import LeastConstraint, inertia_squares, squares
+from mbkit.derivation.least_constraint import LeastConstraint, cancellation, inertia_squares, squares
 from mbkit.derivation.mass_matrix_solve import elimination_order
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import NonPhysicalWarning, NumericalError
@@ -76,7 +75,7 @@ def test_factors_reproduce_the_mass_matrix_and_solve_the_equation_of_motion(mimi
     D = ca.diag(ca.vertcat(*way.diagonal))
     a = way.accelerations(eq.tau + eq.passive)
     rest = ca.substitute(eq.inverse_dynamics, eq.a, a) - eq.tau
-    unit = ca.mtimes(eq.mass_matrix, way.over_mass(ca.SX.eye(n)))
+    unit = ca.mtimes(eq.mass_matrix, way.solve(ca.SX.eye(n)))
     f = ca.Function("f", [eq.q, eq.v, eq.tau], [ca.mtimes([L.T, D, L]), eq.mass_matrix, rest, unit, D])
     for q, v, _, tau in zip(*states(model, 3), strict=True):
         made, M, rest, unit, D = (x.full() for x in f(q, v, tau))

@@ -145,7 +145,7 @@ def test_dampers_are_implicit_in_three_and_springs_in_one(tmp_path: Path, monkey
 def test_no_log_is_left_in_the_working_folder(tmp_path: Path) -> None:
     code = """
 import mbkit as mb, numpy as np, mujoco, warnings
-from mbkit.engines.mujoco.variants import Variant
+from mbkit.engines.mujoco.engine import Variant
 dyn = mb.dynamics(mb.catalog.pendulum(), "mujoco")
 for call in (lambda q: Variant(dyn).accelerations(q, q), lambda q: mujoco.mj_step(dyn.mj_model, data(q))):
     def data(q):

@@ -1,15 +1,14 @@
 """From energies to the equation of motion, each quantity derived when it is asked for.
 
-Boltzmann and Hamel's form of Lagrange's equations (Greenwood 2003, Advanced
-Dynamics, ch. 4.3), with momenta p = ∂T/∂v::
+Boltzmann and Hamel's form of Lagrange's equations (Greenwood 2003, Advanced Dynamics, ch. 4.3), with p = ∂T/∂v::
 
     d/dt p + hamel(v, p) - Dᵀ ∂T/∂q + Dᵀ ∂V/∂q = τ + τ_damping
 
-For coordinate velocities D = 1 and the hamel term vanishes: Lagrange's own form.
-d/dt p is one directional derivative along (D v, a).
+For coordinate velocities D = 1 and the hamel term vanishes: Lagrange's own form. d/dt p is one directional derivative
+along (D v, a).
 
-Forward dynamics solves that by the factors of M. Where those would lose digits (`mbkit.derivation.conditioning`) the
-same accelerations come from Gauss's principle (`mbkit.derivation.least_squares_solve`).
+Forward dynamics solves that by the factors of M, or, where those would lose digits, by Gauss's principle of least
+constraint (`mbkit.derivation.least_constraint`).
 """
 
 from __future__ import annotations
@@ -21,10 +20,9 @@ import casadi as ca
 import numpy as np
 
 from mbkit.derivation import kinematics as energies
-from mbkit.derivation.conditioning import loses_digits
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
 from mbkit.derivation.kinematics import Kinematics, add, constant_transposed_times
-from mbkit.derivation.least_squares_solve import LeastConstraint, squares
+from mbkit.derivation.least_constraint import LeastConstraint, loses_digits, squares
 from mbkit.derivation.mass_matrix_solve import elimination_order, solve
 from mbkit.derivation.model_values import Constants, scalar
 from mbkit.errors import UnknownNameError
@@ -62,16 +60,15 @@ class Equations:
     ----------
     model : Model
     constants : {"literal", "symbols"}
-        Whether the model's numbers stand in the expressions as floats, or as
-        symbols that become the last argument, ``"constants"``, of every function.
+        Whether the model's numbers stand in the expressions as floats, or as symbols that become the last argument,
+        ``"constants"``, of every function.
 
     Attributes
     ----------
     q, v, a, tau : casadi.SX
     parameters : (p, 1) casadi.SX
-        The model's named parameters in the order of `model.parameters`. If there are
-        any, they are the last argument, ``"parameters"``, of every function. With
-        constants as symbols they are among those instead, at their nominal values.
+        The model's named parameters in the order of `model.parameters`, the last argument, ``"parameters"``, of every
+        function if there are any. With constants as symbols they are among those, at their nominal values.
     constants : (k, 1) casadi.SX
         Empty with literal constants.
     constant_values : (k,) array
@@ -90,11 +87,7 @@ class Equations:
 
     @cached_property
     def kept(self) -> dict[str, Any]:
-        """What integrators make of these equations once, by names of their own.
-
-        It lives as long as the equations, which all dynamics of one model at different values of its parameters share.
-        A table from equations to what refers to them, weak or not, would keep both for ever.
-        """
+        """Derived things that integrators keep here by names of their own, for as long as the equations live."""
         return {}
 
     @cached_property
@@ -194,17 +187,14 @@ class Equations:
 
     @cached_property
     def forward_dynamics(self) -> Any:
-        """M⁻¹ (τ + τ_passive - C v - g), by the tree's sparse factorisation or by `least_constraint`."""
+        """M⁻¹ (τ + τ_passive - C v - g), by the tree's sparse factorization or by `least_constraint`."""
         if self.least_constraint is not None:
             return self.least_constraint.accelerations(self.tau + self.passive)
-        return solve(self.mass_matrix, self.tau + self.applied, self.elimination_order)
+        return self.over_mass(self.tau + self.applied)
 
     @cached_property
     def least_constraint(self) -> LeastConstraint | None:
-        """The orthogonal elimination, for a model that needs it; None for all others, and with constants as symbols.
-
-        Symbols are for many digits, some of which can be lost.
-        """
+        """The orthogonal elimination, for a model that needs it; with symbols, for many digits, none does."""
         if self._symbolic or not loses_digits(self.model):
             return None
         return LeastConstraint(squares(self.kin), self.elimination_order)
@@ -212,7 +202,7 @@ class Equations:
     def over_mass(self, f: ca.SX) -> Any:
         """Return M⁻¹ f of right-hand sides, (nv,) or (nv, k), by the same elimination as forward dynamics."""
         if self.least_constraint is not None:
-            return self.least_constraint.over_mass(f)
+            return self.least_constraint.solve(f)
         return solve(self.mass_matrix, f, self.elimination_order)
 
     @cached_property
@@ -254,7 +244,7 @@ class Equations:
         return self.named(name, names, [symbols[n] for n in names], getattr(self, name))
 
     def side_by_side(self, name: str) -> ca.Function:
-        """Return a quantity's several results as one matrix, to be evaluated into one array."""
+        """Return a quantity's several results as one matrix."""
         f = self.function(name)
         given = f.sx_in()
         return ca.Function(name, given, [ca.horzcat(*f.call(given))], f.name_in(), [name])
@@ -267,7 +257,7 @@ class Equations:
 
     @property
     def trailing(self) -> dict[str, ca.SX]:
-        """What every function takes behind its own arguments, by name."""
+        """The last arguments of every function, by name."""
         given = {"parameters": self.parameters, "constants": self.constants}
         return {name: symbols for name, symbols in given.items() if symbols.numel()}
 

@@ -55,40 +55,51 @@ def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:
     return Factors(M, order).solve(f)
 
 
-class Factors:
-    """The LᵀDL factors of a matrix, for several right-hand sides one after the other; parameters as of `solve`."""
+class Elimination:
+    """M = LᵀDL, for several right-hand sides one after the other.
+
+    Attributes
+    ----------
+    diagonal : list of casadi.SX
+        D_k, by the velocities' indices.
+    factors : list of dict of int to casadi.SX
+        L_ki, whose diagonal is one: of each k those i that come before it.
+    """
+
+    def __init__(self, order: Sequence[int]) -> None:
+        self._order = tuple(order)
+        self.diagonal: list[Any] = [0.0] * len(self._order)
+        self.factors: list[dict[int, Any]] = [{} for _ in self._order]
+
+    def solve(self, f: ca.SX, pulls: Sequence[Any] | None = None) -> ca.SX:
+        """Return M⁻¹ f, (n,) or (n, k); less L⁻¹ D⁻¹ of pulls."""
+        x = [scalar(f[k, :]) for k in range(len(self._order))]
+        for k in reversed(self._order):
+            for i, factor in self.factors[k].items():
+                x[i] = x[i] - factor * x[k]
+        for k in self._order:
+            moved = sum((factor * x[i] for i, factor in self.factors[k].items()), 0.0)
+            x[k] = (x[k] - pulls[k] if pulls else x[k]) / self.diagonal[k] - moved
+        return ca.vertcat(ca.SX(0, f.shape[1]), *x)
+
+
+class Factors(Elimination):
+    """The elimination of a matrix; parameters as of `solve`."""
 
     def __init__(self, M: ca.SX, order: Sequence[int]) -> None:
-        n = M.shape[0]
-        self._order = tuple(order)
+        super().__init__(order)
         rank = {index: k for k, index in enumerate(order)}
-        rows: list[dict[int, Any]] = [{} for _ in range(n)]
+        rows: list[dict[int, Any]] = [{} for _ in order]
         for i, j in zip(*M.sparsity().get_triplet(), strict=True):
             if rank[j] <= rank[i]:
-                rows[rank[i]][rank[j]] = scalar(M[i, j])
-        self._diagonal: list[Any] = [None] * n
-        self._factors: list[dict[int, Any]] = [{} for _ in range(n)]
-        for k in reversed(range(n)):
-            row, factors = rows[k], self._factors[k]
-            # A joint that moves nothing has no entry at all: the quotient is then
-            # infinite, and the evaluation reports it.
-            self._diagonal[k] = row.pop(k, 0.0)
-            for i in sorted(row, reverse=True):
-                factors[i] = row[i] / self._diagonal[k]
+                rows[i][j] = scalar(M[i, j])
+        for k in reversed(self._order):
+            row = rows[k]
+            # A joint that moves nothing has no entry at all: the quotient is then infinite, and the evaluation
+            # reports it.
+            self.diagonal[k] = row.pop(k, 0.0)
+            for i in sorted(row, key=rank.__getitem__, reverse=True):
+                factor = self.factors[k][i] = row[i] / self.diagonal[k]
                 for j, entry in row.items():
-                    if j <= i:
-                        rows[i][j] = rows[i].get(j, 0.0) - factors[i] * entry
-
-    def solve(self, f: ca.SX) -> ca.SX:
-        """Return M⁻¹ f, (n,) or (n, k)."""
-        n = len(self._order)
-        x = [scalar(f[index, :]) for index in self._order]
-        for k in reversed(range(n)):
-            for i, factor in self._factors[k].items():
-                x[i] = x[i] - factor * x[k]
-        for k in range(n):
-            x[k] = x[k] / self._diagonal[k] - sum((factor * x[i] for i, factor in self._factors[k].items()), 0.0)
-        rows_out: list[Any] = [None] * n
-        for k, index in enumerate(self._order):
-            rows_out[index] = x[k]
-        return ca.vertcat(ca.SX(0, f.shape[1]), *rows_out)
+                    if rank[j] <= rank[i]:
+                        rows[i][j] = rows[i].get(j, 0.0) - factor * entry

@@ -1,8 +1,7 @@
 """The numbers of a description as the equations read them: floats, or symbols.
 
-This is the one place through which a number of the model enters an expression. With literal constants a number is a
-float, and CasADi folds it in double while the graph is built. With symbols it is an argument, so that the graph can be
-evaluated in any precision: no two of them meet in double on the way.
+Every number of the model enters expressions here. With literal constants it is a float, and CasADi folds it in double
+while the graph is built. With symbols it is an argument, so that the graph can be evaluated in any precision.
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model
 
-# Expressions whose arithmetic is quick to write down, entry by entry.
-#
 # CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2. A tree's
 # kinematics are tens of thousands of them. This module replaces CasADi in the formulas of the joint types.
 
@@ -93,8 +90,8 @@ _JOINT: Final = (*_PLACE, "axes", "pitch", "armature", "damping", "stiffness", "
 _MIMIC: Final = ("ratio", "offset")
 _COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
 _SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
-# A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum
-# of literal masses could be divided by, and its quotient be rounded to double.
+# A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
+# by, and its quotient be rounded to double.
 _DIRECTIONS: Final = frozenset({"rotation", "axes"})
 
 
@@ -106,19 +103,15 @@ def is_zero(value: Any) -> bool:
 class Values:
     """Every number of a model that enters its equations.
 
-    The parts' own attribute names, with scalars that are floats or `casadi.SX`;
-    vectors are lists of them, matrices lists of rows.
+    The parts have their own attribute names, with scalars that are floats or `casadi.SX`; vectors are lists of them,
+    matrices lists of rows. A number that stands for an expression of parameters is that expression.
 
     Parameters
     ----------
     model : Model
     constants : {"literal", "symbols"}
-        Whether the model's numbers are floats or symbols. Zeros are floats either
-        way, and so are the ones of rotations and axes, so that they vanish.
-
-    A number that stands for an expression of parameters is that expression. The
-    parameters are symbols either way: arguments of their own beside literal constants,
-    and among the constants, at their nominal values, where those are symbols.
+        Whether the model's numbers are floats or symbols. Zeros are floats either way, and so are the ones of rotations
+        and axes, so that they vanish.
 
     Attributes
     ----------
@@ -132,7 +125,7 @@ class Values:
     constants : (k, 1) casadi.SX
         The symbols that stand for numbers: the parameters, then the others, of which equal ones share a symbol.
     constant_values : (k,) array
-        What they stand for.
+        Their values, of parameters the nominal ones.
     """
 
     def __init__(self, model: Model, constants: Constants = "literal") -> None:

@@ -1,48 +1,49 @@
 """The protocol of the engines: `Dynamics`, one description evaluated by one engine.
 
-The equation of motion stands in the package's docstring. An adapter fills in the
-``_``-methods for one state or a batch; checks of arguments and results, and the
-quantities that follow from others, are here.
+The equation of motion stands in the package's docstring. Checks of arguments and results, batches, and the
+quantities that follow from others are here.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
-from types import MethodType
-from typing import Any, ClassVar, Final, NamedTuple, TypeVar
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.model import Joint, Model
+from mbkit.model import Frame, Joint, Model
 
 QUANTITIES: Final = (
-    "mass_matrix",
-    "coriolis_matrix",
-    "coriolis_force",
-    "gravity",
-    "nle",
-    "passive",
-    "inverse_dynamics",
-    "forward_dynamics",
-    "kinetic_energy",
-    "potential_energy",
-    "pose",
-    "jacobian",
-    "function",
+    *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
+    *("inverse_dynamics", "forward_dynamics", "kinetic_energy", "potential_energy", "pose", "jacobian", "function"),
 )
 
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
+#: Largest error of a quaternion's squared norm that fast calls take.
+NEAR_UNIT: Final = 1e-9
+#: Names in a list of an error message.
+_MAX_NAMES: Final = 3
 
-#: Loops or prescribed joints that a refusal names.
-_NAMED: Final = 3
-
-_Method = TypeVar("_Method", bound=Callable[..., Any])
 _Dynamics = TypeVar("_Dynamics", bound="Dynamics")
+
+
+def first_names(texts: Iterable[str], more: str = " and {} more") -> str:
+    """Return the first few texts of a list, and how many more there are."""
+    all_ = list(texts)
+    return ", ".join(all_[:_MAX_NAMES]) + (more.format(len(all_) - _MAX_NAMES) if all_[_MAX_NAMES:] else "")
+
+
+def unit_quaternions(q: Array, starts: Iterable[int]) -> bool:
+    """Return whether the quaternions that begin at these places are of unit length; False of one with a NaN."""
+    for start in starts:
+        x, y, z, w = q[start : start + 4].tolist()
+        if not -NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < NEAR_UNIT:
+            return False
+    return True
 
 
 def require_tree(model: Model, user: str) -> None:
@@ -50,7 +51,7 @@ def require_tree(model: Model, user: str) -> None:
     for feature, text in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
         parts = getattr(model, feature)
         if parts:
-            names = ", ".join(repr(x.name) for x in parts[:_NAMED]) + (", ..." if parts[_NAMED:] else "")
+            names = first_names((repr(x.name) for x in parts), ", ...")
             raise UnsupportedError(
                 f"{user}: {model.name} has {text} ({names}), and an engine takes the tree alone; "
                 "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
@@ -78,17 +79,19 @@ class ForwardDynamicsDerivatives(NamedTuple):
     tau: Array
 
 
-class Dynamics(ABC):
+class Dynamics:
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
-    Every method takes one state or a batch with one leading axis, checks shapes,
-    finite numbers and unit quaternions, and returns new arrays.
+    Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,
+    and returns new arrays.
+
+    An adapter defines a method for each quantity, named after it: `_mass_matrix(q)`, `_nle(q, v)`, `_pose(q, frame)`.
+    Its arguments are checked float64 arrays. Derivatives are stacked, (3, nv, nv) or (N, 3, nv, nv).
 
     Raises
     ------
     InputError
-        An argument of the wrong shape, not finite, or with a quaternion that is
-        not of unit length.
+        An argument of the wrong shape, not finite, or with a quaternion that is not of unit length.
     NumericalError
         The engine's answer is not finite.
     UnsupportedError
@@ -106,6 +109,12 @@ class Dynamics(ABC):
     derived: ClassVar[bool] = False
     #: Of the significand with which it computes.
     bits: ClassVar[int] = DOUBLE_BITS
+    #: Whether the adapter's methods take batches too, all of one size, and not single states alone.
+    _batches: ClassVar[bool] = True
+    # Of the adapter's methods those that others here use.
+    _coriolis_matrix: Callable[..., Any]
+    _forward_dynamics: Callable[..., Any]
+    _inverse_dynamics_derivatives: Callable[..., Any]
 
     def __init__(self, model: Model) -> None:
         if not model.has_bodies and not self.takes_written:
@@ -126,7 +135,7 @@ class Dynamics(ABC):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.model.name!r}: nq={self.model.nq}, nv={self.model.nv}>"
 
-    def __reduce__(self) -> tuple[type, tuple[Model]]:
+    def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.model,)
 
     def at(self, /, **values: Any) -> Dynamics:
@@ -137,10 +146,9 @@ class Dynamics(ABC):
         Parameters
         ----------
         **values : float
-            By name; parameters that are not named keep their values. A number is
-            checked as `ModelBuilder.build` would, which takes a millisecond or so. The
-            lagrangian engine also takes (N,) arrays, one value per sample of a batch,
-            checked for finite numbers only.
+            By name; the others keep their values. A number is checked as `ModelBuilder.build` would, which takes a
+            millisecond or so. The lagrangian engine also takes (N,) arrays, one value per sample of a batch, checked
+            for finite numbers only.
 
         Raises
         ------
@@ -174,90 +182,78 @@ class Dynamics(ABC):
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         """Return M(q), shape (nv, nv) or (N, nv, nv)."""
-        return self._evaluate("mass_matrix", self._mass_matrix, q=q)
+        return self._evaluate("mass_matrix", q=q)
 
     def coriolis_matrix(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return C(q, v) with Ṁ - 2C skew, shape (nv, nv) or (N, nv, nv).
 
-        Coriolis matrices are not unique; mbkit's own is Christoffel's. Compare C v
-        between engines, not the entries. A value that an engine is known to get
-        wrong comes with a `KnownDefectWarning`.
+        Coriolis matrices are not unique; mbkit's own is Christoffel's. Compare C v between engines, not the entries.
+        A value that an engine is known to get wrong comes with a `KnownDefectWarning`.
         """
-        return self._evaluate("coriolis_matrix", self._coriolis_matrix, q=q, v=v)
+        return self._evaluate("coriolis_matrix", q=q, v=v)
 
     def coriolis_force(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return C(q, v) v, shape (nv,) or (N, nv).
 
-        Formed with the engine's own Coriolis matrix where it has one, so that a
-        wrong matrix shows.
+        It is formed with the engine's own Coriolis matrix where it has one, so that a wrong matrix shows.
         """
-        return self._evaluate("coriolis_force", self._coriolis_force, q=q, v=v)
+        return self._evaluate("coriolis_force", q=q, v=v)
 
     def gravity(self, q: ArrayLike) -> Array:
         """Return g(q), on the left of the equation, without springs; (nv,) or (N, nv)."""
-        return self._evaluate("gravity", self._gravity, q=q)
+        return self._evaluate("gravity", q=q)
 
     def nle(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return C(q, v) v + g(q), shape (nv,) or (N, nv)."""
-        return self._evaluate("nle", self._nle, q=q, v=v)
+        return self._evaluate("nle", q=q, v=v)
 
     def passive(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return the generalized force of springs and dampers, shape (nv,) or (N, nv)."""
-        return self._evaluate("passive", self._passive, q=q, v=v)
+        return self._evaluate("passive", q=q, v=v)
 
     def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
         """Return τ = M a + nle - τ_passive, shape (nv,) or (N, nv)."""
-        return self._evaluate("inverse_dynamics", self._inverse_dynamics, q=q, v=v, a=a)
+        return self._evaluate("inverse_dynamics", q=q, v=v, a=a)
 
     def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
         """Return v̇ = M⁻¹ (τ + τ_passive - nle), shape (nv,) or (N, nv)."""
-        return self._evaluate("forward_dynamics", self._forward_dynamics, q=q, v=v, tau=tau)
+        return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
         """Return ½ vᵀ M v in J, a float or shape (N,)."""
-        return self._scalar(self._evaluate("kinetic_energy", self._kinetic_energy, q=q, v=v))
+        return self._number("kinetic_energy", q=q, v=v)
 
     def potential_energy(self, q: ArrayLike) -> Any:
         """Return the energy of gravity and springs in J, a float or shape (N,).
 
         Gravity's part is zero where every centre of mass is at the world's origin.
         """
-        return self._scalar(self._evaluate("potential_energy", self._potential_energy, q=q))
+        return self._number("potential_energy", q=q)
 
     def pose(self, q: ArrayLike, frame: str) -> Array:
         """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4)."""
-        self.model.frame(frame)
-        return self._evaluate("pose", lambda q: self._pose(q, frame), q=q)
+        return self._evaluate("pose", self.model.frame(frame), q=q)
 
     def jacobian(self, q: ArrayLike, frame: str, axes: str = "world") -> Array:
-        """Return the Jacobian of a frame's velocity, shape (6, nv) or (N, 6, nv).
+        """Return the Jacobian of the velocity of a frame or body, shape (6, nv) or (N, 6, nv).
 
-        Parameters
-        ----------
-        q : (nq,) or (N, nq) array_like
-        frame : str
-            Name of a frame or body.
-        axes : {"world", "body"}
-            Axes in which the velocity is written. It is that of the frame's
-            origin either way, linear then angular.
+        The velocity is that of the frame's origin, linear then angular, written in the axes of the world or, with
+        ``axes="body"``, of the frame.
         """
-        self.model.frame(frame)
+        place = self.model.frame(frame)
         if axes not in ("world", "body"):
             raise InputError(f"axes: expected 'world' or 'body', got {axes!r}")
-        return self._evaluate("jacobian", lambda q: self._jacobian(q, frame, axes), q=q)
+        return self._evaluate("jacobian", place, axes, q=q)
 
     def function(self, name: str) -> Any:
         """Return a quantity as a `casadi.Function`; the lagrangian engine only.
 
-        Inputs are named as in `mbkit.derivation.FUNCTIONS` (q, v, a, tau), all of them
-        column vectors; of a model with parameters the last one is "parameters", in
-        the order of ``model.parameters``. The output has the quantity's name and is
-        dense: (nv, nv), (nv, 1) or (1, 1); derivatives are by_q, by_v and by_a or
-        by_tau. It may be called with MX or SX and differentiated.
-        `mbkit.lagrangian.export_c` writes it as C.
+        Inputs are named as in `mbkit.derivation.FUNCTIONS` (q, v, a, tau), all of them column vectors; of a model with
+        parameters the last one is "parameters", in the order of ``model.parameters``. The output has the quantity's
+        name and is dense: (nv, nv), (nv, 1) or (1, 1); derivatives are by_q, by_v and by_a or by_tau. It may be called
+        with MX or SX and differentiated. `mbkit.lagrangian.export_c` writes it as C.
         """
-        self._require("function")
-        return self._function(name)
+        return self._method("function")(name)
 
     # Derivatives
 
@@ -269,150 +265,175 @@ class Dynamics(ABC):
     def inverse_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> InverseDynamicsDerivatives:
         """Return the partial derivatives of inverse dynamics: fields q, v and a, each (nv, nv) or (N, nv, nv).
 
-        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
-        with v and a held fixed. That by a is M.
+        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``, with v and a held.
         """
-        self._require_derivatives("inverse_dynamics_derivatives")
-        out = self._evaluate("inverse_dynamics_derivatives", self._inverse_dynamics_derivatives, q=q, v=v, a=a)
-        return InverseDynamicsDerivatives(*np.split(out, 3, axis=-1))
+        return InverseDynamicsDerivatives(*self._derivatives("inverse_dynamics_derivatives", q=q, v=v, a=a))
 
     def forward_dynamics_derivatives(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> ForwardDynamicsDerivatives:
         """Return the partial derivatives of forward dynamics: fields q, v and tau, each (nv, nv) or (N, nv, nv).
 
-        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``,
-        with v and tau held fixed. That by tau is M⁻¹.
+        That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``, with v and tau held.
         """
-        self._require_derivatives("forward_dynamics_derivatives")
-        out = self._evaluate("forward_dynamics_derivatives", self._forward_dynamics_derivatives, q=q, v=v, tau=tau)
-        return ForwardDynamicsDerivatives(*np.split(out, 3, axis=-1))
+        return ForwardDynamicsDerivatives(*self._derivatives("forward_dynamics_derivatives", q=q, v=v, tau=tau))
 
-    def _require_derivatives(self, quantity: str) -> None:
+    def _derivatives(self, quantity: str, **arguments: ArrayLike) -> list[Array]:
         if self.lacks_derivatives:
             raise UnsupportedError(f"{self.engine} cannot give {quantity}: {self.lacks_derivatives}")
+        out = self._evaluate(quantity, **arguments)
+        return [out[..., k, :, :] for k in range(3)]
 
     def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:  # noqa: ARG002  # for the engines that override it
         """Return how far the engine's own formula amplifies rounding in M, per sample.
 
-        Σ |terms| / M_jj of the sum that makes the worst diagonal entry, (N,) or a
-        scalar; None where the formula is not known to amplify.
+        Σ |terms| / M_jj of the sum that makes the worst diagonal entry, (N,) or a scalar; None where the formula is not
+        known to amplify.
         """
         return None
 
-    # For an adapter to define. Arguments are float64, checked, and either all single states or all batches of one size.
-
-    @abstractmethod
-    def _mass_matrix(self, q: Array) -> Array: ...
-
-    @abstractmethod
-    def _gravity(self, q: Array) -> Array: ...
-
-    @abstractmethod
-    def _nle(self, q: Array, v: Array) -> Array: ...
-
-    @abstractmethod
-    def _passive(self, q: Array, v: Array) -> Array: ...
-
-    @abstractmethod
-    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array: ...
-
-    @abstractmethod
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array: ...
-
-    @abstractmethod
-    def _kinetic_energy(self, q: Array, v: Array) -> Array: ...
-
-    @abstractmethod
-    def _potential_energy(self, q: Array) -> Array: ...
-
-    @abstractmethod
-    def _pose(self, q: Array, frame: str) -> Array: ...
-
-    @abstractmethod
-    def _jacobian(self, q: Array, frame: str, axes: str) -> Array: ...
-
-    def _coriolis_matrix(self, q: Array, v: Array) -> Array:
-        raise NotImplementedError
+    # Quantities that follow from others
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
         return np.asarray((self._coriolis_matrix(q, v) @ v[..., None])[..., 0])
 
-    def _function(self, name: str) -> Any:
-        raise NotImplementedError
-
-    def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the three matrices side by side, (nv, 3 nv) or (N, nv, 3 nv)."""
-        raise NotImplementedError
-
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
-        return through_inverse(self._inverse_dynamics_derivatives(q, v, self._forward_dynamics(q, v, tau)))
+        by_q, by_v, M = np.moveaxis(self._inverse_dynamics_derivatives(q, v, self._forward_dynamics(q, v, tau)), -3, 0)
+        unit = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
+        right = np.concatenate([-by_q, -by_v, unit], axis=-1)
+        return np.stack(np.split(np.linalg.solve(M, right), 3, axis=-1), axis=-3)
 
-    # Shared by all
+    # Checks and batches
 
-    def _require(self, quantity: str) -> None:
-        if quantity in self.refuses:
-            raise UnsupportedError(f"{self.engine} cannot give {quantity}: {self.refuses[quantity]}")
+    def _method(self, quantity: str) -> Callable[..., Any]:
+        """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
+        method = getattr(self, f"_{quantity}", None)
+        if method is None or quantity in self.refuses:
+            reason = self.refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")
+            raise UnsupportedError(f"{self.engine} cannot give {quantity}: {reason}")
+        return method  # type: ignore[no-any-return]  # by name
 
-    def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
-        if self.refuses:
-            self._require(quantity)
-        checked = {k: (self.model.check_q(x) if k == "q" else self.model.check_v(x, k)) for k, x in arguments.items()}
+    def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
+        """Return a quantity at states, checked; `more` are arguments that are the same for every state."""
+        method = self._method(quantity)
+        states, size = self._states(arguments)
+        try:
+            out = np.asarray(self._value(method, [*states.values()], more, size), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            raise NumericalError(
+                f"{self.engine}: {quantity} of {self.model.name}: the mass matrix is singular{self._suspects()}"
+            ) from None
+        self._require_finite(quantity, out, states)
+        return out
+
+    def _number(self, quantity: str, **arguments: ArrayLike) -> Any:
+        value = self._evaluate(quantity, **arguments)
+        return float(value) if value.ndim == 0 else value
+
+    def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
+        """Return arguments as checked arrays, all single states or all batches, and the size of the batch."""
+        checked = {k: self.model.check_q(x) if k == "q" else self.model.check_v(x, k) for k, x in arguments.items()}
         size = batch_of(**checked)
         if size is not None:
             checked = {k: np.broadcast_to(x, (size, x.shape[-1])) for k, x in checked.items()}
-        try:
-            out = np.asarray(method(*checked.values()), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            raise NumericalError(
-                f"{self.engine}: {quantity} of {self.model.name}: the mass matrix is singular{self._blame()}"
-            ) from None
-        self._require_finite(quantity, out, checked)
-        return out
+        return checked, size
 
-    def _require_finite(self, quantity: str, out: Array, arguments: dict[str, Array]) -> None:
+    def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
+        if self._batches:
+            return method(*states, *more)
+        if size is None:
+            return np.array(method(*states, *more))
+        if not size:
+            one = method(self.model.neutral(), *(np.zeros(x.shape[1]) for x in states[1:]), *more)
+            return np.empty((0, *np.shape(one)))
+        return np.array([np.array(method(*row, *more)) for row in zip(*states, strict=True)])
+
+    def _require_finite(self, quantity: str, out: Array, states: dict[str, Array]) -> None:
         if all_finite(out):
             return
-        where = np.argwhere(~np.isfinite(out))[0]
-        state = f" in sample {where[0]}" if next(iter(arguments.values())).ndim == 2 else ""
-        index = tuple(int(i) for i in where)
-        if not self.model.has_bodies:
-            q = np.atleast_2d(arguments["q"])[where[0] if arguments["q"].ndim == 2 else 0]
-            there = ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, q, strict=True))
+        model, index = self.model, tuple(np.argwhere(~np.isfinite(out))[0].tolist())
+        sample = f" in sample {index[0]}" if next(iter(states.values())).ndim == 2 else ""
+        if model.has_bodies:
+            where, why = f"index {index}{sample}", self._suspects()
+        else:
+            q = states["q"][index[0]] if sample else states["q"]
+            where = ", ".join(f"{n} = {x:.6g}" for n, x in zip(model.coordinate_names, q, strict=True)) + sample
             # Rows that depend on each other are named.
-            self.model.require_independent(q)
-            constraints = ", or the constraints depend on each other," if self.model.constrained else ""
-            raise NumericalError(
-                f"{self.engine}: {quantity} of {self.model.name} is not finite at {there}{state}; perhaps the mass "
-                f"matrix is singular{constraints} there, or numbers are so large that they overflow"
+            model.require_independent(q)
+            constraints = ", or the constraints depend on each other," if model.constrained else ""
+            why = (
+                f"; perhaps the mass matrix is singular{constraints} there, or numbers are so large that they overflow"
             )
-        raise NumericalError(
-            f"{self.engine}: {quantity} of {self.model.name} is not finite at index {index}{state}{self._blame()}"
-        )
+        raise NumericalError(f"{self.engine}: {quantity} of {model.name} is not finite at {where}{why}")
 
-    def _blame(self) -> str:
-        suspects = [f"{name!r} ({why})" for name, why in self.model.nonphysical]
+    def _suspects(self) -> str:
+        """Return what in the model may make numbers that are not finite, for a message."""
         # A joint that moves no mass is the likeliest cause; say it first.
-        suspects.sort(key=lambda text: "no mass moves" not in text)
-        more = f" and {len(suspects) - 3} more" if len(suspects) > 3 else ""
-        if suspects:
-            return f"; suspect: {', '.join(suspects[:3])}{more}"
+        inconsistent = sorted(self.model.nonphysical, key=lambda pair: "no mass moves" not in pair[1])
+        if inconsistent:
+            return f"; suspect: {first_names(f'{name!r} ({why})' for name, why in inconsistent)}"
         springs = [repr(s.name) for s in self.model.springs if s.needs_direction]
         if springs:
             return (
                 f"; possible cause: a point spring with a damper or a rest length has no direction where "
-                f"its length is zero: {', '.join(springs[:3])}"
+                f"its length is zero: {', '.join(springs[:_MAX_NAMES])}"
             )
         return "; perhaps links without mass, or numbers so large that they overflow"
 
-    @staticmethod
-    def _scalar(value: Array) -> Any:
-        return float(value) if value.ndim == 0 else value
+
+class MappedDynamics(Dynamics):
+    """An engine of single states with velocities of its own, v_engine = T v.
+
+    Entry i is full velocity `_v_index[i]`; then rotations, set with each state, turn three entries each. T is
+    orthogonal, so forces map as velocities do.
+    """
+
+    _batches = False
+    _v_index: np.ndarray
+    _turned: list[tuple[Array, slice]]
+
+    @classmethod
+    def holding(cls, model: Model, compiled: Any) -> Self:
+        """Return the dynamics of what the engine compiled of a model elsewhere."""
+        out = object.__new__(cls)
+        Dynamics.__init__(out, model)
+        out._hold(compiled)
+        return out
+
+    def _hold(self, compiled: Any) -> None:
+        """Take what the engine compiled of the model, with its coordinates."""
+        raise NotImplementedError
+
+    def _to_engine(self, x: Array) -> Array:
+        """Return T x for velocities, accelerations or forces."""
+        out: Array = self.model.layout.expand_v(x)[self._v_index]
+        for R, part in self._turned:
+            out[part] = R @ out[part]
+        return out
+
+    def _columns(self, J: Array) -> Array:
+        """Return J T, in the description's order and reduced."""
+        J, full = J.copy(), np.empty_like(J)
+        for R, part in self._turned:
+            J[:, part] = J[:, part] @ R
+        full[:, self._v_index] = J
+        return np.asarray(full @ self.model.layout.G) if self.model.layout.reduced else full
+
+    def _force(self, f: Array) -> Array:
+        return np.asarray(self._columns(f[None, :])[0])
+
+    def _pose(self, q: Array, frame: Frame) -> Array:
+        X = np.eye(4)
+        X[:3, :3], X[:3, 3] = self._placement(q, frame)
+        return X
+
+    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
+        """Return R_WF and p_WF."""
+        raise NotImplementedError
 
 
 _X, _Y, _Z = np.eye(3)
 #: Joint type -> type and axis of each joint of a stack of one-coordinate joints with the same motion.
 STACKS: Final[dict[str, Callable[[Joint], list[tuple[str, Array]]]]] = {
-    "revolute": lambda joint: [("revolute", joint.axes[0])],
-    "continuous": lambda joint: [("revolute", joint.axes[0])],
+    **dict.fromkeys(("revolute", "continuous"), lambda joint: [("revolute", joint.axes[0])]),
     "prismatic": lambda joint: [("prismatic", joint.axes[0])],
     "universal": lambda joint: [("revolute", axis) for axis in joint.axes],
     "spherical_zyx": lambda _: [("revolute", axis) for axis in (_Z, _Y, _X)],
@@ -426,33 +447,6 @@ def unknown_joint(engine: str, joint: Joint) -> UnsupportedError:
         f"{engine}: joint {joint.name!r} is {joint.kind}, a type that this engine does not have; "
         "the lagrangian engine takes every joint type"
     )
-
-
-def per_sample(method: Callable[..., Array], *arguments: Array) -> Array:
-    """Call a single-state method on one state, or on each of a batch."""
-    if arguments[0].ndim == 1:
-        return np.array(method(*arguments))
-    if not len(arguments[0]):
-        return np.empty((0, *np.shape(method(*(np.zeros(a.shape[1]) for a in arguments)))))
-    return np.array([np.array(method(*row)) for row in zip(*arguments, strict=True)])
-
-
-def by_sample(method: _Method) -> _Method:
-    """Return a method for one state or a batch, made of one for a single state."""
-
-    def evaluate(self: Dynamics, *arguments: Array) -> Array:
-        if arguments[0].ndim == 1:
-            return np.array(method(self, *arguments))
-        return per_sample(MethodType(method, self), *arguments)
-
-    return evaluate  # type: ignore[return-value]  # the same arguments
-
-
-def through_inverse(inverse_derivatives: Array) -> Array:
-    """Return ∂FD/∂q, ∂FD/∂v and ∂FD/∂τ side by side, from ∂ID/∂q, ∂ID/∂v and M side by side at a = FD(q, v, τ)."""
-    by_q, by_v, M = np.split(inverse_derivatives, 3, axis=-1)
-    unit = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
-    return np.asarray(np.linalg.solve(M, np.concatenate([-by_q, -by_v, unit], axis=-1)))
 
 
 def no_dynamics(value: Any, name: str = "dyn") -> InputError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,7 +16,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import UnsupportedError
 from mbkit.load.xml_reader import unused as unused
-from mbkit.model import Joint, Model
+from mbkit.model import Body, Joint, Model
 from mbkit.model.joint_types import kind_of
 
 
@@ -80,29 +80,48 @@ def joint_of(
     return Joint(name, kind, parent, child, rotation, translation, **values | numbers)
 
 
-def stacked(states: Iterable[dict[str, Array]]) -> dict[str, Array]:
-    """Return the terms of each state as arrays over a batch."""
-    values = list(states)
-    return {name: np.array([x[name] for x in values]) for name in ("M", "g", "nle", "passive")}
+class Parts:
+    """Bodies and joints as they are read, with names that nothing else has."""
+
+    def __init__(self) -> None:
+        self.bodies: list[Body] = []
+        self.joints: list[Joint] = []
+        self._names: dict[str, set[str]] = {"body": {"world"}}
+
+    def name(self, what: str, name: str) -> str:
+        """Return a name that no "body", say, has yet: an importer may take what mbkit's loader refuses."""
+        names = self._names.setdefault(what, set())
+        names.add(name := unused(name, names))
+        return name
+
+    def joint(self, *place: Any, **numbers: Any) -> None:
+        """Add a joint; arguments as of `joint_of`."""
+        self.joints.append(joint_of(*place, **numbers))
+
+    def body(self, name: str, mass: float = 0.0, com: Array | None = None, inertia: Array | None = None) -> None:
+        """Add a body; without numbers it has none of matter."""
+        com, inertia = np.zeros(3) if com is None else com, np.zeros((3, 3)) if inertia is None else inertia
+        self.bodies.append(Body(name, mass, com, 0.5 * (inertia + inertia.T)))
+
+    def model(self, name: str, gravity: Array) -> Model:
+        """Return the description."""
+        return Model(name=name, gravity=gravity, bodies=tuple(self.bodies), joints=tuple(self.joints))
 
 
 def checked(engine: str, model: Model) -> Model:
     """Return an importer's model; raise `UnsupportedError` where nothing moves in it or a number is not sound."""
     if not model.nv:
         raise UnsupportedError(f"{engine}: nothing moves in what it made of the file (nv = 0)")
-    for what, parts, names in (
-        ("body", model.bodies, ("mass", "com", "inertia")),
-        ("joint", model.joints, ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness")),
+    joint_numbers = ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness")
+    for what, part, names in (
+        *((f"body {x.name!r} with a", x, ("mass", "com", "inertia")) for x in model.bodies),
+        *((f"joint {x.name!r} with a", x, joint_numbers) for x in model.joints),
+        ("a", model, ("gravity",)),
     ):
-        for part in parts:
-            for name in names:
-                # Not a number, or memory that nobody wrote to.
-                if not (np.abs(getattr(part, name)) <= _MAX_NUMBER).all():
-                    raise UnsupportedError(
-                        f"{engine}: made {what} {part.name!r} with a {name} that nothing has: {getattr(part, name)}"
-                    )
-    if not (np.abs(model.gravity) <= _MAX_NUMBER).all():
-        raise UnsupportedError(f"{engine}: made a gravity that nothing has: {model.gravity}")
+        for name in names:
+            # Not a number, or memory that nobody wrote to.
+            if not (np.abs(getattr(part, name)) <= _MAX_NUMBER).all():
+                raise UnsupportedError(f"{engine}: made {what} {name} that nothing has: {getattr(part, name)}")
     return model
 
 
@@ -131,7 +150,7 @@ def written(text: str, files: Mapping[str, bytes]) -> Iterator[Path]:
 def reader(module: str) -> Callable[[str, str, bool, dict[str, bytes]], Imported]:
     """Return an importer's function (text, format, floating_base, meshes by name) -> Imported.
 
-    The function raises `UnsupportedError` where the importer refuses a text.
+    It raises `UnsupportedError` where the importer refuses a text.
     """
     read: Callable[[str, str, bool, dict[str, bytes]], Imported] = import_module(module).read
     return read

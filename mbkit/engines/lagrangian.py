@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
@@ -14,39 +14,32 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, count, finite_array
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
 from mbkit.codegen.interpreter import Machine
-from mbkit.derivation.conditioning import loses_digits
 from mbkit.derivation.equations import Equations, equations_of
+from mbkit.derivation.least_constraint import loses_digits
 from mbkit.derivation.mass_matrix_solve import elimination_size
-from mbkit.engines.base import Dynamics
+from mbkit.engines.base import NEAR_UNIT, Dynamics, unit_quaternions
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.model import Model
+from mbkit.model import Frame, Model
 
 if TYPE_CHECKING:
     from mbkit.codegen.compiled import Compiled
 
 # Fast calls of machine code, without the checks of `Dynamics`
 #
-# The code itself finds NaN and infinity in all that it reads and writes. A fast call returns None for arguments
-# that it does not take, and `Dynamics` repeats the call with its checks and messages.
+# The code itself finds NaN and infinity in all that it reads and writes. A fast call returns None for arguments that it
+# does not take, and `Dynamics` repeats the call with its checks and messages.
 
 _FLOAT: Final = np.dtype(np.float64)
-_NEAR_UNIT: Final = 1e-9
 Call = Callable[..., Any]
 
 
-def short_way(model: Model, code: Compiled, trim: Callable[[Array], Array], threads: int | None) -> Call:
+def _fast_call(model: Model, code: Compiled, trim: Callable[[Array], Array], threads: int | None) -> Call:
     """Return a call for float64 arrays that are one state or one batch; None is its answer to all else.
 
-    Parameters
-    ----------
-    model : Model
-    code : Compiled
-        Of one result, q its first argument.
-    trim : callable
-        Gives the code's (rows, columns) or (N, rows, columns) the quantity's shape.
-    threads : int, optional
+    `code` has one result and q as its first argument; `trim` gives (rows, columns) or (N, rows, columns) the
+    quantity's shape.
     """
-    single = _single(code, trim)
+    single = _single_call(code, trim)
     sizes = code.inputs
     starts = tuple(start for start, _ in model.quaternions)
     ones = [(n,) for n in sizes]
@@ -55,9 +48,11 @@ def short_way(model: Model, code: Compiled, trim: Callable[[Array], Array], thre
         # A subclass may be masked, and `is` would refuse the dtype of an array that was unpickled.
         if not all(type(x) is np.ndarray and x.dtype == _FLOAT for x in given):
             return None
-        if [x.shape for x in given] == ones:
-            return single(given) if not starts or _unit(given[0], starts) else None
-        if not _is_batch(given, sizes) or (starts and not _all_unit(given[0], starts)):
+        shapes = [x.shape for x in given]
+        if shapes == ones:
+            return single(given) if not starts or unit_quaternions(given[0], starts) else None
+        n = shapes[0][0] if shapes[0] else 0
+        if shapes != [(n, size) for size in sizes] or (starts and not _all_unit(given[0], starts)):
             return None
         results, finite = code.call_checked(*given, threads=threads)
         return trim(results[0]) if finite else None
@@ -65,7 +60,7 @@ def short_way(model: Model, code: Compiled, trim: Callable[[Array], Array], thre
     return call
 
 
-def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[Any, ...]], Any]:
+def _single_call(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[Any, ...]], Any]:
     ends = np.cumsum([0, *code.inputs]).tolist()
     parts = [slice(a, b) for a, b in pairwise(ends)]
     rows, columns = code.shapes[0]
@@ -99,145 +94,37 @@ def _single(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[A
     return call
 
 
-def _is_batch(given: tuple[Any, ...], sizes: tuple[int, ...]) -> bool:
-    n = given[0].shape[0] if given[0].ndim else 0
-    return all(x.shape == (n, size) for x, size in zip(given, sizes, strict=True))
-
-
-def _unit(q: Array, starts: tuple[int, ...]) -> bool:
-    for start in starts:
-        x, y, z, w = q[start : start + 4].tolist()
-        if not -_NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < _NEAR_UNIT:
-            return False
-    return True
-
-
 def _all_unit(q: Array, starts: tuple[int, ...]) -> bool:
-    for start in starts:
-        x = q[:, start : start + 4]
-        # A NaN is not below anything.
-        if not bool((np.abs(np.einsum("ni,ni->n", x, x) - 1.0) < _NEAR_UNIT).all()):
-            return False
-    return True
-
-
-# The values of a model's named parameters during evaluation: one each, or one per sample.
-
-
-class ParameterValues:
-    """What a compiled function of a parametrised model gets as its argument ``"parameters"``.
-
-    Parameters
-    ----------
-    model : Model
-        Whose nominal values are those that all samples share.
-    batched : mapping of str to (N,) array, optional
-        Values that differ from sample to sample.
-    """
-
-    def __init__(self, model: Model, batched: Mapping[str, Array] | None = None) -> None:
-        self.model, self.batched = model, dict(batched or {})
-
-    def at(self, values: Mapping[str, ArrayLike]) -> ParameterValues:
-        """Return these values with some replaced.
-
-        Raises
-        ------
-        UnknownNameError, InputError, ModelError
-            No such parameter; not a finite number or (N,) of them; no such system
-            can exist (a batch is checked for finite numbers only).
-        """
-        for name in values:
-            if name not in self.model.parameters:
-                raise UnknownNameError("parameter", name, self.model.parameters)
-        many = {name: _column(name, x) for name, x in values.items() if np.ndim(x)}
-        kept = {name: x for name, x in self.batched.items() if name not in values}
-        batched = {**kept, **many}
-        if len({len(x) for x in batched.values()}) > 1:
-            message = ", ".join(f"{name} has {len(x)}" for name, x in batched.items())
-            raise InputError(f"parameters: batches of different sizes: {message}")
-        single: dict[str, Any] = {name: x for name, x in values.items() if name not in many}
-        return ParameterValues(self.model.with_nominal(single) if single else self.model, batched)
-
-    @property
-    def samples(self) -> int | None:
-        """Size of the batch that the values make, None where every sample has the same."""
-        return next((len(x) for x in self.batched.values()), None)
-
-    def of_samples(self, which: ArrayLike) -> ParameterValues:
-        """Return the values of these samples, by index, which may repeat."""
-        index = np.asarray(which)
-        # A mask would be taken for the samples 0 and 1.
-        if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
-            raise InputError(
-                f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask"
-            )
-        index = index.astype(int)
-        return ParameterValues(self.model, {name: x[index] for name, x in self.batched.items()})
-
-    def bound(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that passes these values on, behind its own arguments."""
-        return (lambda *given: function(*given, *self.behind(given[0]))) if self.model.parameters else function
-
-    def behind(self, first: Any) -> tuple[Array, ...]:
-        """Return what a function takes behind its own arguments, of which the first is given: nothing, or one array.
-
-        Raises
-        ------
-        InputError
-            A parameter has no value.
-        """
-        if not self.model.parameters:
-            return ()
-        values = self.array
-        if values.ndim == 1 and np.ndim(first) == 2:
-            return (np.broadcast_to(values, (len(first), len(values))),)
-        return (values,)
-
-    @cached_property
-    def array(self) -> Array:
-        """The values in the order of `model.parameters`, shape (p,) or (N, p)."""
-        parameters = self.model.parameters
-        missing = [name for name, x in parameters.items() if x is None and name not in self.batched]
-        if missing:
-            message = ", ".join(f"{name}=..." for name in missing)
-            raise InputError(
-                f"{self.model.name}: no value for parameter {', '.join(map(repr, missing))}; "
-                f"give it with dynamics.at({message})"
-            )
-        columns = np.broadcast_arrays(*(np.asarray(self.batched.get(name, x)) for name, x in parameters.items()))
-        return np.stack(columns, axis=-1).astype(np.float64)
-
-    def spread(self, arguments: dict[str, ArrayLike]) -> dict[str, ArrayLike]:
-        """Return arguments of which at least one has a row per sample, if values differ between samples."""
-        n = self.samples
-        if n is None:
-            return arguments
-        out: dict[str, ArrayLike] = {}
-        for name, x in arguments.items():
-            if np.ndim(x) == 2 and len(np.asarray(x)) != n:
-                raise InputError(f"{name}: a batch of {len(np.asarray(x))}, but the parameters' values are {n}")
-            out[name] = np.broadcast_to(np.asarray(x), (n, *np.shape(x))) if np.ndim(x) == 1 else x
-        return out
+    parts = (q[:, start : start + 4] for start in starts)
+    # A NaN is not below anything.
+    return all((np.abs(np.einsum("ni,ni->n", x, x) - 1.0) < NEAR_UNIT).all() for x in parts)
 
 
 def _column(name: str, value: ArrayLike) -> Array:
+    """Return a parameter's values, one per sample."""
     if np.ndim(value) != 1:
         raise InputError(f"parameter {name!r}: expected a number or shape (N,), got {np.shape(value)}")
     return finite_array(f"parameter {name!r}", value, (len(np.asarray(value)),))
 
 
-# Written out, forward dynamics grows as the cube of a chain's length. Beyond these
-# many multiplications, forming M and solving in LAPACK is faster to make and run.
+# Written out, forward dynamics grows as the cube of a chain's length. Beyond these many multiplications, forming M and
+# solving in LAPACK is faster to make and run.
 _WRITTEN_OUT: Final = {False: 6000, True: 100_000}
-# Quantities with a short way, and how their result loses the axes that it does not need.
+#: Quantities that one compiled function of their name gives, and how its result loses the axes that they do not have.
 _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
     **dict.fromkeys(("mass_matrix", "coriolis_matrix"), lambda x: x),
     **dict.fromkeys(
         ("coriolis_force", "gravity", "nle", "passive", "inverse_dynamics", "forward_dynamics"), lambda x: x[..., 0]
     ),
-    **dict.fromkeys(("kinetic_energy", "potential_energy"), lambda x: x[..., 0, 0]),
+    **dict.fromkeys(("kinetic_energy", "potential_energy", "energy_rate"), lambda x: x[..., 0, 0]),
 }
+
+
+def _term(name: str) -> Callable[..., Any]:
+    def evaluate(self: LagrangianDynamics, *arguments: Array) -> Array:
+        return self._trimmed(name, *arguments)
+
+    return evaluate
 
 
 class LagrangianDynamics(Dynamics):
@@ -247,9 +134,8 @@ class LagrangianDynamics(Dynamics):
     ----------
     model : Model
     compile : bool, optional
-        Whether to make machine code of what is derived, which is kept on disk; else
-        CasADi's machine interprets it, right for what is evaluated a few times. By
-        default compiled, unless the environment says ``MBKIT_COMPILE=0``.
+        Whether to make machine code of the terms, which is kept on disk; else CasADi's machine interprets them, right
+        for a few evaluations. By default compiled, unless the environment says ``MBKIT_COMPILE=0``.
     threads : int, optional
         Threads that share a large batch; by default as many as the process has cores.
 
@@ -271,7 +157,8 @@ class LagrangianDynamics(Dynamics):
             raise InputError(f"compile: expected True, False or None, got {compile!r}")
         self.compile = compile_by_default() if compile is None else compile
         self.threads = None if threads is None else count("threads", threads, least=1)
-        self._parameters = ParameterValues(model)
+        #: Values of parameters that differ from sample to sample, (N,) each; the others are in the model.
+        self._batched: dict[str, Array] = {}
         self._machines: dict[tuple[str, ...], Any] = {}
         self._short: dict[str, Callable[..., Any]] = {}
 
@@ -284,15 +171,14 @@ class LagrangianDynamics(Dynamics):
     def elimination(self) -> str:
         """What accelerations come from: ``"mass matrix"``, or ``"least constraint"`` where that would lose digits.
 
-        The sparse LᵀDL of M loses M_kk/D_k of its digits, where D_k is what is left of a diagonal entry once all
-        beyond joint k gives way. Where that is more than six digits at some pose, as of a light cart below a heavy
-        pole, the accelerations, and the products with M⁻¹ in their derivatives, come from Gauss's principle of least
-        constraint instead, in which no M is formed. It is decided from the description, with parameters at the
-        nominal values that the model had when its dynamics were made (a pickled copy is made anew): `at` changes
-        masses but not the way. Systems that were written as energies, and trees too large to be written out, have
-        the mass matrix only, and so have the methods that solve with it themselves, ``"rodas5"`` and
-        ``"implicit_midpoint"``. The pose is looked for within the limits, and may be missed where several coordinates
-        have to be right at once.
+        The sparse LᵀDL of M loses M_kk/D_k of its digits, where D_k is what is left of a diagonal entry once all beyond
+        joint k gives way. Where that is more than six digits at some pose, as of a light cart below a heavy pole, the
+        accelerations, and the products with M⁻¹ in their derivatives, come from Gauss's principle of least constraint,
+        in which no M is formed. It is decided from the description, at the nominal values of parameters when the
+        dynamics were built: `at` changes masses but not the way. Systems that were written as energies, and trees too
+        large to be written out, have the mass matrix only, and so have the methods that solve with it themselves,
+        ``"rodas5"`` and ``"implicit_midpoint"``. The pose is searched within the limits, and may be missed where
+        several coordinates have to be right at once.
         """
         return "least constraint" if loses_digits(self.model) else "mass matrix"
 
@@ -320,90 +206,124 @@ class LagrangianDynamics(Dynamics):
             with DERIVING:
                 code = executable((self.form, *key), derive, compile=self.compile)
             if name in _TRIM and not isinstance(code, Machine):
-                self._short[name] = short_way(self.model, code, _TRIM[name], self.threads)
+                self._short[name] = _fast_call(self.model, code, _TRIM[name], self.threads)
             self._machines[key] = code
         return self._machines[key]
 
     def _machine(self, name: str, *extra: str) -> Callable[..., list[Array]]:
         code = self.code(name, *extra)
-        return self._parameters.bound(lambda *given: code(*given, threads=self.threads))
+        return lambda *arguments: code(*arguments, *self._trailing(arguments[0]), threads=self.threads)
+
+    def _trailing(self, first: Any) -> tuple[Array, ...]:
+        """Return the argument of parameters that a compiled function takes behind its own, if it takes one."""
+        if not self.model.parameters:
+            return ()
+        values = self.parameter_values
+        if values.ndim == 1 and np.ndim(first) == 2:
+            return (np.broadcast_to(values, (len(first), len(values))),)
+        return (values,)
+
+    @cached_property
+    def parameter_values(self) -> Array:
+        """Values of the model's parameters in their order, (p,) or one row per sample."""
+        parameters = self.model.parameters
+        missing = [name for name, x in parameters.items() if x is None and name not in self._batched]
+        if missing:
+            raise InputError(
+                f"{self.model.name}: no value for parameter {', '.join(map(repr, missing))}; "
+                f"give it with dynamics.at({', '.join(f'{name}=...' for name in missing)})"
+            )
+        if not parameters:
+            return np.empty(0)
+        columns = np.broadcast_arrays(*(np.asarray(self._batched.get(name, x)) for name, x in parameters.items()))
+        return np.stack(columns, axis=-1).astype(np.float64)
 
     def at(self, /, **values: ArrayLike) -> LagrangianDynamics:
         """Return the same dynamics at other values of parameters, as `Dynamics.at` does; nothing is derived again."""
-        return self._with(self._parameters.at(values))
-
-    @property
-    def parameter_values(self) -> Array:
-        """Values of the model's parameters, (p,) or one row per sample."""
-        return self._parameters.array if self.model.parameters else np.empty(0)
+        for name in values:
+            if name not in self.model.parameters:
+                raise UnknownNameError("parameter", name, self.model.parameters)
+        many = {name: _column(name, x) for name, x in values.items() if np.ndim(x)}
+        batched = {name: x for name, x in self._batched.items() if name not in values} | many
+        if len({len(x) for x in batched.values()}) > 1:
+            message = ", ".join(f"{name} has {len(x)}" for name, x in batched.items())
+            raise InputError(f"parameters: batches of different sizes: {message}")
+        single: dict[str, Any] = {name: x for name, x in values.items() if name not in many}
+        return self._with(self.model.with_nominal(single) if single else self.model, batched)
 
     @property
     def samples(self) -> int | None:
         """Size of the batch that the parameters' values make, None where every sample has the same."""
-        return self._parameters.samples
+        return next((len(x) for x in self._batched.values()), None)
 
     def of_samples(self, which: ArrayLike) -> LagrangianDynamics:
-        """Return the dynamics of these samples of a batch, by index."""
-        return self._with(self._parameters.of_samples(which)) if self._parameters.batched else self
+        """Return the dynamics of these samples of a batch, by index, which may repeat."""
+        if not self._batched:
+            return self
+        index = np.asarray(which)
+        # A mask would be taken for the samples 0 and 1.
+        if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
+            raise InputError(
+                f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask"
+            )
+        index = index.astype(int)
+        return self._with(self.model, {name: x[index] for name, x in self._batched.items()})
 
-    def _with(self, parameters: ParameterValues) -> LagrangianDynamics:
+    def _with(self, model: Model, batched: dict[str, Array]) -> LagrangianDynamics:
         out = object.__new__(type(self))
         # Both share what is derived and compiled, now and later.
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
-        out._parameters, out.model = parameters, parameters.model
+        out.__dict__.pop("parameter_values", None)
+        out.model, out._batched = model, batched
         return out
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _remade, (self.model, self._parameters.batched, self.compile, self.threads)
+        return _restore, (self.model, self._batched, self.compile, self.threads)
 
-    def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+    def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
+        n = self.samples
+        if n is not None:
+            for name, x in arguments.items():
+                if np.ndim(x) == 2 and len(np.asarray(x)) != n:
+                    raise InputError(f"{name}: a batch of {len(np.asarray(x))}, but the parameters' values are {n}")
+            arguments = {
+                k: np.broadcast_to(x, (n, *np.shape(x))) if np.ndim(x) == 1 else x for k, x in arguments.items()
+            }
+        return super()._states(arguments)
+
+    def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
         short = self._short.get(quantity)
         if short is not None:
             own: Iterable[Any] = arguments.values()
             if self.model.parameters:
-                own = (*own, *self._parameters.behind(arguments["q"]))
+                own = (*own, *self._trailing(arguments["q"]))
             out: Array | None = short(*own)
             if out is not None:
                 return out
-        return super()._evaluate(quantity, method, **self._parameters.spread(arguments))
+        return super()._evaluate(quantity, *more, **arguments)
 
-    def _vector(self, name: str, *arguments: Array) -> Array:
-        return self._machine(name)(*arguments)[0][..., 0]
+    def _trimmed(self, name: str, *arguments: Array) -> Array:
+        return _TRIM[name](self._machine(name)(*arguments)[0])
 
-    def _mass_matrix(self, q: Array) -> Array:
-        return self._machine("mass_matrix")(q)[0]
-
-    def _coriolis_matrix(self, q: Array, v: Array) -> Array:
-        return self._machine("coriolis_matrix")(q, v)[0]
-
-    def _coriolis_force(self, q: Array, v: Array) -> Array:
-        return self._vector("coriolis_force", q, v)
+    _mass_matrix, _coriolis_matrix, _coriolis_force = map(_term, ("mass_matrix", "coriolis_matrix", "coriolis_force"))
+    _gravity, _nle, _passive, _inverse_dynamics = map(_term, ("gravity", "nle", "passive", "inverse_dynamics"))
+    _kinetic_energy, _potential_energy, _energy_rate = map(_term, ("kinetic_energy", "potential_energy", "energy_rate"))
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
         """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
-        return self._scalar(
-            self._evaluate("energy_rate", lambda q, v, a: self._vector("energy_rate", q, v, a)[..., 0], q=q, v=v, a=a)
-        )
+        return self._number("energy_rate", q=q, v=v, a=a)
 
-    def _gravity(self, q: Array) -> Array:
-        return self._vector("gravity", q)
-
-    def _nle(self, q: Array, v: Array) -> Array:
-        return self._vector("nle", q, v)
+    def _stacked(self, name: str, *arguments: Array) -> Array:
+        out = self._machine("side_by_side", name)(*arguments)[0]
+        return out.reshape(*out.shape[:-1], 3, self.model.nv).swapaxes(-2, -3)
 
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
-        return self._machine("side_by_side", "inverse_dynamics_derivatives")(q, v, a)[0]
+        return self._stacked("inverse_dynamics_derivatives", q, v, a)
 
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
         if self.written_out:
-            return self._machine("side_by_side", "forward_dynamics_derivatives")(q, v, tau)[0]
+            return self._stacked("forward_dynamics_derivatives", q, v, tau)
         return super()._forward_dynamics_derivatives(q, v, tau)
-
-    def _passive(self, q: Array, v: Array) -> Array:
-        return self._vector("passive", q, v)
-
-    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        return self._vector("inverse_dynamics", q, v, a)
 
     @cached_property
     def written_out(self) -> bool:
@@ -415,30 +335,24 @@ class LagrangianDynamics(Dynamics):
         if self.model.constrained:
             self.model.require_independent(q, once=True)
         if self.written_out:
-            return self._vector("forward_dynamics", q, v, tau)
+            return self._trimmed("forward_dynamics", q, v, tau)
         M, f = self._machine("applied_function")(q, v)
         return np.asarray(np.linalg.solve(M, f + tau[..., None])[..., 0])
 
-    def _kinetic_energy(self, q: Array, v: Array) -> Array:
-        return self._vector("kinetic_energy", q, v)[..., 0]
+    def _pose(self, q: Array, frame: Frame) -> Array:
+        return self._machine("pose", frame.name)(q)[0]
 
-    def _potential_energy(self, q: Array) -> Array:
-        return self._vector("potential_energy", q)[..., 0]
-
-    def _pose(self, q: Array, frame: str) -> Array:
-        return self._machine("pose", frame)(q)[0]
-
-    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
-        return self._machine("jacobian", frame, axes)(q)[0]
+    def _jacobian(self, q: Array, frame: Frame, axes: str) -> Array:
+        return self._machine("jacobian", frame.name, axes)(q)[0]
 
     def _function(self, name: str) -> Any:
         f = self.equations.function(name)
         given = f.sx_in()
-        # Whoever asks for it inlines and differentiates it: small is worth a search.
+        # Users inline and differentiate it: small is worth a search.
         return ca.Function(name, given, f.call(given), f.name_in(), f.name_out(), {"cse": True})
 
 
-def _remade(
+def _restore(
     model: Model,
     batched: dict[str, Array],
     compile: bool,  # noqa: A002  # as above

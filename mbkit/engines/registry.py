@@ -31,13 +31,12 @@ class EngineInfo:
         As in ``mbkit.dynamics(model, name)``, in tables and in figures.
     adapter : type
         The subclass of `Dynamics`, whose attribute ``engine`` is the name; or None where `module` and `class_name` say
-        where it is, which imports the engine when it is first asked for.
+        where it is: the engine is imported at its first use.
     module, class_name : str
     package : str
         To install, with pip.
     distribution : str
-        Whose version decides the engine's numbers, as `importlib.metadata` knows it; empty of an engine without a
-        library.
+        Whose version decides the engine's numbers, for `importlib.metadata`; empty of an engine without a library.
     standard : bool
         Whether studies take it where no engines are named.
     reference : bool
@@ -98,65 +97,47 @@ class EngineInfo:
 PINOCCHIO: Final = "pinocchio"
 MUJOCO: Final = "mujoco"
 
+
+def _own(name: str, class_name: str, distribution: str, package: str = "", **facts: Any) -> EngineInfo:
+    folder = f"mbkit.engines.{name}"
+    module = folder if facts.get("derived") or facts.get("reference") else f"{folder}.engine"
+    return EngineInfo(name, None, module, class_name, package or distribution, distribution, **facts)
+
+
+_OWN_ENGINES: Final = (
+    _own(
+        PINOCCHIO,
+        "PinocchioDynamics",
+        "pin",
+        standard=True,
+        shown=("rk4", "semi_implicit_euler", "dop853"),
+        quick=("auto", "rk4", "semi_implicit_euler", "radau"),
+    ),
+    # Where nothing is compiled, CasADi evaluates the expressions.
+    _own(
+        "lagrangian",
+        "LagrangianDynamics",
+        "casadi",
+        standard=True,
+        derived=True,
+        brief={"compile": False},
+        shown=("rk853", "rk4"),
+        quick=("auto", "rk4", "implicit_midpoint", "rk853", "cvodes"),
+    ),
+    _own(
+        MUJOCO,
+        "MujocoDynamics",
+        "mujoco",
+        standard=True,
+        rk4="mujoco_rk4",
+        shown=("mujoco_euler", "mujoco_implicitfast", "mujoco_rk4"),
+        quick=("mujoco_rk4", "mujoco_euler", "mujoco_implicitfast", "mujoco_discrete"),
+    ),
+    _own("drake", "DrakeDynamics", "drake", "mbkit[drake]", shown=(), quick=()),
+    _own("oracle", "OracleDynamics", "mpmath", reference=True, shown=(), quick=()),
+)
 #: Engine by name: mbkit's own adapters, then those of `register_engine`.
-ENGINES: Final[dict[str, EngineInfo]] = {
-    info.name: info
-    for info in (
-        EngineInfo(
-            PINOCCHIO,
-            module="mbkit.engines.pinocchio.engine",
-            class_name="PinocchioDynamics",
-            package="pin",
-            distribution="pin",
-            standard=True,
-            shown=("rk4", "semi_implicit_euler", "dop853"),
-            quick=("auto", "rk4", "semi_implicit_euler", "radau"),
-        ),
-        EngineInfo(
-            "lagrangian",
-            module="mbkit.engines.lagrangian",
-            class_name="LagrangianDynamics",
-            package="casadi",
-            # Where nothing is compiled, CasADi evaluates the expressions.
-            distribution="casadi",
-            standard=True,
-            derived=True,
-            brief={"compile": False},
-            shown=("rk853", "rk4"),
-            quick=("auto", "rk4", "implicit_midpoint", "rk853", "cvodes"),
-        ),
-        EngineInfo(
-            MUJOCO,
-            module="mbkit.engines.mujoco.engine",
-            class_name="MujocoDynamics",
-            package="mujoco",
-            distribution="mujoco",
-            standard=True,
-            rk4="mujoco_rk4",
-            shown=("mujoco_euler", "mujoco_implicitfast", "mujoco_rk4"),
-            quick=("mujoco_rk4", "mujoco_euler", "mujoco_implicitfast", "mujoco_discrete"),
-        ),
-        EngineInfo(
-            "drake",
-            module="mbkit.engines.drake.engine",
-            class_name="DrakeDynamics",
-            package="mbkit[drake]",
-            distribution="drake",
-            shown=(),
-            quick=(),
-        ),
-        EngineInfo(
-            "oracle",
-            module="mbkit.engines.oracle",
-            class_name="OracleDynamics",
-            package="mpmath",
-            distribution="mpmath",
-            reference=True,
-            shown=(),
-            quick=(),
-        ),
-    )
-}
+ENGINES: Final[dict[str, EngineInfo]] = {info.name: info for info in _OWN_ENGINES}
 _OWN: Final = frozenset(ENGINES)
 
 #: Engines that a study takes where none are named.
@@ -174,21 +155,8 @@ def register_engine(info: EngineInfo) -> EngineInfo:
     The command and worker processes import nothing of a script: they know engines whose package names them in the
     entry point group ``"mbkit.engines"``, by an `EngineInfo` or by a module that calls this function.
 
-    Parameters
-    ----------
-    info : EngineInfo
-        With a subclass of `Dynamics`, or the module and class where it is.
-
-    Returns
-    -------
-    EngineInfo
-        The same.
-
-    Raises
-    ------
-    InputError
-        Attributes of a wrong type, an adapter that is no subclass of `Dynamics` or names another engine, or a name
-        that another engine has.
+    Returns `info`. Raises `InputError` for attributes of a wrong type, an adapter that is no subclass of `Dynamics` or
+    names another engine, or a name that another engine has.
 
     Examples
     --------
@@ -202,26 +170,23 @@ def register_engine(info: EngineInfo) -> EngineInfo:
     """
     if not isinstance(info, EngineInfo):
         raise InputError(f"info: expected an EngineInfo, got {type(info).__name__}")
-    if not isinstance(info.name, str) or not info.name.isidentifier():
-        raise InputError(f"name: expected a word of letters, digits and underscores, got {info.name!r}")
-    if info.adapter is None and not (info.module and info.class_name):
-        raise InputError(f"engine {info.name!r}: expected an adapter, or a module and a class_name; got none")
-    if info.adapter is not None:
-        if not isinstance(info.adapter, type) or not issubclass(info.adapter, Dynamics):
-            raise InputError(f"engine {info.name!r}: expected a subclass of Dynamics as adapter, got {info.adapter!r}")
-        if getattr(info.adapter, "engine", None) != info.name:
-            raise InputError(
-                f"engine {info.name!r}: {info.adapter.__name__}.engine is {getattr(info.adapter, 'engine', None)!r}; "
-                "expected the same name"
-            )
-    known = ENGINES.get(info.name)
-    if info.name in _OWN or (known is not None and _place(known) != _place(info)):
-        raise InputError(f"engine {info.name!r}: the name is taken; use another one")
+    name, adapter = info.name, info.adapter
+    if not isinstance(name, str) or not name.isidentifier():
+        raise InputError(f"name: expected a word of letters, digits and underscores, got {name!r}")
+    if adapter is None and not (info.module and info.class_name):
+        raise InputError(f"engine {name!r}: expected an adapter, or a module and a class_name; got none")
+    if adapter is not None:
+        if not isinstance(adapter, type) or not issubclass(adapter, Dynamics):
+            raise InputError(f"engine {name!r}: expected a subclass of Dynamics as adapter, got {adapter!r}")
+        if getattr(adapter, "engine", None) != name:
+            got = getattr(adapter, "engine", None)
+            raise InputError(f"engine {name!r}: {adapter.__name__}.engine is {got!r}; expected the same name")
+    known = ENGINES.get(name)
+    if name in _OWN or (known is not None and _place(known) != _place(info)):
+        raise InputError(f"engine {name!r}: the name is taken; use another one")
     if info.reference or info.derived:
-        raise InputError(
-            f"engine {info.name!r}: reference and derived are for mbkit's own derivation; leave them False"
-        )
-    ENGINES[info.name] = info
+        raise InputError(f"engine {name!r}: reference and derived are for mbkit's own derivation; leave them False")
+    ENGINES[name] = info
     return info
 
 
@@ -256,13 +221,7 @@ def load_entry_points() -> None:
 
 
 def find_engine(name: str) -> EngineInfo:
-    """Return what is known of an engine.
-
-    Raises
-    ------
-    UnknownNameError
-        No engine of this name.
-    """
+    """Return what is known of an engine; `UnknownNameError` where there is none of this name."""
     if name not in ENGINES:
         load_entry_points()
     if name not in ENGINES:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit._escape import one_line
-from mbkit.engines.base import QUANTITIES, Dynamics, per_sample
+from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.constraints import Manifold, require_few
@@ -72,6 +72,7 @@ class EmbeddedDynamics(Dynamics):
     """The equation on one chart; time runs from `begin`, in s."""
 
     engine = "embedded"
+    _batches = False
     refuses: ClassVar = dict.fromkeys(
         sorted(
             set(QUANTITIES)
@@ -185,32 +186,21 @@ class EmbeddedDynamics(Dynamics):
     # The protocol
 
     def _mass_matrix(self, q: Array) -> Array:
-        return per_sample(lambda u: self._reduced(u, np.zeros(len(u)))[1], q)
+        return self._reduced(q, np.zeros(len(q)))[1]
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        def one(u: Array, w: Array, force: Array) -> Array:
-            _, M, applied = self._reduced(u, w)
-            return np.asarray(np.linalg.solve(M, force + applied))
-
-        return per_sample(one, q, v, tau)
+        _, M, applied = self._reduced(q, v)
+        return np.asarray(np.linalg.solve(M, tau + applied))
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        def one(u: Array, w: Array, rate: Array) -> Array:
-            M, applied = self._reduced(u, w)[1:]
-            return np.asarray(M @ rate - applied)
+        _, M, applied = self._reduced(q, v)
+        return np.asarray(M @ a - applied)
 
-        return per_sample(one, q, v, a)
+    def _kinetic_energy(self, q: Array, v: Array) -> Any:
+        return self._manifold.dyn.kinetic_energy(*self.state(q, v))
 
-    def _kinetic_energy(self, q: Array, v: Array) -> Array:
-        return per_sample(lambda u, w: np.asarray(self._manifold.dyn.kinetic_energy(*self.state(u, w))), q, v)
-
-    def _potential_energy(self, q: Array) -> Array:
-        return per_sample(lambda u: np.asarray(self._manifold.dyn.potential_energy(self.configuration(u))), q)
-
-    def _refused(self, *args: Any, **named: Any) -> Array:
-        raise NotImplementedError
-
-    _gravity = _nle = _passive = _pose = _jacobian = _refused
+    def _potential_energy(self, q: Array) -> Any:
+        return self._manifold.dyn.potential_energy(self.configuration(q))
 
 
 class Embedded:

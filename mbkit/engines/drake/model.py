@@ -1,14 +1,14 @@
 """Drake's plant, built from a description.
 
-Joints of several coordinates with v = q̇ are stacks of one-coordinate joints on bodies
-without mass: a universal joint two, a spherical-ZYX joint three, a planar joint three. A ball
-joint is Drake's roll-pitch-yaw joint, whose velocities are angular velocities all the same, so that
-only its q̇ is singular, which nothing here uses.
+Joints of several coordinates with v = q̇ are stacks of one-coordinate joints on bodies without mass. A ball joint is
+Drake's roll-pitch-yaw joint, whose velocities are angular velocities all the same: only its q̇ is singular, which
+nothing here uses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -32,7 +32,7 @@ class DrakeModel:
     """A continuous, finalized plant, and the maps between its coordinates and the description's."""
 
     plant: Any
-    #: Entry i of a joint of real coordinates is full coordinate q_index[i]; -1 where a joint turns by a quaternion.
+    #: Entry i is full coordinate q_index[i], but the three angles of a ball joint, which mean nothing there.
     q_index: np.ndarray
     v_index: np.ndarray
     #: Ball and free joints, with their starts in Drake's positions and velocities.
@@ -64,11 +64,19 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
     added = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
     springs = [s for s in description.springs if bushings or s.rest_length > 0]
     bushings_ = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
-    try:
+    with _refusal(f"drake: refuses {description.name}"):
         plant.Finalize()
+    return mapped(plant, description, added, bodies, bushings_)
+
+
+@contextmanager
+def _refusal(what: str) -> Iterator[None]:
+    """Raise `UnsupportedError` with Drake's reason where a demand of Drake's fails, as an error or as an exit."""
+    try:
+        yield
     except (RuntimeError, SystemExit) as error:
-        raise UnsupportedError(f"drake: refuses {description.name}: {str(error).splitlines()[0]}") from None
-    return _mapped(plant, description, added, bodies, bushings_)
+        reason = (str(error).strip().splitlines() or ["not physical"])[0]
+        raise UnsupportedError(f"{what}: {reason}") from None
 
 
 def _add_spring(
@@ -97,14 +105,9 @@ def _inertia(body: Body, static: bool) -> Any:
         return tree.SpatialInertia.Zero()
     # Drake refuses some inertias that cannot act, because the body never moves.
     I = np.zeros((3, 3)) if static else body.inertia
-    try:
+    with _refusal(f"drake: refuses body {body.name!r} (mass {body.mass:.4g} kg)"):
         central = tree.RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
         return tree.SpatialInertia.MakeFromCentralInertia(float(body.mass), np.array(body.com), central)
-    except (RuntimeError, SystemExit) as error:
-        lines = str(error).strip().splitlines()
-        raise UnsupportedError(
-            f"drake: refuses body {body.name!r} (mass {body.mass:.4g} kg): {lines[0] if lines else 'not physical'}"
-        ) from None
 
 
 def _add(plant: Any, joint: Joint, bodies: dict[str, Any]) -> list[Any]:
@@ -158,10 +161,8 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
         if kind not in ("revolute", "prismatic"):
             raise UnsupportedError(f"drake: joint {joint.name!r} has a spring, which Drake's {kind} joint cannot have")
         spring = tree.RevoluteSpring if kind == "revolute" else tree.PrismaticSpring
-        try:
+        with _refusal(f"drake: refuses the spring of joint {joint.name!r}"):
             plant.AddForceElement(spring(added, rest, stiffness))
-        except (RuntimeError, SystemExit) as error:
-            raise UnsupportedError(f"drake: refuses the spring of joint {joint.name!r}: {error}") from None
     return added
 
 
@@ -177,19 +178,27 @@ def _turning(joint: Joint, at: Any, body: Any) -> Any:
     return tree.QuaternionFloatingJoint(joint.name, at, body, float(angular[0]), float(linear[0]))
 
 
-def _mapped(
-    plant: Any, description: Model, added: dict[str, list[Any]], bodies: dict[str, Any], bushings: tuple[Any, ...]
+def mapped(
+    plant: Any, description: Model, added: dict[str, list[Any]], bodies: dict[str, Any], bushings: tuple[Any, ...] = ()
 ) -> DrakeModel:
+    """Return a finalized plant with the maps between its coordinates and the description's."""
     layout = description.layout
     q_index, v_index = np.full(plant.num_positions(), -1), np.full(plant.num_velocities(), -1)
     turning = []
     for joint in description.joints:
         if not joint.type.nv:
             continue
-        q, v, own = layout.full_q[joint.name], layout.full_v[joint.name], added[joint.name]
+        first_q, first_v, own = layout.full_q[joint.name].start, layout.full_v[joint.name].start, added[joint.name]
+        order_q, order_v = [*range(joint.type.nq)], [*range(joint.type.nv)]
         if joint.type.quaternion is not None:
             turning.append((joint, own[0].position_start(), own[0].velocity_start()))
-            continue
-        for k, one in enumerate(own):
-            q_index[one.position_start()], v_index[one.velocity_start()] = q.start + k, v.start + k
+            if joint.kind == "free":
+                # w, x, y, z, then the position; the angular velocity first.
+                order_q, order_v = [6, 3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2]
+            else:
+                order_q = [0, 0, 0]
+        for one in own:
+            q, v, nq, nv = one.position_start(), one.velocity_start(), one.num_positions(), one.num_velocities()
+            q_index[q : q + nq], order_q = first_q + np.array(order_q[:nq]), order_q[nq:]
+            v_index[v : v + nv], order_v = first_v + np.array(order_v[:nv]), order_v[nv:]
     return DrakeModel(plant, q_index, v_index, tuple(turning), bodies, bushings)

@@ -1,8 +1,7 @@
 """MuJoCo behind the protocol: terms from its smooth dynamics, rollouts from its integrators.
 
-Todorov, Erez, Tassa 2012, "MuJoCo: a physics engine for model-based control". The
-only place that knows MuJoCo's quaternion order and its velocity of a free joint
-(linear in the world's axes): v_mj = T v with T = diag(R, 1), so M = Tᵀ M_mj T, and
+Todorov, Erez, Tassa 2012, "MuJoCo: a physics engine for model-based control". The only place that knows MuJoCo's
+velocity of a free joint (linear in the world's axes): v_mj = T v with T = diag(R, 1), so M = Tᵀ M_mj T, and
 a_mj = T a + b with b = R (ω × v).
 """
 
@@ -10,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -22,17 +21,17 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
 from mbkit.engines import known_defects
-from mbkit.engines.base import Dynamics, by_sample, per_sample
+from mbkit.engines.base import MappedDynamics
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
-from mbkit.engines.mujoco.rollout import Rollout
+from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.model import Model
+from mbkit.model import Frame, Model
 
 #: Quantities that M is part of.
 _OF_MASS: Final = ("mass_matrix", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
 
 
-class MujocoDynamics(Dynamics):
+class MujocoDynamics(MappedDynamics):
     """MuJoCo on a description.
 
     Attributes
@@ -55,13 +54,14 @@ class MujocoDynamics(Dynamics):
 
     def _hold(self, compiled: MujocoModel) -> None:
         self._maps = compiled
+        self._v_index = compiled.v_index
         self.mj_model = self._m = compiled.model
         self.disabled = compiled.disabled
         self._d = mujoco.MjData(self._m)
         self._reduced = self.model.layout.reduced
         self._lock = fork_safe(threading.RLock())
 
-    def _evaluate(self, quantity: str, method: Callable[..., Array], **arguments: ArrayLike) -> Array:
+    def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
         if quantity in _OF_MASS and self.model.couplings and self._torn_couplings:
             names = ", ".join(repr(name) for name in self._torn_couplings)
             known_defects.announce(known_defects.TENDON_ARMATURE, f"coupling {names}")
@@ -69,9 +69,9 @@ class MujocoDynamics(Dynamics):
         with self._lock, heard_warnings() as heard:
             # MuJoCo gives each kind of warning once, unless its count is put back.
             self._d.warning.number.fill(0)
-            out = super()._evaluate(quantity, method, **arguments)
+            out = super()._evaluate(quantity, *more, **arguments)
         if heard:
-            raise NumericalError(f"mujoco: {quantity} of {self.model.name}: {heard[0].strip()}{self._blame()}")
+            raise NumericalError(f"mujoco: {quantity} of {self.model.name}: {heard[0].strip()}{self._suspects()}")
         return out
 
     @cached_property
@@ -82,8 +82,8 @@ class MujocoDynamics(Dynamics):
         if not rows:
             return ()
         with self._lock:
-            M = self._one_mass_matrix(q)
-        bare = MujocoDynamics(replace(self.model, couplings=()))._one_mass_matrix(q)
+            M = self._mass_matrix(q)
+        bare = MujocoDynamics(replace(self.model, couplings=()))._mass_matrix(q)
         missing = np.abs(bare + sum(np.outer(x, x) for x in rows.values()) - M)
         root = np.sqrt(np.abs(np.diag(M)))
         lost = missing > 1e-9 * np.outer(root, root)
@@ -91,46 +91,26 @@ class MujocoDynamics(Dynamics):
 
     # Between the description's numbers and MuJoCo's.
 
-    def _set(self, q: Array, v: Array | None = None) -> tuple[Array, Array]:
-        """Put a state into MuJoCo; return full velocities and b of a_mj = T a + b."""
+    def _set(self, q: Array, v: Array | None = None) -> Array:
+        """Put a state into MuJoCo; return b of a_mj = T a + b."""
         layout, d = self.model.layout, self._d
         d.qpos[:] = layout.expand_q(q)[self._maps.q_index]
-        full = np.zeros(layout.sizes[3]) if v is None else layout.expand_v(v)
-        qvel = full[self._maps.v_index]
+        self._turned = [(self._rotation(iq), slice(iv, iv + 3)) for iq, iv in self._maps.free]
         b = np.zeros(self._m.nv)
-        for iq, iv in self._maps.free:
-            R = self._rotation(iq)
-            linear = qvel[iv : iv + 3].copy()
-            slip = np.empty(3)
-            mujoco.mju_cross(slip, qvel[iv + 3 : iv + 6], linear)
-            b[iv : iv + 3] = R @ slip
-            qvel[iv : iv + 3] = R @ linear
-        d.qvel[:] = qvel
-        return qvel, b
+        if v is None:
+            d.qvel[:] = 0.0
+            return b
+        d.qvel[:] = self._to_engine(v)
+        own = layout.expand_v(v)[self._v_index] if self._turned else b
+        for R, part in self._turned:
+            mujoco.mju_cross(b[part], own[part.stop : part.stop + 3], own[part])
+            b[part] = R @ b[part]
+        return b
 
     def _rotation(self, start_q: int) -> Array:
         R = np.empty(9)
         mujoco.mju_quat2Mat(R, self._d.qpos[start_q + 3 : start_q + 7])
         return R.reshape(3, 3)
-
-    def _to_mujoco(self, x: Array) -> Array:
-        """Return T x for a vector of full velocities or accelerations, after `_set`."""
-        out = self.model.layout.expand_v(x)[self._maps.v_index].copy()
-        for iq, iv in self._maps.free:
-            out[iv : iv + 3] = self._rotation(iq) @ out[iv : iv + 3]
-        return np.asarray(out)
-
-    def _columns(self, J: Array) -> Array:
-        """Return J T, in the description's order and reduced."""
-        J = J.copy()
-        for iq, iv in self._maps.free:
-            J[:, iv : iv + 3] = J[:, iv : iv + 3] @ self._rotation(iq)
-        full = np.empty_like(J)
-        full[:, self._maps.v_index] = J
-        return np.asarray(full @ self.model.layout.G) if self._reduced else full
-
-    def _force(self, f: Array) -> Array:
-        return np.asarray(self._columns(f[None, :])[0])
 
     @cached_property
     def _lines(self) -> list[int]:
@@ -138,7 +118,7 @@ class MujocoDynamics(Dynamics):
         return [k for k, spring in enumerate(self.model.springs) if spring.needs_direction]
 
     def _directed(self, x: np.ndarray) -> Array:
-        """Return what contains spring forces; NaN where a spring that needs a direction has no length.
+        """Return forces or accelerations; NaN where a spring that needs a direction has no length.
 
         MuJoCo takes the x axis for the direction of a shorter line than mjMINVAL.
         """
@@ -151,7 +131,7 @@ class MujocoDynamics(Dynamics):
 
     # The protocol.
 
-    def _one_mass_matrix(self, q: Array) -> Array:
+    def _mass_matrix(self, q: Array) -> Array:
         self._set(q)
         mujoco.mj_kinematics(self._m, self._d)
         mujoco.mj_comPos(self._m, self._d)
@@ -161,19 +141,16 @@ class MujocoDynamics(Dynamics):
         mujoco.mj_makeM(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
 
-    _mass_matrix = by_sample(_one_mass_matrix)
-
     def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
         """Return Σ |terms| / M_jj, worst over j.
 
-        MuJoCo writes composite inertias and joint axes about the centre of mass of
-        the whole tree (`mj_comPos`, `mj_crb`); a light link far from there is the
-        small difference of large numbers.
+        MuJoCo writes composite inertias and joint axes about the centre of mass of the whole tree (`mj_comPos`,
+        `mj_crb`); a light link far from there is the small difference of large numbers.
         """
-        return self._evaluate("mass_matrix_rounding", lambda q: per_sample(self._one_rounding, q), q=q)
+        return self._evaluate("mass_matrix_rounding", q=q)
 
-    def _one_rounding(self, q: Array) -> Array:
-        M = self._one_mass_matrix(q)
+    def _mass_matrix_rounding(self, q: Array) -> Array:
+        diagonal = np.diag(self._mass_matrix(q))
         cdof, composite = np.abs(self._d.cdof), np.abs(self._d.crb[self._m.dof_bodyid])
         # crb holds Ixx, Iyy, Izz, Ixy, Ixz, Iyz, m cx, m cy, m cz, m about that point.
         w, v, h, mass = cdof[:, :3], cdof[:, 3:], composite[:, 6:9], composite[:, 9]
@@ -181,23 +158,18 @@ class MujocoDynamics(Dynamics):
         turning = composite[:, :3] * w * w
         mixed = 2 * (composite[:, 3] * x * y + composite[:, 4] * x * z + composite[:, 5] * y * z)
         coupling = 2 * np.sum(h * (np.roll(w, 1, 1) * np.roll(v, 2, 1) + np.roll(w, 2, 1) * np.roll(v, 1, 1)), axis=1)
-        terms = turning.sum(axis=1) + mixed + coupling + mass * np.sum(v * v, axis=1)
-        layout = self.model.layout
-        full = np.empty(self._m.nv)
-        full[self._maps.v_index] = terms
-        own = layout.G.T**2 @ full if self._reduced else full
-        diagonal = np.diag(M)
+        terms = np.empty(self._m.nv)
+        terms[self._v_index] = turning.sum(axis=1) + mixed + coupling + mass * np.sum(v * v, axis=1)
+        own = self.model.layout.G.T**2 @ terms if self._reduced else terms
         return np.array(np.max(own / np.where(diagonal > 0, diagonal, np.inf), initial=1.0))
 
-    @by_sample
     def _gravity(self, q: Array) -> Array:
         self._set(q)
         self._velocities()
         return self._force(self._d.qfrc_bias)
 
-    @by_sample
     def _nle(self, q: Array, v: Array) -> Array:
-        _, b = self._set(q, v)
+        b = self._set(q, v)
         self._velocities()
         return self._force(self._d.qfrc_bias + self._times_mass(b))
 
@@ -216,91 +188,63 @@ class MujocoDynamics(Dynamics):
             mujoco.mj_mulM(self._m, self._d, out, x)
         return out
 
-    @by_sample
     def _passive(self, q: Array, v: Array) -> Array:
         self._set(q, v)
         self._velocities()
         return self._directed(self._force(self._d.qfrc_passive))
 
-    @by_sample
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        _, b = self._set(q, v)
-        self._d.qacc[:] = self._to_mujoco(a) + b
+        b = self._set(q, v)
+        self._d.qacc[:] = self._to_engine(a) + b
         mujoco.mj_inverse(self._m, self._d)
         return self._directed(self._force(self._d.qfrc_inverse))
 
-    @by_sample
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self._reduced:
-            return self._forward_reduced(q, v, tau)
-        _, b = self._set(q, v)
-        # T is orthogonal, so a force maps as a velocity does.
-        self._d.qfrc_applied[:] = self._to_mujoco(tau)
+            # A mimic joint inside MuJoCo would be a soft equality: reduce instead.
+            M = self._mass_matrix(q)
+            b = self._set(q, v)
+            self._velocities()
+            rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
+            return self._directed(np.linalg.solve(M, tau + rest))
+        b = self._set(q, v)
+        self._d.qfrc_applied[:] = self._to_engine(tau)
         mujoco.mj_forward(self._m, self._d)
         self._d.qfrc_applied[:] = 0.0
         return self._directed(self._force(self._d.qacc - b))
 
-    def _forward_reduced(self, q: Array, v: Array, tau: Array) -> Array:
-        # A mimic joint inside MuJoCo would be a soft equality: reduce instead.
-        M = self._one_mass_matrix(q)
-        _, b = self._set(q, v)
-        self._velocities()
-        rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
-        return self._directed(np.linalg.solve(M, tau + rest))
-
-    @by_sample
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
         self._set(q, v)
         self._velocities()
         mujoco.mj_energyVel(self._m, self._d)
-        return float(self._d.energy[1])
+        return self._d.energy[1]
 
-    @by_sample
     def _potential_energy(self, q: Array) -> Any:
         self._set(q)
         mujoco.mj_fwdPosition(self._m, self._d)
         mujoco.mj_energyPos(self._m, self._d)
-        return float(self._d.energy[0])
+        return self._d.energy[0]
 
-    def _body(self, frame: str) -> tuple[int, Array, Array]:
-        f = self.model.frame(frame)
-        if f.body in self._maps.absorbed:
+    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
+        if frame.body in self._maps.absorbed:
             raise UnsupportedError(
-                f"mujoco: frame {frame!r} rides on {f.body!r}, a body without mass between two joints, "
+                f"mujoco: frame {frame.name!r} rides on {frame.body!r}, a body without mass between two joints, "
                 "which MuJoCo holds as two joints of one body"
             )
-        return self._maps.bodies[f.body], f.rotation, f.translation
-
-    def _frame_pose(self, body: int, R_BF: Array, p_BF: Array) -> tuple[Array, Array]:
+        body = self._maps.bodies[frame.body]
+        self._set(q)
         mujoco.mj_kinematics(self._m, self._d)
         mujoco.mj_comPos(self._m, self._d)
         R = self._d.xmat[body].reshape(3, 3)
-        return R @ R_BF, self._d.xpos[body] + R @ p_BF
+        return R @ frame.rotation, self._d.xpos[body] + R @ frame.translation
 
-    def _pose(self, q: Array, frame: str) -> Array:
-        body, R_BF, p_BF = self._body(frame)
-
-        def one(q: Array) -> Array:
-            self._set(q)
-            X = np.eye(4)
-            X[:3, :3], X[:3, 3] = self._frame_pose(body, R_BF, p_BF)
-            return X
-
-        return per_sample(one, q)
-
-    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
-        body, R_BF, p_BF = self._body(frame)
-
-        def one(q: Array) -> Array:
-            self._set(q)
-            R, p = self._frame_pose(body, R_BF, p_BF)
-            linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
-            mujoco.mj_jac(self._m, self._d, linear, angular, p, body)
-            if axes == "body":
-                linear, angular = R.T @ linear, R.T @ angular
-            return self._columns(np.vstack([linear, angular]))
-
-        return per_sample(one, q)
+    def _jacobian(self, q: Array, frame: Frame, axes: str) -> Array:
+        R, p = self._placement(q, frame)
+        linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
+        mujoco.mj_jac(self._m, self._d, linear, angular, p, self._maps.bodies[frame.body])
+        if axes == "body":
+            linear, angular = R.T @ linear, R.T @ angular
+        return self._columns(np.vstack([linear, angular]))
 
     # Native integration.
 
@@ -316,22 +260,17 @@ class MujocoDynamics(Dynamics):
         euler_damping: bool = False,
         progress: Callable[[float], object] | None = None,
     ) -> tuple[Array, Array]:
-        """Integrate with MuJoCo's own steps.
+        """Integrate one state or a batch with MuJoCo's own steps of `dt` seconds.
 
         Parameters
         ----------
-        integrator : {"euler", "rk4", "implicit", "implicitfast"}
-        q0, v0 : (n,) or (N, n) arrays
-        dt : float
-            Step, s.
+        integrator : {"euler", "rk4", "implicit", "implicitfast", "discrete"}
         tau : (steps, nv) or (N, steps, nv) array, optional
             Held over each step.
-        steps : int
         euler_damping : bool
-            Whether Euler treats joint damping implicitly, MuJoCo's default; it
-            then solves (M + h D) a = f and is no longer the explicit formula.
+            Whether Euler treats joint damping implicitly, MuJoCo's default; it then solves (M + h D) a = f.
         progress : callable, optional
-            Gets the fraction done, about ten times a second; what it raises ends the run.
+            Gets the finished fraction, about ten times a second; an exception of its ends the run.
 
         Returns
         -------
@@ -341,8 +280,8 @@ class MujocoDynamics(Dynamics):
         Raises
         ------
         UnsupportedError
-            For reduced mimic joints (MuJoCo would make them soft), and forces on
-            a free joint's translation (MuJoCo holds them in world axes).
+            For reduced mimic joints (MuJoCo would make them soft), and forces on a free joint's translation (MuJoCo
+            holds them in world axes).
         """
         if self._reduced:
             names = ", ".join(j.name for j in self.model.joints if j.mimic)
@@ -363,4 +302,37 @@ class MujocoDynamics(Dynamics):
         model = copy.copy(self._m)
         if euler_damping:
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        return Rollout(self.model, self._maps, model)(integrator, q0, v0, dt, tau, steps, progress)
+        return rollout(self.model, replace(self._maps, model=model), integrator, q0, v0, dt, tau, steps, progress)
+
+
+class Variant:
+    """The same MuJoCo model with features on that mbkit leaves out, to measure them.
+
+    `enable` names MuJoCo's disable bits to clear, such as ``"CONTACT"``. With `spheres` every body carries a sphere of
+    1 µm at its centre of mass, which costs what geometry costs and touches nothing.
+    """
+
+    def __init__(self, dyn: MujocoDynamics, enable: Iterable[str] = (), *, spheres: bool = False) -> None:
+        maps = build(dyn.model, spheres=spheres)
+        self._m = maps.model
+        flags = int(self._m.opt.disableflags)
+        for name in enable:
+            flags &= ~int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+        self._m.opt.disableflags = flags
+        self._d = mujoco.MjData(self._m)
+        self._maps, self._layout = maps, dyn.model.layout
+
+    def set(self, q: Array, v: Array) -> None:
+        """Put a state in; the velocities' frame does not matter for what is measured."""
+        self._d.qpos[:] = self._layout.expand_q(q)[self._maps.q_index]
+        self._d.qvel[:] = self._layout.expand_v(v)[self._maps.v_index]
+
+    def forward(self) -> Any:
+        """Run the forward dynamics once."""
+        mujoco.mj_forward(self._m, self._d)
+
+    def accelerations(self, q: Array, v: Array) -> Array:
+        """Return MuJoCo's qacc at a state."""
+        self.set(q, v)
+        self.forward()
+        return np.array(self._d.qacc)

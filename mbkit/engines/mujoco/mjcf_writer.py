@@ -5,7 +5,7 @@ MuJoCo's writer keeps six digits. Here numbers are the shortest decimals that gi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, Final
 
 import mujoco
@@ -13,9 +13,8 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
-from mbkit.engines.base import Dynamics
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.engines.mujoco.model import JOINT_TYPES, MujocoModel, Placed, heard_warnings, mapped, specified
+from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, heard_warnings, mapped, specified
 from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 
@@ -25,16 +24,9 @@ _TYPES: Final = {
     int(mujoco.mjtJoint.mjJNT_BALL): "ball",
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
 }
+_OF_COUPLING: Final = ("stiffness", "damping", "armature")
 # MuJoCo refuses principal moments below 1e-15 kg m².
 _LEAST: Final = 2e-15
-
-
-class ReadBack(MujocoDynamics):
-    """MuJoCo on the model that its own parser compiled of a text."""
-
-    def __init__(self, model: Model, compiled: MujocoModel) -> None:
-        Dynamics.__init__(self, model)
-        self._hold(compiled)
 
 
 def mjcf_text(model: Model, comment: str) -> str:
@@ -51,14 +43,11 @@ def mjcf_text(model: Model, comment: str) -> str:
         "  <worldbody>",
     ]
     owners = {name: joint for joint in model.joints for name in placed.joints[joint.name]}
-    lines += _body(spec.worldbody, owners, placed, model, "    ")
-    lines.append("  </worldbody>")
-    lines += _tendons(spec, model)
-    lines += _equalities(model)
-    return "\n".join([*lines, "</mujoco>"]) + "\n"
+    lines += [*_body(spec.worldbody, owners, placed, model, "    "), "  </worldbody>"]
+    return "\n".join([*lines, *_tendons(spec, model), *_equalities(model), "</mujoco>", ""])
 
 
-def read_back(model: Model, text: str) -> ReadBack:
+def read_back(model: Model, text: str) -> MujocoDynamics:
     """Return the model that MuJoCo's parser reads from a text of `mjcf_text`, in the description's coordinates."""
     _, placed, _ = specified(model)
     with heard_warnings():
@@ -67,7 +56,7 @@ def read_back(model: Model, text: str) -> ReadBack:
         except ValueError as error:
             reason = " ".join(str(error).split())
             raise UnsupportedError(f"mujoco: refuses what was written of {model.name}: {reason}") from None
-    return ReadBack(model, mapped(compiled, model, placed, ()))
+    return MujocoDynamics.holding(model, mapped(compiled, model, placed.joints, placed.bodies, placed.absorbed))
 
 
 def _unsupported(model: Model) -> Iterator[str]:
@@ -135,48 +124,48 @@ def _joint(joint: Any, owner: Joint) -> str:
     kind = _TYPES[int(joint.type)]
     attributes: dict[str, Any] = {"name": joint.name, "type": kind}
     if kind in ("hinge", "slide"):
-        attributes |= {"pos": joint.pos, "axis": joint.axis}
-        for name in ("stiffness", "damping"):
-            attributes[name] = np.ravel(getattr(joint, name))[0] or None
+        attributes |= {"pos": joint.pos, "axis": joint.axis, **_numbers(joint, "stiffness", "damping")}
         attributes["springref"] = joint.springref if attributes["stiffness"] else None
-        attributes["armature"], attributes["frictionloss"] = joint.armature or None, joint.frictionloss or None
+        attributes |= _numbers(joint, "armature", "frictionloss")
         # 2 is MuJoCo's "as the range says".
         if int(joint.limited) == 1:
             attributes |= {"limited": "true", "range": joint.range}
-        if owner.type.nv == 1 and np.isfinite(owner.effort_limit[0]) and owner.effort_limit[0] > 0:
+        if owner.type.nv == 1 and 0 < owner.effort_limit[0] < np.inf:
             effort = owner.effort_limit[0]
-            attributes |= {"actuatorfrclimited": "true", "actuatorfrcrange": np.array([-effort, effort])}
+            attributes |= {"actuatorfrclimited": "true", "actuatorfrcrange": (-effort, effort)}
     else:
         attributes |= {"pos": joint.pos} if kind == "ball" else {}
         attributes["damping"] = owner.damping[-1] or None
     return _attributes(**attributes)
 
 
-def _tendons(spec: Any, model: Model) -> Iterable[str]:
-    if not spec.tendons:
-        return []
-    out = ["  <tendon>"]
-    points, between = spec.tendons[: len(model.springs)], spec.tendons[len(model.springs) :]
-    for tendon in points:
-        attributes = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping")}
-        out.append(f"    <spatial{_attributes(name=tendon.name, springlength=tendon.springlength[0], **attributes)}>")
-        out += [f"      <site{_attributes(site=wrap.target.name)}/>" for wrap in tendon.path]
-        out.append("    </spatial>")
-    for tendon in between:
-        attributes = {n: np.ravel(getattr(tendon, n))[0] or None for n in ("stiffness", "damping", "armature")}
-        rest = tendon.springlength[0] if attributes["stiffness"] else None
-        out.append(f"    <fixed{_attributes(name=tendon.name, springlength=rest, **attributes)}>")
-        out += [f"      <joint{_attributes(joint=wrap.target.name, coef=wrap.coef)}/>" for wrap in tendon.path]
-        out.append("    </fixed>")
-    return [*out, "  </tendon>"]
+def _numbers(element: Any, *names: str) -> dict[str, float | None]:
+    """Return the first of each of these numbers, None for a zero."""
+    return {name: np.ravel(getattr(element, name))[0] or None for name in names}
 
 
-def _equalities(model: Model) -> Iterable[str]:
+def _tendons(spec: Any, model: Model) -> Iterator[str]:
+    if spec.tendons:
+        yield "  <tendon>"
+    for k, tendon in enumerate(spec.tendons):
+        between_points = k < len(model.springs)
+        tag, names = ("spatial", ("stiffness", "damping")) if between_points else ("fixed", _OF_COUPLING)
+        numbers = _numbers(tendon, *names)
+        rest = tendon.springlength[0] if between_points or numbers["stiffness"] else None
+        yield f"    <{tag}{_attributes(name=tendon.name, springlength=rest, **numbers)}>"
+        for wrap in tendon.path:
+            part = {"site": wrap.target.name} if between_points else {"joint": wrap.target.name, "coef": wrap.coef}
+            yield f"      <{'site' if between_points else 'joint'}{_attributes(**part)}/>"
+        yield f"    </{tag}>"
+    if spec.tendons:
+        yield "  </tendon>"
+
+
+def _equalities(model: Model) -> Iterator[str]:
     mimics = [(j.name, j.mimic) for j in model.joints if j.mimic is not None]
-    if not mimics:
-        return []
-    out = ["  <equality>"]
-    for name, m in mimics:
-        shape = np.array([m.offset, m.ratio, 0.0, 0.0, 0.0])
-        out.append(f"    <joint{_attributes(joint1=name, joint2=m.joint, polycoef=shape)}/>")
-    return [*out, "  </equality>"]
+    if mimics:
+        yield "  <equality>"
+        for name, m in mimics:
+            shape = (m.offset, m.ratio, 0.0, 0.0, 0.0)
+            yield f"    <joint{_attributes(joint1=name, joint2=m.joint, polycoef=shape)}/>"
+        yield "  </equality>"

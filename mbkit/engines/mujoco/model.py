@@ -1,17 +1,15 @@
 """A MuJoCo model built from a description with `MjSpec`, everything off that it does not need.
 
-MuJoCo puts several joints into one body, first to last. So a universal joint is two
-hinges, a spherical-ZYX joint three, a planar joint two slides and a hinge, and a free
-joint that does not hang directly in the world three slides and a ball (the same
-velocities: linear in the parent's axes, angular in the body's). A body without mass
-between two joints becomes such a stack too.
+MuJoCo puts several joints into one body, first to last: a universal joint is two hinges, a spherical-ZYX joint three, a
+planar joint two slides and a hinge, and a free joint that does not hang directly in the world three slides and a ball
+(the same velocities: linear in the parent's axes, angular in the body's). So does a body without mass between two.
 """
 
 from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -26,10 +24,7 @@ from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.validation import static_bodies
 
-# What differs between versions of MuJoCo and what is global in it, in one place.
-#
-# 4.0 is the first whose Runge–Kutta on rotations is of fourth order, and the lower
-# bound. `mj_fullM` took the matrix itself before 3.10, and takes the data since.
+# What is global in MuJoCo. 4.0, the lower bound, is the first whose Runge–Kutta on rotations is of fourth order.
 
 
 def _leave_no_log() -> None:
@@ -109,7 +104,7 @@ def build(description: Model, *, spheres: bool = False) -> MujocoModel:
             raise UnsupportedError(f"mujoco: {_refusal(description, str(error))}") from None
         _set_constants(model, description, placed)
     _verify(model, description, placed)
-    return mapped(model, description, placed, disabled)
+    return mapped(model, description, placed.joints, placed.bodies, placed.absorbed, disabled)
 
 
 @dataclass
@@ -153,31 +148,30 @@ def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
     return spec, placed, disabled
 
 
+#: Features that no smooth term needs, with their disable bits, and those that some models need.
+_OFF: Final = {
+    "contacts": "CONTACT",
+    "joint limits": "LIMIT",
+    "dry friction": "FRICTIONLOSS",
+    "equality constraints": "EQUALITY",
+    "constraint solver": "CONSTRAINT",
+    "actuators": "ACTUATION",
+    "sensors": "SENSOR",
+    "implicit damping in Euler": "EULERDAMP",
+    "restart after divergence": "AUTORESET",
+    "warm start": "WARMSTART",
+    "islands": "ISLAND",
+}
+_OFF_WITHOUT: Final = {
+    "gravity": ("gravity", "GRAVITY"),
+    "springs": ("springs", "SPRING"),
+    "damping": ("dampers", "DAMPER"),
+}
+
+
 def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
-    needs = description.needs
-    bits = {
-        "contacts": "CONTACT",
-        "joint limits": "LIMIT",
-        "dry friction": "FRICTIONLOSS",
-        "equality constraints": "EQUALITY",
-        "constraint solver": "CONSTRAINT",
-        "actuators": "ACTUATION",
-        "sensors": "SENSOR",
-        "implicit damping in Euler": "EULERDAMP",
-        "restart after divergence": "AUTORESET",
-        "warm start": "WARMSTART",
-        "islands": "ISLAND",
-    }
-    if not needs.gravity:
-        bits["gravity"] = "GRAVITY"
-    if not needs.springs:
-        bits["springs"] = "SPRING"
-    if not needs.damping:
-        bits["dampers"] = "DAMPER"
-    flags = 0
-    for bit in bits.values():
-        flags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}", 0))
-    spec.option.disableflags = flags
+    bits = _OFF | dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
+    spec.option.disableflags = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}", 0)) for bit in bits.values())
     spec.option.gravity = np.array(description.gravity)
     # 4.0.0 can give wrong accelerations with sparse Jacobians.
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -190,8 +184,8 @@ def _add_tree(spec: Any, description: Model) -> Placed:
     for joint in description.joints:
         children.setdefault(joint.parent, []).append(joint)
     sprung = {b for s in description.springs for b in (s.body_a, s.body_b)}
-    # (MuJoCo parent, R, p) of the frame in which a joint stands, and the joints
-    # stacked on the way there, each with its frame in the same parent.
+    # (MuJoCo parent, R, p) of the frame in which a joint stands, and the joints stacked on the way there, each with its
+    # frame in the same parent.
     at: dict[str, tuple[str, Array, Array, list[tuple[Joint, Array, Array]]]] = {
         "world": ("world", np.eye(3), np.zeros(3), [])
     }
@@ -216,16 +210,14 @@ def _add_tree(spec: Any, description: Model) -> Placed:
         placed.bodies[body.name] = new
         _give_inertia(new, body, description, placed)
         if len(stack) > 1 and any(stacked.kind == "prismatic" for stacked, _, _ in stack):
-            # MuJoCo 4.0.0 takes the mass matrix of several slides of a "simple" body for diagonal, even
-            # where they are parallel.
+            # MuJoCo 4.0.0 takes M of several slides of a "simple" body for diagonal, even where they are parallel.
             new.simple = 0
         at_origin = owner == "world" and np.array_equal(R, np.eye(3)) and not p.any()
         for stacked, R_PJ, p_PJ in stack:
-            _add_joint(new, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin=at_origin)
+            _add_joint(new, stacked, R.T @ R_PJ, R.T @ (p_PJ - p), placed, at_origin)
         if owner == "world" and joint.kind == "fixed":
-            # MuJoCo forms inertias about the centre of mass of a body's whole tree, and
-            # rounds accordingly. What hangs on a body fixed to the world starts a tree
-            # of its own in the world, so that one leg is not measured from the other's.
+            # MuJoCo forms inertias about the centre of mass of a body's whole tree, and rounds accordingly. What hangs
+            # on a body fixed to the world starts a tree of its own, so that one leg is not measured from the other's.
             at[body.name] = ("world", R, p, [])
         else:
             at[body.name] = (body.name, np.eye(3), np.zeros(3), [])
@@ -246,21 +238,10 @@ def _give_inertia(new: Any, body: Body, description: Model, placed: Placed) -> N
     low, middle, high = np.sort(moments)
     harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
     if harmless and (low < _SMALLEST or low + middle < high):
-        # A point mass, a thin rod or a plate is a fair idealization, and what is fixed
-        # to the world may have any inertia. The compiler refuses them though the dynamics
-        # needs no such rule: they are compiled with a placeholder and get their own
-        # moments afterwards.
+        # A point mass, a thin rod or a plate is a fair idealization, and what is fixed to the world may have any
+        # inertia. The compiler refuses them: they are compiled with a placeholder and get their own moments afterwards.
         placed.degenerate[body.name] = moments
         new.inertia = np.ones(3)
-
-
-def _stack(joint: Joint) -> list[tuple[Any, Array, str]]:
-    """Return MuJoCo's type, axis and name suffix of each joint of a stack."""
-    if joint.kind in _OWN_STACKS:
-        return _OWN_STACKS[joint.kind]
-    types = {"revolute": _HINGE, "prismatic": _SLIDE}
-    suffixes = [f".{suffix}" if suffix else "" for suffix in joint.type.suffixes]
-    return [(types[kind], axis, x) for (kind, axis), x in zip(STACKS[joint.kind](joint), suffixes, strict=True)]
 
 
 _OWN_STACKS: Final[dict[str, list[tuple[Any, Array, str]]]] = {
@@ -271,14 +252,25 @@ _OWN_STACKS: Final[dict[str, list[tuple[Any, Array, str]]]] = {
 JOINT_TYPES: Final = frozenset(STACKS) | frozenset(_OWN_STACKS)
 
 
-def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, at_origin: bool) -> None:
-    """Add the joint, whose fixed frame at q = 0 is (R, p) in the body."""
-    names: list[str] = []
+def _stack(joint: Joint, at_origin: bool) -> list[tuple[Any, Array, str]]:
+    """Return MuJoCo's type, axis and name suffix of each joint of a stack."""
+    if joint.kind == "free" and at_origin:
+        # A true free joint's qpos is the pose in the world, ours too then.
+        return [(_FREE, _Z, "")]
+    if joint.kind in _OWN_STACKS:
+        return _OWN_STACKS[joint.kind]
+    types = {"revolute": _HINGE, "prismatic": _SLIDE}
+    suffixes = [f".{suffix}" if suffix else "" for suffix in joint.type.suffixes]
+    return [(types[kind], axis, x) for (kind, axis), x in zip(STACKS[joint.kind](joint), suffixes, strict=True)]
 
-    def add(kind: Any, axis: Array, k: int, suffix: str) -> None:
-        name = joint.name + suffix
-        j = new.add_joint(name=name, type=kind, axis=R @ axis, pos=p)
-        if kind in (_HINGE, _SLIDE):
+
+def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, at_origin: bool) -> None:
+    """Add the joint, whose fixed frame at q = 0 is (R, p) in the body."""
+    names = placed.joints[joint.name] = []
+    for k, (type_, axis, suffix) in enumerate(_stack(joint, at_origin)):
+        names.append(joint.name + suffix)
+        j = new.add_joint(name=names[-1], type=type_, axis=R @ axis, pos=p)
+        if type_ in (_HINGE, _SLIDE):
             j.stiffness[0], j.springref = joint.stiffness[k], joint.rest[k]
             j.damping[0], j.frictionloss = joint.damping[k], joint.friction[k]
             if joint.type.nv == 1:
@@ -287,15 +279,6 @@ def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, *, at
             if np.isfinite([low, high]).any() and low < high:
                 # MuJoCo has no open end; this one is never reached.
                 j.limited, j.range = 1, [max(low, -_OPEN), min(high, _OPEN)]
-        names.append(name)
-
-    steps = _stack(joint)
-    if joint.kind == "free" and at_origin:
-        # A true free joint's qpos is the pose in the world, ours too then.
-        steps = [(_FREE, _Z, "")]
-    for k, (type_, axis, suffix) in enumerate(steps):
-        add(type_, axis, k, suffix)
-    placed.joints[joint.name] = names
 
 
 def _add_springs(spec: Any, description: Model, placed: Placed) -> None:
@@ -325,17 +308,15 @@ def _add_couplings(spec: Any, description: Model, placed: Placed) -> None:
 
 def _refusal(description: Model, error: str) -> str:
     """Return MuJoCo's complaint in one line, with the body it names."""
-    lines = [line.strip() for line in error.splitlines() if line.strip()]
-    reason = lines[0].removeprefix("Error: ") if lines else "compile failed"
+    lines = [line.strip() for line in error.splitlines() if line.strip()] or ["compile failed"]
+    reason = lines[0].removeprefix("Error: ")
     named = next((x for x in lines if x.startswith("Element name")), "")
-    name = named.split("'")[1] if "'" in named else ""
-    reasons = dict(description.nonphysical)
-    if name:
-        body = next((b for b in description.bodies if b.name == name), None)
-        detail = f" (mass {body.mass:.4g} kg)" if body is not None else ""
-        why = f"; {reasons[name]}" if name in reasons else ""
-        return f"the compiler refuses body {name!r}{detail}: {reason}{why}"
-    return f"the compiler refuses {description.name}: {reason}"
+    if "'" not in named:
+        return f"the compiler refuses {description.name}: {reason}"
+    name = named.split("'")[1]
+    mass = "".join(f" (mass {b.mass:.4g} kg)" for b in description.bodies if b.name == name)
+    why = "".join(f"; {why}" for body, why in description.nonphysical if body == name)
+    return f"the compiler refuses body {name!r}{mass}: {reason}{why}"
 
 
 def _set_constants(model: Any, description: Model, placed: Placed) -> None:
@@ -354,54 +335,67 @@ def _verify(model: Any, description: Model, placed: Placed) -> None:
         if body.name in placed.absorbed:
             continue
         own = model.body(body.name)
-        x, y, z = own.iquat[1:]
-        R = spatial.matrix_from_quaternion(np.array([x, y, z, own.iquat[0]]))
+        R = matrix_of(own.iquat)
         inertia = R @ np.diag(own.inertia) @ R.T
-        for what, got, wanted in (
+        triples = (
             ("mass", own.mass, body.mass),
             ("centre of mass", own.ipos, body.com),
             ("inertia", inertia, body.inertia),
-        ):
-            off = np.abs(np.asarray(got) - wanted).max()
-            if off > 1e-13 * np.abs(wanted).max():
+        )
+        for what, result, expected in triples:
+            off = np.abs(np.asarray(result) - expected).max()
+            if off > 1e-13 * np.abs(expected).max():
                 raise MbkitError(
                     f"mujoco: {what} of body {body.name!r} changed by {off:.2e} on the way into MuJoCo "
-                    f"{mujoco.__version__}: expected {wanted}, got {got}; please report this model"
+                    f"{mujoco.__version__}: expected {expected}, got {result}; please report this model"
                 )
 
 
-def _addresses(model: Any, names: list[str]) -> tuple[list[int], list[int]]:
+def _addresses(model: Any, joints: Iterable[str | int]) -> tuple[list[int], list[int]]:
     q: list[int] = []
     v: list[int] = []
-    for name in names:
-        j = model.joint(name)
+    for j in map(model.joint, joints):
         q += range(int(j.qposadr[0]), int(j.qposadr[0]) + len(j.qpos0))
         v += range(int(j.dofadr[0]), int(j.dofadr[0]) + len(j.damping))
     return q, v
 
 
-def mapped(model: Any, description: Model, placed: Placed, disabled: tuple[str, ...]) -> MujocoModel:
-    """Return a compiled model with the maps between its coordinates and the description's, by name."""
+def mapped(
+    model: Any,
+    description: Model,
+    joints: Mapping[str, Sequence[str | int]],
+    bodies: Iterable[str] = (),
+    absorbed: Iterable[str] = (),
+    disabled: tuple[str, ...] = (),
+) -> MujocoModel:
+    """Return a compiled model with the maps between its coordinates and the description's.
+
+    `joints` has MuJoCo's joints, by name or number, of each joint of the description.
+    """
     layout = description.layout
     q_index, v_index = np.zeros(model.nq, int), np.zeros(model.nv, int)
     free = []
     for joint in description.joints:
         if not joint.type.nv:
             continue
-        q, v = _addresses(model, placed.joints[joint.name])
-        ours_q, ours_v = layout.full_q[joint.name], layout.full_v[joint.name]
-        order = list(range(ours_q.start, ours_q.stop))
+        q, v = _addresses(model, joints[joint.name])
+        own_q, own_v = layout.full_q[joint.name], layout.full_v[joint.name]
+        order = list(range(own_q.start, own_q.stop))
         if joint.type.quaternion is not None:
             # x, y, z, w here; w, x, y, z there.
             k = joint.type.quaternion
             order[k:] = [order[-1], *order[k:-1]]
-        q_index[q], v_index[v] = order, range(ours_v.start, ours_v.stop)
+        q_index[q], v_index[v] = order, range(own_v.start, own_v.stop)
         if joint.kind == "free":
             free.append((q[0], v[0]))
-    bodies = {name: model.body(name).id for name in placed.bodies if name != "world"} | {"world": 0}
-    return MujocoModel(model, q_index, v_index, tuple(free), bodies, frozenset(placed.absorbed), disabled)
+    ids = {name: model.body(name).id for name in bodies if name != "world"} | {"world": 0}
+    return MujocoModel(model, q_index, v_index, tuple(free), ids, frozenset(absorbed), disabled)
 
 
 def _wxyz(R: Array) -> Array:
-    x, y, z, w = spatial.quaternion_from_matrix(R)
-    return np.array([w, x, y, z])
+    return np.roll(spatial.quaternion_from_matrix(R), 1)
+
+
+def matrix_of(wxyz: Any) -> Array:
+    """Return the rotation matrix of a quaternion in MuJoCo's order."""
+    return spatial.matrix_from_quaternion(np.roll(np.asarray(wxyz, dtype=np.float64), -1))

@@ -18,11 +18,10 @@ from mbkit.engines.mujoco.model import MujocoModel, heard_warnings
 from mbkit.errors import DoubtfulRunWarning, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 
-# All but RK4 are of first order. "euler" takes damping as it is, because the description
-# is built with MuJoCo's implicit damping off; the three implicit ones take it at the
-# step's end, "discrete" springs too: stable at any stiffness, by damping what the step
-# cannot resolve. "implicit" has the derivatives of all velocity terms, and damps whatever
-# turns; "implicitfast" and "discrete" have them for free bodies only.
+# All but RK4 are of first order. "euler" takes damping as it is, because the description is built with MuJoCo's
+# implicit damping off; the three implicit ones take it at the step's end, "discrete" springs too: stable at any
+# stiffness, by damping what the step cannot resolve. "implicit" has the derivatives of all velocity terms, and damps
+# whatever turns; "implicitfast" and "discrete" have them for free bodies only.
 INTEGRATORS: Final = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
@@ -32,120 +31,103 @@ INTEGRATORS: Final = {
 }
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _SINGULAR: Final = int(mujoco.mjtWarning.mjWARN_INERTIA)
-_FORCE: Final = mujoco.mjtState.mjSTATE_QFRC_APPLIED
-
-
+_FORCE: Final = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 # MuJoCo's code cannot be interrupted: it is left this often, s, for signals and progress. States do not depend on it.
 _PERIOD: Final = 0.1
 
 
-class Rollout:
-    """One call integrates one state or a batch on all cores."""
-
-    def __init__(self, description: Model, maps: MujocoModel, model: Any) -> None:
-        self._description, self._maps, self._m = description, maps, model
-
-    def __call__(
-        self,
-        integrator: str,
-        q0: Array,
-        v0: Array,
-        dt: float,
-        tau: Array | None,
-        steps: int,
-        progress: Callable[[float], object] | None = None,
-    ) -> tuple[Array, Array]:
-        if integrator not in INTEGRATORS:
-            raise UnknownNameError("integrator of MuJoCo", integrator, INTEGRATORS)
-        self._m.opt.integrator = INTEGRATORS[integrator]
-        self._m.opt.timestep = dt
-        single = q0.ndim == 1
-        q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
-        n = len(q0)
-        if not steps or not n:
-            # Nothing to do, and MuJoCo does not survive an empty batch.
-            q, v = (np.repeat(x[:, None], steps + 1, axis=1) for x in (q0, v0))
-            return (q[0], v[0]) if single else (q, v)
-        start = np.zeros((n, mujoco.mj_stateSize(self._m, _STATE)))
-        nq = self._m.nq
-        start[:, 1 : 1 + nq] = q0[:, self._maps.q_index]
-        start[:, 1 + nq : 1 + nq + self._m.nv] = self._velocity_in(q0, v0)
-        control = None if tau is None else self._forces(tau, n, steps)
-        threads = max(1, min(n, os.cpu_count() or 1))
-        data = [mujoco.MjData(self._m) for _ in range(threads)]
+def rollout(
+    description: Model,
+    compiled: MujocoModel,
+    integrator: str,
+    q0: Array,
+    v0: Array,
+    dt: float,
+    tau: Array | None,
+    steps: int,
+    progress: Callable[[float], object] | None = None,
+) -> tuple[Array, Array]:
+    """Integrate one state or a batch on all cores, with options of the compiled model; see `MujocoDynamics.rollout`."""
+    m = compiled.model
+    if integrator not in INTEGRATORS:
+        raise UnknownNameError("integrator of MuJoCo", integrator, INTEGRATORS)
+    m.opt.integrator, m.opt.timestep = INTEGRATORS[integrator], dt
+    single = q0.ndim == 1
+    q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)
+    n, end_q = len(q0), 1 + m.nq
+    if steps and n:
+        start = np.zeros((n, mujoco.mj_stateSize(m, _STATE)))
+        qpos = start[:, 1:end_q] = q0[:, compiled.q_index]
+        start[:, end_q : end_q + m.nv] = _turned(compiled, qpos, v0[:, compiled.v_index])
+        control = None if tau is None else _forces(compiled, np.broadcast_to(tau, (n, steps, description.nv)))
+        data = [mujoco.MjData(m) for _ in range(max(1, min(n, os.cpu_count() or 1)))]
         # A divergence is read off the states themselves.
         with heard_warnings():
-            states = self._run(data, start, control, steps, progress)
+            states = _run(m, data, start, control, steps, progress)
         if any(d.warning.number[_SINGULAR] for d in data):
             reason = "MuJoCo met a mass matrix that is too close to singular, and went on with another one"
-            warn(f"{self._description.name}: {reason}; compare with rk853", DoubtfulRunWarning)
-        states[np.logical_not(self._alive(states, dt))] = np.nan
-        q, v = self._read(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + self._m.nv])
-        return (q[0], v[0]) if single else (q, v)
-
-    def _run(
-        self,
-        data: list[Any],
-        start: Array,
-        control: Array | None,
-        steps: int,
-        progress: Callable[[float], object] | None,
-    ) -> Array:
-        """Return the states after 0, 1, ... steps, (N, steps + 1, size)."""
-        states = np.empty((len(start), steps + 1, start.shape[1]))
-        states[:, 0] = start
-        done, count = 0, 16
-        while done < steps:
-            end = min(done + count, steps)
-            part = None if control is None else np.ascontiguousarray(control[:, done:end])
-            started = time.perf_counter()
-            states[:, done + 1 : end + 1], _ = mujoco.rollout.rollout(
-                self._m,
-                data,
-                np.ascontiguousarray(states[:, done]),
-                part,
-                control_spec=int(_FORCE),
-                nstep=end - done,
-                skip_checks=False,
-            )
-            seconds = time.perf_counter() - started
-            count = max(1, int(count * min(16.0, _PERIOD / max(seconds, 1e-6))))
-            done = end
-            if progress is not None:
-                progress(done / steps)
-        return states
-
-    def _velocity_in(self, q: Array, v: Array) -> Array:
-        out = v[:, self._maps.v_index].copy()
-        for iq, iv in self._maps.free:
-            quaternion = q[:, self._maps.q_index[iq + 3 : iq + 7]][:, [1, 2, 3, 0]]
-            out[:, iv : iv + 3] = spatial.rotate(quaternion, out[:, iv : iv + 3])
-        return np.asarray(out)
-
-    def _forces(self, tau: Array, n: int, steps: int) -> Array:
-        out = np.broadcast_to(tau, (n, steps, self._description.nv))[..., self._maps.v_index].copy()
-        for _, iv in self._maps.free:
-            if out[..., iv : iv + 3].any():
-                raise UnsupportedError(
-                    "mujoco: native rollouts hold a force on a free joint in world axes, mbkit in body axes; "
-                    "use method='rk4' or 'semi_implicit_euler' on this engine"
-                )
-        return out
-
-    @staticmethod
-    def _alive(states: Array, dt: float) -> Array:
-        # A diverged rollout may be restarted or stand still: time must advance by
-        # one step each, and everything before must have been finite.
-        steps = np.arange(states.shape[1])
-        good = np.isfinite(states).all(axis=-1) & (np.abs(states[..., 0] - steps * dt) < 0.5 * dt)
-        return np.asarray(np.logical_and.accumulate(good, axis=1))
-
-    def _read(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+            warn(f"{description.name}: {reason}; compare with rk853", DoubtfulRunWarning)
+        states[np.logical_not(_alive(states, dt))] = np.nan
+        qpos, qvel = states[..., 1:end_q], states[..., end_q : end_q + m.nv]
         q, v = np.empty_like(qpos), np.empty_like(qvel)
-        qvel = qvel.copy()
-        for iq, iv in self._maps.free:
-            quaternion = qpos[..., iq + 3 : iq + 7][..., [1, 2, 3, 0]]
-            qvel[..., iv : iv + 3] = spatial.rotate(spatial.conjugate(quaternion), qvel[..., iv : iv + 3])
-        q[..., self._maps.q_index] = qpos
-        v[..., self._maps.v_index] = qvel
-        return q, v
+        q[..., compiled.q_index], v[..., compiled.v_index] = qpos, _turned(compiled, qpos, qvel, back=True)
+    else:
+        # Nothing to do, and MuJoCo does not survive an empty batch.
+        q, v = (np.repeat(x[:, None], steps + 1, axis=1) for x in (q0, v0))
+    return (q[0], v[0]) if single else (q, v)
+
+
+def _run(
+    m: Any,
+    data: list[Any],
+    start: Array,
+    control: Array | None,
+    steps: int,
+    progress: Callable[[float], object] | None,
+) -> Array:
+    """Return the states after 0, 1, ... steps, (N, steps + 1, size)."""
+    states = np.empty((len(start), steps + 1, start.shape[1]))
+    states[:, 0] = start
+    done, count = 0, 16
+    while done < steps:
+        end = min(done + count, steps)
+        part = None if control is None else np.ascontiguousarray(control[:, done:end])
+        first = np.ascontiguousarray(states[:, done])
+        started = time.perf_counter()
+        states[:, done + 1 : end + 1], _ = mujoco.rollout.rollout(
+            m, data, first, part, control_spec=_FORCE, nstep=end - done, skip_checks=False
+        )
+        seconds = time.perf_counter() - started
+        count = max(1, int(count * min(16.0, _PERIOD / max(seconds, 1e-6))))
+        done = end
+        if progress is not None:
+            progress(done / steps)
+    return states
+
+
+def _turned(compiled: MujocoModel, qpos: Array, velocities: Array, back: bool = False) -> Array:
+    """Return velocities with those of free joints turned into the world's axes, or back."""
+    out = velocities.copy()
+    for iq, iv in compiled.free:
+        quaternion = np.roll(qpos[..., iq + 3 : iq + 7], -1, axis=-1)
+        turn = spatial.conjugate(quaternion) if back else quaternion
+        out[..., iv : iv + 3] = spatial.rotate(turn, out[..., iv : iv + 3])
+    return out
+
+
+def _forces(compiled: MujocoModel, tau: Array) -> Array:
+    out = tau[..., compiled.v_index]
+    if any(out[..., iv : iv + 3].any() for _, iv in compiled.free):
+        raise UnsupportedError(
+            "mujoco: native rollouts hold a force on a free joint in world axes, mbkit in body axes; "
+            "use method='rk4' or 'semi_implicit_euler' on this engine"
+        )
+    return out
+
+
+def _alive(states: Array, dt: float) -> Array:
+    # A diverged rollout may be restarted or stand still: time must advance by one step each, and everything before must
+    # have been finite.
+    steps = np.arange(states.shape[1])
+    good = np.isfinite(states).all(axis=-1) & (np.abs(states[..., 0] - steps * dt) < 0.5 * dt)
+    return np.asarray(np.logical_and.accumulate(good, axis=1))

@@ -1,7 +1,7 @@
 """Pinocchio behind the protocol: CRBA for M, RNEA for nle, ABA for forward dynamics.
 
 Carpentier et al. 2019, "The Pinocchio C++ library"; the algorithms are those of
-Featherstone 2008, ch. 5 to 7. Single states go straight to Pinocchio, see `direct_calls`.
+Featherstone 2008, ch. 5 to 7. Single states go straight to Pinocchio.
 """
 
 from __future__ import annotations
@@ -14,31 +14,30 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines import known_defects
-from mbkit.engines.base import Dynamics, by_sample, per_sample
+from mbkit.engines.base import NEAR_UNIT, Dynamics, first_names, unit_quaternions
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
-from mbkit.model import Model
+from mbkit.model import Frame, Model
 
 # Calls for one state, with the fewest checks that are safe
 #
-# Arguments have to be plain vectors of native doubles: Pinocchio reads the memory of a
-# byte-swapped array, and the data of a masked one, as if they were such vectors. One sum
-# finds NaN and infinity in the answer, and so in the arguments; Pinocchio itself objects
-# to wrong sizes. On any doubt the checked method of `Dynamics` takes over: it
-# converts the arguments, or says what is wrong with them.
+# Arguments have to be plain vectors of native doubles: Pinocchio reads the memory of a byte-swapped array, and the data
+# of a masked one, as if they were such vectors. One sum finds NaN and infinity in the answer, and so in the arguments;
+# Pinocchio itself objects to wrong sizes. On any doubt the checked method of `Dynamics` takes over: it converts the
+# arguments, or says what is wrong with them.
 
 Call = Callable[..., Any]
 Sound = Callable[[Array], bool]
-_NEAR_UNIT: Final = 1e-9
-#: Quantities with such a call, and their arguments as in `Dynamics`.
-_ARGUMENTS: Final = {
-    "mass_matrix": "q",
-    "gravity": "q",
-    "nle": "q, v",
-    "inverse_dynamics": "q, v, a",
-    "forward_dynamics": "q, v, tau",
+#: Quantities with such a call, their arguments as in `Dynamics`, and Pinocchio's function of these arguments.
+_DIRECT: Final[dict[str, tuple[str, Call]]] = {
+    "mass_matrix": ("q", pin.crba),
+    "gravity": ("q", pin.computeGeneralizedGravity),
+    "nle": ("q, v", pin.nonLinearEffects),
+    "inverse_dynamics": ("q, v, a", pin.rnea),
+    "forward_dynamics": ("q, v, tau", pin.aba),
 }
 
 
@@ -68,60 +67,35 @@ def factory(bare, checked, sound):
     return factory
 
 
-_FACTORIES: Final = {name: _factory(name, arguments) for name, arguments in _ARGUMENTS.items()}
+_FACTORIES: Final = {name: _factory(name, arguments) for name, (arguments, _) in _DIRECT.items()}
 
 
-def _unread_coordinates(m: Any, d: Any, neutral: Array) -> tuple[dict[str, tuple[int, ...]], bool]:
-    """Return, per quantity, the coordinates in which a NaN leaves it finite, and whether any has such a velocity."""
-    q, v, zero = neutral.copy(), np.zeros(m.nv), np.zeros(m.nv)
-    terms: dict[str, Callable[[], Any]] = {
-        "mass_matrix": lambda: pin.crba(m, d, q),
-        "gravity": lambda: pin.computeGeneralizedGravity(m, d, q),
-        "nle": lambda: pin.nonLinearEffects(m, d, q, v),
-        "inverse_dynamics": lambda: pin.rnea(m, d, q, v, zero),
-        "forward_dynamics": lambda: pin.aba(m, d, q, v, zero),
-    }
-
-    def unread(state: Array, term: Callable[[], Any]) -> tuple[int, ...]:
-        out = []
-        for i in range(state.size):
-            state[i], kept = np.nan, state[i]
-            if not np.isnan(term()).any():
-                out.append(i)
-            state[i] = kept
-        return tuple(out)
-
-    moving = [term for name, term in terms.items() if "v" in _ARGUMENTS[name]]
-    return {name: unread(q, term) for name, term in terms.items()}, any(unread(v, term) for term in moving)
+def _unread(state: Array, term: Call) -> set[int]:
+    """Return the entries of a state in which a NaN leaves a term finite."""
+    out = set()
+    for i in range(state.size):
+        state[i], before = np.nan, state[i]
+        if not np.isnan(term()).any():
+            out.add(i)
+        state[i] = before
+    return out
 
 
-def _always(_q: Array) -> bool:
-    return True
-
-
-def _sound(model: Model, unread: tuple[int, ...]) -> Sound:
+def _sound(model: Model, unread: set[int]) -> Sound:
     """Return a check of what the answer does not show: unread coordinates and quaternions."""
     starts = tuple(start for start, _ in model.quaternions)
     # A quaternion with a NaN is not of unit length.
-    rest = set(unread) - {start + k for start in starts for k in range(4)}
+    rest = unread - {start + k for start in starts for k in range(4)}
     if not rest and not starts:
-        return _always
+        return lambda _: True
     if starts == (3,) and rest <= {0, 1, 2}:
         # A floating base: position, then quaternion.
         def floating(q: Array) -> bool:
             a, b, c, x, y, z, w = q[:7].tolist()
-            return bool(-_NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < _NEAR_UNIT and isfinite(a + b + c))
+            return bool(-NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < NEAR_UNIT and isfinite(a + b + c))
 
         return floating
-
-    def general(q: Array) -> bool:
-        for start in starts:
-            x = q[start : start + 4]
-            if not -_NEAR_UNIT < x.dot(x) - 1.0 < _NEAR_UNIT:
-                return False
-        return isfinite(sum(q.tolist()))
-
-    return general
+    return lambda q: unit_quaternions(q, starts) and isfinite(sum(q.tolist()))
 
 
 #: Joint types of which computeRNEADerivatives and computeABADerivatives of 4.1.0 are wrong (pinocchio#2053).
@@ -139,6 +113,7 @@ class PinocchioDynamics(Dynamics):
 
     engine = "pinocchio"
     refuses: ClassVar[dict[str, str]] = {"function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has"}
+    _batches = False
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -147,54 +122,54 @@ class PinocchioDynamics(Dynamics):
         self._d = self._m.createData()
         self._joint_passive = JointPassive(model, self._pin.q_order, self._pin.v_order)
         self._springs = PointSprings(model, self._pin) if model.springs else None
-        self._reduced = model.layout.reduced
+        layout = model.layout
+        self._reduced = layout.reduced
         #: Whether q and v go to Pinocchio as they are; else as G_q q + c and G v.
         self._direct = self._pin.ordered and not self._reduced
-        layout = model.layout
         self._G_q, self._c = layout.G_q[self._pin.q_order], layout.offsets[self._pin.q_order]
         self._G = layout.G[self._pin.v_order]
         self._Gt = np.ascontiguousarray(self._G.T)
-        self._install_direct_calls()
+        self._placements: dict[str, tuple[int, pin.SE3]] = {}
+        # A class that derives from this one may have methods of its own.
+        if type(self) is PinocchioDynamics:
+            self._install_direct_calls()
         if tiny := self._tiny_bodies():
             known_defects.announce(known_defects.TINY_MASS, f"the mass of body {tiny}")
 
     def _install_direct_calls(self) -> None:
         """Put calls for one state in the place of this object's methods."""
-        m, d = self._m, self._d
-        bare: dict[str, Call] = {name: getattr(self, f"_one_{name}") for name in _ARGUMENTS}
+        m, d, needs, damping = self._m, self._d, self.model.needs, self._joint_passive.damping
+        bare: dict[str, Call] = {name: getattr(self, f"_{name}") for name in _DIRECT}
         # What is mixed by G_q q spreads a NaN to every coordinate.
-        unread: dict[str, tuple[int, ...]] = {}
+        unread: dict[str, set[int]] = {}
         if self._direct:
-            unread, velocities_unread = _unread_coordinates(m, d, self.model.neutral())
-            if velocities_unread:
-                # A lone slide: nothing depends on v, so it must be looked at.
-                return
-            terms = {"mass_matrix": pin.crba, "gravity": pin.computeGeneralizedGravity, "nle": pin.nonLinearEffects}
-            needs = self.model.needs
-            if not (needs.springs or needs.damping):
-                terms |= {"inverse_dynamics": pin.rnea, "forward_dynamics": pin.aba}
-            elif not needs.springs and self._springs is None and not self.model.couplings:
-                bare |= self._damped_only()
+            q, v, zero = self.model.neutral(), np.zeros(m.nv), np.zeros(m.nv)
+            for name, (arguments, function) in _DIRECT.items():
+                term = functools.partial(function, m, d, *(q, v, zero)[: arguments.count(",") + 1])
+                unread[name] = _unread(q, term)
+                if "v" in arguments and _unread(v, term):
+                    # A lone slide: nothing depends on v, so it must be looked at.
+                    return
+            own = {name: functools.partial(function, m, d) for name, (_, function) in _DIRECT.items()}
+            if needs.springs or needs.damping:
+                rnea, aba = own.pop("inverse_dynamics"), own.pop("forward_dynamics")
+                if not (needs.springs or self.model.springs or self.model.couplings):
+                    bare["inverse_dynamics"] = lambda q, v, a: rnea(q, v, a) + damping * v
+                    bare["forward_dynamics"] = lambda q, v, tau: aba(q, v, tau - damping * v)
             if self._joint_passive.armature is not None:
-                terms = {name: terms[name] for name in ("gravity", "nle")}
-            bare |= {name: functools.partial(function, m, d) for name, function in terms.items()}
+                own = {name: own[name] for name in ("gravity", "nle")}
+            bare |= own
         for name, call in bare.items():
             checked = getattr(self, name)
-            direct = _FACTORIES[name](call, checked, _sound(self.model, unread.get(name, ())))
+            direct = _FACTORIES[name](call, checked, _sound(self.model, unread.get(name, set())))
             vars(self)[name] = functools.update_wrapper(direct, checked)
 
-    def _damped_only(self) -> dict[str, Call]:
-        m, d, damping, rnea, aba = self._m, self._d, self._joint_passive.damping, pin.rnea, pin.aba
-
-        def inverse_dynamics(q: Array, v: Array, a: Array) -> Any:
-            out = rnea(m, d, q, v, a)
-            out += damping * v
-            return out
-
-        def forward_dynamics(q: Array, v: Array, tau: Array) -> Any:
-            return aba(m, d, q, v, tau - damping * v)
-
-        return {"inverse_dynamics": inverse_dynamics, "forward_dynamics": forward_dynamics}
+    def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
+        if quantity.startswith("coriolis") and self._coriolis_fault:
+            known_defects.announce(known_defects.CORIOLIS, self._coriolis_fault)
+        if quantity == "kinetic_energy" and self._kinetic_fault:
+            known_defects.announce(known_defects.KINETIC_ENERGY, self._kinetic_fault)
+        return super()._evaluate(quantity, *more, **arguments)
 
     # Between the description's coordinates and Pinocchio's.
 
@@ -210,12 +185,9 @@ class PinocchioDynamics(Dynamics):
     def _matrix(self, A: Array) -> Array:
         return A if self._direct else self._Gt.dot(A).dot(self._G)
 
-    def _columns(self, J: Array) -> Array:
-        return J if self._direct else J @ self._G
-
     # Terms at one state.
 
-    def _one_mass_matrix(self, q: Array) -> Array:
+    def _mass_matrix(self, q: Array) -> Array:
         return self._matrix(self._full_mass_matrix(self._full_q(q)))
 
     def _full_mass_matrix(self, q: Array) -> Array:
@@ -223,13 +195,13 @@ class PinocchioDynamics(Dynamics):
         rotors = self._joint_passive.armature
         return M if rotors is None else M + rotors
 
-    def _one_gravity(self, q: Array) -> Array:
+    def _gravity(self, q: Array) -> Array:
         return self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q)))
 
-    def _one_nle(self, q: Array, v: Array) -> Array:
+    def _nle(self, q: Array, v: Array) -> Array:
         return self._force(pin.nonLinearEffects(self._m, self._d, self._full_q(q), self._full_v(v)))
 
-    def _one_inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         q, v = self._full_q(q), self._full_v(v)
         a, rotors = self._full_v(a), self._joint_passive.armature
         out: Array = pin.rnea(self._m, self._d, q, v, a)
@@ -238,7 +210,7 @@ class PinocchioDynamics(Dynamics):
             out += rotors @ a
         return self._force(out)
 
-    def _one_forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         q, v = self._full_q(q), self._full_v(v)
         m, d, passive = self._m, self._d, self._full_passive(q, v)
         if not self._reduced and self._joint_passive.armature is None:
@@ -254,15 +226,8 @@ class PinocchioDynamics(Dynamics):
             out += self._springs.force(self._m, self._d, q, v)
         return out
 
-    def _one_passive(self, q: Array, v: Array) -> Array:
+    def _passive(self, q: Array, v: Array) -> Array:
         return self._force(self._full_passive(self._full_q(q), self._full_v(v)))
-
-    _mass_matrix = by_sample(_one_mass_matrix)
-    _gravity = by_sample(_one_gravity)
-    _nle = by_sample(_one_nle)
-    _passive = by_sample(_one_passive)
-    _inverse_dynamics = by_sample(_one_inverse_dynamics)
-    _forward_dynamics = by_sample(_one_forward_dynamics)
 
     @cached_property
     def lacks_derivatives(self) -> str:
@@ -276,48 +241,32 @@ class PinocchioDynamics(Dynamics):
             return f"Pinocchio {pin.__version__} differentiates joint {names} wrongly; {instead}"
         return ""
 
-    @by_sample
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
-        passive, rotors = self._joint_passive, self._joint_passive.armature
+        passive = self._joint_passive
         q, v, a = self._full_q(q), self._full_v(v), self._full_v(a)
         by_q, by_v, M = pin.computeRNEADerivatives(self._m, self._d, q, v, a)
         by_q, by_v = by_q + passive.stiffness_matrix, by_v + passive.damping_matrix
-        return np.hstack([self._matrix(x) for x in (by_q, by_v, M if rotors is None else M + rotors)])
+        M = M if passive.armature is None else M + passive.armature
+        return np.stack([self._matrix(x) for x in (by_q, by_v, M)])
 
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
-        if self._reduced or self._joint_passive.armature is not None:
-            return super()._forward_dynamics_derivatives(q, v, tau)
-        return per_sample(self._one_forward_dynamics_derivatives, q, v, tau)
-
-    def _one_forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
         passive = self._joint_passive
+        if self._reduced or passive.armature is not None:
+            return super()._forward_dynamics_derivatives(q, v, tau)
         q, v = self._full_q(q), self._full_v(v)
         force = self._full_v(tau) + passive.force(q, v)
         by_q, by_v, inverse = pin.computeABADerivatives(self._m, self._d, q, v, force)
         by_q, by_v = by_q - inverse @ passive.stiffness_matrix, by_v - inverse @ passive.damping_matrix
-        return np.hstack([self._matrix(x) for x in (by_q, by_v, inverse)])
+        return np.stack([self._matrix(x) for x in (by_q, by_v, inverse)])
 
     def _coriolis_matrix(self, q: Array, v: Array) -> Array:
-        if self._coriolis_fault:
-            known_defects.announce(known_defects.CORIOLIS, self._coriolis_fault)
-        return per_sample(self._one_coriolis_matrix, q, v)
-
-    def _one_coriolis_matrix(self, q: Array, v: Array) -> Array:
         return self._matrix(pin.computeCoriolisMatrix(self._m, self._d, self._full_q(q), self._full_v(v)))
 
-    def _kinetic_energy(self, q: Array, v: Array) -> Array:
-        if self._kinetic_fault:
-            known_defects.announce(known_defects.KINETIC_ENERGY, self._kinetic_fault)
-        rotors = self._joint_passive.armature
+    def _kinetic_energy(self, q: Array, v: Array) -> Any:
+        q, v, rotors = self._full_q(q), self._full_v(v), self._joint_passive.armature
+        own = pin.computeKineticEnergy(self._m, self._d, q, v)
+        return own if rotors is None else own + 0.5 * float(v @ rotors @ v)
 
-        def one(q: Array, v: Array) -> Any:
-            q, v = self._full_q(q), self._full_v(v)
-            own = pin.computeKineticEnergy(self._m, self._d, q, v)
-            return own if rotors is None else own + 0.5 * float(v @ rotors @ v)
-
-        return per_sample(one, q, v)
-
-    @by_sample
     def _potential_energy(self, q: Array) -> Any:
         q = self._full_q(q)
         stored = self._joint_passive.energy(q)
@@ -326,38 +275,31 @@ class PinocchioDynamics(Dynamics):
         ground = -float(self.model.gravity @ self._pin.ground_moment)
         return pin.computePotentialEnergy(self._m, self._d, q) + stored + ground
 
-    def _frame_in_joint(self, frame: str) -> tuple[int, pin.SE3]:
-        f = self.model.frame(frame)
-        carrier, R, p = self._pin.bodies[f.body]
-        return carrier, pin.SE3(R @ f.rotation, p + R @ f.translation)
+    def _in_joint(self, frame: Frame) -> tuple[int, pin.SE3]:
+        """Return the joint that carries a frame, and X_JF."""
+        if frame.name not in self._placements:
+            carrier, R, p = self._pin.bodies[frame.body]
+            self._placements[frame.name] = carrier, pin.SE3(R @ frame.rotation, p + R @ frame.translation)
+        return self._placements[frame.name]
 
-    def _pose(self, q: Array, frame: str) -> Array:
-        carrier, X_JF = self._frame_in_joint(frame)
+    def _pose(self, q: Array, frame: Frame) -> Array:
+        carrier, X_JF = self._in_joint(frame)
+        pin.forwardKinematics(self._m, self._d, self._full_q(q))
+        return np.array((self._d.oMi[carrier] * X_JF).homogeneous)
 
-        def one(q: Array) -> Array:
-            pin.forwardKinematics(self._m, self._d, self._full_q(q))
-            return np.array((self._d.oMi[carrier] * X_JF).homogeneous)
-
-        return per_sample(one, q)
-
-    def _jacobian(self, q: Array, frame: str, axes: str) -> Array:
-        carrier, X_JF = self._frame_in_joint(frame)
-
-        def one(q: Array) -> Array:
-            q = self._full_q(q)
-            if carrier:
-                # One column comes back as a vector.
-                own = pin.computeJointJacobian(self._m, self._d, q, carrier).reshape(6, self._m.nv)
-                J = X_JF.toActionMatrixInverse() @ own
-            else:
-                J = np.zeros((6, self._m.nv))
-            if axes == "world":
-                pin.forwardKinematics(self._m, self._d, q)
-                R = (self._d.oMi[carrier] * X_JF).rotation
-                J = np.vstack([R @ J[:3], R @ J[3:]])
-            return self._columns(J)
-
-        return per_sample(one, q)
+    def _jacobian(self, q: Array, frame: Frame, axes: str) -> Array:
+        carrier, X_JF = self._in_joint(frame)
+        q = self._full_q(q)
+        J = np.zeros((6, self._m.nv))
+        if carrier:
+            # One column comes back as a vector.
+            own = pin.computeJointJacobian(self._m, self._d, q, carrier).reshape(6, self._m.nv)
+            J = X_JF.toActionMatrixInverse() @ own
+        if axes == "world":
+            pin.forwardKinematics(self._m, self._d, q)
+            R = (self._d.oMi[carrier] * X_JF).rotation
+            J = np.vstack([R @ J[:3], R @ J[3:]])
+        return J if self._direct else J @ self._G
 
     # Known defects, measured on this very model.
 
@@ -368,7 +310,7 @@ class PinocchioDynamics(Dynamics):
             if 0 < body.mass < np.finfo(float).eps:
                 one = pin.Inertia(body.mass, np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)))
                 out += [repr(body.name)] if abs((one + one).lever[0] - 1) > 1e-9 else []
-        return ", ".join(out[:3]) + (f" and {len(out) - 3} more" if len(out) > 3 else "")
+        return first_names(out)
 
     @cached_property
     def _coriolis_fault(self) -> str:

@@ -13,11 +13,10 @@ import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit.engines.imported import Imported, checked, joint_of, stacked, unused, written
+from mbkit.engines.imported import Imported, Parts, checked, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.urdf import joint_kind, joint_numbers
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.model import Body, Joint, Model
 
 
 def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
@@ -55,34 +54,32 @@ class _Description:
     """Reads a parsed model joint by joint."""
 
     def __init__(self, raw: Any) -> None:
-        self.raw, self.data = raw, raw.createData()
+        self.raw, self.data, parts = raw, raw.createData(), Parts()
         frames: dict[int, str] = {}
         for frame in list(raw.frames)[1:]:
             # A moving body is named after the first link on its joint: the one that the joint carries.
             if frame.type == pin.BODY and frame.parentJoint:
                 frames.setdefault(int(frame.parentJoint), str(frame.name))
-        self.bodies: list[str] = ["world"]
-        joints, bodies = [], []
-        ground = raw.inertias[0]
-        if ground.mass:
-            bodies.append(_body("universe", ground))
-            joints.append(_joint("universe_fixed", "fixed", "world", "universe", pin.SE3.Identity(), None))
+        bodies = ["world"]
+        if raw.inertias[0].mass:
+            _add_body(parts, "universe", raw.inertias[0])
+            parts.joint("universe_fixed", "fixed", "world", "universe", np.eye(3), np.zeros(3))
         #: (joint of ours, Pinocchio's joint, kind) of each that moves.
         self.moving: list[tuple[str, Any, str]] = []
         for i in range(1, raw.njoints):
-            name, body = str(raw.names[i]), unused(frames.get(i, f"{raw.names[i]}_body"), self.bodies)
-            parent, X = self.bodies[raw.parents[i]], raw.jointPlacements[i]
+            name, body = str(raw.names[i]), parts.name("body", frames.get(i, f"{raw.names[i]}_body"))
+            parent, X = bodies[raw.parents[i]], raw.jointPlacements[i]
             steps = self._steps(raw.joints[i])
             for k, (joint, kind, axis, inner) in enumerate(steps):
                 last = k == len(steps) - 1
                 child, own = (body, name) if last else (f"{body}.{k}", f"{name}.{k}")
-                joints.append(_joint(own, kind, parent, child, X * inner, axis, raw, joint))
-                bodies.append(_body(child, raw.inertias[i] if last else pin.Inertia.Zero()))
+                place, numbers = X * inner, _numbers(raw, joint, kind, axis)
+                parts.joint(own, kind, parent, child, np.array(place.rotation), np.array(place.translation), **numbers)
+                _add_body(parts, child, raw.inertias[i] if last else pin.Inertia.Zero())
                 self.moving.append((own, joint, kind))
                 parent, X = child, pin.SE3.Identity()
-            self.bodies.append(body)
-        gravity = np.array(raw.gravity.linear)
-        self.model = Model(name="pinocchio", gravity=gravity, bodies=tuple(bodies), joints=tuple(joints))
+            bodies.append(body)
+        self.model = parts.model("pinocchio", np.array(raw.gravity.linear))
 
     def _steps(self, joint: Any) -> list[tuple[Any, str, Array | None, Any]]:
         """Return a joint as steps: Pinocchio's joint, kind, axis, and where it stands in the one before."""
@@ -98,7 +95,8 @@ class _Description:
 
         passive is of the damping that Pinocchio read: its algorithms leave that to the caller.
         """
-        return stacked(self._one(*x) for x in zip(q, v, strict=True))
+        each = [self._one(*x) for x in zip(q, v, strict=True)]
+        return {name: np.array([values[name] for values in each]) for name in ("M", "g", "nle", "passive")}
 
     def _one(self, q: Array, v: Array) -> dict[str, Array]:
         raw, layout = self.raw, self.model.layout
@@ -126,16 +124,10 @@ class _Description:
         return {"M": T.T @ M @ T, "g": T.T @ g, "nle": T.T @ (nle + M @ slip), "passive": T.T @ passive}
 
 
-def _body(name: str, inertia: Any) -> Body:
-    return Body(name, float(inertia.mass), np.array(inertia.lever), np.array(inertia.inertia))
+def _add_body(parts: Parts, name: str, inertia: Any) -> None:
+    parts.body(name, float(inertia.mass), np.array(inertia.lever), np.array(inertia.inertia))
 
 
-def _joint(
-    name: str, kind: str, parent: str, child: str, X: Any, axis: Array | None, raw: Any = None, joint: Any = None
-) -> Joint:
-    numbers: dict[str, Any] = {} if axis is None else {"axes": np.array([axis])}
-    if kind == "helical":
-        numbers["pitch"] = float(getattr(joint, "pitch", 0.0))
-    if raw is not None:
-        numbers |= joint_numbers(raw, joint)
-    return joint_of(name, kind, parent, child, np.array(X.rotation), np.array(X.translation), **numbers)
+def _numbers(raw: Any, joint: Any, kind: str, axis: Array | None) -> dict[str, Any]:
+    out = joint_numbers(raw, joint) | ({} if axis is None else {"axes": np.array([axis])})
+    return out | ({"pitch": float(getattr(joint, "pitch", 0.0))} if kind == "helical" else {})

@@ -1,9 +1,8 @@
 """A `pinocchio.Model` built from a description, and how its numbers map to ours.
 
-Joints are added depth first, because Pinocchio's algorithms take a subtree to be
-contiguous. Continuous joints are plain revolute ones, with one angle. A planar
-joint is two slides and a hinge, whose velocities are the derivatives of its
-coordinates (Pinocchio's own planar joint has four numbers and body velocities).
+Joints are added depth first, because Pinocchio's algorithms take a subtree to be contiguous. Continuous joints are
+plain revolute ones, with one angle. A planar joint is two slides and a hinge, whose velocities are the derivatives of
+its coordinates (Pinocchio's own planar joint has four numbers and body velocities).
 """
 
 from __future__ import annotations
@@ -74,8 +73,7 @@ def build(description: Model) -> PinModel:
 
 
 def _inertia(body: Body) -> pin.Inertia:
-    # Set part by part: the constructor refuses an inertia that is not positive, which
-    # a description may hold after a warning.
+    # Set part by part: the constructor refuses an inertia that is not positive, which a description may hold.
     out = pin.Inertia.Zero()
     out.mass, out.lever, out.inertia = body.mass, np.array(body.com), np.array(body.inertia)
     return out
@@ -135,9 +133,9 @@ class PointSprings:
         for spring, (i, a), (j, b) in self._ends:
             gap = d.oMi[j].act(b) - d.oMi[i].act(a)
             J = self._point_jacobian(m, d, j, b) - self._point_jacobian(m, d, i, a)
-            # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0. Where one
-            # is needed and there is none, the answer is NaN, which the caller finds.
             length = float(np.linalg.norm(gap))
+            # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0. Where one is needed and there is none,
+            # the answer is NaN, which the caller finds.
             pull = spring.stiffness * gap
             with np.errstate(invalid="ignore", divide="ignore"):
                 if spring.stiffness and spring.rest_length:
@@ -157,7 +155,7 @@ class PointSprings:
         return np.asarray(R @ (J[:3] - pin.skew(point) @ J[3:]))
 
 
-# Forces and energy of springs and dampers at joints and between them, for engines that leave them out.
+# Springs and dampers at joints and between them, which Pinocchio's algorithms leave out.
 
 
 class JointPassive:
@@ -169,52 +167,47 @@ class JointPassive:
 
     def __init__(self, model: Model, q_order: np.ndarray, v_order: np.ndarray) -> None:
         layout = model.layout
-        q_place, v_place = np.argsort(q_order), np.argsort(v_order)
-        self.damping = np.zeros(layout.sizes[3])
-        springs: list[tuple[int, int, float, float]] = []
+        lengths, rates = np.eye(layout.sizes[2]), np.eye(layout.sizes[3])
+        damping = np.zeros(layout.sizes[3])
+        # Each row is a length, linear in q, with its rate, stiffness, rest length, damping and armature.
+        rows: list[tuple[Any, ...]] = []
         for joint in model.joints:
             iq, iv = layout.full_q[joint.name], layout.full_v[joint.name]
-            self.damping[v_place[iv]] = joint.damping
+            damping[iv] = joint.damping
             # A joint spring acts on one coordinate per velocity.
-            springs += [
-                (q_place[iq.start + k], v_place[iv.start + k], float(joint.stiffness[k]), float(joint.rest[k]))
+            rows += [
+                (lengths[iq.start + k], rates[iv.start + k], joint.stiffness[k], joint.rest[k], 0.0, 0.0)
                 for k in range(joint.type.nv)
                 if joint.stiffness[k]
             ]
+        for c in model.couplings:
+            rate = layout.coupling_row(c)
+            length = sum(
+                rate[layout.full_v[x].start] * lengths[layout.full_q[x].start] for x in dict.fromkeys(c.joints)
+            )
+            rows.append((length, rate, c.stiffness, c.rest_length, c.damping, c.armature))
+        self.damping = damping[v_order]
         self._against = -self.damping
-        self._spring_q = np.array([s[0] for s in springs], dtype=int)
-        self._spring_v = np.array([s[1] for s in springs], dtype=int)
-        self._stiffness = np.array([s[2] for s in springs])
-        self._rest = np.array([s[3] for s in springs])
-        couplings = model.couplings
-        rows = np.array([layout.coupling_row(c) for c in couplings]).reshape(len(couplings), layout.sizes[3])
-        # The couplings' lengths are self._lengths q, the rates self._rates v.
-        self._rates, self._lengths = rows[:, v_order], np.zeros((len(couplings), layout.sizes[2]))
-        for name in {name for c in couplings for name in c.joints}:
-            iq, iv = layout.full_q[name].start, layout.full_v[name].start
-            self._lengths[:, q_place[iq]] = rows[:, iv]
-        stiffness, rest, damping, armature = (
-            np.array([getattr(c, field) for c in couplings])
-            for field in ("stiffness", "rest_length", "damping", "armature")
+        self._lengths, rates = (
+            np.array([row[i] for row in rows]).reshape(len(rows), order.size)[:, order]
+            for i, order in enumerate((q_order, v_order))
         )
-        self._coupled = (stiffness, rest, damping)
-        self.armature = (self._rates.T * armature) @ self._rates if armature.any() else None
-        self.damping_matrix = np.diag(self.damping) + (self._rates.T * damping) @ self._rates
-        self.stiffness_matrix = (self._rates.T * stiffness) @ self._rates
-        self.stiffness_matrix[self._spring_v, self._spring_v] += self._stiffness
+        self._stiffness, self._rest, dampers, armature = (np.array([row[i] for row in rows]) for i in range(2, 6))
+        self._pull = rates.T * self._stiffness
+        self.stiffness_matrix = self._pull @ rates
+        self.armature = (rates.T * armature) @ rates if armature.any() else None
+        self._coupled_damping = (rates.T * dampers) @ rates if dampers.any() else None
+        self.damping_matrix = np.diag(self.damping) + (rates.T * dampers) @ rates
 
     def force(self, q: Array, v: Array) -> Array:
         """Return the generalized force."""
         out: Array = self._against * v
-        if self._stiffness.size:
-            out[self._spring_v] -= self._stiffness * (q[self._spring_q] - self._rest)
-        if len(self._rates):
-            stiffness, rest, damping = self._coupled
-            out -= self._rates.T @ (stiffness * (self._lengths @ q - rest) + damping * (self._rates @ v))
+        if self._rest.size:
+            out -= self._pull @ (self._lengths @ q - self._rest)
+        if self._coupled_damping is not None:
+            out -= self._coupled_damping @ v
         return out
 
     def energy(self, q: Array) -> float:
         """Return the energy stored in the springs."""
-        stored = 0.5 * np.sum(self._stiffness * (q[self._spring_q] - self._rest) ** 2)
-        stiffness, rest, _ = self._coupled
-        return float(stored + 0.5 * np.sum(stiffness * (self._lengths @ q - rest) ** 2))
+        return float(0.5 * np.sum(self._stiffness * (self._lengths @ q - self._rest) ** 2))

@@ -172,7 +172,7 @@ def omissions(model: Model, engines: Mapping[str, Dynamics], seed: int) -> tuple
 
 
 def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
-    from mbkit.engines.mujoco.variants import Variant
+    from mbkit.engines.mujoco.engine import Variant
 
     needs = model.needs.as_dict()
     variants = {
