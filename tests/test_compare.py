@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import pickle
 import sys
-import time
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -525,7 +526,18 @@ def test_forward_dynamics_is_allowed_its_condition_and_no_more():
     assert cancelled.relative == pytest.approx([1e-13 / 1999.0])
 
 
-def test_timings_are_positive_and_ordered():
-    times = interleaved({"fast": lambda: None, "slow": lambda: time.sleep(1e-3)}, rounds=3)
-    assert 0 < times["fast"][0] < times["slow"][0]
-    assert times["slow"][0] > 1e6
+def test_timings_are_medians_per_call_by_one_clock(monkeypatch):
+    """Calls of 10 µs, and of 1 ms in which every third takes 3 ms, on a clock that only they advance."""
+    now, calls = [0.0], itertools.count()
+    monkeypatch.setattr(
+        sys.modules["mbkit.studies.compare.errors"], "time", SimpleNamespace(perf_counter=lambda: now[0])
+    )
+
+    def spend(seconds):
+        now[0] += seconds
+
+    times = interleaved(
+        {"fast": lambda: spend(1e-5), "slow": lambda: spend(3e-3 if next(calls) % 3 == 0 else 1e-3)}, rounds=9
+    )
+    assert times["fast"] == pytest.approx((1e4, 0.0), abs=1e-3)
+    assert times["slow"] == pytest.approx((1e6, 1e6), rel=1e-9)

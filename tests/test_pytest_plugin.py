@@ -152,20 +152,16 @@ def test_a_project_records_under_xdist_and_is_told_what_changed(project):
     assert "Traceback" not in out
 
 
-def test_the_plugin_costs_a_run_nothing():
+def test_the_plugin_loads_nothing_of_mbkit_but_itself():
     code = """
-import sys, pytest, time
+import sys, pytest
 before = set(sys.modules)
-start = time.process_time()
 import mbkit.pytest_plugin
-spent = time.process_time() - start
-print(spent, *sorted(m for m in set(sys.modules) - before))
+print(*sorted(m for m in set(sys.modules) - before))
 """
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(TOP), os.environ.get("PYTHONPATH", "")])}
     made = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
-    spent, *loaded = made.stdout.split()
-    assert loaded == ["mbkit", "mbkit._version", "mbkit.pytest_plugin"]
-    assert float(spent) < 0.02
+    assert made.stdout.split() == ["mbkit", "mbkit._version", "mbkit.pytest_plugin"]
 
 
 # The asserts, wherever they are called.
