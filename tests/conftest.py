@@ -7,6 +7,11 @@ import os
 import tempfile
 from pathlib import Path
 
+from hypothesis import HealthCheck, settings
+
+# A slow or busy machine fails no test.
+settings.register_profile("mbkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("mbkit")
 # Before anything is compiled, in every worker and in what the tests start: trees that
 # are used once are not worth a compiler, and no test reads what an earlier run left.
 os.environ.setdefault("MBKIT_COMPILE", "0")

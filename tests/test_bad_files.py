@@ -716,9 +716,7 @@ WORDS = [
 ]
 
 
-@settings(
-    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=150, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     original=st.sampled_from([URDF, MJCF]),
     edits=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 30), st.sampled_from(WORDS)), min_size=1, max_size=4),
@@ -738,9 +736,7 @@ def test_damaged_files_never_crash(tmp_path, original, edits):
                 load(path, nonphysical=policy)
 
 
-@settings(
-    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=150, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_values_never_crash(tmp_path, data):
     """As above, but the file stays XML, so that the checks behind the parser are reached."""

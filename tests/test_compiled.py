@@ -123,7 +123,7 @@ def test_every_layout_gives_the_same_bits(code, n):
             np.testing.assert_array_equal(got, want[i])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=12, max_size=12))
 def test_every_operation_agrees_with_casadi(code, numbers):
     given_ = np.array(numbers)

@@ -96,7 +96,7 @@ def built_or_refused(wrong):
 
 
 @given(wrong=st.dictionaries(st.sampled_from(PLACES), st.sampled_from(HOSTILE), min_size=2, max_size=3))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_whatever_a_builder_is_given_is_built_or_refused_by_name(wrong):
     built_or_refused(wrong)
 
@@ -133,7 +133,7 @@ def test_numbers_whose_mass_matrix_overflows_are_refused_by_name():
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_difference_undoes_integrate(seed):
     model = random_tree(seed % 7, 10, springs=False)
     rng = np.random.default_rng(seed)

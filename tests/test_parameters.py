@@ -482,7 +482,7 @@ class Magnitude(float):
         return Magnitude(float(self) ** exponent)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.recursive(LEAVES, _grown, max_leaves=8))
 def test_expressions_are_what_floats_would_be(x):
     if not isinstance(x, Expression):

@@ -239,7 +239,7 @@ def _numbers(x: Any) -> Array | None:
 
 
 def _difference(field: str, old: Array, new: Array) -> str:
-    if field.startswith("rotation") and (turned := _turn(old, new)):
+    if field.startswith("rotation") and len(old) == 9 and (turned := _turn(old, new)):
         return turned
     names = _ENTRIES.get(field, [str(k) for k in range(len(old))] if len(old) > 1 else [""])
     # Equal infinities are no difference, though they have none.
