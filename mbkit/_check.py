@@ -33,11 +33,10 @@ def _as_float(name: str, value: ArrayLike) -> Array:
         raise InputError(f"{name}: expected an array of numbers, got a masked array with masked entries; fill them")
     try:
         raw = np.asarray(value)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__} ({error})") from None
-    except Exception:
+    except Exception as error:
         # Any: objects may bring conversions of their own.
-        raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__}") from None
+        why = f" ({error})" if isinstance(error, (ValueError, TypeError)) else ""
+        raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__}{why}") from None
     if raw.dtype.kind not in "fiu":
         raise InputError(f"{name}: expected real numbers, got dtype {raw.dtype}")
     return np.asarray(raw, dtype=np.float64)
@@ -60,10 +59,7 @@ def require_finite(name: str, array: Array) -> None:
 
 
 def rows(name: str, value: ArrayLike, n: int, owner: str, size: str) -> Array:
-    """Return `value` as float64 with shape ``(n,)`` or ``(N, n)``, all finite.
-
-    `owner` and `size` only serve the message: "panda has nq = 7".
-    """
+    """Return `value` as float64, ``(n,)`` or ``(N, n)``, all finite; `owner` and `size` serve the message alone."""
     array = _as_float(name, value)
     if array.ndim not in (1, 2) or array.shape[-1] != n:
         raise InputError(f"{name}: expected shape ({n},) or (N, {n}), got {array.shape}; {owner} has {size} = {n}")
@@ -72,16 +68,11 @@ def rows(name: str, value: ArrayLike, n: int, owner: str, size: str) -> Array:
 
 
 def batch_of(**arrays: Array) -> int | None:
-    """Return the common batch size, or None when every array is a single state.
-
-    A single state beside a batch is allowed: it is repeated.
-    """
+    """Return the common batch size, or None when every array is a single state; one beside a batch is repeated."""
     sizes = {name: a.shape[0] for name, a in arrays.items() if a.ndim == 2}
-    if not sizes:
-        return None
     if len(set(sizes.values())) > 1:
-        found = ", ".join(f"{k} has {v}" for k, v in sizes.items())
-        raise InputError(f"batches of different sizes: {found}; give every array the same N, or one state")
+        each = ", ".join(f"{k} has {v}" for k, v in sizes.items())
+        raise InputError(f"batches of different sizes: {each}; give every array the same N, or one state")
     return next(iter(sizes.values()), None)
 
 

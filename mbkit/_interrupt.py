@@ -49,20 +49,12 @@ class Section:
 
 
 class _Interrupts:
-    """State of the command.
-
-    Attributes
-    ----------
-    heard, count : int
-        Number of Ctrl-C, and of those that the main thread knows of.
-    pending : bool
-        Whether one came while a file was written, and is still to be raised.
-    ending : bool
-        Whether the command has said that it was interrupted.
-    """
+    """State of the command."""
 
     def __init__(self) -> None:
+        # Number of Ctrl-C, and of those that the main thread knows of.
         self.heard = self.count = 0
+        # Whether one came while a file was written, and is still to be raised; whether the command has said so.
         self.pending = self.ending = False
         # A signal handler may come upon itself.
         self.lock = threading.RLock()
@@ -123,18 +115,15 @@ def _begin_end() -> None:
         os.write(2, _CLEAR + _LINE if os.isatty(2) else _LINE)
         # Libraries report an interruption as a failure of theirs.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        threading.Thread(target=_end_later, daemon=True).start()
+        threading.Thread(target=_end, args=(True,), daemon=True).start()
 
 
-def _end_later() -> None:
-    time.sleep(GRACE)
-    while uninterrupted.depth:
-        time.sleep(0.01)
-    _end()
-
-
-def _end() -> None:
-    """End this process and those that it started."""
+def _end(later: bool = False) -> None:
+    """End this process and those that it started, at once or when its files are closed."""
+    if later:
+        time.sleep(GRACE)
+        while uninterrupted.depth:
+            time.sleep(0.01)
     for action in list(_interrupts.at_end):
         action()
     os._exit(INTERRUPTED)

@@ -90,20 +90,16 @@ class UnknownNameError(MbkitError, LookupError):
 
     Parameters
     ----------
-    what : str
-        The kind of thing, such as ``"robot"``.
-    name : str
-        The unknown name.
+    what, name : str
+        The kind of thing, such as ``"robot"``, and the unknown name.
     known : iterable of str
-        The names that exist.
     hint : str
         What else the caller can do.
     """
 
     def __init__(self, what: str, name: str, known: Iterable[str], hint: str = "") -> None:
         self.what, self.name, self.known, self.hint = what, name, tuple(known), hint
-        near = nearest(name, self.known)
-        if near:
+        if near := nearest(name, self.known):
             advice = f"did you mean {' or '.join(repr(n) for n in near)}?"
         elif len(self.known) <= 40:
             advice = f"there are: {', '.join(self.known) or 'none'}"
@@ -121,21 +117,18 @@ class ModelError(MbkitError, ValueError):
     Parameters
     ----------
     name : str
-        Name of the model, or the file it came from.
+        Of the model or the file.
     faults : sequence of str
-        One sentence per fault, each with its remedy. The message shows the first of very many.
+        A sentence each, with its remedy. The message shows the first of very many.
     """
 
     def __init__(self, name: str, faults: Sequence[str]) -> None:
         self.name, self.faults = name, tuple(faults)
         shown = [_shortened(fault) for fault in self.faults[:_MAX_FAULTS]]
-        if len(self.faults) == 1:
-            text = f"{name}: {shown[0]}"
-        else:
-            more = len(self.faults) - len(shown)
-            rest = [f"  - and {more} more; the error's .faults holds all"] if more else []
-            text = "\n".join([f"{name}: {len(self.faults)} faults", *(f"  - {f}" for f in shown), *rest])
-        super().__init__(text)
+        if more := len(self.faults) - len(shown):
+            shown.append(f"and {more} more; the error's .faults holds all")
+        listed = "".join(f"\n  - {fault}" for fault in shown)
+        super().__init__(f"{name}: {shown[0]}" if len(shown) == 1 else f"{name}: {len(self.faults)} faults{listed}")
 
     def __reduce__(self) -> tuple[type, tuple[object, ...]]:
         return type(self), (self.name, self.faults)
@@ -201,17 +194,14 @@ class Suggestions:
     """
 
     def __init__(self, most: int = 5) -> None:
-        self._left = most
-        self._found: dict[str, str] = {}
+        self._most = most
+        self._near: dict[str, str] = {}
 
     def near(self, name: str, known: Iterable[str]) -> str:
         """Return the nearest known name, or an empty text."""
-        if name not in self._found:
-            if self._left <= 0:
-                return ""
-            self._left -= 1
-            self._found[name] = next(iter(nearest(name, known, 1)), "")
-        return self._found[name]
+        if name not in self._near and len(self._near) < self._most:
+            self._near[name] = next(iter(nearest(name, known, 1)), "")
+        return self._near.get(name, "")
 
 
 def _shortened(text: str, most: int = _MAX_CHARACTERS) -> str:

@@ -21,7 +21,7 @@ from mbkit.report.compare_view import failures, headline, omission_state
 from mbkit.report.figures import term_costs
 from mbkit.report.formatting import count_text, error_text, refusals, time_text
 from mbkit.report.output_folder import check_writable, file_stem, write
-from mbkit.report.progress import Bar
+from mbkit.simulate.progress import Bar
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 from mbkit.studies.results import Refusal
@@ -314,7 +314,7 @@ def test_a_run_that_is_the_fastest_for_several_errors_is_one_row():
 
 
 def test_failures_hold_terms_rollouts_and_omissions_with_reasons():
-    found = {f.what: f.reason for f in failures(DIFFERING)}
+    found = {f.head: f.text for f in failures(DIFFERING)}
     assert found["kinetic energy, pinocchio"] == "differs by 3.0e-01; pinocchio#2053"
     assert "1e-12 expected" in found["rollout rk4, pinocchio"]
     assert "leaving out limits" in found

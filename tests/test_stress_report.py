@@ -12,12 +12,11 @@ from rich.console import Console
 
 from mbkit.errors import UnknownNameError
 from mbkit.report import stress_view, terminal
+from mbkit.report.figures import stable_steps
 from mbkit.report.page import render
-from mbkit.report.stress_page import case_map, view
-from mbkit.report.stress_steps import kinds, rules, stable_steps, steps
-from mbkit.report.stress_view import avoid, methods
+from mbkit.report.stress_view import against_theory, avoid, content, map_cells, methods, rules, steps, view
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
-from mbkit.studies.stress.measurements import CaseResult, Measurement, Row, best, lines, place, recommended
+from mbkit.studies.stress.measurements import CaseResult, Measurement, Row, best, lines, name_of, place, recommended
 from mbkit.studies.stress.result import StressResult
 
 NAN, INF = math.nan, math.inf
@@ -298,10 +297,10 @@ def test_the_headline_says_who_held_furthest_and_how_much_was_silent():
 
 
 def test_what_to_avoid_is_told_by_method_with_where_it_begins():
-    found = {a.method: a.places for a in avoid(RESULT)}
+    found = {a.method: a.places for a in avoid(stress_view.overview(RESULT))}
     assert list(found) == ["rk4", "semi_implicit_euler", "pinocchio forward_dynamics"]
-    assert [(p.case.name, p.text, p.engines) for p in found["rk4"]] == [("joint_spring", "1e6 N m/rad", ("mujoco",))]
-    assert found["semi_implicit_euler"][0].engines == ()
+    assert [(o.case.name, *rest) for o, *rest in found["rk4"]] == [("joint_spring", "1e6 N m/rad", ["mujoco"])]
+    assert found["semi_implicit_euler"][0][2] == []
 
 
 def test_where_another_holds_further_than_auto_is_told():
@@ -316,16 +315,17 @@ def test_where_another_holds_further_than_auto_is_told():
 
 def test_methods_are_counted_by_family_with_their_price():
     first, *_ = found = methods(RESULT)
-    assert (first.name, first.families, first.ahead, first.factor) == ("lagrangian auto", {"stiffness": (1, 1)}, 1, 1.0)
-    assert {m.name: m.silent for m in found}["mujoco rk4"] == 1
+    assert (name_of(first.row), first.families) == ("lagrangian auto", {"stiffness": (1, 1)})
+    assert (first.ahead, first.factor) == (1, 1.0)
+    assert {name_of(m.row): m.silent for m in found}["mujoco rk4"] == 1
     assert first.held == 1.0
     # Terms are no methods, a stable step is no merit, and what never ran has no count.
-    assert not {m.name for m in found} & {"pinocchio M", "mujoco semi_implicit_euler", "drake rk3"}
+    assert not {name_of(m.row) for m in found} & {"pinocchio M", "mujoco semi_implicit_euler", "drake rk3"}
 
 
 def test_steps_are_set_against_linear_theory_and_make_a_rule():
     found = steps(stress_view.overview(RESULT))
-    assert [(s.line.row.method, s.verdict) for s in found[0].lines] == [
+    assert [(x.row.method, against_theory(x, found[0].case)) for x in found[0].lines] == [
         ("gauss4", "as theory says"),
         ("rk4", "as theory says"),
         ("semi_implicit_euler", "breaks 2 × earlier"),
@@ -338,39 +338,39 @@ def test_steps_are_set_against_linear_theory_and_make_a_rule():
     }
     further = replace(STEP.rows[0], theory=1.2e-3)
     (case,) = steps(stress_view.overview(replace(RESULT, cases=(replace(STEP, rows=(further,), facts=()),))))
-    assert case.lines[0].verdict == "holds 1.7 × further"
+    assert against_theory(case.lines[0], case.case) == "holds 1.7 × further"
     # Without a frequency there is no rule, and a step all the same.
     assert rules([case]) == []
     # What was too slow tells nothing of stability.
     slow = replace(STEP, rows=(replace(STEP.rows[0], cells=cells(STEPS, 1e-5, "slow")),))
     (case,) = steps(stress_view.overview(replace(RESULT, cases=(slow,))))
-    assert (case.lines[0].verdict, rules([case])) == ("", [])
+    assert (against_theory(case.lines[0], case.case), rules([case])) == ("", [])
 
 
 def test_a_damper_has_a_rule_of_its_own():
     damped = replace(STEP, name="damped", facts=({"fastest rate": 100.0},) * 4)
-    found = rules(steps(stress_view.overview(replace(RESULT, cases=(STEP, damped)))))
-    assert kinds(found) == ["fastest frequency", "fastest rate"]
-    told = {r.method: r.words for r in found}
+    page = content(replace(RESULT, cases=(STEP, damped)))
+    assert page["kinds"] == ["fastest frequency", "fastest rate"]
+    told = {r.method: r.words for r in page["rules"]}
     assert told["rk4"] == "dt ≤ 2 / ω (fastest frequency); dt ≤ 0.2 / ω (fastest rate)"
 
 
 def test_the_map_marks_where_it_breaks_and_where_theory_lets_it():
-    told = {
-        (r.line.row.engine, r.line.row.method): r for o in stress_view.overview(RESULT)[:1] for r in case_map(o).rows
-    }
-    assert [c.style for c in told["pinocchio", "rk4"].cells] == ["h1", "w3 brk", "gross lim", "end"]
-    assert [c.style for c in told["mujoco", "rk4"].cells] == ["h1", "w3 brk", "gross sil lim", "gross sil"]
-    assert [c.text for c in told["mujoco", "mujoco_euler"].cells] == ["1e-3", "NaN", "died", ""]
-    assert "dt ω is 31" in told["pinocchio", "rk4"].cells[2].title
-    assert told["pinocchio", "rk4"].theory == "breaks 100 × earlier"
-    assert ("drake", "rk3") not in told
+    (pinocchio, mujoco, euler) = (
+        map_cells(line(SPRING, *row), SPRING)
+        for row in (("pinocchio", "rk4"), ("mujoco", "rk4"), ("mujoco", "mujoco_euler"))
+    )
+    assert [c.style for c in pinocchio] == ["h1", "w3 brk", "gross lim", "end"]
+    assert [c.style for c in mujoco] == ["h1", "w3 brk", "gross sil lim", "gross sil"]
+    assert [c.text for c in euler] == ["1e-3", "NaN", "died", ""]
+    assert "dt ω is 31" in pinocchio[2].title
+    assert against_theory(line(SPRING, "pinocchio", "rk4"), SPRING) == "breaks 100 × earlier"
+    assert "drake rk3, k" not in stress_page(RESULT)
 
 
 def test_an_interrupted_row_is_filled_with_empty_cells():
     cut = replace(SPRING, rows=(replace(SPRING.rows[1], cells=SPRING.rows[1].cells[:2]),))
-    told = case_map(stress_view.overview(replace(RESULT, cases=(cut,)))[0])
-    assert [c.style for c in told.rows[0].cells] == ["h0", "h0", "none", "none"]
+    assert [c.style for c in map_cells(lines(cut)[0], cut)] == ["h0", "h0", "none", "none"]
     page = " ".join(Tags(stress_page(replace(RESULT, cases=(cut,), complete=False))).text.split())
     assert "auto, then not run" in page
     assert "interrupted" in page
@@ -483,7 +483,7 @@ def test_figures_draw_a_case_or_all_and_refuse_what_there_is_not():
 
 def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():
     for result in (RESULT, NASTY):
-        found = steps(stress_view.overview(result))
+        found = [(o.case, o.lines) for o in steps(stress_view.overview(result))]
         drawn = stable_steps(found)
         assert drawn == stable_steps(found)
         assert ElementTree.fromstring(drawn).tag.endswith("svg")

@@ -10,8 +10,9 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import click
 
@@ -24,30 +25,42 @@ if TYPE_CHECKING:
 
     from mbkit.report.document import Document
 
-# Options that several commands have.
+# Exit status. "Differ" is a verdict, so a fault of mbkit's own has another.
+AGREE: Final = 0
+DONE: Final = 0
+DIFFER: Final = 1
+MISUSE: Final = 2
+INTERNAL: Final = 70
+INTERRUPTED: Final = _interrupt.INTERRUPTED
 
-# Keyword arguments of `mbkit.load` that messages name, as options of the command line.
+#: Keyword arguments of `mbkit.load` that messages name, as options of the command line.
 _OPTIONS: Final = {
     'nonphysical="warn"': "--nonphysical warn",
     "mimic='free'": "--mimic free",
     "floating_base=True": "--floating-base",
 }
 
+# Options that several commands have.
+
 Command = Callable[..., None]
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON, and nothing else, on stdout.")
+force_option = click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
 
 
 def out_option(default: str) -> Callable[[Command], Command]:
     """Return the option for the folder of results."""
-    return click.option(
-        "--out", default=default, show_default=True, type=click.Path(path_type=Path), help="Folder to fill."
-    )
+    kind = click.Path(path_type=Path)
+    return click.option("--out", default=default, show_default=True, type=kind, help="Folder to fill.")
 
 
 def report_options(command: Command) -> Command:
-    """Add the options of commands that write a report: folder, and whether foreign files are replaced."""
-    force = click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
-    return out_option("mbkit-report")(force(command))
+    """Add the options of commands that write a report; the command gets them as a `Report`."""
+
+    @functools.wraps(command)
+    def with_report(*args: Any, out: Path, as_json: bool, force: bool, **more: Any) -> None:
+        command(*args, report=Report(out, as_json, force), **more)
+
+    return json_option(out_option("mbkit-report")(force_option(with_report)))
 
 
 def engines_option(default: str) -> Callable[[Command], Command]:
@@ -55,15 +68,32 @@ def engines_option(default: str) -> Callable[[Command], Command]:
     return click.option("--engines", default=default, show_default=True, callback=split, metavar="A,B,...")
 
 
+def methods_option(default: str) -> Callable[[Command], Command]:
+    """Return the option for names of methods of integration; `default` is for the help."""
+    text = f"Integrators.  [default: {default}]"
+    return click.option("--methods", default="", callback=_methods, metavar="A,B,...", help=text)
+
+
+def _methods(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
+    names = split(ctx, parameter, value)
+    if names:
+        from mbkit.methods.registry import method_of
+
+        for name in names:
+            method_of(name)
+    return names
+
+
+def states_options(samples: int) -> Callable[[Command], Command]:
+    """Return the options for random states: how many, and their seed."""
+    count = click.IntRange(min=1)
+    number = click.option("--samples", default=samples, show_default=True, type=count, help="Random states.")
+    return lambda command: number(seed_option()(command))
+
+
 def seed_option(text: str | None = None) -> Callable[[Command], Command]:
     """Return the option for the seed of random states."""
     return click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help=text)
-
-
-def samples_option(default: int) -> Callable[[Command], Command]:
-    """Return the option for the number of random states."""
-    kind = click.IntRange(min=1)
-    return click.option("--samples", default=default, show_default=True, type=kind, help="Random states.")
 
 
 def split(_ctx: click.Context, _parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -79,26 +109,11 @@ def load_options(command: Command) -> Command:
         options = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical}
         command(*args, options={k: v for k, v in options.items() if v is not None}, **more)
 
-    out: Command = with_options
-    for option in (
-        click.option(
-            "--nonphysical", type=click.Choice(["error", "warn"]), help="Refuse impossible bodies, or take them."
-        ),
-        click.option(
-            "--mimic", type=click.Choice(["reduce", "free"]), help="What mimic joints become.  [default: reduce]"
-        ),
-        click.option("--floating-base", is_flag=True, help="Let the base of a file or robot move freely."),
-    ):
-        out = option(out)
-    return out
-
-
-def prepare(out: Path, stem: str, *endings: str, force: bool) -> None:
-    """Raise before anything is computed if a result could not be written."""
-    from mbkit.report.output_folder import check_replaceable, check_writable
-
-    check_writable(out)
-    check_replaceable(out, *(f"{stem}.{ending}" for ending in endings), force=force)
+    bodies, mimics = click.Choice(["error", "warn"]), click.Choice(["reduce", "free"])
+    base = click.option("--floating-base", is_flag=True, help="Let the base of a file or robot move freely.")
+    mimic = click.option("--mimic", type=mimics, help="What mimic joints become.  [default: reduce]")
+    nonphysical = click.option("--nonphysical", type=bodies, help="Refuse impossible bodies, or take them.")
+    return base(mimic(nonphysical(with_options)))
 
 
 def stem_of(target: str, name: str) -> str:
@@ -133,27 +148,14 @@ def check_engines(names: tuple[str, ...], least: int) -> None:
         )
 
 
-AGREE: Final = 0
-DONE: Final = 0
-DIFFER: Final = 1
-MISUSE: Final = 2
-INTERNAL: Final = 70
-INTERRUPTED: Final = _interrupt.INTERRUPTED
+# Messages.
 
 
-class Door(click.Group):
+class CommandGroup(click.Group):
     """Turns what the library raises into one message and an exit status."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
-        try:
-            return self._invoke(ctx)
-        finally:
-            # A library may have swallowed the interruption, or treated it as its own failure.
-            if _interrupt.received():
-                ctx.exit(INTERRUPTED)
-
-    def _invoke(self, ctx: click.Context) -> Any:
         try:
             with _one_line_warnings():
                 return super().invoke(ctx)
@@ -171,10 +173,13 @@ class Door(click.Group):
         except (click.exceptions.Exit, click.Abort):
             raise
         except Exception:
-            # "differ" is a verdict, so a fault has a status of its own.
             traceback.print_exc()
             say("error", "this is a fault of mbkit's; please report it with the lines above")
             ctx.exit(INTERNAL)
+        finally:
+            # A library may have swallowed the interruption, or treated it as its own failure.
+            if _interrupt.received():
+                ctx.exit(INTERRUPTED)
 
 
 def say(what: str, text: str) -> None:
@@ -189,7 +194,7 @@ def tell(text: str) -> None:
     click.echo(terminal(text))
 
 
-def leave(status: int) -> None:
+def leave(status: int) -> NoReturn:
     """End the command with a status."""
     click.get_current_context().exit(status)
 
@@ -214,72 +219,73 @@ def _one_line_warnings() -> Iterator[None]:
 # Output.
 
 
-class Result(Protocol):
-    """A study's result as a command writes it."""
+def show(view: Document, *, as_json: bool) -> None:
+    """Print a view, or its result as JSON."""
+    if as_json:
+        tell(view.result.to_json())
+    else:
+        from mbkit.report.terminal import render
 
-    def to_json(self) -> str:
-        """Return it as JSON."""
-        ...
+        console().print(render(view))
 
 
-def show(
-    result: Result,
-    view: Callable[[], Document],
-    stem: str,
-    out: Path,
-    *,
-    as_json: bool,
-    force: bool,
-    table: Callable[[], str] | None = None,
-    figure: Callable[[], bytes] | None = None,
-) -> bool:
-    """Write JSON, CSV (`table`), PNG (`figure`) and a page of a result; print its view, or the JSON.
+@dataclass(frozen=True)
+class Report:
+    """The folder of a result's files, whether its JSON is printed, and whether foreign files are replaced."""
 
-    Return whether all files could be written. With `force`, files are replaced that mbkit did not write.
-    """
-    from mbkit.report import output_folder
+    out: Path
+    as_json: bool
+    force: bool
 
-    data = result.to_json()
+    def prepare(self, stem: str = "", *endings: str) -> None:
+        """Raise before anything is computed if a result could not be written."""
+        from mbkit.report import output_folder
 
-    def page() -> str:
+        output_folder.check_writable(self.out)
+        output_folder.check_replaceable(self.out, *(f"{stem}.{ending}" for ending in endings), force=self.force)
+
+    def write(
+        self,
+        view: Document,
+        stem: str,
+        table: Callable[[], str] | None = None,
+        figure: Callable[[], bytes] | None = None,
+    ) -> bool:
+        """Write JSON, CSV (`table`), PNG (`figure`) and a page of a result, and print it; return whether all went."""
+        from mbkit.report import output_folder
         from mbkit.report.page import render
 
-        return render(view(), data=f"{stem}.json", table=f"{stem}.csv" if table else "")
+        def page() -> str:
+            return render(view, data=f"{stem}.json", table=f"{stem}.csv" if table else "")
 
-    contents: dict[str, tuple[str, Callable[[], str | bytes] | None]] = {
-        "data": ("json", lambda: data + "\n"),
-        "table": ("csv", table),
-        "figure": ("png", figure),
-        "page": ("html", page),
-    }
-    paths: dict[str, Path] = {}
-    failure = ""
-    try:
-        for what, (ending, content) in contents.items():
-            if content is not None:
-                paths[what] = output_folder.write(out, f"{stem}.{ending}", content(), force=force)
-    except OutputError as error:
-        failure = str(error)
-    try:
-        if as_json:
-            tell(data)
-        else:
-            from mbkit.report import terminal as report
-
-            screen = console()
-            screen.print(report.render(view()))
-            if not failure:
+        contents: dict[str, tuple[str, Callable[[], str | bytes] | None]] = {
+            "data": ("json", lambda: view.result.to_json() + "\n"),
+            "table": ("csv", table),
+            "figure": ("png", figure),
+            "page": ("html", page),
+        }
+        paths: dict[str, Path] = {}
+        failure = ""
+        try:
+            for what, (ending, content) in contents.items():
+                if content is not None:
+                    paths[what] = output_folder.write(self.out, f"{stem}.{ending}", content(), force=self.force)
+        except OutputError as error:
+            failure = str(error)
+        try:
+            show(view, as_json=self.as_json)
+            if not self.as_json and not failure:
                 lines = "\n".join(f"{what} {path}" for what, path in reversed(paths.items()))
-                screen.print(lines, markup=False, highlight=False, soft_wrap=True)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader may stop early (head). The verdict stands, and the rest of the buffer must not fail at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if failure:
-        say("error", f"{failure}; the result itself is printed on stdout")
-    elif as_json:
-        say("written", " ".join(map(str, paths.values())))
-    return not failure
+                console().print(lines, markup=False, highlight=False, soft_wrap=True)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # The reader may stop early (head). The verdict stands, and the rest of the buffer must not fail at the end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if failure:
+            say("error", f"{failure}; the result itself is printed on stdout")
+        elif self.as_json:
+            say("written", " ".join(map(str, paths.values())))
+        return not failure
 
 
 def console() -> Console:

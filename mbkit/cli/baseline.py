@@ -9,28 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mbkit._escape import one_line
-from mbkit.cli._shared import (
-    AGREE,
-    DIFFER,
-    DONE,
-    MISUSE,
-    check_engines,
-    console,
-    in_options,
-    json_option,
-    leave,
-    load_options,
-    samples_option,
-    say,
-    seed_option,
-    split,
-    tell,
-)
+from mbkit.cli import _shared as shared
+from mbkit.cli._shared import AGREE, DIFFER, MISUSE
 from mbkit.errors import BaselineError, InputError, MbkitError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.studies.baseline import Baseline, BaselineResult
+
+_FILE = click.Path(path_type=Path)
 
 
 @click.group()
@@ -43,21 +30,14 @@ def baseline() -> None:
 
 @baseline.command()
 @click.argument("targets", metavar="TARGET...", nargs=-1, required=True)
-@click.argument("path", type=click.Path(path_type=Path))
-@click.option("--engines", callback=split, default="", metavar="A,B,...", help="[default: all that are installed]")
-@samples_option(2)
-@seed_option()
-@load_options
+@click.argument("path", type=_FILE)
+@click.option(
+    "--engines", callback=shared.split, default="", metavar="A,B,...", help="[default: all that are installed]"
+)
+@shared.states_options(2)
+@shared.load_options
 @click.option("--force", is_flag=True, help="Replace a file that is another robot's baseline, or none.")
-def record(
-    targets: tuple[str, ...],
-    path: Path,
-    engines: tuple[str, ...],
-    samples: int,
-    seed: int,
-    options: dict[str, Any],
-    force: bool,
-) -> None:
+def record(targets: tuple[str, ...], path: Path, engines: tuple[str, ...], **settings: Any) -> None:
     """Record each TARGET in PATH: a .toml file, or a folder that gets a file for each.
 
     TARGET is what `mbkit check` takes; `mbkit baseline check` loads a robot, a catalog system or a file again,
@@ -67,59 +47,44 @@ def record(
     if path.suffix == ".toml" and len(targets) > 1:
         raise click.UsageError(f"{len(targets)} targets want a folder, and {path} is a file's name")
     if engines:
-        check_engines(engines, least=1)
+        shared.check_engines(engines, least=1)
     files = {target: path if path.suffix == ".toml" else path / _name(target) for target in targets}
     for file in files.values():
         alike = [t for t, other in files.items() if other == file]
         if len(alike) > 1:
             raise click.UsageError(f"{' and '.join(alike)} would both be {file}; record them one by one")
     for target, file in files.items():
-        _record_one(target, options, file, engines, samples, seed, force)
+        _record_one(target, file, engines, **settings)
 
 
-def _record_one(
-    target: str, options: dict[str, Any], file: Path, engines: tuple[str, ...], samples: int, seed: int, force: bool
-) -> None:
-    from mbkit.report.progress import Bar
+def _record_one(target: str, file: Path, engines: tuple[str, ...], options: dict[str, Any], **settings: Any) -> None:
+    from mbkit.simulate.progress import Bar
     from mbkit.studies import baseline as baselines
     from mbkit.studies._targets import kept, model_of
 
     model = model_of(target, options)
+    place = kept(target, file)
     with Bar(f"record {model.name}") as bar:
-        recorded = baselines.record(
-            model,
-            file,
-            engines or None,
-            samples=samples,
-            seed=seed,
-            target=kept(target, file),
-            options=options,
-            force=force,
-            progress=bar,
-        )
-    tell(f"{file}: {one_line(model.name)}, {', '.join(recorded.engines)}, {file.stat().st_size / 1000:.0f} kB")
-    for refusal in recorded.left_out:
-        say("note", f"{refusal.engine}{' ' * bool(refusal.term)}{refusal.term}: {refusal.reason}")
-    for disagreement in recorded.disagreements:
-        say("warning", disagreement)
+        result = baselines.record(model, file, engines or None, target=place, options=options, progress=bar, **settings)
+    size = file.stat().st_size / 1000
+    shared.tell(f"{file}: {one_line(model.name)}, {', '.join(result.engines)}, {size:.0f} kB")
+    for refusal in result.left_out:
+        shared.say("note", f"{f'{refusal.engine} {refusal.term}'.rstrip()}: {refusal.reason}")
+    for disagreement in result.disagreements:
+        shared.say("warning", disagreement)
 
 
 @baseline.command()
-@click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--target", help="Check this instead of what was recorded, or the function that was recorded; with one file."
 )
 @click.option("--strict", is_flag=True, help="Fail where an engine that was recorded is not installed.")
 @click.option("--rebaseline", is_flag=True, help="Show what differs, and record it again.")
-@load_options
-@json_option
+@shared.load_options
+@shared.json_option
 def check(
-    paths: tuple[Path, ...],
-    target: str | None,
-    strict: bool,
-    rebaseline: bool,
-    options: dict[str, Any],
-    as_json: bool,
+    paths: tuple[Path, ...], target: str | None, strict: bool, rebaseline: bool, options: dict[str, Any], as_json: bool
 ) -> None:
     """Hold robots and engines against what was recorded in each PATH, a file or a folder of them.
 
@@ -138,18 +103,18 @@ def check(
     results: list[BaselineResult] = []
     for file in files:
         try:
-            result, recorded = _check_one(file, target, options, strict, rebaseline, table=not as_json)
+            result, again = _check_one(file, target, options, strict, rebaseline, table=not as_json)
         except MbkitError as error:
             # One file's fault must not hide what the others say.
-            say("error", in_options(str(error)))
+            shared.say("error", shared.in_options(str(error)))
             statuses.append(MISUSE)
             continue
         results.append(result)
         nothing = result.status == "skipped" and not strict
-        statuses.append(MISUSE if nothing else AGREE if result.passed or recorded else DIFFER)
+        statuses.append(MISUSE if nothing else AGREE if result.passed or again else DIFFER)
     if as_json:
-        tell("[" + ",\n".join(r.to_json() for r in results) + "]")
-    leave(max(statuses))
+        shared.tell("[" + ",\n".join(r.to_json() for r in results) + "]")
+    shared.leave(max(statuses))
 
 
 def _check_one(
@@ -157,8 +122,7 @@ def _check_one(
 ) -> tuple[BaselineResult, bool]:
     """Return the result, and whether it was recorded again."""
     from mbkit.report.explain_view import baseline_view
-    from mbkit.report.progress import Bar
-    from mbkit.report.terminal import render
+    from mbkit.simulate.progress import Bar
     from mbkit.studies import baseline as baselines
     from mbkit.studies._targets import kept, model_of
 
@@ -170,13 +134,16 @@ def _check_one(
     with Bar(f"check {file.name}") as bar:
         result = baselines.check(model, file, strict=strict, target=new_target, progress=bar)
     if table:
-        console().print(render(baseline_view(result, _again(file, target))))
-    differs = result.status not in ("same", "skipped")
-    if not differs or not (rebaseline or (table and result.status == "versions" and _confirmed(file))):
+        again = f"mbkit baseline check {file}{f' --target {target}' if target else ''} --rebaseline"
+        shared.show(baseline_view(result, again), as_json=False)
+    if result.status in ("same", "skipped"):
+        return result, False
+    if not rebaseline and not (table and result.status == "versions" and _confirmed(file)):
         return result, False
     if result.skipped:
         names = ", ".join(r.engine for r in result.skipped)
-        say("error", f"{file}: not recorded anew, because what it has of {names} would be lost; install that first")
+        why = f"what it has of {names} would be lost; install that first"
+        shared.say("error", f"{file}: not recorded anew, because {why}")
         return result, False
     baselines.record(
         model,
@@ -184,26 +151,25 @@ def _check_one(
         recorded.engines,
         samples=recorded.states.kinds.count("random"),
         seed=recorded.seed,
-        target=recorded.target if new_target is None else new_target,
+        target=new_target or recorded.target,
         options=options,
         # It was read above, so it is this robot's.
         force=True,
     )
-    say("recorded", str(file))
+    shared.say("recorded", str(file))
     return result, True
 
 
 def _confirmed(file: Path) -> bool:
     """Return whether a person at a terminal wants a baseline recorded again."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        return False
-    return click.confirm(f"Record {file} anew with these versions?", default=False)
+    there = sys.stdin.isatty() and sys.stdout.isatty()
+    return there and click.confirm(f"Record {file} anew with these versions?", default=False)
 
 
 @baseline.command()
-@click.argument("path_a", type=click.Path(path_type=Path))
-@click.argument("path_b", type=click.Path(path_type=Path))
-@json_option
+@click.argument("path_a", type=_FILE)
+@click.argument("path_b", type=_FILE)
+@shared.json_option
 def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     """Say what PATH_B has that PATH_A has not: parameters, numbers, versions. Nothing is computed.
 
@@ -211,15 +177,11 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     that cannot be read.
     """
     from mbkit.report.explain_view import baseline_view
-    from mbkit.report.terminal import render
     from mbkit.studies import baseline as baselines
 
     result = baselines.diff(path_a, path_b)
-    if as_json:
-        tell(result.to_json())
-    else:
-        console().print(render(baseline_view(result)))
-    leave(DONE if result.passed else DIFFER)
+    shared.show(baseline_view(result), as_json=as_json)
+    shared.leave(AGREE if result.passed else DIFFER)
 
 
 # Targets and files.
@@ -233,11 +195,6 @@ def _name(target: str) -> str:
     robot = canonical(target)
     path = robot is None and (Path(target).is_file() or "/" in target)
     return f"{file_stem(Path(target).stem if path else robot or target.rpartition(':')[2])}.toml"
-
-
-def _again(file: Path, target: str | None) -> str:
-    """Return the command that records again."""
-    return f"mbkit baseline check {file}{f' --target {target}' if target else ''} --rebaseline"
 
 
 def _model(recorded: Baseline, file: Path) -> Model:
@@ -260,11 +217,8 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
 
     out: list[Path] = []
     for path in paths:
-        if not path.is_dir():
-            out.append(path)
-            continue
-        baselines = sorted(p for p in path.glob("*.toml") if is_baseline(p))
-        if not baselines:
+        files = sorted(p for p in path.glob("*.toml") if is_baseline(p)) if path.is_dir() else [path]
+        if not files:
             raise InputError(f"{path}: no baseline in this folder; mbkit baseline record TARGET {path} makes one")
-        out += baselines
+        out += files
     return out

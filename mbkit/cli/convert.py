@@ -1,14 +1,32 @@
-"""`mbkit convert`: a description in another format, checked by reading it back."""
+"""`mbkit robots` and `mbkit convert`: descriptions by name, and in another format."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import click
 
-from mbkit.cli._shared import load_options, say, tell
+from mbkit.cli import _shared as shared
 from mbkit.errors import OutputError
+
+
+@click.command()
+@shared.json_option
+def robots(as_json: bool) -> None:
+    """List the robots and catalog systems that can be checked by name."""
+    from mbkit import catalog
+    from mbkit.load import robots as records
+
+    if as_json:
+        fields = ("name", "aliases", "nq", "nv", "mass", "reason")
+        listed = [{f: getattr(r, f) for f in fields} | {"path": str(r.path)} for r in records()]
+        shared.tell(json.dumps(listed, indent=1))
+        return
+    from mbkit.report import terminal
+
+    shared.console().print(terminal.robots(records(), catalog.systems()))
 
 
 @click.command()
@@ -16,7 +34,7 @@ from mbkit.errors import OutputError
 @click.option("--to", "to", required=True, type=click.Choice(["mjcf", "urdf"]), help="The format.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="File to write.  [default: print]")
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
-@load_options
+@shared.load_options
 def convert(target: str, to: str, output: Path | None, force: bool, options: dict[str, Any]) -> None:
     """Write TARGET as MJCF or URDF: its motion alone, without geometry.
 
@@ -30,10 +48,10 @@ def convert(target: str, to: str, output: Path | None, force: bool, options: dic
         raise OutputError(f"{output} is there already; choose another with -o, or replace it with --force")
     result = converted(model_of(target, options), to)
     if output is None:
-        tell(result.text.removesuffix("\n"))
+        shared.tell(result.text.removesuffix("\n"))
     else:
         result.write(output)
     for note in result.notes:
-        say("note", note)
+        shared.say("note", note)
     where = "printed" if output is None else f"written to {output}"
-    say("checked", f"{result.model} as {to}, {where}: read back, every term agrees to {result.worst:.1e}")
+    shared.say("checked", f"{result.model} as {to}, {where}: read back, every term agrees to {result.worst:.1e}")

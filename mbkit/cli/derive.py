@@ -1,8 +1,11 @@
-"""`mbkit derive`: the equations of motion to read."""
+"""`mbkit derive` and `mbkit export`: the equations of motion to read, and as C."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import asdict
+from inspect import getdoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -10,14 +13,16 @@ import click
 
 from mbkit._escape import json_text
 from mbkit._version import __version__
-from mbkit.cli._shared import json_option, load_options, say, tell
-from mbkit.cli.export import list_functions
+from mbkit.cli import _shared as shared
+from mbkit.cli._shared import say, tell
 
 if TYPE_CHECKING:
+    from mbkit.codegen.c_source import CSource
     from mbkit.lagrangian.system import Lagrangian
     from mbkit.model import Model
 
 _WIDTH: Final = 100
+_C_FOLDER: Final = "mbkit-export"
 
 
 @click.command()
@@ -25,7 +30,7 @@ _WIDTH: Final = 100
 @click.option("--latex", "form", flag_value="latex", help="Print LaTeX.")
 @click.option("--python", "form", flag_value="python", help="Print a Python module that needs NumPy only.")
 @click.option("--c", "form", flag_value="c", help="Write C99, as mbkit export does.")
-@load_options
+@shared.load_options
 @click.option(
     "--snap",
     type=click.FloatRange(0.0, 1e-2),
@@ -33,17 +38,11 @@ _WIDTH: Final = 100
     show_default=True,
     help="To read: take entries of rotations this near to 0 or 1 as exact. --python and --c take them as they are.",
 )
-@json_option
+@shared.json_option
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to, instead of printing.")
-@click.option("--force", is_flag=True, help="Replace files that mbkit did not write.")
+@shared.force_option
 def derive(
-    system: str,
-    form: str | None,
-    options: dict[str, Any],
-    snap: float,
-    as_json: bool,
-    out: Path | None,
-    force: bool,
+    system: str, form: str | None, options: dict[str, Any], snap: float, as_json: bool, out: Path | None, force: bool
 ) -> None:
     """Print T, V, M, C, g and the equation of motion of SYSTEM, and what it conserves.
 
@@ -54,25 +53,27 @@ def derive(
     """
     if as_json and form:
         raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
-    from mbkit.report.output_folder import check_writable
+    from mbkit.report.output_folder import check_writable, file_stem, write
 
     if out is not None:
         check_writable(out)
     target = _model(system, options)
-    if form == "c":
-        _write_c(target, system, out or Path("mbkit-export"), force)
-        return
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
-    from mbkit.lagrangian.printing.catalog_symbols import letters, with_plain_turns
-    from mbkit.report.progress import Bar
+    from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters, with_plain_turns
+    from mbkit.simulate.progress import Bar
 
-    if form != "python" and not isinstance(target, EnergyModel):
+    on_paper = isinstance(target, EnergyModel)
+    if form == "c":
+        model = target if on_paper else in_symbols(target) or target
+        _tell_functions(*_write_c(model, system, out or Path(_C_FOLDER), force))
+        return
+    if form != "python" and not on_paper:
         target, note = with_plain_turns(target, snap)
         if note:
             say("note", f"{note}. The equations to read differ from the model by that; --snap 0 leaves it as it is")
     with Bar(f"derive {target.name}") as bar:
-        names = None if isinstance(target, EnergyModel) else letters(target)
+        names = None if on_paper else letters(target)
         lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.1 * x, text))
         # Prescribed joints are no coordinates of the equation.
         own = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
@@ -80,13 +81,10 @@ def derive(
     if out is None:
         tell(text)
         return
-    from mbkit.report.output_folder import file_stem, write
-
     if ending == ".txt":
         # By this line mbkit knows its own file.
         text += f"\n\nWritten by mbkit {__version__}"
-    path = write(out, f"{file_stem(lag.name)}{ending}", text + "\n", force=force)
-    tell(str(path))
+    tell(str(write(out, f"{file_stem(lag.name)}{ending}", text + "\n", force=force)))
 
 
 def _model(name: str, options: dict[str, Any]) -> Model:
@@ -104,7 +102,7 @@ def _model(name: str, options: dict[str, Any]) -> Model:
             say("note", f"{name} is in independent coordinates here; {other}")
         elif model is not None:
             say("note", f"{name} is in Euler angles here; the catalog's has a quaternion, which mbkit check takes")
-        say("note", _described(systems.get(name)))
+        say("note", _about(systems.get(name)))
         return systems.get(name)().model
     if model is not None:
         robot = find(name)
@@ -120,26 +118,11 @@ def _model(name: str, options: dict[str, Any]) -> Model:
         raise UnknownNameError("robot, catalog system or system on paper", name, known, error.hint) from None
 
 
-def _described(system: Callable[..., Lagrangian]) -> str:
+def _about(system: Callable[..., Lagrangian]) -> str:
     """Return what a system on paper is, its coordinates and their zero, from its docstring."""
-    from inspect import getdoc
-
     about = (getdoc(system) or "").split("\n\nReferences\n")[0].split("\n\nParameters\n")[0]
     first, *rest = " ".join(about.replace("`", "").split()).split(". ")
     return ". ".join([first.replace("Return ", f"{system.__name__}: ", 1), *rest])
-
-
-def _write_c(model: Model, name: str, out: Path, force: bool) -> None:
-    from mbkit.codegen.c_source import c_identifier, export_c
-    from mbkit.lagrangian.energy_model import EnergyModel
-    from mbkit.lagrangian.printing.catalog_symbols import in_symbols
-    from mbkit.load.loader import canonical
-
-    if not isinstance(model, EnergyModel):
-        model = in_symbols(model) or model
-    robot = canonical(name)
-    source = export_c(model, name=None if robot is None else c_identifier(robot))
-    list_functions(source, source.write(out, force=force))
 
 
 def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
@@ -150,9 +133,69 @@ def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: boo
         return python_code(lag).rstrip("\n"), ".py"
     from mbkit.lagrangian.printing.summary import SystemSummary
 
-    account = SystemSummary(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text))
+    summary = SystemSummary(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text))
     if as_json:
-        import json
+        return json_text(json.dumps(summary.data(), indent=1, ensure_ascii=False)), ".json"
+    return (summary.latex(), ".tex") if form == "latex" else (summary.text(_WIDTH), ".txt")
 
-        return json_text(json.dumps(account.data(), indent=1, ensure_ascii=False)), ".json"
-    return (account.latex(), ".tex") if form == "latex" else (account.text(_WIDTH), ".txt")
+
+# As C.
+
+
+@click.command()
+@click.argument("target")
+@click.option(
+    "--quantity",
+    "quantities",
+    multiple=True,
+    metavar="NAME",
+    help="What to compute; may be repeated.  [default: inverse_dynamics, forward_dynamics]",
+)
+@shared.load_options
+@click.option("--name", help="Prefix of every name in C, and stem of the files.  [default: the target's name]")
+@shared.force_option
+@shared.json_option
+@shared.out_option(_C_FOLDER)
+def export(target: str, options: dict[str, Any], as_json: bool, out: Path, force: bool, **choices: Any) -> None:
+    """Write the equations of motion of TARGET as C99 that needs no library.
+
+    TARGET is what `mbkit check` takes. The header tells how to compile and call it, the
+    units, the conventions and the order of the joints. A file that mbkit wrote before is
+    replaced; an unknown quantity lists those that there are.
+    """
+    from mbkit.studies._targets import model_of
+
+    model = model_of(target, options)
+    source, paths = _write_c(model, target, out, force, **choices)
+    if not as_json:
+        _tell_functions(source, paths)
+        return
+    functions = [asdict(f) | {"inputs": dict(f.inputs), "outputs": dict(f.outputs)} for f in source.functions]
+    data: dict[str, Any] = {
+        "name": source.name,
+        "model": model.name,
+        "digest": source.digest,
+        "versions": source.versions,
+    }
+    data |= {"header": str(paths[0]), "source": str(paths[1]), "functions": functions}
+    tell(json.dumps(data, indent=1))
+
+
+def _write_c(
+    model: Model, target: str, out: Path, force: bool, quantities: tuple[str, ...] = (), name: str | None = None
+) -> tuple[CSource, tuple[Path, Path]]:
+    """Return the code of a model and the paths of its header and source."""
+    from mbkit.codegen.c_source import DEFAULT, c_identifier, export_c
+    from mbkit.load.loader import canonical
+
+    # Several robots' files hold the same name.
+    robot = canonical(target)
+    stem = c_identifier(robot) if name is None and robot is not None else name
+    source = export_c(model, quantities or DEFAULT, name=stem)
+    return source, source.write(out, force=force)
+
+
+def _tell_functions(source: CSource, paths: tuple[Path, Path]) -> None:
+    for function in source.functions:
+        tell(f"{function.signature}: {function.operations} operations")
+    tell(f"header {paths[0]}\nsource {paths[1]}")

@@ -4,23 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mbkit.cli._shared import (
-    AGREE,
-    DIFFER,
-    check_engines,
-    console,
-    json_option,
-    leave,
-    load_options,
-    samples_option,
-    seed_option,
-    split,
-    tell,
-)
+from mbkit.cli import _shared as shared
 from mbkit.errors import MbkitError
 
 if TYPE_CHECKING:
@@ -31,24 +20,20 @@ if TYPE_CHECKING:
 @click.argument("first")
 @click.argument("second", required=False)
 @click.option(
-    "--engines", callback=split, default="", metavar="A,B", help="Two engines, to be compared on FIRST (and SECOND)."
+    "--engines",
+    callback=shared.split,
+    default="",
+    metavar="A,B",
+    help="Two engines, to be compared on FIRST (and SECOND).",
 )
-@samples_option(3)
-@seed_option()
+@shared.states_options(3)
 @click.option(
     "--tolerance", default=1e-9, show_default=True, type=click.FloatRange(min=0, min_open=True), help="What counts."
 )
-@load_options
-@json_option
+@shared.load_options
+@shared.json_option
 def diff(
-    first: str,
-    second: str | None,
-    engines: tuple[str, ...],
-    samples: int,
-    seed: int,
-    tolerance: float,
-    options: dict[str, Any],
-    as_json: bool,
+    first: str, second: str | None, engines: tuple[str, ...], options: dict[str, Any], as_json: bool, **settings: Any
 ) -> None:
     """Say why SECOND moves otherwise than FIRST, and name the causes.
 
@@ -56,34 +41,26 @@ def diff(
     fused wrongly are named. With two engines they are compared on one description, or each on its own.
     """
     if engines:
-        check_engines(engines, least=2)
+        shared.check_engines(engines, least=2)
         if len(engines) > 2:
             raise click.UsageError("--engines takes two")
     elif second is None:
         raise click.UsageError("give two descriptions, or one and --engines A,B")
     from mbkit.engines import dynamics
+    from mbkit.report.explain_view import explanation_view
     from mbkit.studies.explain import explain
 
-    models = [_model(target, options) for target in ([first] if second is None else [first, second])]
-    sides: list[Any] = list(models)
+    targets = [first] if second is None else [first, second]
+    sides: list[Any] = [_model(target, options) for target in targets]
+    names = None
     if engines:
-        sides = [dynamics(models[k % len(models)], engine) for k, engine in enumerate(engines)]
-    names = None if engines else (_short(first), _short(second or ""))
-    if names is not None and names[0] == names[1]:
-        names = first, second or ""
-    result = explain(*sides, samples=samples, seed=seed, tolerance=tolerance, names=names)
-    if as_json:
-        tell(result.to_json())
+        sides = [dynamics(sides[k % len(sides)], engine) for k, engine in enumerate(engines)]
     else:
-        from mbkit.report.explain_view import explanation_view
-        from mbkit.report.terminal import render
-
-        console().print(render(explanation_view(result)))
-    leave(AGREE if result.agree else DIFFER)
-
-
-def _short(target: str) -> str:
-    return os.path.basename(target) or target
+        a, b = (os.path.basename(target) or target for target in targets)
+        names = (a, b) if a != b else (targets[0], targets[1])
+    result = explain(*sides, names=names, **settings)
+    shared.show(explanation_view(result), as_json=as_json)
+    shared.leave(shared.AGREE if result.agree else shared.DIFFER)
 
 
 def _model(target: str, options: Mapping[str, Any]) -> Model:
@@ -94,11 +71,8 @@ def _model(target: str, options: Mapping[str, Any]) -> Model:
     from mbkit.studies.importers.study import written
 
     # `model_of` says which one it takes where a robot is also a catalog system.
-    plain = not options and (os.path.isfile(target) or (find(target) is not None and target not in catalog.systems()))
-    if plain:
-        try:
+    if not options and (os.path.isfile(target) or (find(target) is not None and target not in catalog.systems())):
+        # The loader has the better message, or reads it after all.
+        with suppress(MbkitError):
             return written(target)
-        except MbkitError:
-            # The loader has the better message, or reads it after all.
-            pass
     return model_of(target, options)

@@ -52,13 +52,11 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
     try:
         return compiled(name, checked)
     except _TooLargeError as error:
-        return Machine(error.function)
+        return Machine(error.args[0])
 
 
 class _TooLargeError(Exception):
-    def __init__(self, function: ca.Function) -> None:
-        super().__init__()
-        self.function = function
+    """Its argument is the function."""
 
 
 @cache

@@ -22,8 +22,8 @@ from mbkit.derivation.equations import FUNCTIONS, equations_of
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 
-#: Quantity -> (name in C of its one output, what it is).
-_ONE_OUTPUT: Final = {
+#: Quantity -> (name in C of its one output, its meaning).
+_OUTPUTS: Final = {
     "mass_matrix": ("M", "mass matrix M(q), symmetric"),
     "coriolis_matrix": ("C", "Coriolis matrix C(q, v), Christoffel's"),
     "gravity": ("g", "gravity g(q), without springs"),
@@ -36,8 +36,8 @@ _ONE_OUTPUT: Final = {
     "potential_energy": ("V", "potential energy of gravity and springs, J"),
     "energy_rate": ("dE_dt", "d(T + V)/dt at accelerations a, W"),
 }
-#: Output of a quantity that has several -> what it is.
-_SEVERAL_OUTPUTS: Final = {
+#: Output of a quantity that has several -> its meaning.
+_DERIVATIVES: Final = {
     "by_q": "derivative by q along the configuration manifold: column k is that of q (+) t e_k",
     "by_v": "derivative by v",
     "by_a": "derivative by a, the mass matrix",
@@ -51,25 +51,8 @@ _INPUTS: Final = {
     "parameters": "parameters",
 }
 
-_CONVENTIONS: Final = """\
-The equation of motion
-    M(q) dv/dt + C(q, v) v + g(q) = tau + tau_passive(q, v)
-
-Conventions
-    SI units and radians. Vectors are arrays of double, in the order listed below.
-    Matrices are stored by columns: entry (i, j) of M is M[i + {macro}_NV * j].
-    Angles are plain real numbers, never wrapped. Quaternions are x, y, z, w, of unit
-    length, and taken as they are. A free joint is its position in the parent, then its
-    quaternion; its velocity is linear, then angular, both in the moving body's axes.
-    A ball joint's velocity is angular, in the moving body's axes. A planar joint is
-    x, y, theta in its parent's axes, and its velocity is their rate. The potential
-    energy of gravity is zero with every centre of mass at the world's origin.
-    Dry friction, limits and contacts are left out.
-
-Calls
-    Nothing is allocated, kept or locked: any number of threads may call at once.
-    An output may lie on an input of the same size. Arguments are not checked: a singular
-    mass matrix, or a function outside of its domain, gives NaN or infinity."""
+#: The comment at the head of the header.
+_DESCRIPTION: Final = Path(__file__).with_name("c_header.txt")
 
 
 @dataclass(frozen=True)
@@ -92,80 +75,71 @@ class CFunction:
         outputs = ", ".join(f"{name}[{rows * columns}]" for name, (rows, columns) in self.outputs)
         return f"{self.name}({inputs}) -> {outputs}"
 
-    def prototype(self, macro: str, nv: int) -> str:
-        """Return the declaration without its semicolon, with the header's macros as sizes."""
-        arguments = [f"const double {name}[{_extent(macro, name, n, nv)}]" for name, n in self.inputs]
-        for name, shape in self.outputs:
-            extent = " * ".join(_extent(macro, "", n, nv) for n in shape if n > 1) or "1"
-            arguments.append(f"double {name}[{extent}]")
-        one_line = f"void {self.name}({', '.join(arguments)})"
-        return one_line if len(one_line) < 110 else f"void {self.name}(\n    " + ",\n    ".join(arguments) + ")"
-
-    def documentation(self) -> list[str]:
-        """Return the lines of the comment above the declaration."""
-        rows = [(f"{name}[{n}]", _INPUTS.get(name, "")) for name, n in self.inputs]
-        for name, (n, columns) in self.outputs:
-            text = _ONE_OUTPUT[self.quantity][1] if self.quantity in _ONE_OUTPUT else _SEVERAL_OUTPUTS.get(name, "")
-            rows.append((f"{name}[{n}]", f"out: {text}"))
-            if columns > 1:
-                rows[-1] = (f"{name}[{n} * {columns}]", f"out, by columns: {text}")
-        width = max(len(shape) for shape, _ in rows)
-        return [
-            f"{self.quantity}: {self.operations} operations, {self.stack} bytes of local variables.",
-            *(f"    {shape.ljust(width)}  {text}".rstrip() for shape, text in rows),
-        ]
-
 
 def _extent(macro: str, name: str, n: int, nv: int) -> str:
     named = {"q": "NQ", "parameters": "NP"}.get(name, "NV" if n == nv else "")
     return f"{macro}_{named}" if named else str(n)
 
 
+def _declaration(f: CFunction, macro: str, nv: int) -> str:
+    """Return the declaration of a function with the header's macros as sizes, below a comment."""
+    arguments = [f"const double {name}[{_extent(macro, name, n, nv)}]" for name, n in f.inputs]
+    rows = [(f"{name}[{n}]", _INPUTS.get(name, "")) for name, n in f.inputs]
+    for name, shape in f.outputs:
+        extent = " * ".join(_extent(macro, "", n, nv) for n in shape if n > 1) or "1"
+        arguments.append(f"double {name}[{extent}]")
+        text = _OUTPUTS[f.quantity][1] if f.quantity in _OUTPUTS else _DERIVATIVES.get(name, "")
+        matrix = shape[1] > 1
+        size = f"{shape[0]} * {shape[1]}" if matrix else shape[0]
+        rows.append((f"{name}[{size}]", f"out{', by columns' * matrix}: {text}"))
+    width = max(len(shape) for shape, _ in rows)
+    about = [f"{f.quantity}: {f.operations} operations, {f.stack} bytes of local variables."]
+    about += [f"    {shape.ljust(width)}  {text}" for shape, text in rows]
+    one_line = f"void {f.name}({', '.join(arguments)})"
+    if len(one_line) >= 110:
+        one_line = f"void {f.name}(\n    " + ",\n    ".join(arguments) + ")"
+    return f"{_comment(about)}\n{one_line};"
+
+
 def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_line: str) -> str:
     macro = prefix.upper()
     present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on]
     q_units, v_units = _units(model)
-    lines = [
-        first_line,
-        "",
-        f"Model       {c_comment(model.name)}",
-        f"Digest      {model.digest}",
-        f"Holds       {', '.join(present) or ('inertia alone' if model.has_bodies else 'energies T and V')}",
-        f"Functions   {functions[0].name}",
-        *(f"            {f.name}" for f in functions[1:]),
-        "",
-        f"A program   cc -std=c99 -O2 main.c {prefix}.c -o main -lm",
-        "",
-        *(f"    {line}".rstrip() for line in _example(prefix, model, functions[0])),
-        "",
-        *_CONVENTIONS.format(macro=macro).splitlines(),
-        "",
-        f"Coordinates q[{model.nq}]",
-        *_table(zip(model.coordinate_names, q_units, strict=True)),
-        "",
-        f"Velocities v[{model.nv}], and the unit of the force on each",
-        *_table((name, *units) for name, units in zip(model.velocity_names, v_units, strict=True)),
-    ]
+    parameters = followers = ""
     if model.parameters:
-        lines += ["", f"Parameters parameters[{len(model.parameters)}], and the value that the model gives each"]
-        lines += _table((name, "none" if x is None else repr(x)) for name, x in model.parameters.items())
-    followers = [(j.name, j.mimic) for j in model.joints if j.mimic]
-    if followers:
-        lines += ["", "Joints that follow another and have no coordinate of their own"]
-        for name, mimic in followers:
-            ratio, offset = ("(of the parameters)" if math.isnan(x) else repr(x) for x in (mimic.ratio, mimic.offset))
-            lines.append(f"    {c_comment(name)} = {ratio} * {c_comment(mimic.joint)} + {offset}")
+        values = _table((name, "none" if x is None else repr(x)) for name, x in model.parameters.items())
+        head = f"Parameters parameters[{len(model.parameters)}], and the value that the model gives each"
+        parameters = f"\n\n{head}\n{values}"
+    mimics = [(j.name, j.mimic) for j in model.joints if j.mimic]
+    if mimics:
+        followers = "\n\nJoints that follow another and have no coordinate of their own"
+    for name, mimic in mimics:
+        ratio, offset = ("(of the parameters)" if math.isnan(x) else repr(x) for x in (mimic.ratio, mimic.offset))
+        followers += f"\n    {c_comment(name)} = {ratio} * {c_comment(mimic.joint)} + {offset}"
+    description = _DESCRIPTION.read_text(encoding="utf-8").format(
+        first_line=first_line,
+        model=model,
+        name=c_comment(model.name),
+        holds=", ".join(present) or ("inertia alone" if model.has_bodies else "energies T and V"),
+        functions=f"\n{' ' * 12}".join(f.name for f in functions),
+        example="\n".join(f"    {line}" for line in _example(prefix, model, functions[0])),
+        coordinates=_table(zip(model.coordinate_names, q_units, strict=True)),
+        velocities=_table((name, *units) for name, units in zip(model.velocity_names, v_units, strict=True)),
+        prefix=prefix,
+        macro=macro,
+        parameters=parameters,
+        followers=followers,
+    )
     sizes = {"NQ": model.nq, "NV": model.nv} | ({"NP": len(model.parameters)} if model.parameters else {})
     blocks = [
-        _comment(lines),
+        _comment(description.splitlines()),
         f"#ifndef MBKIT_{macro}_H\n#define MBKIT_{macro}_H",
         "\n".join(f"#define {macro}_{name} {n}" for name, n in sizes.items()),
         '#ifdef __cplusplus\nextern "C" {\n#endif',
-        *(f"{_comment(f.documentation())}\n{f.prototype(macro, model.nv)};" for f in functions),
-        "#ifdef __cplusplus\n}\n#endif",
-        "#endif",
+        *(_declaration(f, macro, model.nv) for f in functions),
+        "#ifdef __cplusplus\n}\n#endif\n\n#endif\n",
     ]
-    return "\n\n".join(blocks) + "\n"
+    return "\n\n".join(blocks)
 
 
 def _comment(lines: Sequence[str]) -> str:
@@ -178,33 +152,22 @@ def _example(prefix: str, model: Model, function: CFunction) -> list[str]:
     numbers = ["NAN" if x is None else repr(x) for x in model.parameters.values()]
     ones = ", ".join(f"[{k}] = 1.0" for k, x in enumerate(model.neutral().tolist()) if x)
     values = {"q": ones or "0.0", "parameters": ", ".join(numbers)}
-    call = ", ".join(name for name, _ in (*function.inputs, *function.outputs))
-    return [
-        *(["#include <math.h>"] if "NAN" in numbers else []),
-        "#include <stdio.h>",
-        f'#include "{prefix}.h"',
-        "",
-        "int main(void)",
-        "{",
-        *(
-            f"    const double {name}[{_extent(prefix.upper(), name, n, model.nv)}] = {{{values.get(name, '0.0')}}};"
-            for name, n in function.inputs
-        ),
-        *(f"    double {name}[{rows * columns}];" for name, (rows, columns) in function.outputs),
-        f"    {function.name}({call});",
-        f'    printf("%.17g\\n", {function.outputs[0][0]}[0]);',
-        "    return 0;",
-        "}",
+    arrays = [
+        f"    const double {name}[{_extent(prefix.upper(), name, n, model.nv)}] = {{{values.get(name, '0.0')}}};"
+        for name, n in function.inputs
     ]
+    arrays += [f"    double {name}[{rows * columns}];" for name, (rows, columns) in function.outputs]
+    head = [*(["#include <math.h>"] if "NAN" in numbers else []), "#include <stdio.h>", f'#include "{prefix}.h"', ""]
+    call = f"    {function.name}({', '.join(name for name, _ in (*function.inputs, *function.outputs))});"
+    show = f'    printf("%.17g\\n", {function.outputs[0][0]}[0]);'
+    return [*head, "int main(void)", "{", *arrays, call, show, "    return 0;", "}"]
 
 
-def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
+def _table(rows: Iterable[tuple[str, ...]]) -> str:
     listed = [[c_comment(text) for text in row] for row in rows]
-    widths = [max(len(row[k]) for row in listed) for k in range(len(listed[0]))]
-    return [
-        f"    {index:3}  {'  '.join(text.ljust(width) for text, width in zip(row, widths, strict=True))}".rstrip()
-        for index, row in enumerate(listed)
-    ]
+    widths = [max(map(len, column)) for column in zip(*listed, strict=True)]
+    texts = ("  ".join(map(str.ljust, row, widths)) for row in listed)
+    return "\n".join(f"    {index:3}  {text}".rstrip() for index, text in enumerate(texts))
 
 
 def _units(model: Model) -> tuple[list[str], list[tuple[str, str]]]:
@@ -289,51 +252,39 @@ class CSource:
     versions: dict[str, str]
 
     def write(self, folder: str | Path, *, force: bool = False) -> tuple[Path, Path]:
-        """Write both files, and return their paths: header, then source.
+        """Write both files, and return their paths: header, then source; files of mbkit's own are replaced.
 
         Parameters
         ----------
         folder : path
-            Made if it is not there.
+            Created if necessary.
         force : bool
-            Replace files that mbkit did not write. Those that it wrote are replaced in any case.
-
-        Raises
-        ------
-        OutputError
-            A file of other origin is in the way, or the folder cannot be written to.
+            Replace files that mbkit did not write, too, which is an `OutputError` otherwise.
         """
-        with _interrupt.uninterrupted:
-            return self._write(Path(folder), force=force)
-
-    def _write(self, folder: Path, *, force: bool) -> tuple[Path, Path]:
-        texts = {folder / f"{self.name}.h": self.header, folder / f"{self.name}.c": self.source}
-        header, source = texts
+        texts = {Path(folder) / f"{self.name}.h": self.header, Path(folder) / f"{self.name}.c": self.source}
+        # Both are checked before either is written.
+        for path in texts:
+            if not force and path.exists() and not _is_own(path):
+                raise OutputError(
+                    f"{path} is there and mbkit did not write it; choose another folder or name, or force (--force)"
+                )
         try:
-            # Both are checked before either is written.
-            for path in texts:
-                if not force and path.exists() and not _ours(path):
-                    raise OutputError(
-                        f"{path} is there and mbkit did not write it; choose another folder or name, or force (--force)"
-                    )
-            folder.mkdir(parents=True, exist_ok=True)
-            for path, text in texts.items():
-                path.write_bytes(text.encode())
-        except OutputError:
-            raise
+            with _interrupt.uninterrupted:
+                Path(folder).mkdir(parents=True, exist_ok=True)
+                for path, text in texts.items():
+                    path.write_bytes(text.encode())
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}; choose another folder") from error
+        header, source = texts
         return header, source
 
 
 def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | None = None) -> CSource:
-    """Return C99 code that computes quantities of a model.
+    """Return C99 code that computes quantities of a model, each in one function without heap or state.
 
-    Each becomes one function without heap or state, such as ``void panda_forward_dynamics(const double q[], const
-    double v[], const double tau[], double a[])``; named parameters of the model are a last input. The header states
-    units, layouts, conventions and the order of the joints. Compilers take long for long functions: with ``gcc -O2``
-    about a second for Panda's forward dynamics (4,000 operations), four for Talos' (18,000), over a minute for the
-    two-armed Tiago's (72,000), which ``-O0`` compiles in two seconds.
+    Named parameters of the model are a last input. The header states units, layouts, conventions and the order of the
+    joints. Compilers take long for long functions: with ``gcc -O2`` about a second for Panda's forward dynamics (4,000
+    operations), over a minute for the two-armed Tiago's (72,000), which ``-O0`` compiles in two seconds.
 
     Parameters
     ----------
@@ -341,13 +292,12 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     quantities : iterable of str
         Keys of `mbkit.derivation.FUNCTIONS`.
     name : str, optional
-        Prefix of every name in C, and stem of the files; the model's name in lower
-        case letters, digits and underscores if not given.
+        Prefix of every name in C, and stem of the files; the model's name in lower case, with underscores, if not
+        given.
 
     Returns
     -------
     CSource
-        Its `write` writes the files.
 
     Raises
     ------
@@ -395,17 +345,15 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
 def _described(name: str, function: ca.Function, quantity: str) -> CFunction:
     operations = program(function)
     inputs = tuple(zip(function.name_in(), operations.inputs, strict=True))
-    names = (_ONE_OUTPUT[quantity][0],) if quantity in _ONE_OUTPUT else function.name_out()
+    names = (_OUTPUTS[quantity][0],) if quantity in _OUTPUTS else function.name_out()
     outputs = tuple(zip(names, operations.shapes, strict=True))
     stack = 8 * (function.sz_w() + sum(operations.inputs))
     return CFunction(name, quantity, inputs, outputs, operations.arithmetic, stack)
 
 
 def _checked(quantities: Iterable[str]) -> list[str]:
-    if isinstance(quantities, str):
-        raise InputError(f"quantities: expected a list of names, got the text {quantities!r}; write [{quantities!r}]")
-    if not isinstance(quantities, Iterable):
-        raise InputError(f"quantities: expected a list of names, got {quantities!r}; write ['nle'], for example")
+    if isinstance(quantities, str) or not isinstance(quantities, Iterable):
+        raise InputError(f"quantities: expected a list of names such as ['nle'], got {quantities!r}")
     # Each once, in the caller's order.
     wanted = list(dict.fromkeys(map(str, quantities)))
     for quantity in wanted:
@@ -422,6 +370,9 @@ def c_identifier(name: str) -> str:
     return plain if plain[:1].isalpha() else f"model_{plain}".rstrip("_")
 
 
-def _ours(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(64).startswith(f"/* {_MARK} ".encode())
+def _is_own(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(64).startswith(f"/* {_MARK} ".encode())
+    except OSError:
+        return False

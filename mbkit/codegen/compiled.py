@@ -50,6 +50,12 @@ def _readable(x: Array) -> Array:
     return x if good else np.array(x, dtype=np.float64)
 
 
+def _cache_line_offset(arrays: Sequence[Array], first: int, last: int) -> int:
+    """Return where vectors of coordinate-major arrays begin to lie on whole cache lines, each fetched once."""
+    leads = (-(x.ctypes.data // 8 + first) % 8 for x in arrays if x.strides[0] == 8 and x.strides[1] % 64 == 0)
+    return min(first + next(leads, 0), last)
+
+
 class Compiled:
     """Machine code of a function whose arguments are vectors."""
 
@@ -82,8 +88,7 @@ class Compiled:
                 raise ValueError(f"argument {i}: expected ({n}, {size}), got {x.shape}")
         args = [_readable(x) for x in args]
         major = n > 1 and all(x.strides[0] == 8 for x in args if x.shape[1] > 1)
-        sizes = [rows * columns for rows, columns in self.shapes]
-        flat = [np.empty((size, n)).T if major else np.empty((n, size)) for size in sizes]
+        flat = [np.empty((r * c, n)).T if major else np.empty((n, r * c)) for r, c in self.shapes]
         finite = self.run(args, flat, threads)
         results = [
             (x.T.reshape(r, c, n).transpose(2, 0, 1) if major else x.reshape(n, r, c))
@@ -121,22 +126,16 @@ class Compiled:
         return finite
 
     def _run_range(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
-        table = self.table(inputs, outputs)
-        work = self._work()
+        if not hasattr(self._local, "work"):
+            # Each thread has a work space of its own.
+            self._local.work = aligned(self.work_size)
+        table, work = self.table(inputs, outputs), self._local.work
         watch = work[: jit.host().width]
         watch[:] = 0.0
-        lead = self._cache_line_offset((*inputs, *outputs), first, last)
+        lead = _cache_line_offset((*inputs, *outputs), first, last)
         for start, end in ((first, lead), (lead, last)):
             self.loaded.run(table.ctypes.data, work.ctypes.data, start, end)
         return bool(np.dot(watch, watch) == 0.0)
-
-    @staticmethod
-    def _cache_line_offset(arrays: Sequence[Array], first: int, last: int) -> int:
-        """Return where vectors of coordinate-major arrays begin to lie on whole cache lines, each fetched once."""
-        for x in arrays:
-            if x.strides[0] == 8 and x.strides[1] % 64 == 0:
-                return min(first + -(x.ctypes.data // 8 + first) % 8, last)
-        return first
 
     def table(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Array:
         """Return the table of these arrays that the code reads; they must outlive its use."""
@@ -162,13 +161,6 @@ class Compiled:
 
         return call, watch
 
-    def _work(self) -> Array:
-        """Return this thread's own work space."""
-        if not hasattr(self._local, "work"):
-            self._local.work = aligned(self.work_size)
-        work: Array = self._local.work
-        return work
-
 
 @cache
 def _batch_object() -> bytes:
@@ -178,9 +170,8 @@ def _batch_object() -> bytes:
 def shared_object(name: str, make: Callable[[], bytes]) -> bytes:
     """Return an object file that depends on no model, from disk or compiled now."""
     key = disk.key_of(name, SOURCES, *map(str, jit.host()))
-    found = disk.read(key)
-    if found:
-        return found[1]
+    if (entry := disk.read(key)) is not None:
+        return entry[1]
     code = make()
     disk.write(key, {}, code)
     return code
@@ -220,8 +211,8 @@ _HELD: Final[WeakValueDictionary[str, Compiled]] = WeakValueDictionary()
 
 # Compiled functions called one after another without going back to Python in between.
 
-# With the signature of a compiled function's own loop, so that it is loaded like one: the list holds, for each call,
-# the addresses of loop, table and work space, and the number of states.
+# The list holds, for each call, the addresses of loop, table and work space, and the number of states. The signature is
+# that of a compiled function's own loop, so that it is loaded like one.
 _CODE: Final = f"""
 define void @{RUN}(ptr %list, ptr %unused, i64 %first, i64 %last) nounwind {{
 entry:
@@ -229,15 +220,12 @@ entry:
   br i1 %any, label %one, label %done
 one:
   %i = phi i64 [ %first, %entry ], [ %next, %one ]
-  %start = mul i64 %i, 4
-  %at = getelementptr ptr, ptr %list, i64 %start
-  %run = load ptr, ptr %at
-  %at1 = getelementptr ptr, ptr %at, i64 1
-  %table = load ptr, ptr %at1
-  %at2 = getelementptr ptr, ptr %at, i64 2
-  %work = load ptr, ptr %at2
-  %at3 = getelementptr ptr, ptr %at, i64 3
-  %states = load i64, ptr %at3
+  %call = getelementptr {{ptr, ptr, ptr, i64}}, ptr %list, i64 %i
+  %entries = load {{ptr, ptr, ptr, i64}}, ptr %call
+  %run = extractvalue {{ptr, ptr, ptr, i64}} %entries, 0
+  %table = extractvalue {{ptr, ptr, ptr, i64}} %entries, 1
+  %work = extractvalue {{ptr, ptr, ptr, i64}} %entries, 2
+  %states = extractvalue {{ptr, ptr, ptr, i64}} %entries, 3
   call void %run(ptr %table, ptr %work, i64 0, i64 %states)
   %next = add i64 %i, 1
   %more = icmp slt i64 %next, %last
@@ -260,25 +248,21 @@ class KernelSequence:
     """Calls on fixed arrays, kept alive, in order, repeated `times`; one thread may run it at a time."""
 
     def __init__(self, calls: Sequence[Call], times: int = 1) -> None:
-        self._calls = tuple(calls)
+        self._calls, self._runner = tuple(calls), _runner()
         self._work = aligned(max((call.code.work_size for call in calls), default=0))
         # The sum in which a compiled function marks numbers that are not finite.
         self._work[:] = 0.0
         self._tables = [call.code.table(call.inputs, call.outputs) for call in calls]
+        loops = (ctypes.cast(call.code.loaded.run, ctypes.c_void_p).value for call in calls)
         entries = [
-            (_address(call.code), table.ctypes.data, self._work.ctypes.data, len(call.inputs[0]))
-            for call, table in zip(calls, self._tables, strict=True)
+            (loop, table.ctypes.data, self._work.ctypes.data, len(call.inputs[0]))
+            for loop, table, call in zip(loops, self._tables, calls, strict=True)
         ]
         self._list = np.array(entries * times, dtype=np.int64)
-        self._runner = _runner()
 
     def run(self, first: int, last: int) -> None:
         """Make the calls from `first` to before `last`; other Python threads run meanwhile."""
         self._runner.run(self._list.ctypes.data, None, first, last)
-
-
-def _address(code: Compiled) -> int:
-    return ctypes.cast(code.loaded.run, ctypes.c_void_p).value or 0
 
 
 @cache

@@ -1,12 +1,9 @@
 """Machine code kept on disk between processes.
 
-The folder belongs to the user alone (0700), an entry is written under another name and then renamed, so that any number
-of processes may write at once, and an entry is used only if its SHA-256, its key and its owner are right. A faulty
-entry counts as absent.
-
-``MBKIT_CACHE_DIR`` moves the folder; set to the empty string it switches this off. A
-folder that is open to others and holds other files belongs to the user: its mode is
-not changed, and nothing is kept there. Only entries are ever deleted.
+The folder belongs to the user alone (0700). An entry is written under another name and then renamed, so that any number
+of processes may write at once. It is used only if its SHA-256, its key and its owner are right, and else counts as
+absent. ``MBKIT_CACHE_DIR`` moves the folder; set to the empty string it switches this off. A folder that is open to
+others and holds other files belongs to the user: its mode stays, and nothing is kept there. Only entries are deleted.
 """
 
 from __future__ import annotations
@@ -48,11 +45,11 @@ def folder() -> Path | None:
     try:
         path = Path(chosen) if chosen else user_cache_path("mbkit") / "machine-code"
         path.mkdir(parents=True, exist_ok=True, mode=0o700)
-        found = path.stat()
+        status = path.stat()
         if hasattr(os, "getuid"):
-            if found.st_uid != os.getuid():
+            if status.st_uid != os.getuid():
                 return None
-            if stat.S_IMODE(found.st_mode) != 0o700:
+            if stat.S_IMODE(status.st_mode) != 0o700:
                 if not all(_ENTRY.fullmatch(name) for name in os.listdir(path)):
                     return None
                 path.chmod(0o700)
@@ -74,8 +71,8 @@ def force_recompile() -> Iterator[None]:
 
 def is_bypassed(key: str) -> bool:
     """Return whether a kept entry, on disk or in memory, must be compiled again: see `force_recompile`."""
-    made = _RECOMPILED.get()
-    return made is not None and key not in made
+    fresh = _RECOMPILED.get()
+    return fresh is not None and key not in fresh
 
 
 def read(key: str) -> tuple[dict[str, Any], bytes] | None:
@@ -88,8 +85,8 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
         # Not through a link, which may lead out of the folder; and a pipe would be waited for.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
         with os.fdopen(handle, "rb") as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode) or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode) or (hasattr(os, "getuid") and status.st_uid != os.getuid()):
                 return None
             content = file.read()
         with suppress(OSError):
@@ -107,11 +104,9 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
 
 def write(key: str, about: dict[str, Any], code: bytes) -> None:
     """Write an entry; failures are ignored."""
-    made = _RECOMPILED.get()
-    if made is not None:
-        made.add(key)
-    at = folder()
-    if at is None:
+    if (fresh := _RECOMPILED.get()) is not None:
+        fresh.add(key)
+    if (at := folder()) is None:
         return
     rest = json.dumps({**about, "key": key}).encode() + b"\n" + code
     content = _MAGIC + hashlib.sha256(rest).hexdigest().encode() + b"\n" + rest
@@ -137,33 +132,25 @@ def cached(
     make: Callable[[], tuple[dict[str, Any], bytes]],
 ) -> T:
     """Return compiled code: held in this process, from disk, or compiled by `make` now and written."""
-    found = None if is_bypassed(key) else held.get(key)
-    if found is None:
-        found = _restored(key, restore)
-    if found is None:
-        about, code = make()
-        write(key, about, code)
-        found = restore(about, code)
-    held[key] = found
-    return found
-
-
-def _restored(key: str, restore: Callable[[dict[str, Any], bytes], T]) -> T | None:
-    entry = read(key)
+    code = None if is_bypassed(key) else held.get(key)
     # An intact entry of another form is compiled again.
     with suppress(KeyError, TypeError, ValueError):
-        return restore(*entry) if entry else None
-    return None
+        if code is None and (entry := read(key)):
+            code = restore(*entry)
+    if code is None:
+        new = make()
+        write(key, *new)
+        code = restore(*new)
+    held[key] = code
+    return code
 
 
 def _delete_oldest(at: Path) -> None:
     entries = []
     for path in at.iterdir():
-        if not _ENTRY.fullmatch(path.name):
-            continue
         with suppress(OSError):
-            found = path.stat()
-            entries.append((found.st_mtime, found.st_size, path))
+            if _ENTRY.fullmatch(path.name):
+                entries.append((path.stat().st_mtime, path.stat().st_size, path))
     size = sum(entry[1] for entry in entries)
     for _, bytes_, path in sorted(entries):
         if size <= _MAX_BYTES:

@@ -38,17 +38,13 @@ class Machine:
             f = self.function if n == 1 else self.function.map(n)
             buffer: Any
             buffer, run = f.buffer()
-            inputs: list[Any] = [np.zeros((n, self.function.size1_in(i))) for i in range(f.n_in())]
-            outputs: list[Any] = [
-                np.zeros((n, self.function.size2_out(i), self.function.size1_out(i))) for i in range(f.n_out())
-            ]
-            # An empty array has no memory to hand over, and CasADi reads none.
-            for i, x in enumerate(inputs):
-                if x.size:
-                    buffer.set_arg(i, memoryview(x))
-            for i, x in enumerate(outputs):
-                if x.size:
-                    buffer.set_res(i, memoryview(x))
+            inputs: list[Any] = [np.zeros((n, size)) for size in self.inputs]
+            outputs: list[Any] = [np.zeros((n, columns, rows)) for rows, columns in self.shapes]
+            for arrays, hand_over in ((inputs, buffer.set_arg), (outputs, buffer.set_res)):
+                for i, x in enumerate(arrays):
+                    # An empty array has no memory to hand over, and CasADi reads none.
+                    if x.size:
+                        hand_over(i, memoryview(x))
             self._sizes[n] = (buffer, run, inputs, outputs)
         return self._sizes[n]
 
@@ -81,7 +77,7 @@ class Machine:
                 raise ValueError(f"argument {i}: expected {size} entries, got shape {x.shape}")
         with self._lock:
             _, run, inputs, outputs = self._prepared(n)
-            for held, given in zip(inputs, arguments, strict=True):
-                held[:] = given
+            for own, argument in zip(inputs, arguments, strict=True):
+                own[:] = argument
             run()
             return [x[0].T.copy() if single else x.swapaxes(1, 2).copy() for x in outputs]

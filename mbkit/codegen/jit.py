@@ -1,8 +1,4 @@
-"""Machine code for this processor, by LLVM (llvmlite).
-
-A compiled program is an object file in memory: bytes that can be kept and loaded
-again, by this process or another one on the same kind of processor.
-"""
+"""Machine code for this processor, by LLVM (llvmlite): object files, to be loaded on the same kind of processor."""
 
 from __future__ import annotations
 
@@ -54,10 +50,10 @@ def host() -> Host:
     """Return what this machine's code depends on."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    found = llvm.get_host_cpu_features()
-    width = 8 if found.get("avx512f") else 4 if found.get("avx") else 2
+    flags = llvm.get_host_cpu_features()
+    width = 8 if flags.get("avx512f") else 4 if flags.get("avx") else 2
     version = f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
-    return Host(llvm.get_process_triple(), llvm.get_host_cpu_name(), found.flatten(), width, version)
+    return Host(llvm.get_process_triple(), llvm.get_host_cpu_name(), flags.flatten(), width, version)
 
 
 def _target() -> Any:

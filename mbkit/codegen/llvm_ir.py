@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Final
 
 from mbkit.codegen.program import Program
@@ -71,7 +72,7 @@ class Text:
         return self.put(f"select <{self.width} x i1> {which}, {self.vector} {yes}, {self.vector} {no}")
 
 
-# Sine and cosine of a whole vector, as LLVM code.
+# Sine and cosine of a whole vector.
 #
 # Reduction by Cody and Waite with π/2 in three parts: the first difference is exact in a fused multiply-add, the second
 # by Knuth's exact sum, so that the reduced angle has twice the working precision. On [-π/4, π/4] the minimax
@@ -165,11 +166,9 @@ def sincos(width: int) -> str:
         cosines = f"{V} " + s.put(
             f"insertelement {cosines}, double {s.put(f'call double @cos(double {x})')}, i64 {lane}"
         )
-    sines, cosines = (
-        s.put(f"select {B} %far, {far}, {V} {near}") for far, near in zip((sines, cosines), results, strict=True)
-    )
-    slow_out = s.put(f"insertvalue {pair} poison, {V} {sines}, 0")
-    slow_out = s.put(f"insertvalue {pair} {slow_out}, {V} {cosines}, 1")
+    both = [s.put(f"select {B} %far, {far}, {V} {near}") for far, near in zip((sines, cosines), results, strict=True)]
+    slow_out = s.put(f"insertvalue {pair} poison, {V} {both[0]}, 0")
+    slow_out = s.put(f"insertvalue {pair} {slow_out}, {V} {both[1]}, 1")
     slow = "\n".join(s.lines)
     return f"""
 declare double @sin(double) nounwind willreturn memory(none)
@@ -191,11 +190,10 @@ slow:
 """
 
 
-# Functions of whole vectors, as LLVM code that calls the C library lane by lane.
+# Functions of whole vectors that call the C library lane by lane.
 #
-# What a lane gets depends on its own number alone, as with `mbkit.codegen.llvm_ir`. An
-# exponential or a logarithm takes three times as long as a sine of `sincos`, the others ten
-# times. No error of glibc's is known above 2.5 ulps, nor above 1 but for hyperbolic functions.
+# A lane depends on its own number alone. An exponential or a logarithm takes three times as long as a sine of `sincos`,
+# the others ten times. No error of glibc's is known above 2.5 ulps, nor above 1 but for hyperbolic functions.
 
 #: Operation, which is its name in C too -> number of arguments.
 CALLS: Final = {
@@ -235,3 +233,52 @@ define internal {V} @mbkit_{name}({parameters}) noinline {attributes} {{
   ret {V} {result}
 }}
 """
+
+
+# Operations of a program that are no calls.
+
+_ZERO: Final = number(0.0)
+_ONE: Final = number(1.0)
+_Operation = Callable[..., str]
+
+
+def _contracted(instruction: str) -> _Operation:
+    return lambda t, a, b: t.op(instruction, a, b, "contract ")
+
+
+def _comparison(how: str) -> _Operation:
+    return lambda t, a, b: t.select(t.compare(how, a, b), _ONE, _ZERO)
+
+
+def _logical(how: str) -> _Operation:
+    return lambda t, a, b: t.select(t.bits(how, t.compare("une", a, _ZERO), t.compare("une", b, _ZERO)), _ONE, _ZERO)
+
+
+def _least(how: str) -> _Operation:
+    # NaN is propagated.
+    return lambda t, a, b: t.select(t.bits("or", t.compare(how, a, b), t.compare("uno", a, a)), a, b)
+
+
+def _sign(t: Text, a: str) -> str:
+    negative = t.select(t.compare("olt", a, _ZERO), number(-1.0), a)
+    return t.select(t.compare("ogt", a, _ZERO), _ONE, negative)
+
+
+#: Operation -> function that appends it to a text, and returns the name of its result.
+OPERATIONS: Final[dict[str, _Operation]] = {
+    **{name: _contracted(f"f{name}") for name in ("add", "sub", "mul", "div")},
+    **{name: _comparison(how) for name, how in (("lt", "olt"), ("le", "ole"), ("eq", "oeq"), ("ne", "une"))},
+    "and": _logical("and"),
+    "or": _logical("or"),
+    "fmin": _least("olt"),
+    "fmax": _least("ogt"),
+    "sq": lambda t, a: t.op("fmul", a, a, "contract "),
+    "twice": lambda t, a: t.op("fadd", a, a, "contract "),
+    "inv": lambda t, a: t.op("fdiv", _ONE, a),
+    "neg": Text.neg,
+    "sqrt": lambda t, a: t.call("sqrt", a),
+    "fabs": lambda t, a: t.call("fabs", a),
+    "sign": _sign,
+    "not": lambda t, a: t.select(t.compare("oeq", a, _ZERO), _ONE, _ZERO),
+    "if_else_zero": lambda t, a, b: t.select(t.compare("une", a, _ZERO), b, _ZERO),
+}

@@ -70,8 +70,8 @@ _Entry = tuple[str, tuple[int, ...], float]
 def program(function: ca.Function) -> Program:
     """Return the operations of an expanded function with dense outputs."""
     where: dict[int, int] = {}
-    operations: list[Operation] = []
     entry: _Entry
+    # In the order of their first appearance.
     known: dict[_Entry, int] = {}
     shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
     outputs = [np.full(rows * columns, -1, dtype=np.intp) for rows, columns in shapes]
@@ -96,25 +96,18 @@ def program(function: ca.Function) -> Program:
         elif code in _BINARY:
             entry = (_BINARY[code], (where[args[0]], where[args[1]]), 0.0)
         else:
-            raise UnsupportedError(_unknown(function, code))
+            name = next((n for n in dir(ca) if n.startswith("OP_") and getattr(ca, n) == code), f"number {code}")
+            raise UnsupportedError(
+                f"{function.name()}: CasADi's operation {name.removeprefix('OP_').lower()} has no counterpart in "
+                "machine code, 113-bit numbers, Taylor series and C; write it with "
+                f"{', '.join(sorted({*_UNARY.values(), *_BINARY.values()}))} (of an MX function, .expand() first)"
+            )
         # CasADi has one zero, so that equal constants are the same.
-        place = where[out[0]] = known.setdefault(entry, len(operations))
-        if place == len(operations):
-            operations.append(Operation(*entry))
+        where[out[0]] = known.setdefault(entry, len(known))
     return Program(
         inputs=tuple(function.size1_in(i) for i in range(function.n_in())),
         shapes=shapes,
-        operations=tuple(operations),
+        operations=tuple(Operation(*entry) for entry in known),
         # CasADi counts down the columns.
         outputs=tuple(out.reshape(shape, order="F") for out, shape in zip(outputs, shapes, strict=True)),
-    )
-
-
-def _unknown(function: ca.Function, code: int) -> str:
-    """Return what to say of an operation that is in neither table."""
-    name = next((n for n in dir(ca) if n.startswith("OP_") and getattr(ca, n) == code), f"number {code}")
-    known = sorted({*_UNARY.values(), *_BINARY.values()})
-    return (
-        f"{function.name()}: CasADi's operation {name.removeprefix('OP_').lower()} has no counterpart in machine code, "
-        f"113-bit numbers, Taylor series and C; write it with {', '.join(known)} (of an MX function, .expand() first)"
     )

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit.codegen.llvm_ir import CALLS, Text, call, declarations, library, number
+from mbkit.codegen.llvm_ir import CALLS, OPERATIONS, Text, call, declarations, library, number
 from mbkit.codegen.program import Program
 
 BODY: Final = "mbkit_body"
@@ -29,15 +29,11 @@ _WHOLE: Final = 20000
 _PIECE: Final = 3000
 _STORE: Final = 4  # weight of a store, in operations
 _ARGUMENTS: Final = "ptr noalias %in, ptr noalias %is, ptr noalias %out, ptr noalias %os, ptr noalias %work"
-_COMPARISONS: Final = {"lt": "olt", "le": "ole", "eq": "oeq", "ne": "une"}
-_LOGICAL: Final = {"and": "and", "or": "or"}
 #: Operations that can be finite where an argument is not: 1/inf, exp(-inf), atan(inf), NaN to the power of 0.
 _HIDING: Final = frozenset(
-    {"div", "inv", "sign", "fmin", "fmax", "not", "if_else_zero", *_COMPARISONS, *_LOGICAL}
+    {"div", "inv", "sign", "fmin", "fmax", "not", "if_else_zero", "lt", "le", "eq", "ne", "and", "or"}
     | {"exp", "expm1", "tanh", "atan", "atan2", "pow"}
 )
-_BINARY: Final = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
-_INTRINSICS: Final = frozenset({"sqrt", "fabs"})
 _CALLED: Final = frozenset({"sin", "cos", *CALLS})
 
 
@@ -141,8 +137,7 @@ class Piece:
     """One function over a run of operations."""
 
     def __init__(self, program: Program, piece: list[int], width: int) -> None:
-        self._program, self._own = program, piece
-        self._text = Text(width, prefix="v")
+        self._program, self._own, self._text = program, piece, Text(width, prefix="v")
         self._names: dict[int, str] = {}
         self._pairs: dict[int, str] = {}
         self._pointers: dict[tuple[str, str, int], str] = {}
@@ -158,19 +153,11 @@ class Piece:
         operations = self._program.operations
         if first:
             seen = _seen(self._program)
-            for i, size in enumerate(self._program.inputs):
-                for j in range(size):
-                    if (i, j) in seen:
-                        continue
-                    place = self._place("in", "is", i, j)
-                    self._watched.append(self._text.put(f"load {self._text.vector}, ptr {place}, align 8"))
+            entries = ((i, j) for i, size in enumerate(self._program.inputs) for j in range(size))
+            self._watched += [self._load(self._place("in", "is", *at)) for at in entries if at not in seen]
         # A call spills live values: functions of inputs come first, when few are live.
-        early = [
-            k
-            for k in self._own
-            if operations[k].name in _CALLED
-            and all(operations[j].name in ("input", "const") for j in operations[k].arguments)
-        ]
+        free = {k for k, o in enumerate(operations) if o.name in ("input", "const")}
+        early = [k for k in self._own if operations[k].name in _CALLED and free.issuperset(operations[k].arguments)]
         for k in [*early, *self._own]:
             if k in self._names:
                 continue
@@ -178,21 +165,18 @@ class Piece:
             if k in slots:
                 self._store(self._names[k], self._work(slots[k]))
             self._give(k)
-        if first:
-            # Outputs that are inputs or numbers belong to no piece.
-            for k in self._outputs:
-                if operations[k].name in ("input", "const"):
-                    self._value(k, slots)
-                    self._give(k)
-
+        # Outputs that are inputs or numbers belong to no piece.
+        for k in self._outputs if first else ():
+            if k in free:
+                self._value(k, slots)
+                self._give(k)
         self._watch()
 
     def _watch(self) -> None:
         """Add 0 times all numbers read and written to the vector that finds those that are not finite."""
-        t = self._text
-        total = t.put(f"load {t.vector}, ptr %work, align 8")
+        total = self._load("%work")
         for name in self._watched:
-            total = t.fma(name, number(0.0), total)
+            total = self._text.fma(name, number(0.0), total)
         self._store(total, "%work")
 
     def _give(self, k: int) -> None:
@@ -202,6 +186,9 @@ class Piece:
         operation = self._program.operations[k]
         if places and not (operation.name == "const" and math.isfinite(operation.value)):
             self._watched.append(self._names[k])
+
+    def _load(self, pointer: str) -> str:
+        return self._text.put(f"load {self._text.vector}, ptr {pointer}, align 8")
 
     def _store(self, value: str, pointer: str) -> None:
         self._text.do(f"store {self._text.vector} {value}, ptr {pointer}, align 8")
@@ -221,60 +208,23 @@ class Piece:
     def _value(self, k: int, slots: dict[int, int]) -> str:
         """Return the name of a value, fetched if another piece made it."""
         if k not in self._names:
-            o, t = self._program.operations[k], self._text
+            o = self._program.operations[k]
             if o.name == "const":
                 self._names[k] = number(o.value)
             else:
-                place = self._place("in", "is", *o.arguments) if o.name == "input" else self._work(slots[k])
-                self._names[k] = t.put(f"load {t.vector}, ptr {place}, align 8")
+                at = self._place("in", "is", *o.arguments) if o.name == "input" else self._work(slots[k])
+                self._names[k] = self._load(at)
         return self._names[k]
 
     def _operation(self, k: int, slots: dict[int, int]) -> str:
         o, t = self._program.operations[k], self._text
-        V = t.vector
         a = [self._value(j, slots) for j in o.arguments]
-        if o.name in _BINARY:
-            return t.op(_BINARY[o.name], a[0], a[1], "contract ")
         if o.name in ("sin", "cos"):
-            x = o.arguments[0]
+            x, pair = o.arguments[0], f"{{ {t.vector}, {t.vector} }}"
             if x not in self._pairs:
-                self._pairs[x] = t.put(f"call {{ {V}, {V} }} @mbkit_sincos({V} {a[0]})")
-            return t.put(f"extractvalue {{ {V}, {V} }} {self._pairs[x]}, {int(o.name == 'cos')}")
-        if o.name in CALLS:
-            return call(t, o.name, a)
-        if o.name == "sq":
-            return t.op("fmul", a[0], a[0], "contract ")
-        if o.name == "twice":
-            return t.op("fadd", a[0], a[0], "contract ")
-        if o.name == "inv":
-            return t.op("fdiv", number(1.0), a[0])
-        if o.name == "neg":
-            return t.neg(a[0])
-        if o.name in _INTRINSICS:
-            return t.call(o.name, a[0])
-        return self._choice(o.name, a)
-
-    def _choice(self, name: str, a: list[str]) -> str:
-        """Append an operation that compares, or decides by it."""
-        t = self._text
-        zero, one = number(0.0), number(1.0)
-        if name in _COMPARISONS:
-            return t.select(t.compare(_COMPARISONS[name], a[0], a[1]), one, zero)
-        if name in _LOGICAL:
-            both = (t.compare("une", x, zero) for x in a)
-            return t.select(t.bits(_LOGICAL[name], *both), one, zero)
-        if name == "not":
-            return t.select(t.compare("oeq", a[0], zero), one, zero)
-        if name == "if_else_zero":
-            return t.select(t.compare("une", a[0], zero), a[1], zero)
-        if name == "sign":
-            negative = t.select(t.compare("olt", a[0], zero), number(-1.0), a[0])
-            return t.select(t.compare("ogt", a[0], zero), one, negative)
-        if name in ("fmin", "fmax"):
-            better = t.compare("olt" if name == "fmin" else "ogt", a[0], a[1])
-            # NaN is propagated.
-            return t.select(t.bits("or", better, t.compare("uno", a[0], a[0])), a[0], a[1])
-        raise ValueError(f"operation {name!r} has no vector code")
+                self._pairs[x] = t.put(f"call {pair} @mbkit_sincos({t.vector} {a[0]})")
+            return t.put(f"extractvalue {pair} {self._pairs[x]}, {int(o.name == 'cos')}")
+        return call(t, o.name, a) if o.name in CALLS else OPERATIONS[o.name](t, *a)
 
     def function(self, name: str) -> str:
         """Return this piece's text."""

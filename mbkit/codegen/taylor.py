@@ -1,12 +1,12 @@
 """The equations of motion as Taylor integrators of heyoka's, in double and beyond.
 
 A Taylor step expands the solution to the order that its tolerance asks for, by automatic differentiation of every
-operation (Jorba and Zou 2005, A software package for the numerical integration of ODEs by means of high-order Taylor
-methods; Biscani and Izzo 2021, Revisiting high-order Taylor methods for astrodynamics and celestial mechanics). So the
-graph that CasADi made is handed over operation by operation, and q̇ = D(q) v and v̇ of it are compiled together.
+operation (Jorba and Zou 2005; Biscani and Izzo 2021, Revisiting high-order Taylor methods for astrodynamics and
+celestial mechanics). So CasADi's graph is handed over operation by operation, and q̇ = D(q) v and v̇ of it are compiled
+together.
 
-Rotations see unit quaternions: each is divided by its norm before it enters the dynamics, while its rate D(q) v stays
-linear in it. Its norm is then a constant of the exact flow, and whatever it drifts by never bends the motion.
+Each quaternion is divided by its norm before it enters the dynamics, while its rate D(q) v stays linear in it. Its norm
+is then a constant of the exact flow, and what it drifts by never bends the motion.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._fork import fork_safe
-from mbkit.codegen.program import Operation, program
+from mbkit.codegen.program import Operation, Program, program
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.errors import UnsupportedError
@@ -66,9 +66,8 @@ class Precision:
 
     def array(self, high: Array, low: Array | float = 0.0) -> Any:
         """Return high + low."""
-        return np.asarray(high, dtype=np.float64).astype(self.dtype) + np.asarray(low, dtype=np.float64).astype(
-            self.dtype
-        )
+        first, rest = (np.asarray(x, dtype=np.float64).astype(self.dtype) for x in (high, low))
+        return first + rest
 
     def pair(self, x: Any) -> tuple[Array, Array]:
         """Return (high, low): numbers rounded to double, and the rounded rest."""
@@ -119,9 +118,9 @@ def rates(equations: Equations) -> ca.Function:
         q[start : start + 4] = part / ca.sqrt(ca.sumsqr(part))
     forward = eq.function("forward_dynamics")
     a = forward(q, eq.v, eq.tau, *eq.trailing.values())
-    given = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.trailing}
+    inputs = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.trailing}
     outs = [ca.densify(eq.kin.qdot), ca.densify(a)]
-    return ca.Function("rates", list(given.values()), outs, list(given), ["qdot", "a"])
+    return ca.Function("rates", list(inputs.values()), outs, list(inputs), ["qdot", "a"])
 
 
 class TaylorSystem:
@@ -138,29 +137,29 @@ class TaylorSystem:
         size = elimination_size(equations.model)
         if size <= _MAX_OPERATIONS:
             self.rates = rates(equations)
-            made = program(self.rates)
-            size = made.arithmetic
+            graph = program(self.rates)
+            size = graph.arithmetic
         if size > _MAX_OPERATIONS:
             name = equations.model.name
             raise UnsupportedError(
                 f"taylor: {name} takes {size} operations, too many for a Taylor series; method='rk853' or 'dop853'"
             )
-        self.operations = made.arithmetic
+        self.operations = size
         # Each quaternion's norm is a square root too, and each constraint's weight, of what never vanishes.
-        kinks, model = sum(o.name in _KINKS for o in made.operations), equations.model
+        kinks, model = sum(o.name in _KINKS for o in graph.operations), equations.model
         rows = equations.constraints.value.numel() if model.constrained else 0  # type: ignore[attr-defined]  # written
         self.kinked = kinks > len(model.quaternions) + rows
         # Parameters stand first among the arguments behind tau.
         self.clock = list(model.parameters).index(model.time_parameter) if model.time_parameter else None
-        self._nq, self._nv = made.inputs[:2]
+        self._nq, self._nv = graph.inputs[:2]
         #: Place of each parameter among heyoka's -> (argument, entry); unused ones have none.
         self._places: dict[tuple[int, int], int] = {}
         variables = heyoka.make_vars(*(f"y{i}" for i in range(self._nq + self._nv)))
         variables = [variables] if self._nq + self._nv == 1 else list(variables)
-        self._system = list(zip(variables, self._expressions(heyoka, made, variables), strict=True))
+        self._system = list(zip(variables, self._expressions(heyoka, graph, variables), strict=True))
         self._idle: dict[tuple[int, int], list[Any]] = {}
 
-    def _expressions(self, heyoka: Any, made: Any, variables: list[Any]) -> list[Any]:
+    def _expressions(self, heyoka: Any, graph: Program, variables: list[Any]) -> list[Any]:
         functions, clock = _functions(heyoka), self.clock
         values: list[Any] = []
 
@@ -172,14 +171,14 @@ class TaylorSystem:
                 return heyoka.time
             return heyoka.par[self._places.setdefault((which, at), len(self._places))]
 
-        for operation in made.operations:
+        for operation in graph.operations:
             if operation.name == "input":
                 values.append(entry(operation))
             elif operation.name == "const":
                 values.append(heyoka.expression(operation.value))
             else:
                 values.append(functions[operation.name](*(values[i] for i in operation.arguments)))
-        return [values[k] for out in made.outputs for k in out.ravel()]
+        return [values[k] for out in graph.outputs for k in out.ravel()]
 
     @contextmanager
     def integrator(self, kind: Precision, tolerance: float) -> Iterator[Any]:
@@ -187,12 +186,12 @@ class TaylorSystem:
         key = (kind.bits, order_of(tolerance))
         idle = self._idle.setdefault(key, [])
         try:
-            made = idle.pop()
+            integrator = idle.pop()
         except IndexError:
-            made = self._compiled(kind, tolerance)
-        yield made
+            integrator = self._compiled(kind, tolerance)
+        yield integrator
         # One whose run ended in an error is not lent again.
-        idle.append(made)
+        idle.append(integrator)
 
     def _compiled(self, kind: Precision, tolerance: float) -> Any:
         n = self._nq + self._nv
@@ -222,8 +221,8 @@ def taylor_system(equations: Equations) -> TaylorSystem:
     """Return the Taylor system of equations, made once for all dynamics that share them."""
     if "series" not in equations.kept:
         equations.kept["series"] = TaylorSystem(equations)
-    made: TaylorSystem = equations.kept["series"]
-    return made
+    system: TaylorSystem = equations.kept["series"]
+    return system
 
 
 def _functions(heyoka: Any) -> dict[str, Any]:

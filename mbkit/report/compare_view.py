@@ -4,24 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from mbkit.report import document as doc
 from mbkit.report import figures, work_precision_view
-from mbkit.report.document import (
-    Block,
-    Bullet,
-    Column,
-    Document,
-    Facts,
-    Figure,
-    Items,
-    Paragraph,
-    Section,
-    Span,
-    Table,
-    Text,
-)
 from mbkit.report.formatting import count_text, error_text, mark, model_facts, refusals, time_text
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
@@ -44,16 +30,7 @@ _MEASURED: Final = (
 )
 
 
-@dataclass(frozen=True)
-class Failure:
-    """One thing that differs; `row` is there for terms."""
-
-    what: str
-    reason: str
-    row: Row | None = None
-
-
-def view(result: Comparison, target: str = "") -> Document:
+def view(result: Comparison, target: str = "") -> doc.Document:
     """Return the document of a comparison; `target` is the name by which a person called the model."""
     target = target if target != result.model else ""
     facts = result.facts
@@ -63,7 +40,7 @@ def view(result: Comparison, target: str = "") -> Document:
     outcome = "agree" if result.passed else "not compared" if result.nothing else "differ"
     precision = result.precision
     steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in _judged(result)))
-    return Document(
+    return doc.Document(
         name=f"{result.model} ({target})" if target else result.model,
         heading=result.model,
         title=f"{result.model}: {outcome}",
@@ -71,19 +48,19 @@ def view(result: Comparison, target: str = "") -> Document:
         good=result.passed,
         summary=f"{size} · {samples} states (seed {result.seed}) · tolerance {result.tolerance:.0e}"
         f" · {result.seconds:.1f} s",
-        opening=[Items([_failure(f) for f in failures(result)], most=_MAX_FAILURES)],
+        opening=[doc.Items(failures(result), most=_MAX_FAILURES)],
         sections=[
-            Section("The model", [Facts(list(model_facts(facts, target, result.setup)))], on="page"),
-            Section("Terms: worst relative error, time per call", _terms(result) if result.rows else []),
-            Section(_ROLLOUTS.format(steps), _rollouts(result)),
+            doc.Section("The model", [doc.Facts(list(model_facts(facts, target, result.setup)))], on="page"),
+            doc.Section("Terms: worst relative error, time per call", _terms(result) if result.rows else []),
+            doc.Section(_ROLLOUTS.format(steps), _rollouts(result)),
             *(work_precision_view.sections(precision, whole=False) if precision is not None else []),
-            Section(
+            doc.Section(
                 "Left out because the scene does not need it: change is that of the accelerations", _omissions(result)
             ),
-            Section("Notes", _notes(result)),
-            Section(
+            doc.Section("Notes", _notes(result)),
+            doc.Section(
                 "How errors are measured",
-                [Paragraph(_MEASURED[0]), Items([Bullet("", text) for text in _MEASURED[1]])],
+                [doc.Paragraph(_MEASURED[0]), doc.Items([doc.Bullet("", text) for text in _MEASURED[1]])],
                 on="page",
             ),
         ],
@@ -92,7 +69,7 @@ def view(result: Comparison, target: str = "") -> Document:
     )
 
 
-def _basis(result: Comparison | Sweep) -> dict[str, Text]:
+def _basis(result: Comparison | Sweep) -> dict[str, doc.Text]:
     states = f"{result.samples} random ones, seed {result.seed}; beside them neutral, at-limit and near-singular ones"
     return {"states": states}
 
@@ -101,16 +78,17 @@ def headline(result: Comparison) -> str:
     """Return the verdict in one sentence that stays short however much differs."""
     if result.nothing or result.passed or result.only_known_defects:
         return result.verdict
-    parts = []
-    for some, all_, what in (
-        (sum(not r.passed for r in result.rows), len(result.rows), "comparisons of terms"),
-        (sum(not r.passed for r in result.rollouts), len(_judged(result)), "rollouts"),
-        (sum(not o.unchanged for o in result.omissions), len(result.omissions), "omissions"),
-    ):
-        parts += [f"{some} of {all_} {what}"] if some else []
     # Rows are measured by the oracle: the engine that differs fails. Rollouts are measured by MuJoCo's own.
     rows = [r for r in result.rows if not r.passed]
-    engines = dict.fromkeys([*(r.engine for r in rows), *(r.engine for r in result.rollouts if not r.passed)])
+    runs = [r for r in result.rollouts if not r.passed]
+    omissions = [o for o in result.omissions if not o.unchanged]
+    counts = (
+        (rows, result.rows, "comparisons of terms"),
+        (runs, _judged(result), "rollouts"),
+        (omissions, result.omissions, "omissions"),
+    )
+    parts = [f"{len(failed)} of {len(every)} {what}" for failed, every, what in counts if failed]
+    engines = dict.fromkeys([*(r.engine for r in rows), *(r.engine for r in runs)])
     known = [r.engine for r in rows if r.defect]
     by_defect = f" ({len(known)} by a known defect of {', '.join(dict.fromkeys(known))})" if known else ""
     missing = "".join(f"; {x}" for x in result.shortened)
@@ -118,56 +96,55 @@ def headline(result: Comparison) -> str:
     return f"{subject}{', '.join(parts)}{by_defect}{missing}"
 
 
-def failures(result: Comparison) -> list[Failure]:
+def failures(result: Comparison) -> list[doc.Bullet]:
     """Return everything that differs, with its reason."""
-    out = [Failure(f"{r.term}, {r.engine}", r.reason or "differs", r) for r in result.rows if not r.passed]
-    for r in result.rollouts:
+    out = []
+    for r in result.rows:
         if not r.passed:
-            reason = f"differs from {r.against} by {r.error:.1e} in q, {r.tolerance:.0e} expected"
-            out.append(Failure(f"rollout {r.method}, {r.engine}", reason + (f"; {r.note}" if r.note else "")))
+            q, v = (", ".join(map(str, x)) for x in (r.worst_q, r.worst_v))
+            state = f"the state of the worst error ({r.worst_kind})", f"q = [{q}]\nv = [{v}]"
+            out.append(doc.Bullet(f"{r.term}, {r.engine}", r.reason or "differs", "✗", "bad", folded=state))
+    for run in result.rollouts:
+        if not run.passed:
+            reason = f"differs from {run.against} by {run.error:.1e} in q, {run.tolerance:.0e} expected"
+            reason += f"; {run.note}" if run.note else ""
+            out.append(doc.Bullet(f"rollout {run.method}, {run.engine}", reason, "✗", "bad"))
     changed = [o for o in result.omissions if not o.unchanged]
-    return out + [Failure(f"leaving out {o.need}", f"changes the accelerations by {o.change:.1e}") for o in changed]
-
-
-def _failure(f: Failure) -> Bullet:
-    folded = None
-    if f.row is not None:
-        q, v = (", ".join(map(str, x)) for x in (f.row.worst_q, f.row.worst_v))
-        folded = f"the state of the worst error ({f.row.worst_kind})", f"q = [{q}]\nv = [{v}]"
-    return Bullet(f.what, f.reason, "✗", "bad", folded=folded)
+    what = "changes the accelerations by {:.1e}"
+    return out + [doc.Bullet(f"leaving out {o.need}", what.format(o.change), "✗", "bad") for o in changed]
 
 
 # Terms.
 
 
-def _terms(result: Comparison) -> list[Block]:
+def _terms(result: Comparison) -> list[doc.Block]:
     by_term = figures.by_term(result)
-    short = [Column("term", lambda rows: next(iter(rows.values())).term)]
+    short = [doc.Column("term", lambda rows: next(iter(rows.values())).term)]
     short += [_of_engine(engine, result.reference) for engine in result.engines]
     entries = [(term, engine, rows.get(engine)) for term, rows in by_term.items() for engine in result.engines]
     allowed = [r for r in result.rows if r.passed and r.reason]
     but = ", but where an engine's own formula cannot do better (marked !)" if allowed else ""
     return [
-        Table(short, [*by_term.values()], on="terminal"),
-        Paragraph(
+        doc.Table(short, [*by_term.values()], on="terminal"),
+        doc.Paragraph(
             f"Every engine against the {result.reference}, the own derivation evaluated with 34 digits, at "
             f"{result.rows[0].samples} states; an error above {result.tolerance:g} fails{but}.",
             on="page",
         ),
-        Figure(
+        doc.Figure(
             lambda: figures.digits(result),
             "A marker is the worst state, crossed out where it fails; the thin bar's other end is the median. Double "
             "precision ends near 16 digits; “same” is the same number in every state.",
         ),
-        Figure(
+        doc.Figure(
             lambda: figures.term_costs(result),
             "The same worst errors over the time of one call through mbkit: lower left is better. Errors below what "
             "double precision can tell stand at the bottom.",
             wide=True,
         ),
-        Table(_COLUMNS, entries, on="page"),
-        Items([Bullet(f"{r.term}, {r.engine}", r.reason, "!", "allowed") for r in allowed]),
-        Paragraph(
+        doc.Table(_COLUMNS, entries, on="page"),
+        doc.Items([doc.Bullet(f"{r.term}, {r.engine}", r.reason, "!", "allowed") for r in allowed]),
+        doc.Paragraph(
             "Times are medians of single calls through mbkit, interleaved between engines; ± is half the interquartile "
             "range. The joint named has the largest error on its own scale.",
             on="page",
@@ -176,56 +153,56 @@ def _terms(result: Comparison) -> list[Block]:
     ]
 
 
-def _error(row: Row) -> Span:
+def _error(row: Row) -> doc.Span:
     if row.zero and row.passed:
-        return Span(f"– {'zero':>7}", "muted")
+        return doc.Span(f"– {'zero':>7}", "muted")
     if row.passed and row.reason:
-        return Span(f"! {error_text(row.relative):>7}", "allowed")
+        return doc.Span(f"! {error_text(row.relative):>7}", "allowed")
     return mark(row.passed, error_text(row.relative))
 
 
-def _of_engine(engine: str, reference: str) -> Column:
-    return Column(f"{engine}\nvs {reference}", lambda rows: _short(rows.get(engine)), right=True)
+def _of_engine(engine: str, reference: str) -> doc.Column:
+    return doc.Column(f"{engine}\nvs {reference}", lambda rows: _short(rows.get(engine)), right=True)
 
 
-def _short(row: Row | None) -> Text:
+def _short(row: Row | None) -> doc.Text:
     """Return the error and the time of a term in one cell."""
     if row is None:
-        return Span("refused", "muted")
+        return doc.Span("refused", "muted")
     spent = f" {time_text(row.ns * 1e-9):>8}"
     # Where the oracle has no value, an engine stands in for it.
     return spent if row.engine == row.reference else (_error(row), spent)
 
 
-def _of_row(text: Callable[[Row], Text], own: Text = "", refused: Text = "") -> Callable[[Any], Text]:
+def _of_row(text: Callable[[Row], doc.Text], own: doc.Text = "", refused: doc.Text = "") -> Callable[[Any], doc.Text]:
     """Return a cell of the long table; `own` of the engine that stands in for the oracle, `refused` without a row."""
 
-    def cell(entry: tuple[str, str, Row | None]) -> Text:
+    def cell(entry: tuple[str, str, Row | None]) -> doc.Text:
         row = entry[2]
         return refused if row is None else own if row.engine == row.reference else text(row)
 
     return cell
 
 
-def _time(ns: Callable[[Row], float]) -> Callable[[Any], Text]:
+def _time(ns: Callable[[Row], float]) -> Callable[[Any], doc.Text]:
     return lambda row: "" if row[2] is None else time_text(ns(row[2]) * 1e-9)
 
 
 _COLUMNS: Final = (
-    Column("term", lambda row: row[0], group=True),
-    Column("engine", lambda row: row[1]),
-    Column(
+    doc.Column("term", lambda row: row[0], group=True),
+    doc.Column("engine", lambda row: row[1]),
+    doc.Column(
         "worst",
-        _of_row(_error, Span("stands in for the oracle", "muted"), Span("refused, see the notes", "muted")),
+        _of_row(_error, doc.Span("stands in for the oracle", "muted"), doc.Span("refused, see the notes", "muted")),
         right=True,
     ),
-    Column("median", _of_row(lambda r: error_text(r.median)), right=True),
-    Column("per joint", _of_row(lambda r: error_text(r.per_joint) if r.joint else ""), right=True),
-    Column("at joint", _of_row(lambda r: Span(r.joint, "mono"))),
-    Column("in a state", _of_row(lambda r: r.worst_kind if r.relative else "")),
-    Column("largest\ndifference, SI", _of_row(lambda r: error_text(r.max_abs)), right=True),
-    Column("time\nper call", _time(lambda r: r.ns), right=True),
-    Column("±", _time(lambda r: r.ns_spread), right=True),
+    doc.Column("median", _of_row(lambda r: error_text(r.median)), right=True),
+    doc.Column("per joint", _of_row(lambda r: error_text(r.per_joint) if r.joint else ""), right=True),
+    doc.Column("at joint", _of_row(lambda r: doc.Span(r.joint, "mono"))),
+    doc.Column("in a state", _of_row(lambda r: r.worst_kind if r.relative else "")),
+    doc.Column("largest\ndifference, SI", _of_row(lambda r: error_text(r.max_abs)), right=True),
+    doc.Column("time\nper call", _time(lambda r: r.ns), right=True),
+    doc.Column("±", _time(lambda r: r.ns_spread), right=True),
 )
 
 
@@ -237,34 +214,34 @@ def _judged(result: Comparison) -> list[RolloutRow]:
     return [r for r in result.rollouts if math.isfinite(r.tolerance)]
 
 
-def _rollouts(result: Comparison) -> list[Block]:
+def _rollouts(result: Comparison) -> list[doc.Block]:
     judged = _judged(result)
     notes = {note: k for k, note in enumerate(dict.fromkeys(r.note for r in judged if r.note), 1)}
     columns = (
-        Column("integrator", lambda r: r.method),
-        Column("engine", lambda r: r.engine),
-        Column("against", lambda r: r.against, on="page"),
-        Column("step", lambda r: time_text(r.dt), right=True, on="page"),
-        Column("horizon", lambda r: time_text(r.duration), right=True),
-        Column("condition", lambda r: count_text(r.condition), right=True),
-        Column("difference", lambda r: mark(r.passed if r.judged else None, error_text(r.error)), right=True),
-        Column("tolerance", lambda r: f"{r.tolerance:.2g}", right=True, on="page"),
-        Column("run time", lambda r: time_text(r.seconds), right=True),
-        Column("MuJoCo's", lambda r: time_text(r.seconds_against), right=True),
-        Column("", lambda r: Span(f"[{notes[r.note]}]" if r.note else "", "muted")),
+        doc.Column("integrator", lambda r: r.method),
+        doc.Column("engine", lambda r: r.engine),
+        doc.Column("against", lambda r: r.against, on="page"),
+        doc.Column("step", lambda r: time_text(r.dt), right=True, on="page"),
+        doc.Column("horizon", lambda r: time_text(r.duration), right=True),
+        doc.Column("condition", lambda r: count_text(r.condition), right=True),
+        doc.Column("difference", lambda r: mark(r.passed if r.judged else None, error_text(r.error)), right=True),
+        doc.Column("tolerance", lambda r: f"{r.tolerance:.2g}", right=True, on="page"),
+        doc.Column("run time", lambda r: time_text(r.seconds), right=True),
+        doc.Column("MuJoCo's", lambda r: time_text(r.seconds_against), right=True),
+        doc.Column("", lambda r: doc.Span(f"[{notes[r.note]}]" if r.note else "", "muted")),
     )
-    out: list[Block] = []
+    out: list[doc.Block] = []
     if judged:
-        out.append(Paragraph("The same integrator with the same step, step for step.", on="page"))
-        out.append(Table(columns, judged, dense=True))
+        out.append(doc.Paragraph("The same integrator with the same step, step for step.", on="page"))
+        out.append(doc.Table(columns, judged, dense=True))
         about = (
             "Condition is how far q moves when the forces are disturbed anew in every step, per relative disturbance: "
             "rounding disturbs them so, in any engine, by some eps."
         )
-        out.append(Paragraph(about, on="page", note=True))
-    below = [Bullet("", note, f"[{k}]") for note, k in notes.items()]
+        out.append(doc.Paragraph(about, on="page", note=True))
+    below = [doc.Bullet("", note, f"[{k}]") for note, k in notes.items()]
     below += [
-        Bullet(
+        doc.Bullet(
             f"{r.method} vs {r.against}",
             f"{error_text(r.error)} in q after {time_text(r.duration)} at {time_text(r.dt)}; {r.note}",
             "i",
@@ -272,7 +249,7 @@ def _rollouts(result: Comparison) -> list[Block]:
         for r in result.rollouts
         if not math.isfinite(r.tolerance)
     ]
-    return [*out, Items(below)]
+    return [*out, doc.Items(below)]
 
 
 # What was left out of the computation, and what no engine could do.
@@ -287,83 +264,80 @@ def omission_state(omission: Omission) -> Literal["on", "same", "chosen", "chang
     return "chosen" if omission.present and omission.change > _VISIBLE else "same"
 
 
-def _saving(omission: Omission) -> Span:
+def _saving(omission: Omission) -> doc.Span:
     """Return the time that leaving a thing out saves at each call, with its spread, where it can be measured."""
     if math.isnan(omission.saved_ns):
-        return Span("–", "muted")
+        return doc.Span("–", "muted")
     if not omission.measurable:
-        return Span("not measurable", "muted")
-    return Span(f"{time_text(omission.saved_ns * 1e-9)} ± {time_text(omission.saved_spread * 1e-9)}")
+        return doc.Span("not measurable", "muted")
+    return doc.Span(f"{time_text(omission.saved_ns * 1e-9)} ± {time_text(omission.saved_spread * 1e-9)}")
 
 
-def _change(omission: Omission) -> Text:
-    state = omission_state(omission)
-    if state == "on":
-        return "–"
-    return error_text(omission.change) if state == "chosen" else mark(state == "same", error_text(omission.change))
+def _change(omission: Omission) -> doc.Text:
+    state, text = omission_state(omission), error_text(omission.change)
+    return "–" if state == "on" else text if state == "chosen" else mark(state == "same", text)
 
 
-def _omissions(result: Comparison) -> list[Block]:
+def _omissions(result: Comparison) -> list[doc.Block]:
     columns = (
-        Column("need", lambda o: o.need, width=1),
-        Column("in model", lambda o: "yes" if o.present else "no"),
-        Column("saves/call", _saving, right=True),
-        Column("set-up", lambda o: time_text(o.saved_setup) or "–", right=True),
-        Column("change", _change, right=True),
-        Column("what was off", lambda o: Span(o.what, "muted"), fill=True),
-        Column("note", lambda o: Span(o.note, "muted"), on="page"),
+        doc.Column("need", lambda o: o.need, width=1),
+        doc.Column("in model", lambda o: "yes" if o.present else "no"),
+        doc.Column("saves/call", _saving, right=True),
+        doc.Column("set-up", lambda o: time_text(o.saved_setup) or "–", right=True),
+        doc.Column("change", _change, right=True),
+        doc.Column("what was off", lambda o: doc.Span(o.what, "muted"), fill=True),
+        doc.Column("note", lambda o: doc.Span(o.note, "muted"), on="page"),
     )
-    chosen = [Bullet(o.need, o.note, "i") for o in result.omissions if omission_state(o) == "chosen"]
-    return [Table(columns, result.omissions), Items(chosen, on="terminal")]
+    chosen = [doc.Bullet(o.need, o.note, "i") for o in result.omissions if omission_state(o) == "chosen"]
+    return [doc.Table(columns, result.omissions), doc.Items(chosen, on="terminal")]
 
 
-def _notes(result: Comparison) -> list[Block]:
-    bullets = refusals(result.refusals)
-    bullets += [Bullet("", note) for note in result.facts.get("notes", ())]
+def _notes(result: Comparison) -> list[doc.Block]:
+    notes = [doc.Bullet("", note) for note in result.facts.get("notes", ())]
     bodies = "; ".join(result.facts.get("nonphysical", ()))
-    bullets += [Bullet("bodies with inconsistent inertia", bodies)] if bodies else []
-    return [Items(bullets)]
+    inconsistent = [doc.Bullet("bodies with inconsistent inertia", bodies)] if bodies else []
+    return [doc.Items([*refusals(result.refusals), *notes, *inconsistent])]
 
 
 # Many robots.
 
 _STATUS: Final = {
-    "agree": Span("✓ agree", "good"),
-    "refused": Span("– refused", "allowed"),
-    "differ": Span("✗ differ", "bad"),
-    "failed": Span("✗ failed", "bad"),
+    "agree": doc.Span("✓ agree", "good"),
+    "refused": doc.Span("– refused", "allowed"),
+    "differ": doc.Span("✗ differ", "bad"),
+    "failed": doc.Span("✗ failed", "bad"),
 }
 
 
-def robots_view(result: Sweep) -> Document:
+def robots_view(result: Sweep) -> doc.Document:
     """Return the document of many robots."""
     reasons = [
-        Bullet(o.robot, o.reason, _STATUS[o.status].text[0], _STATUS[o.status].style)
+        doc.Bullet(o.robot, o.reason, _STATUS[o.status].text[0], _STATUS[o.status].style)
         for o in result.outcomes
         if o.reason
     ]
     compared = any(o.comparison and o.comparison.rows for o in result.outcomes)
     about = "Worst relative error of any term and state, one marker per robot; the dotted line is the tolerance."
     columns = (
-        Column("result", lambda o: _STATUS[o.status], width=9),
-        Column("robot", lambda o: o.robot, width=20),
-        Column("nv", _of(lambda c: str(c.facts["nv"])), right=True, width=3),
-        Column("engines", _of(lambda c: str(len(c.engines))), right=True, width=7, on="terminal"),
-        Column("engines", _of(lambda c: ", ".join(c.engines)), on="page"),
-        Column("digits", _of(lambda c: f"{c.digits:.1f}" if c.worst else ""), right=True, width=6),
-        Column("worst", _of(lambda c: error_text(c.worst.relative) if c.worst else ""), right=True, width=7),
-        Column("where", _of(lambda c: f"{c.worst.term}, {c.worst.engine}" if c.worst else ""), on="page"),
+        doc.Column("result", lambda o: _STATUS[o.status], width=9),
+        doc.Column("robot", lambda o: o.robot, width=20),
+        doc.Column("nv", _of(lambda c: str(c.facts["nv"])), right=True, width=3),
+        doc.Column("engines", _of(lambda c: str(len(c.engines))), right=True, width=7, on="terminal"),
+        doc.Column("engines", _of(lambda c: ", ".join(c.engines)), on="page"),
+        doc.Column("digits", _of(lambda c: f"{c.digits:.1f}" if c.worst else ""), right=True, width=6),
+        doc.Column("worst", _of(lambda c: error_text(c.worst.relative) if c.worst else ""), right=True, width=7),
+        doc.Column("where", _of(lambda c: f"{c.worst.term}, {c.worst.engine}" if c.worst else ""), on="page"),
     )
-    return Document(
+    return doc.Document(
         name="",
         heading="All robots of example-robot-data",
         title=f"all robots: {'agree' if result.passed else 'differ'}",
         verdict=result.verdict,
         good=result.passed,
-        opening=[Figure(lambda: figures.robots(result), about)] if compared else [],
+        opening=[doc.Figure(lambda: figures.robots(result), about)] if compared else [],
         sections=[
-            Section("Robot by robot", [Table(columns, result.outcomes, dense=True)]),
-            Section("Reasons", [Items(reasons)]),
+            doc.Section("Robot by robot", [doc.Table(columns, result.outcomes, dense=True)]),
+            doc.Section("Reasons", [doc.Items(reasons)]),
         ],
         result=result,
         basis=_basis(result),

@@ -143,10 +143,6 @@ class Details:
 Block = Paragraph | Table | Items | Facts | Figure | Details
 
 
-def _is_empty(block: Block) -> bool:
-    return (isinstance(block, Table) and not block.rows) or (isinstance(block, Items) and not block.bullets)
-
-
 @dataclass(frozen=True)
 class Section:
     """Blocks under a title; one of level 3 belongs to the one before it. Blocks without content are left out."""
@@ -159,7 +155,9 @@ class Section:
     def shown(self, where: On) -> list[Block]:
         """Return the blocks that are shown there."""
         places = ("both", where)
-        return [b for b in self.blocks if b.on in places and not _is_empty(b)] if self.on in places else []
+        if self.on not in places:
+            return []
+        return [b for b in self.blocks if b.on in places and getattr(b, "rows", True) and getattr(b, "bullets", True)]
 
 
 @dataclass(frozen=True)
@@ -167,18 +165,18 @@ class Document:
     """All that is shown of a result.
 
     A terminal has `name` before the verdict and `summary` below it, or the verdict at the end (`last`); a page has a
-    heading and, in the browser's bar, a title. `marked` is a verdict that is a judgement, with ✓ or ✗. At the foot of
-    the page stand `basis` and the result's `versions`, `processor` and `seconds`. A page with tables of its own names
-    its template, and what this is filled with.
+    heading and, in the browser's bar, a title, which are the name by default. `marked`: the verdict is a judgement,
+    with ✓ or ✗. At the foot of the page stand `basis` and the result's `versions`, `processor` and `seconds`. A page
+    with tables of its own names its template, and its content.
     """
 
     name: str
-    heading: str
-    title: str
     verdict: str
     good: bool
     sections: Sequence[Section]
     result: Any
+    heading: str = ""
+    title: str = ""
     marked: bool = True
     summary: str = ""
     opening: Sequence[Block] = ()

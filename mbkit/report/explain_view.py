@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterable, Iterator
-from pathlib import PurePath
+from functools import cache
+from pathlib import Path, PurePath
 from typing import Final
 
 from mbkit.report.document import Block, Bullet, Column, Document, Items, Paragraph, Section, Span, Style, Table
@@ -31,8 +33,6 @@ def explanation_view(result: Explanation) -> Document:
     by_name = sum(m.how == "name" for m in result.matches)
     return Document(
         name=f"{result.a} and {result.b}",
-        heading=f"{result.a} and {result.b}",
-        title=f"{result.a} and {result.b}",
         verdict=result.verdict,
         good=result.agree,
         sections=[
@@ -59,26 +59,6 @@ def _causes(causes: Iterable[Cause]) -> list[Block]:
 
 # One file through several importers.
 
-_GLOSS: Final = {
-    "joints": "every moving joint has its counterpart",
-    "kinds": "they move in the same way",
-    "parents": "they hang on the same bodies",
-    "places": "they stand at the same places",
-    "axes": "about or along the same directions",
-    "mimic": "what follows another joint does so",
-    "total mass": "with all that stands still",
-    "masses": "of each moving body, with what is fixed to it",
-    "centres of mass": "of the same bodies",
-    "inertias": "about their centres of mass",
-    "armature": "motors' inertias at the joints",
-    "damping": "viscous, at the joints",
-    "friction": "dry, at the joints",
-    "limits": "of position, speed and effort",
-    "M": "mass matrix, by the engine itself",
-    "g": "forces of gravity, by the engine itself",
-    "nle": "C v + g, by the engine itself",
-    "passive": "springs, dampers and all else that acts without a command, by the engine itself",
-}
 _LEGEND: Final = (
     "✓ the same. ✗ another motion: these stages decide whether an importer agrees. ! another number, which decides "
     "nothing by itself: what it does shows in M, g, nle and passive. – cannot be compared."
@@ -94,7 +74,7 @@ def importers_view(result: ParserComparison) -> Document:
     rows = [p.stages for p in read]
     columns = [
         Column("stage", lambda k: Span(rows[0][k].name, "bold")),
-        Column("", lambda k: Span(_GLOSS.get(rows[0][k].name, ""), "muted"), on="page"),
+        Column("", lambda k: Span(_meanings()["stages"].get(rows[0][k].name, ""), "muted"), on="page"),
         *(_importer(p) for p in read),
     ]
     plural = "s" * (result.samples != 1)
@@ -107,7 +87,6 @@ def importers_view(result: ParserComparison) -> Document:
     )
     return Document(
         name=name,
-        heading=name,
         title=f"{name}: importers {outcome}",
         verdict=result.verdict,
         good=result.agree,
@@ -160,16 +139,16 @@ def _differences(read: list[Parsed]) -> Iterator[Section]:
         on="page",
     )
     for p in read:
-        found = p.explanation
-        if found is None or not found.causes:
+        why = p.explanation
+        if why is None or not why.causes:
             continue
         title = p.engine
-        if not found.explained:
-            where = f"; the smallest part that still differs: {', '.join(found.subtree)}" if found.subtree else ""
+        if not why.explained:
+            where = f"; the smallest part that still differs: {', '.join(why.subtree)}" if why.subtree else ""
             title += f": not all is explained{where}"
-        elif not found.acting:
+        elif not why.acting:
             title += " moves the same; what differs is data"
-        yield Section(f"Why they differ: {title}", [about, *_causes(found.causes)])
+        yield Section(f"Why they differ: {title}", [about, *_causes(why.causes)])
 
 
 def _stage(stage: Stage) -> Span:
@@ -206,8 +185,6 @@ def baseline_view(result: BaselineResult, again: str = "") -> Document:
         bullets.append(Bullet("if this is meant" if result.status != "versions" else "to record anew", again))
     return Document(
         name=f"{result.model} ({name})",
-        heading=result.model,
-        title=result.model,
         verdict=result.verdict,
         good=result.passed,
         opening=[Items(bullets)],
@@ -216,65 +193,11 @@ def baseline_view(result: BaselineResult, again: str = "") -> Document:
     )
 
 
-# What each kind of cause means, for a reader who meets it for the first time.
-
-_MEANINGS: Final = {
-    "actuator": "A motor or servo: its armature adds to M, and at zero control its gain and damping still act.",
-    "added body": "It has matter where the other side has none.",
-    "added joint": "It has a joint that the other side has not.",
-    "armature": "A motor's inertia, seen through its gear: it adds to the diagonal of M.",
-    "axis": "The joint turns or slides about another direction.",
-    "axis sign": "Positive q goes the other way.",
-    "base mass": "Matter that never moves, fused into the world: no term holds it while the base stands.",
-    "centre of mass": "The matter is as heavy, and elsewhere.",
-    "damping": "Viscous friction in the joint. It is in no term of M and nle.",
-    "fluid": "The drag and lift of the medium in which the bodies move.",
-    "friction": "Dry friction in the joint. It is in no term of M and nle.",
-    "fused at the wrong place": "Links that are fixed to each other were made one body, and one was put elsewhere.",
-    "fused with a rotated frame": "Links that are fixed to each other were made one body, and one was turned wrongly.",
-    "gravity": "Another acceleration of gravity.",
-    "gravity compensation": "A force that holds some of a body's weight.",
-    "inertia": "The matter is as heavy, and resists turning otherwise.",
-    "inertia about the wrong point": "The moments are about another point than the centre of mass.",
-    "inertia axes": "The same principal moments, about other axes.",
-    "inverse rotation": "A rotation from child to parent was taken for the one from parent to child.",
-    "inverse placement": "A frame's place in another was taken for the other's place in it.",
-    "joint coupling": "A gear or transmission couples joints: its rotor's inertia adds to M between them.",
-    "joint held still": "What moves on one side is fixed on the other, so q and v are not the same there.",
-    "joint kind": "The joint moves in another way.",
-    "joint order": "q and v name the same joints in another order; read them by name.",
-    "joint origin": "The joint stands elsewhere in its parent.",
-    "joint rotation": "The joint stands turned in its parent.",
-    "limits": "Bounds of position, speed or effort. They are in no term of M and nle.",
-    "lost body": "Matter is gone: with no joint of its own and little mass, an importer may take a link for empty.",
-    "lost joint": "A joint is gone, with all that it carries, so q and v are not the same there.",
-    "mass": "Another mass.",
-    "mimic": "A joint that follows another has a coordinate of its own, or follows otherwise.",
-    "names exchanged": "Joints are called by each other's names.",
-    "order of angles": "Roll, pitch and yaw were applied in another order.",
-    "order of the inertia's numbers": "Its six numbers were read in another order.",
-    "own terms": "The engine computes other terms than the bodies and joints that were read out of it have.",
-    "parent": "The joint hangs on another body.",
-    "passive forces": "Springs and dampers were put where they do not belong, or left out.",
-    "pitch": "How far a screw goes in a turn.",
-    "products of inertia": "The off-diagonal moments have another sign, or are gone.",
-    "quaternion order": "w, x, y, z was read for x, y, z, w, or the other way round.",
-    "renamed": "The same joints are called otherwise.",
-    "replaced inertia": "An inertia that no body can have was taken out, and a ball of water put in its place.",
-    "rotation left out": "A frame's rotation was not applied.",
-    "rounding": "The numbers were written with few digits on the way.",
-    "spring": "A spring in the joint. It is in no term of M and nle.",
-    "tendon": "It couples joints: its armature adds to M, its spring and damper pull at them.",
-    "unit of angle": "Degrees were taken for radians, or the other way round.",
-    "unit of inertia": "The numbers are of another unit of inertia.",
-    "unit of length": "The numbers are of another unit of length.",
-    "unit of mass": "The numbers are of another unit of mass.",
-    "unit of pitch": "Metres a radian, or a turn.",
-    "velocity frame": "Velocities of a free body are in other axes.",
-    "zero position": "q counts from another pose.",
-}
+@cache
+def _meanings() -> dict[str, dict[str, str]]:
+    return tomllib.loads((Path(__file__).parent / "templates" / "meanings.toml").read_text(encoding="utf-8"))
 
 
 def meaning(kind: str) -> str:
     """Return a sentence on a kind of cause; empty where its name says it all."""
-    return _MEANINGS.get(kind, "")
+    return _meanings()["causes"].get(kind, "")

@@ -1,6 +1,7 @@
-"""Figures of a comparison and of a sweep over robots.
+"""Figures of pages, as SVG that takes its colours from the page, so that light and dark both read.
 
-Engines differ by colour and by marker.
+Matplotlib draws with stand-in colours; each is then replaced by a variable of the page's style sheet. Engines differ by
+colour and by marker.
 """
 
 from __future__ import annotations
@@ -8,25 +9,21 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import html, one_line
-from mbkit.studies._figure_style import Palette, engine_mark, log_ticks, style
+from mbkit.studies._figure_style import Palette, engine_index, engine_mark, log_ticks, style
 from mbkit.studies.compare.all_robots import Sweep
 from mbkit.studies.compare.result import Comparison, Row
+from mbkit.studies.stress.measurements import CaseResult, Line, name_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Figures as SVG that takes its colours from the page, so that light and dark both read.
-#
-# Matplotlib draws with stand-in colours; each is then replaced by a variable of the
-# page's style sheet.
-
-#: Stand-ins for what the page says.
+#: Stand-ins for the page's colours.
 PAGE: Final = Palette(
     "#010101", "#020202", "#030303", "#040404", ("#050501", "#050502", "#050503", "#050504", "#050505", "#050506")
 )
@@ -37,7 +34,10 @@ _VARIABLES: Final = {
     PAGE.bad: "var(--bad)",
     **{colour: f"var(--series{k})" for k, colour in enumerate(PAGE.series, 1)},
 }
-_NO_METADATA: Final[dict[str, None]] = {"Date": None, "Creator": None, "Format": None, "Type": None}
+_DASHES: Final = (0, (2, 2))
+#: A cross over what failed.
+_CROSS: Final[dict[str, Any]] = {"color": PAGE.bad, "markersize": 11, "markeredgewidth": 2.2}
+_WIDTH: Final = 10.4
 
 
 @contextmanager
@@ -51,24 +51,27 @@ def page_style(salt: str) -> Iterator[None]:
 
 
 @contextmanager
-def canvas(width: float, height: float, salt: str) -> Iterator[tuple[Figure, Axes]]:
-    """Give a figure, sized in inches, and its one pair of axes."""
+def _canvas(
+    salt: str, width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Give a figure, sized in inches, and its axes, row by row."""
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib.figure import Figure
 
     with page_style(salt):
         fig = Figure(figsize=(width, height))
-        yield fig, fig.subplots()
+        yield fig, list(fig.subplots(rows, columns, squeeze=False, **grid).flat)
 
 
 def svg(fig: Figure, title: str) -> str:
     """Return a figure as an element of a page; `title` is what a screen reader says."""
     stream = io.StringIO()
-    fig.savefig(stream, format="svg", transparent=True, bbox_inches="tight", pad_inches=0.05, metadata=_NO_METADATA)
+    none: dict[str, None] = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    fig.savefig(stream, format="svg", transparent=True, bbox_inches="tight", pad_inches=0.05, metadata=none)
     text = stream.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    for size in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
     text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}"', 1)
     # Names of parts would otherwise stand twice on a page with two figures.
     text = re.sub(r'<g id="[^"]*"', "<g", text)
@@ -76,6 +79,26 @@ def svg(fig: Figure, title: str) -> str:
     for stand_in, variable in _VARIABLES.items():
         text = text.replace(stand_in, variable)
     return text
+
+
+def _legend(
+    fig: Figure, engines: Sequence[str], lines: Sequence[dict[str, Any]], left: float, size: float, **options: Any
+) -> None:
+    """Name the engines, by colour and marker, and further lines, above the figure."""
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=PAGE.engine(e), marker=engine_mark(e), ls="none", markersize=size, label=one_line(e, 30))
+        for e in engines
+    ]
+    handles += [Line2D([], [], **line) for line in lines]
+    fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(left, 1.0), ncols=len(handles), **options)
+
+
+# The digits of each term.
+
+#: Where an error of exactly zero stands on an axis of digits.
+_SAME: Final = 17.0
 
 
 def by_term(result: Comparison) -> dict[str, dict[str, Row]]:
@@ -86,40 +109,32 @@ def by_term(result: Comparison) -> dict[str, dict[str, Row]]:
     return out
 
 
-_GROUP_MARKS: Final = "osD^vP"
-#: Where an error of exactly zero stands on an axis of digits.
-_SAME: Final = 17.0
-
-
 def digits(result: Comparison) -> str:
     """Draw the digits of agreement of each term and engine: worst sample, and median behind it."""
-    terms = by_term(result)
-    engines = result.engines
-    with canvas(7.2, 0.9 + 0.36 * len(terms), "digits") as (fig, ax):
+    terms, engines = by_term(result), result.engines
+    size = 0.9 + 0.36 * len(terms)
+    with _canvas("digits", 7.2, size) as (fig, (ax,)):
         for k, engine in enumerate(engines):
             colour, mark = PAGE.engine(engine), engine_mark(engine)
-            shift = (k - (len(engines) - 1) / 2) * 0.26
-            first = True
-            for row, name in enumerate(terms):
-                found = terms[name].get(engine)
-                if found is None:
+            label: str | None = f"{engine} against {result.reference}"
+            for place, rows in enumerate(terms.values()):
+                if (row := rows.get(engine)) is None:
                     continue
-                worst, median, y = _digits(found.relative), _digits(found.median), row + shift
+                worst, median = _digits(row.relative), _digits(row.median)
+                y = place + (k - (len(engines) - 1) / 2) * 0.26
                 ax.plot([worst, median], [y, y], color=colour, linewidth=1.2)
                 ax.plot([median], [y], "|", color=colour, markersize=8)
-                label = f"{engine} against {result.reference}" if first else None
                 ax.plot([worst], [y], mark, color=colour, label=label, linestyle="none")
-                first = False
-                if not found.passed:
-                    ax.plot([worst], [y], "x", color=PAGE.bad, markersize=11, markeredgewidth=2.2)
+                label = None
+                if not row.passed:
+                    ax.plot([worst], [y], "x", **_CROSS)
         limit = -math.log10(result.tolerance)
-        ax.axvline(limit, color=PAGE.muted, linestyle=(0, (2, 2)), linewidth=1.0)
+        ax.axvline(limit, color=PAGE.muted, linestyle=_DASHES, linewidth=1.0)
         ax.text(limit, -0.75, f"tolerance {result.tolerance:g} ", color=PAGE.muted, ha="right", va="center", fontsize=9)
         ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])
         ax.set_ylim(len(terms) - 0.4, -1.1)
-        _digit_axis(ax, min(_digits(r.relative) for rows in terms.values() for r in rows.values()))
-        below = -0.06 - 0.55 / (0.9 + 0.36 * len(terms))
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, below), ncols=len(engines))
+        _digit_axis(ax, min(_digits(row.relative) for row in result.rows))
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06 - 0.55 / size), ncols=len(engines))
         return svg(fig, "Digits of agreement of each term and engine")
 
 
@@ -138,36 +153,43 @@ def _digit_axis(ax: Axes, least: float) -> None:
     ax.tick_params(axis="y", length=0)
 
 
+# Many robots.
+
+_GROUP_MARKS: Final = "osD^vP"
+
+
 def robots(result: Sweep) -> str:
     """Draw the worst error of each robot against its size."""
     groups: dict[tuple[str, ...], list[tuple[int, float]]] = {}
-    for o in result.outcomes:
-        if o.comparison is not None and o.comparison.worst is not None:
-            error = o.comparison.worst.relative
-            shown = 1.0 if math.isnan(error) else min(max(error, 1e-17), 1.0)
-            groups.setdefault(o.comparison.engines, []).append((int(o.comparison.facts["nv"]), shown))
-    with canvas(7.2, 3.4, "robots") as (fig, ax):
+    compared = [o.comparison for o in result.outcomes if o.comparison is not None]
+    for c in compared:
+        if c.worst is not None:
+            place = int(c.facts["nv"]), _shown(c.worst.relative, 1e-17)
+            groups.setdefault(c.engines, []).append(place)
+    with _canvas("robots", 7.2, 3.4) as (fig, (ax,)):
         for k, (engines, points) in enumerate(groups.items()):
             ax.plot(*zip(*points, strict=True), _GROUP_MARKS[k % 6], color=PAGE.series[k % 6], label=", ".join(engines))
         ax.set_yscale("log")
         ax.set_xlabel("velocities, nv")
         ax.set_ylabel("worst relative error")
         ax.grid()
-        tolerances = {o.comparison.tolerance for o in result.outcomes if o.comparison}
-        for tolerance in tolerances:
-            ax.axhline(tolerance, color=PAGE.muted, linestyle=(0, (2, 2)), linewidth=1.0)
+        for tolerance in {c.tolerance for c in compared}:
+            ax.axhline(tolerance, color=PAGE.muted, linestyle=_DASHES, linewidth=1.0)
         log_ticks(ax)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
         return svg(fig, "Worst relative error of each robot against its size")
 
 
-# The terms' errors against their run times: what a digit of each term costs on each engine.
+def _shown(error: float, least: float) -> float:
+    return 1.0 if math.isnan(error) else min(max(error, least), 1.0)
+
+
+# What a digit of each term costs on each engine: errors against run times.
 
 _EPS: Final = 2.0**-52
 #: Where smaller errors stand, and none: below this, double precision tells nothing.
 _LEAST: Final = _EPS / 64
 _COLUMNS: Final = 5
-_ROW: Final = 1.55
 
 
 def term_costs(result: Comparison) -> str:
@@ -175,29 +197,34 @@ def term_costs(result: Comparison) -> str:
 
     Terms that were not timed are left out; empty where none was.
     """
-    terms = {name: _timed(rows) for name, rows in by_term(result).items()}
-    terms = {name: rows for name, rows in terms.items() if rows}
+    # An engine that stands in for the oracle has no error of its own.
+    timed = [r for r in result.rows if math.isfinite(r.ns) and r.ns > 0 and r.engine != r.reference]
+    terms = list(dict.fromkeys(r.term for r in timed))
     if not terms:
         return ""
     count = math.ceil(len(terms) / _COLUMNS)
-    with page_style("term costs"):
-        from matplotlib.figure import Figure
-
-        height = 1.0 + _ROW * count
-        fig = Figure(figsize=(10.4, height))
-        margins = {"left": 0.07, "right": 0.995, "top": 1 - 0.6 / height, "bottom": 0.5 / height}
-        grid = fig.subplots(
-            count,
-            _COLUMNS,
-            sharex=True,
-            sharey=True,
-            squeeze=False,
-            gridspec_kw={**margins, "wspace": 0.15, "hspace": 0.3},
-        )
-        panels = list(grid.flat)
-        for ax, (name, rows) in zip(panels, terms.items(), strict=False):
-            _panel(ax, name, rows, result.tolerance)
-        _limits(panels[0], [r for rows in terms.values() for r in rows], result.tolerance)
+    height = 1.0 + 1.55 * count
+    margins = {"left": 0.07, "right": 0.995, "top": 1 - 0.6 / height, "bottom": 0.5 / height}
+    grid = {**margins, "wspace": 0.15, "hspace": 0.3}
+    shared = {"sharex": True, "sharey": True, "gridspec_kw": grid}
+    with _canvas("term costs", _WIDTH, height, count, _COLUMNS, **shared) as (fig, panels):
+        level: dict[str, Any] = {"color": PAGE.muted, "linewidth": 0.9}
+        dashed = {**level, "linestyle": (0, (4, 3))}
+        for ax, term in zip(panels, terms, strict=False):
+            ax.axhline(_EPS, **level)
+            ax.axhline(result.tolerance, **dashed)
+            for row in timed:
+                if row.term == term:
+                    place = [row.ns], [_shown(row.relative, _LEAST)]
+                    ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
+                    if not row.passed:
+                        ax.plot(*place, "x", **_CROSS)
+            ax.set_title(one_line(term, 28), loc="left", fontsize=9.5, pad=3)
+        panels[0].set_xscale("log")
+        panels[0].set_yscale("log")
+        times, errors = [r.ns for r in timed], [_shown(r.relative, _LEAST) for r in timed]
+        panels[0].set_xlim(min(times) / 1.6, max(times) * 1.6)
+        panels[0].set_ylim(min(*errors, _EPS) / 3, max(*errors, result.tolerance) * 3)
         for k, ax in enumerate(panels):
             if k >= len(terms):
                 ax.remove()
@@ -207,46 +234,60 @@ def term_costs(result: Comparison) -> str:
             ax.tick_params(labelsize=8.5, labelbottom=k + _COLUMNS >= len(terms))
         fig.text(0.53, 0.0, "time of one call, ns", ha="center", va="bottom")
         fig.text(0.0, 0.5, "worst relative error", rotation=90, ha="left", va="center")
-        _legend(fig, result)
+        levels = [level | {"label": "eps of double precision"}, dashed | {"label": f"tolerance {result.tolerance:g}"}]
+        _legend(fig, result.engines, levels, 0.03, 7.0, columnspacing=1.8)
         return svg(fig, "Error of each term against the time of a call")
 
 
-def _timed(rows: dict[str, Row]) -> list[Row]:
-    # An engine that stands in for the oracle has no error of its own.
-    return [r for r in rows.values() if math.isfinite(r.ns) and r.ns > 0 and r.engine != r.reference]
+# The largest stable steps: measured as a bar between held and not, linear theory as a mark.
+
+_STEP_COLUMNS: Final = 3
+_THEORY: Final[dict[str, Any]] = {"color": PAGE.ink, "linewidth": 1.6, "linestyle": (0, (1.2, 0.8))}
 
 
-def _shown(row: Row) -> float:
-    return 1.0 if math.isnan(row.relative) else min(max(row.relative, _LEAST), 1.0)
+def stable_steps(cases: Sequence[tuple[CaseResult, Sequence[Line]]]) -> str:
+    """Draw each case's steps, a panel a case: from the largest that held to the least that failed, or an arrow."""
+    # The rows of all panels: methods together, engine by engine.
+    rows = [line.row for _, lines in cases for line in lines]
+    methods = list(dict.fromkeys(row.method for row in rows))
+    rows.sort(key=lambda row: (methods.index(row.method), engine_index(row.engine)))
+    names = list(dict.fromkeys(map(name_of, rows)))
+    columns = min(_STEP_COLUMNS, len(cases))
+    count = math.ceil(len(cases) / columns)
+    panel = 0.2 * len(names)
+    height = 0.4 + (panel + 0.75) * count
+    margins = {"left": 0.2, "right": 0.99, "top": 1 - 0.75 / height, "bottom": 0.5 / height}
+    grid = {**margins, "wspace": 0.06, "hspace": 0.75 / panel}
+    with _canvas("stable steps", _WIDTH, height, count, columns, sharey=True, gridspec_kw=grid) as (fig, panels):
+        for ax, (case, lines) in zip(panels, cases, strict=False):
+            _step_panel(ax, case, lines, names)
+        for ax in panels[len(cases) :]:
+            ax.remove()
+        engines = sorted({row.engine for row in rows}, key=engine_index)
+        _legend(fig, engines, [{**_THEORY, "label": "linear theory"}], 0.0, 6.0)
+        return svg(fig, "Largest stable step of each method")
 
 
-def _panel(ax: Axes, name: str, rows: list[Row], tolerance: float) -> None:
-    for y, line in ((_EPS, "-"), (tolerance, (0, (4, 3)))):
-        ax.axhline(y, color=PAGE.muted, linestyle=line, linewidth=0.9)
-    for row in rows:
-        place = [row.ns], [_shown(row)]
-        ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
-        if not row.passed:
-            ax.plot(*place, "x", color=PAGE.bad, markersize=11, markeredgewidth=2.2)
-    ax.set_title(one_line(name, 28), loc="left", fontsize=9.5, pad=3)
-
-
-def _limits(ax: Axes, rows: list[Row], tolerance: float) -> None:
+def _step_panel(ax: Axes, case: CaseResult, lines: Sequence[Line], names: list[str]) -> None:
     ax.set_xscale("log")
-    ax.set_yscale("log")
-    times, errors = [r.ns for r in rows], [_shown(r) for r in rows]
-    ax.set_xlim(min(times) / 1.6, max(times) * 1.6)
-    ax.set_ylim(min(*errors, _EPS) / 3, max(*errors, tolerance) * 3)
-
-
-def _legend(fig: Figure, result: Comparison) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color=PAGE.engine(e), marker=engine_mark(e), linestyle="none", markersize=7, label=e)
-        for e in result.engines
-    ]
-    handles.append(Line2D([], [], color=PAGE.muted, linewidth=0.9, label="eps of double precision"))
-    label = f"tolerance {result.tolerance:g}"
-    handles.append(Line2D([], [], color=PAGE.muted, linestyle=(0, (4, 3)), linewidth=0.9, label=label))
-    fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.03, 1.0), ncols=len(handles), columnspacing=1.8)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    if steps := [s for s in case.values if s > 0]:
+        ax.set_xlim(min(steps) / 2, max(steps) * 2)
+    for line in lines:
+        y, held, failed, theory = names.index(name_of(line.row)), line.broken.held, line.broken.failed, line.row.theory
+        colour, mark = PAGE.engine(line.row.engine), engine_mark(line.row.engine)
+        if held is not None and failed is not None:
+            ax.plot([held, failed], [y, y], color=colour, linewidth=1.4)
+        if failed is not None:
+            ax.plot([failed], [y], "|", color=colour, markersize=7, markeredgewidth=1.4)
+        if held is not None:
+            ax.plot([held], [y], mark if failed is not None else ">", color=colour, markersize=5.5)
+        if theory is not None and 0 < theory < math.inf:
+            ax.plot([theory] * 2, [y - 0.45, y + 0.45], **_THEORY)
+    ax.set_yticks(range(len(names)), [one_line(n, 34) for n in names], fontsize=8.5)
+    ax.set_title(one_line(case.name, 34), loc="left", fontsize=9.5, pad=3)
+    ax.grid(axis="x", which="major")
+    log_ticks(ax, 6)
+    ax.tick_params(axis="y", length=0)
+    ax.tick_params(axis="x", labelsize=8.5)
+    ax.set_xlabel("step, s", fontsize=9)

@@ -67,10 +67,10 @@ def choice(value: Any) -> str:
     return ", ".join(map(choice, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
-def refusals(found: Iterable[Refusal]) -> list[Bullet]:
+def refusals(those: Iterable[Refusal]) -> list[Bullet]:
     """Return what engines could not do, those of one reason together."""
     terms: dict[tuple[str, str], list[str]] = {}
-    for r in found:
+    for r in those:
         terms.setdefault((r.engine, r.reason), []).extend([r.term] if r.term else [])
     out = []
     for (engine, reason), names in terms.items():

@@ -23,20 +23,18 @@ def check_writable(folder: Path) -> None:
     place = folder.absolute()
     while not place.exists() and place != place.parent:
         place = place.parent
-    if not place.is_dir():
-        raise OutputError(f"cannot write to {folder}: {place} is not a folder; choose another with --out")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise OutputError(f"cannot write to {folder}: no permission in {place}; choose another with --out")
+    why = "" if os.access(place, os.W_OK | os.X_OK) else f"no permission in {place}"
+    why = why if place.is_dir() else f"{place} is not a folder"
+    if why:
+        raise OutputError(f"cannot write to {folder}: {why}; choose another with --out")
 
 
 def check_replaceable(folder: Path, *names: str, force: bool = False) -> None:
     """Raise `OutputError`, before long work, for a file that mbkit did not write, unless `force` is set."""
     for path in (folder / name for name in names):
         if not force and os.path.lexists(path) and not _is_own(path):
-            raise OutputError(
-                f"{path} is there and mbkit did not write it; choose another folder with --out, or replace it with "
-                "--force"
-            )
+            remedy = "choose another folder with --out, or replace it with --force"
+            raise OutputError(f"{path} is there and mbkit did not write it; {remedy}")
 
 
 #: At the beginning or the end of what mbkit writes. Pages of earlier versions have their title only.
@@ -69,17 +67,13 @@ def _is_own(path: Path) -> bool:
 
 def write(folder: Path, name: str, content: str | bytes, *, force: bool = False) -> Path:
     """Write a file as a whole or not at all, text as UTF-8, and return its path; see `check_replaceable`."""
+    path = folder / name
     with _interrupt.uninterrupted:
         check_replaceable(folder, name, force=force)
-        return _write(folder, name, content)
-
-
-def _write(folder: Path, name: str, content: str | bytes) -> Path:
-    path = folder / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, content if isinstance(content, bytes) else content.encode("utf-8", "backslashreplace"))
-    except OSError as error:
-        why = error.strerror or error
-        raise OutputError(f"cannot write {path}: {why}; choose another folder with --out") from error
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(path, content if isinstance(content, bytes) else content.encode("utf-8", "backslashreplace"))
+        except OSError as error:
+            why = error.strerror or error
+            raise OutputError(f"cannot write {path}: {why}; choose another folder with --out") from error
     return path

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mbkit._escape import terminal
 from mbkit.report.document import Document, spans
 from mbkit.report.formatting import count_text, error_text, time_text
-from mbkit.report.stress_page import FILTERS
+from mbkit.report.stress_view import FILTERS
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -1,28 +1,22 @@
-"""Where engines and methods break: the words, and the rows of tables, of a page and a terminal."""
+"""Where engines and methods break, as a document: a line a case on a terminal, maps of coloured cells on a page."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
 
+from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Table
+from mbkit.report.figures import stable_steps
+from mbkit.report.formatting import choice, error_text, time_text
 from mbkit.studies._figure_style import engine_index
-from mbkit.studies.stress.figure import number_text
-from mbkit.studies.stress.measurements import (
-    CaseResult,
-    Line,
-    Measurement,
-    Outcome,
-    Row,
-    best,
-    furthest,
-    lines,
-    name_of,
-    recommended,
-)
+from mbkit.studies.stress import measurements as stress
+from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
+from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, name_of, place
 from mbkit.studies.stress.result import StressResult
 
 #: Outcomes in words that follow "then".
@@ -49,16 +43,26 @@ _FAMILIES: Final = {
     "long": "Long runs",
     "step": "Step size",
 }
+_MEASURES: Final = {
+    "motion": "the largest difference of q along the run, over the size of the motion",
+    "energy": "the largest relative error of the energy along the run",
+    "terms": "that of each term at given states, relative to the term",
+}
+#: What a truth's floor stands behind.
+_KNOWN: Final = "; known to "
 #: Names in one sentence; the tables have all.
 _NAMED: Final = 3
+#: On a terminal: methods that were wrong in silence, and the cases of each.
+_METHODS: Final = 6
+_PLACES: Final = 2
 
 
 @dataclass(frozen=True)
 class Overview:
-    """A case in one line."""
+    """A case, and how far each of its rows held."""
 
     case: CaseResult
-    anchor: str  # the case's place on the page
+    anchor: str  # the case's place on the page, whatever its name holds
     lines: tuple[Line, ...]  # the furthest first
     best: dict[str, Line]  # by engine
     choice: Line | None  # of method auto
@@ -72,28 +76,43 @@ class Overview:
     @property
     def leader(self) -> Line | None:
         """What held furthest; of terms, the first to break of the engine that is best in all of them."""
-        ran = [line for line in self.best.values() if not line.left_out]
-        return max(ran, key=lambda line: line.reach, default=None)
-
-    @property
-    def leader_name(self) -> str:
-        """Whose that is."""
-        line = self.leader
-        if line is None:
-            return ""
-        return f"{line.row.engine} (terms)" if self.case.measure == "terms" else name_of(line.row)
+        return max((x for x in self.best.values() if not x.left_out), key=lambda line: line.reach, default=None)
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
         """Names and reasons of the rows that never ran, those of one reason together."""
-        found: dict[str, list[str]] = {}
+        names: dict[str, list[str]] = {}
         for line in self.lines:
             if line.left_out:
                 reason = remarks(line.row.cells[0]) if line.row.cells else ""
-                found.setdefault(reason or HOW[line.outcomes[0] if line.outcomes else "not run"], []).append(
-                    name_of(line.row)
-                )
-        return [(", ".join(names), reason) for reason, names in found.items()]
+                reason = reason or HOW[line.outcomes[0] if line.outcomes else "not run"]
+                names.setdefault(reason, []).append(name_of(line.row))
+        return [(", ".join(alike), reason) for reason, alike in names.items()]
+
+
+def overview(result: StressResult) -> list[Overview]:
+    """Return every case with its rows."""
+    return [
+        Overview(c, f"case-{k}", tuple(stress.lines(c)), stress.best(c), stress.recommended(c), stress.furthest(c))
+        for k, c in enumerate(result.cases, 1)
+    ]
+
+
+def families(cases: Iterable[Overview]) -> list[tuple[str, list[Overview]]]:
+    """Return the cases by family: its title, and its cases."""
+    groups: dict[str, list[Overview]] = {}
+    for each in cases:
+        groups.setdefault(each.case.family, []).append(each)
+    order = [*_FAMILIES, *groups]
+    return [(name, groups[name]) for name in sorted(groups, key=order.index)]
+
+
+def ranks(case: CaseResult) -> bool:
+    """Return whether a case ranks methods: terms have none, and a sweep of the step asks for stability alone."""
+    return case.measure != "terms" and case.family != "step"
+
+
+# Words.
 
 
 def value_text(x: float | None, case: CaseResult, unit: bool = True) -> str:
@@ -110,6 +129,11 @@ def held_text(line: Line, case: CaseResult) -> str:
     return "held nothing" if line.broken.held is None else f"held to {value_text(line.broken.held, case)}"
 
 
+def remarks(cell: Measurement | None) -> str:
+    """Return what was said of a cell beside its numbers."""
+    return "" if cell is None else "; ".join(dict.fromkeys(x for x in (cell.note, *cell.warnings) if x))
+
+
 def headline(result: StressResult) -> str:
     """Return what held furthest and how much was wrong in silence, in one sentence."""
     stopped = "interrupted; what was finished: "
@@ -117,7 +141,9 @@ def headline(result: StressResult) -> str:
         stopped = f"{result.left_out}; " if result.left_out else ""
     if all(cell.end == "not run" for _, row in result.rows() for cell in row.cells):
         return f"{stopped}nothing was run"
-    return f"{stopped}{_leaders(result)}; {_silent(result)}"
+    counts = [[c.outcome(case.bar) for row in case.rows for c in row.cells].count("silent") for case in result.cases]
+    silent = f"{sum(counts)} silent failure{'s' * (sum(counts) != 1)} in {_of(sum(map(bool, counts)))}"
+    return f"{stopped}{_leaders(result)}; {silent if sum(counts) else 'no silent failures'}"
 
 
 def _leaders(result: StressResult) -> str:
@@ -127,76 +153,26 @@ def _leaders(result: StressResult) -> str:
     if not counts:
         return f"nothing held in {_of(len(ranked))}"
     most = max(counts.values())
-    names = _listed([name for name, count in counts.items() if count == most])
-    return f"{names} held furthest, or as far as any, in {most} of {_of(len(ranked))}"
-
-
-def ranks(case: CaseResult) -> bool:
-    """Return whether a case ranks methods: terms have none, and a sweep of the step asks for stability alone."""
-    return case.measure != "terms" and case.family != "step"
+    names = [name for name, count in counts.items() if count == most]
+    if len(names) > _NAMED:
+        names = [", ".join(names[:_NAMED]), f"{len(names) - _NAMED} more"]
+    elif len(names) > 1:
+        names = [", ".join(names[:-1]), names[-1]]
+    return f"{' and '.join(names)} held furthest, or as far as any, in {most} of {_of(len(ranked))}"
 
 
 def _ahead(case: CaseResult) -> list[str]:
     """Return what held as far as any: engine and method, or of terms the engine in all of them."""
-    most = furthest(case)
+    most = stress.furthest(case)
     if not most:
         return []
     if case.measure == "terms":
-        return [engine for engine, line in best(case).items() if line.reach == most]
-    return [name_of(line.row) for line in lines(case) if line.reach == most]
-
-
-def _silent(result: StressResult) -> str:
-    found = [[c.outcome(case.bar) for row in case.rows for c in row.cells].count("silent") for case in result.cases]
-    count = sum(found)
-    if not count:
-        return "no silent failures"
-    return f"{count} silent failure{'s' * (count != 1)} in {_of(sum(map(bool, found)))}"
+        return [engine for engine, line in stress.best(case).items() if line.reach == most]
+    return [name_of(line.row) for line in stress.lines(case) if line.reach == most]
 
 
 def _of(count: int) -> str:
     return f"{count} case{'s' * (count != 1)}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    if len(names) > _NAMED:
-        return f"{', '.join(names[:_NAMED])} and {len(names) - _NAMED} more"
-    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)
-
-
-def overview(result: StressResult) -> list[Overview]:
-    """Return every case in one line."""
-    return [
-        Overview(case, anchor(k), tuple(lines(case)), best(case), recommended(case), furthest(case))
-        for k, case in enumerate(result.cases)
-    ]
-
-
-def anchor(k: int) -> str:
-    """Return where on the page the k-th case stands, whatever its name holds."""
-    return f"case-{k + 1}"
-
-
-def families(cases: Sequence[Overview]) -> list[tuple[str, str, list[Overview]]]:
-    """Return the cases by family: its name, its title, and its cases."""
-    found: dict[str, list[Overview]] = {}
-    for each in cases:
-        found.setdefault(each.case.family, []).append(each)
-    order = [*_FAMILIES, *found]
-    return [(name, _FAMILIES.get(name, name), found[name]) for name in sorted(found, key=order.index)]
-
-
-def remarks(cell: Measurement | None) -> str:
-    """Return what was said of a cell beside its numbers."""
-    return "" if cell is None else "; ".join(dict.fromkeys(x for x in (cell.note, *cell.warnings) if x))
-
-
-def bars(result: StressResult) -> list[tuple[float, str, list[str]]]:
-    """Return each bar with its reason and the cases that it is for."""
-    found: dict[tuple[float, str], list[str]] = {}
-    for case in result.cases:
-        found.setdefault((case.bar, case.why), []).append(case.name)
-    return [(bar, why, names) for (bar, why), names in found.items()]
 
 
 # Which method for which kind of scene: how often none held further, and at what price.
@@ -206,8 +182,7 @@ def bars(result: StressResult) -> list[tuple[float, str, list[str]]]:
 class MethodLine:
     """One engine and method over the families of cases."""
 
-    name: str
-    series: int
+    row: Row
     families: dict[str, tuple[int, int]]  # cases where it held furthest, and where it ran
     ahead: int  # the same of all families
     cases: int
@@ -216,112 +191,382 @@ class MethodLine:
     factor: float  # median run time over the least of those that held as far; NaN: never ahead
 
 
-@dataclass(frozen=True)
-class _Score:
-    """A row on one case."""
-
-    family: str
-    line: Line
-    ahead: bool
-    factor: float
-
-
 def methods(result: StressResult) -> list[MethodLine]:
     """Return every engine and method that ran, the one that was most often unbeaten first."""
-    found: dict[tuple[str, str], list[_Score]] = {}
-    for case in result.cases:
-        if not ranks(case):
+    # Family, line, whether it held furthest, its time over the least of those that did.
+    scores: dict[tuple[str, str], list[tuple[str, Line, bool, float]]] = {}
+    for case in filter(ranks, result.cases):
+        ranked = stress.lines(case)
+        most = max((x.reach for x in ranked), default=0)
+        least = min((x.seconds for x in ranked if x.reach == most and x.seconds > 0), default=math.nan)
+        for x in ranked:
+            score = (case.family, x, x.reach == most > 0, x.seconds / least)
+            scores.setdefault((x.row.engine, x.row.method), []).append(score)
+    out = []
+    for group in scores.values():
+        _, lines, ahead, factors = zip(*group, strict=True)
+        if all(line.left_out for line in lines):
             continue
-        ranked = lines(case)
-        most = max((line.reach for line in ranked), default=0)
-        least = min((line.seconds for line in ranked if line.reach == most and line.seconds > 0), default=math.nan)
-        for line in ranked:
-            ahead = line.reach == most > 0
-            score = _Score(case.family, line, ahead, line.seconds / least if ahead else math.nan)
-            found.setdefault((line.row.engine, line.row.method), []).append(score)
-    out = [_summed(scores) for scores in found.values() if not all(s.line.left_out for s in scores)]
+        places: dict[str, list[bool]] = {}
+        for family, _, first, _ in group:
+            places.setdefault(family, []).append(first)
+        known = [x for x, first in zip(factors, ahead, strict=True) if first and math.isfinite(x)]
+        line = MethodLine(
+            lines[0].row,
+            {family: (sum(firsts), len(firsts)) for family, firsts in places.items()},
+            ahead=sum(ahead),
+            cases=len(group),
+            held=statistics.fmean(line.reach / max(line.size, 1) for line in lines),
+            silent=sum("silent" in line.outcomes for line in lines),
+            factor=statistics.median(known) if known else math.nan,
+        )
+        out.append(line)
     return sorted(out, key=lambda m: (-m.ahead, -m.held, m.silent, math.isnan(m.factor), m.factor))
-
-
-def _summed(scores: list[_Score]) -> MethodLine:
-    families: dict[str, tuple[int, int]] = {}
-    for s in scores:
-        ahead, cases = families.get(s.family, (0, 0))
-        families[s.family] = ahead + s.ahead, cases + 1
-    factors = [s.factor for s in scores if math.isfinite(s.factor)]
-    row = scores[0].line.row
-    return MethodLine(
-        name_of(row),
-        engine_index(row.engine) + 1,
-        families,
-        sum(s.ahead for s in scores),
-        len(scores),
-        statistics.fmean(s.line.reach / max(s.line.size, 1) for s in scores),
-        sum("silent" in s.line.outcomes for s in scores),
-        statistics.median(factors) if factors else math.nan,
-    )
 
 
 # What was wrong in silence: row by row, and the methods to avoid.
 
 
-@dataclass(frozen=True)
-class AvoidAt:
-    """A case in which a method was wrong in silence, from which value on, on which engines if not on all."""
-
-    case: CaseResult
-    anchor: str
-    text: str
-    engines: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Avoid:
-    """A method and where it was wrong in silence."""
-
-    method: str
-    places: tuple[AvoidAt, ...]
-
-
-@dataclass(frozen=True)
-class SilentLine:
+class SilentLine(NamedTuple):
     """One row that was wrong in silence, with the cells where it was."""
 
-    case: CaseResult
-    anchor: str
+    overview: Overview
     row: Row
-    cells: tuple[Measurement, ...]
-
-    @property
-    def worst(self) -> Measurement:
-        """The cell of the largest error."""
-        return max(self.cells, key=lambda c: math.inf if math.isnan(c.seen) else c.seen)
+    cells: list[Measurement]
+    worst: Measurement
 
 
-def silences(result: StressResult) -> list[SilentLine]:
+class Avoid(NamedTuple):
+    """A method, and where it was wrong in silence: the case, from which value on, on which engines if not on all."""
+
+    method: str
+    places: list[tuple[Overview, str, list[str]]]
+
+
+def silences(cases: Iterable[Overview]) -> list[SilentLine]:
     """Return every row that was wrong in silence."""
     out = []
-    for k, case in enumerate(result.cases):
-        for row in case.rows:
-            cells = tuple(cell for cell in row.cells if cell.outcome(case.bar) == "silent")
-            out += [SilentLine(case, anchor(k), row, cells)] if cells else []
+    for o in cases:
+        for row in o.case.rows:
+            if cells := [cell for cell in row.cells if cell.outcome(o.case.bar) == "silent"]:
+                worst = max(cells, key=lambda c: math.inf if math.isnan(c.seen) else c.seen)
+                out.append(SilentLine(o, row, cells, worst))
     return out
 
 
-def avoid(result: StressResult) -> list[Avoid]:
+def avoid(cases: Iterable[Overview]) -> list[Avoid]:
     """Return the methods that were wrong in silence, and where; the most often so first."""
-    found: dict[str, dict[str, list[SilentLine]]] = {}
-    for line in silences(result):
-        name = name_of(line.row) if line.case.measure == "terms" else line.row.method
-        found.setdefault(name, {}).setdefault(line.anchor, []).append(line)
-    out = [Avoid(name, tuple(_avoid_at(group) for group in where.values())) for name, where in found.items()]
+    lines: dict[str, dict[str, list[SilentLine]]] = {}
+    for line in silences(cases):
+        name = name_of(line.row) if line.overview.case.measure == "terms" else line.row.method
+        lines.setdefault(name, {}).setdefault(line.overview.anchor, []).append(line)
+    out = [Avoid(name, list(map(_mildest, where.values()))) for name, where in lines.items()]
     return sorted(out, key=lambda a: -len(a.places))
 
 
-def _avoid_at(group: list[SilentLine]) -> AvoidAt:
-    case = group[0].case
-    first = min((s.cells[0].value for s in group), key=lambda v: case.values.index(v) if v in case.values else 0)
-    of_method = [row.engine for row in case.rows if row.method == group[0].row.method]
-    engines = tuple(s.row.engine for s in group)
+def _mildest(group: list[SilentLine]) -> tuple[Overview, str, list[str]]:
+    o = group[0].overview
+    values = o.case.values
+    first = min((s.cells[0].value for s in group), key=lambda v: values.index(v) if v in values else 0)
     # A method of one engine, or wrong on all of them, needs no engine named.
-    return AvoidAt(case, group[0].anchor, value_text(first, case), () if len(engines) == len(of_method) else engines)
+    everywhere = len(group) == [row.method for row in o.case.rows].count(group[0].row.method)
+    return o, value_text(first, o.case), [] if everywhere else [s.row.engine for s in group]
+
+
+# The largest stable step of each method, against linear theory, and the rule that follows for a step.
+
+#: What a fact's name begins with that a step is to be short against: "fastest frequency", "fastest rate".
+_FASTEST: Final = "fastest"
+#: Ends that say nothing about stability.
+_OTHER: Final = ("slow", "refused", "died")
+
+
+class Bound(NamedTuple):
+    """Steps times the fastest frequency or rate ω, over all cases that have one."""
+
+    held: float  # up to here it held in every case; 0: nowhere
+    failed: float  # NaN: all held
+    theory: float  # the least limit; infinite: no limit, NaN: unknown
+
+    @property
+    def words(self) -> str:
+        """The rule for a step."""
+        if math.isnan(self.failed):
+            return f"no limit found up to {_two(self.held)} / ω"
+        return f"dt ≤ {_two(self.held)} / ω" if self.held else f"none tried held, the least {_two(self.failed)} / ω"
+
+
+class Rule(NamedTuple):
+    """A method's bounds, by what ω is."""
+
+    method: str
+    bounds: dict[str, Bound]
+
+    @property
+    def words(self) -> str:
+        """The rule for a step, once where it is the same for every ω."""
+        by_words: dict[str, list[str]] = {}
+        for kind, bound in self.bounds.items():
+            by_words.setdefault(bound.words, []).append(kind)
+        if len(by_words) == 1:
+            return next(iter(by_words))
+        return "; ".join(f"{words} ({', '.join(which)})" for words, which in by_words.items())
+
+
+def _two(x: float) -> str:
+    return number_text(float(f"{x:.2g}"))
+
+
+def steps(cases: Iterable[Overview]) -> list[Overview]:
+    """Return the cases whose step is swept, with the rows that ran."""
+    swept = (replace(o, lines=tuple(x for x in o.lines if not x.left_out)) for o in cases if o.case.family == "step")
+    return [o for o in swept if o.lines]
+
+
+def rules(cases: Iterable[Overview]) -> list[Rule]:
+    """Return each method's rule over all engines and cases that tell a frequency or rate, the largest step first."""
+    bounds: dict[str, dict[str, list[Bound]]] = {}
+    for o in cases:
+        for line in o.lines:
+            for kind, bound in _bounds(line, o.case):
+                bounds.setdefault(line.row.method, {}).setdefault(kind, []).append(bound)
+    out = [Rule(method, {kind: _least(group) for kind, group in of.items()}) for method, of in bounds.items()]
+    return sorted(out, key=lambda rule: (-min(b.held for b in rule.bounds.values()), rule.method))
+
+
+def _bounds(line: Line, case: CaseResult) -> Iterator[tuple[str, Bound]]:
+    held, failed = line.broken.held, line.broken.failed
+    if line.rest is not None and (failed is None or line.rest in _OTHER):
+        # What stopped it there has nothing to do with the step.
+        return
+    bound = (0.0 if held is None else held, math.nan if failed is None else failed, _limit(line))
+    for kind, rate in case.facts[0].items() if case.facts else ():
+        if kind.startswith(_FASTEST) and rate > 0:
+            yield kind.partition(",")[0], Bound(*(x * rate for x in bound))
+
+
+def _limit(line: Line) -> float:
+    return math.nan if line.row.theory is None else line.row.theory
+
+
+def _least(group: list[Bound]) -> Bound:
+    """Return what is safe in all the cases measured."""
+    failed, theory = (
+        min((x for x in numbers if not math.isnan(x)), default=math.nan)
+        for numbers in ([b.failed for b in group], [b.theory for b in group])
+    )
+    # Steps are tried on a grid, another one in each case: what held in one may be beyond what did not in another.
+    return Bound(min(b.held for b in group if math.isnan(failed) or not math.isnan(b.failed)), failed, theory)
+
+
+def against_theory(line: Line, case: CaseResult) -> str:
+    """Return how the measured breaking point compares with linear theory; empty where one is unknown."""
+    limit, failed = _limit(line), line.broken.failed
+    at = place(case.values, limit)
+    if math.isnan(at):
+        return ""
+    if line.reach and at < line.reach - 1:
+        return f"holds {_times(case.values[line.reach - 1], limit)}further"
+    if line.rest is not None and (failed is None or line.rest in _OTHER):
+        return ""
+    if failed is not None and at > line.reach:
+        return f"breaks {_times(failed, limit)}earlier" if math.isfinite(limit) else "breaks, theory has no limit"
+    return "as theory says"
+
+
+def _times(x: float, y: float) -> str:
+    return f"{_two(max(abs(x / y), abs(y / x)))} × " if x and y else ""
+
+
+# The map of a case on the page: a table of cells, as sharp as the page, that can be searched and copied.
+
+
+class MapCell(NamedTuple):
+    """A cell: its classes in the style sheet, its text, and its tooltip."""
+
+    style: str
+    text: str
+    title: str
+
+
+def map_cells(line: Line, case: CaseResult) -> list[MapCell]:
+    """Return a row of a case's map."""
+    at = place(case.values, _limit(line))
+    beyond = -1 if math.isnan(at) else math.floor(at) + 1
+    out = []
+    for k, (cell, how) in enumerate(zip(line.row.cells, line.outcomes, strict=True)):
+        style = [shade(cell, how)]
+        style += ["sil"] if how == "silent" else []
+        style += ["brk"] if k == line.reach and line.broken.failed is not None else []
+        style += ["lim"] if k == beyond else []
+        text = cell_text(cell, how, short=len(case.values) > ROOMY)
+        out.append(MapCell(" ".join(style), text, _title(case, line.row, cell, how)))
+    # An interrupted study has fewer cells than values.
+    return out + [MapCell("none", "", "")] * (len(case.values) - len(out))
+
+
+def _title(case: CaseResult, row: Row, cell: Measurement, outcome: Outcome) -> str:
+    """Return the tooltip of a cell: all its numbers."""
+    parts = [f"{name_of(row)}, {case.parameter} = {value_text(cell.value, case)}: {HOW[outcome]}"]
+    for name, x in (("error", cell.error), ("energy", cell.energy)):
+        parts += [] if math.isnan(x) else [f"{name} {error_text(x)}"]
+    parts += [f"the truth is known to {error_text(cell.floor)}"] if cell.floor else []
+    parts += [] if math.isnan(cell.seconds) else [time_text(cell.seconds)]
+    parts += [f"{cell.steps} steps"] if cell.steps else []
+    return "; ".join(parts + ([remarks(cell)] if remarks(cell) else []))
+
+
+def _truths(case: CaseResult) -> list[tuple[str, str]]:
+    """Return how the truth is known, neighbours of one kind together: for which values, and how."""
+    known = [(v, *how.partition(_KNOWN)) for v, how in zip(case.values, case.truths, strict=False) if how]
+    out = []
+    for how, group in itertools.groupby(known, key=lambda entry: entry[1]):
+        values, _, _, floors = zip(*group, strict=True)
+        where = _ends([value_text(v, case, unit=False) for v in values])
+        floor = _ends(floors)
+        out.append(("" if len(values) == len(case.values) else where, how + (_KNOWN + floor if floor else "")))
+    return out
+
+
+def _ends(texts: Sequence[str]) -> str:
+    """Return the first and the last, or one where they are the same."""
+    return " … ".join(dict.fromkeys((texts[0], texts[-1])))
+
+
+def _facts(case: CaseResult) -> list[tuple[str, list[float]]]:
+    """Return each fact over the values, NaN where it is unknown."""
+    names = dict.fromkeys(name for facts in case.facts for name in facts)
+    padded = [*case.facts, *({} for _ in range(len(case.values) - len(case.facts)))]
+    return [(name, [facts.get(name, math.nan) for facts in padded]) for name in names]
+
+
+def content(result: StressResult) -> dict[str, Any]:
+    """Return what the template of the page is filled with."""
+    cases = overview(result)
+    swept = steps(cases)
+    step_rules = rules(swept)
+    bars: dict[tuple[float, str], list[str]] = {}
+    for case in result.cases:
+        bars.setdefault((case.bar, case.why), []).append(case.name)
+    return {
+        "avoid": avoid(cases),
+        "silences": silences(cases),
+        "asked": [o for o in cases if o.choice is not None],
+        "behind": [o for o in cases if o.behind],
+        "methods": methods(result),
+        "run_families": families(o for o in cases if ranks(o.case)),
+        "families": families(cases),
+        "engines": stress.engines_of(result.cases),
+        "steps": swept,
+        "rules": step_rules,
+        "kinds": list(dict.fromkeys(kind for rule in step_rules for kind in rule.bounds)),
+        "step_figure": stable_steps([(o.case, o.lines) for o in swept]) if swept else None,
+        "bars": bars,
+    }
+
+
+def _three_digits(x: float) -> str:
+    return "" if math.isnan(x) else number_text(float(f"{x:.3g}"))
+
+
+def _limit_text(x: float | None, unit: str = "") -> str:
+    """Return where theory lets something break."""
+    if x is None or math.isnan(x):
+        return "–"
+    return "no limit" if math.isinf(x) else f"{_three_digits(x)} {unit}".rstrip()
+
+
+#: What the template writes numbers and rows with.
+FILTERS: Final[Mapping[str, Any]] = {
+    "short": error_short,
+    "number": number_text,
+    "fact": _three_digits,
+    "limit": _limit_text,
+    "value": value_text,
+    "held": held_text,
+    "how": lambda outcome: HOW.get(outcome, ""),
+    "remarks": remarks,
+    "rowname": name_of,
+    "series": lambda engine: engine_index(engine) + 1,
+    "family": lambda name: _FAMILIES.get(name, name),
+    "against_theory": against_theory,
+    "map_cells": map_cells,
+    "facts": _facts,
+    "truths": _truths,
+    "measured": lambda case: _MEASURES.get(case.measure, case.measure),
+    "any_energy": lambda lines: any(not math.isnan(cell.energy) for line in lines for cell in line.row.cells),
+}
+
+
+# The document.
+
+
+def view(result: StressResult) -> Document:
+    """Return the document of a stress study."""
+    cases = overview(result)
+    runs = sum(cell.end != "not run" for _, row in result.rows() for cell in row.cells)
+    behind_or_not = {True: Span("behind", "allowed"), False: Span("✓", "good")}
+    auto = [Column("auto", lambda o: behind_or_not[o.behind] if o.choice else Span("", "good"), fill=True)]
+    columns = (
+        Column("case", lambda o: o.case.name, most=22, fill=True),
+        Column("furthest", _leader, most=24, fill=True),
+        Column("held to", lambda o: _held(o.leader, o.case) if o.leader else "", fill=True),
+        *(auto if any(o.choice for o in cases) else []),
+        Column("✗", lambda o: Span(str(sum(x.outcomes.count("silent") for x in o.lines) or ""), "bad"), right=True),
+        Column("first to break", lambda o: Span(_first(o), "muted"), fill=True),
+    )
+    behind = [
+        Bullet(
+            o.case.name,
+            f"auto {held_text(o.choice, o.case)}, {name_of(o.lines[0].row)} {held_text(o.lines[0], o.case)}",
+            "!",
+            "allowed",
+        )
+        for o in cases
+        if o.behind and o.choice is not None
+    ]
+    silent = [Bullet(a.method, _places(a), "✗", "bad") for a in avoid(cases)]
+    return Document(
+        name="stress",
+        heading="Stiff and extreme: where each engine and method breaks",
+        title="Stiff and extreme",
+        verdict=headline(result),
+        good=bool(result.complete and result.cases and not silent),
+        marked=False,
+        summary=f"{len(cases)} cases · {runs} runs · {time_text(result.seconds)}",
+        sections=[
+            Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
+            Section("Where another held further than auto", [Items(behind)]),
+            Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
+        ],
+        result=result,
+        basis={name: choice(value) for name, value in result.settings.items()},
+        template="stress.html",
+        content=lambda: content(result),
+    )
+
+
+def _leader(o: Overview) -> str:
+    if o.leader is None:
+        return "none ran"
+    return f"{o.leader.row.engine} (terms)" if o.case.measure == "terms" else name_of(o.leader.row)
+
+
+def _held(line: Line, case: CaseResult) -> str:
+    if line.whole:
+        return "all"
+    return "nothing" if line.broken.held is None else value_text(line.broken.held, case)
+
+
+def _first(o: Overview) -> str:
+    """Return which row is the first that is of no use, and how."""
+    line = min((x for x in o.lines if x.ended and not x.left_out), key=lambda x: x.usable, default=None)
+    if line is None or line.ended is None:
+        return ""
+    cell, how = line.ended
+    return f"{value_text(cell.value, o.case, unit=False)} {how}: {name_of(line.row)}"
+
+
+def _places(a: Avoid) -> str:
+    places = [f"{o.case.name} at {o.case.parameter} = {text}" for o, text, _ in a.places[:_PLACES]]
+    return ", ".join(places + ([f"{len(a.places) - _PLACES} more"] if len(a.places) > _PLACES else []))

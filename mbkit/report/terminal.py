@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 from rich import box
@@ -13,7 +13,7 @@ from rich.text import Text
 
 from mbkit._escape import one_line, terminal
 from mbkit.report import document
-from mbkit.report.document import Bullet, Document, Items, Paragraph, Span, Style
+from mbkit.report.document import Bullet, Column, Document, Items, Paragraph, Span, Style
 
 _STYLES: Final[dict[Style, str]] = {
     "good": "green",
@@ -47,7 +47,7 @@ def _verdict(shown: Document) -> list[RenderableType]:
 
 def _block(block: document.Block) -> Iterator[RenderableType]:
     if isinstance(block, document.Table):
-        yield _table(block)
+        yield table(block)
     elif isinstance(block, Paragraph):
         yield Text("  ") + _text(document.spans(block.text))
     elif isinstance(block, Items):
@@ -60,11 +60,12 @@ def _block(block: document.Block) -> Iterator[RenderableType]:
 
 def _text(spans: Iterable[Span], most: int = 0) -> Text:
     """Return pieces of text on one line, with the spaces that align them."""
-    return Text.assemble(*((_aligned(s.text, most), _STYLES.get(s.style, "")) for s in spans))
-
-
-def _aligned(text: str, most: int) -> str:
-    return one_line(text, most) if most else terminal(text).replace("\n", " ")
+    return Text.assemble(
+        *(
+            (one_line(s.text, most) if most else terminal(s.text).replace("\n", " "), _STYLES.get(s.style, ""))
+            for s in spans
+        )
+    )
 
 
 def _bullet(bullet: Bullet) -> RenderableType:
@@ -78,41 +79,36 @@ def _bullet(bullet: Bullet) -> RenderableType:
     return grid
 
 
-def columns(*heads: str) -> Table:
-    """Return an empty table."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
-    for head in heads:
-        # A long name goes on in the next line; an ellipsis would make it another name.
-        table.add_column(Text(head), overflow="fold")
-    return table
-
-
-def _table(block: document.Table) -> Table:
+def table(block: document.Table) -> Table:
+    """Return a table as rich prints it."""
     shown = block.shown("terminal")
-    table = columns(*(c.head for c in shown))
-    table.padding = 0 if block.dense else table.padding
-    for k, (spec, column) in enumerate(zip(shown, table.columns, strict=True)):
-        column.justify = "right" if spec.right else "left"
-        column.no_wrap = spec.right or spec.fill or bool(spec.width)
-        column.min_width = spec.width or None
-        if spec.fill:
-            table.expand, column.overflow = True, "ellipsis"
-            column.ratio = 1 if k == len(shown) - 1 else None
+    out = Table(box=box.SIMPLE_HEAD, padding=0 if block.dense else (0, 1, 0, 0), pad_edge=False, show_edge=False)
+    for column in shown:
+        # A long name goes on in the next line; an ellipsis would make it another name.
+        out.add_column(
+            Text(column.head),
+            overflow="ellipsis" if column.fill else "fold",
+            justify="right" if column.right else "left",
+            no_wrap=column.right or column.fill or bool(column.width),
+            min_width=column.width or None,
+            ratio=1 if column.fill and column is shown[-1] else None,
+        )
+    out.expand = any(column.fill for column in shown)
     for group in block.groups("terminal"):
         for row in group:
-            table.add_row(*(_text(cell, c.most) for c, cell in zip(shown, row, strict=True)))
-    return table
+            out.add_row(*(_text(cell, c.most) for c, cell in zip(shown, row, strict=True)))
+    return out
 
 
-def robots(records: Iterable[Any], systems: Iterable[str]) -> RenderableType:
+def robots(records: Sequence[Any], systems: Iterable[str]) -> RenderableType:
     """Return the table of robots that there are, and the names of catalog systems."""
-    table = columns("robot", "short names", "nq", "nv", "mass, kg", "")
-    for column in table.columns[2:5]:
-        column.justify, column.no_wrap = "right", True
-    for r in records:
-        numbers = ("–", "–", "–") if r.reason else (str(r.nq), str(r.nv), f"{r.mass:.4g}")
-        names = Text(", ".join(r.aliases), style="bold")
-        table.add_row(Text(r.name), names, *numbers, Text(one_line(r.reason or ""), style="yellow"))
-    head = f"{len(table.rows)} robots of example-robot-data; mimic joints reduced."
+    columns = [Column("robot", lambda r: r.name), Column("short names", lambda r: Span(", ".join(r.aliases), "bold"))]
+    columns += [
+        Column("nq", lambda r: "–" if r.reason else str(r.nq), right=True),
+        Column("nv", lambda r: "–" if r.reason else str(r.nv), right=True),
+        Column("mass, kg", lambda r: "–" if r.reason else f"{r.mass:.4g}", right=True),
+        Column("", lambda r: Span(one_line(r.reason or ""), "allowed")),
+    ]
+    head = f"{len(records)} robots of example-robot-data; mimic joints reduced."
     foot = f"{head} Catalog systems: {', '.join(systems)}"
-    return Group(table, Padding(Text(foot, style="dim"), (0, 0, 1, 0)))
+    return Group(table(document.Table(columns, records)), Padding(Text(foot, style="dim"), (0, 0, 1, 0)))
