@@ -152,7 +152,7 @@ class Kinematics:
         return 0.5 * ca.sqrt(4.0 * square)
 
     def length_rate(self, square: Any) -> Any:
-        """Return the rate of the length of which the square is given."""
+        """Return the rate of a length from its square."""
         return ca.jtimes(self.length(square), self.q, self.qdot)
 
     @cached_property

@@ -217,7 +217,7 @@ class WrittenKinematics(Kinematics):
         return sp.sqrt(square)
 
     def length_rate(self, square: sp.Expr) -> sp.Expr:
-        """Return the rate of the length of which the square is given."""
+        """Return the rate of a length from its square."""
         pairs = zip(self._exact.symbols, self._exact.rates, strict=True)
         return sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / sp.sqrt(square) / 2
 

@@ -121,7 +121,7 @@ class EquationsOfMotion(Printable):
 
 
 def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
-    """Return a sum in the order given: SymPy's own order is the alphabet's."""
+    """Return a sum in the order of its terms: SymPy's own order is the alphabet's."""
     flat = [x for term in terms for x in sp.Add.make_args(term)]
     out = ""
     for x in flat:

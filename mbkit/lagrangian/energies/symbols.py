@@ -32,7 +32,7 @@ def _dotted(symbol: sp.Symbol, dots: str) -> sp.Symbol:
 
 
 def free_name(name: str, used: Collection[str]) -> str:
-    """Return a name, with a capital or a mark behind it where it is taken: p_x, P_x, P_x_."""
+    """Return a name, with a capital or a mark behind it where it is in use: p_x, P_x, P_x_."""
     while name in used:
         name = name[0].upper() + name[1:] if name[0].islower() else f"{name}_"
     return name
@@ -41,7 +41,7 @@ def free_name(name: str, used: Collection[str]) -> str:
 class PlainSymbols:
     """The plain symbols of coordinates, velocities and time, and their dynamicsymbols.
 
-    Velocities that are not given may be in `among` already. A name stands for one thing: `Symbol("m", positive=True)`
+    Velocities by default may be in `among` already. A name stands for one thing: `Symbol("m", positive=True)`
     is the parameter `Symbol("m")` of `named`, as engines know parameters by their names.
     """
 
@@ -62,7 +62,7 @@ class PlainSymbols:
         if time is not None and not isinstance(time, sp.Symbol):
             raise InputError(f"time: expected a SymPy symbol, got {time!r}")
         if time is not None and own is not None and own.name != time.name:
-            raise InputError(f"time: {time} is given, but the coordinates are functions of {own}")
+            raise InputError(f"time: expected {own}, of which the coordinates are functions, got {time}")
         self.time = time if own is None else own
         for c in originals:
             if not isinstance(c, (AppliedUndef, sp.Symbol)):
@@ -126,7 +126,7 @@ def plain(names: Iterable[sp.Symbol]) -> str:
 
 
 def name_of(value: Any) -> str:
-    """Return the name of a coordinate given as a symbol, a dynamicsymbol or a name."""
+    """Return the name of a coordinate: of a symbol, a dynamicsymbol, or the name itself."""
     return (
         value if isinstance(value, str) else str(getattr(value, "func", value) if getattr(value, "args", ()) else value)
     )

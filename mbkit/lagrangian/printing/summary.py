@@ -221,7 +221,7 @@ def _aligned(rows: list[str]) -> str:
 # The equations as a Python module that needs NumPy only
 
 #: Names that the module itself uses, beside Python's own.
-_TAKEN: Final = {"np", "q", "v", "tau", "t", "M", "h", "out", "given", "unknown", "parameters", "PARAMETERS"}
+_RESERVED: Final = {"np", "q", "v", "tau", "t", "M", "h", "out", "given", "unknown", "parameters", "PARAMETERS"}
 _FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}
 
 
@@ -296,5 +296,5 @@ def _names(system: Lagrangian) -> dict[sp.Symbol, str]:
     if system.time:
         out[system.time] = "t"
     for s in (*system.parameters, *system.coordinates, *system.velocities):
-        out[s] = identifier(s.name, _TAKEN | _FUNCTIONS | set(out.values()))
+        out[s] = identifier(s.name, _RESERVED | _FUNCTIONS | set(out.values()))
     return out
