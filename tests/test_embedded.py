@@ -112,7 +112,7 @@ def test_the_coefficients_are_scipys() -> None:
 def fixed_steps(kind: str, dyn: Any, q: np.ndarray, v: np.ndarray, duration: float, n: int) -> np.ndarray:
     """Return q and w after n equal steps."""
     made, space = trials(kind, dyn), Space(dyn.model)
-    w = space.enter(q, v)
+    w = space.to_integrator_velocity(q, v)
     made.start([0], q[None], w[None])
     made.hold(0, duration)
     times = np.linspace(0.0, duration, n + 1)

@@ -1232,9 +1232,9 @@ def test_solids_against_counting_points(shape, size, inside):
     matter = points[inside(points)]
     mass = len(matter) * (0.6 / 120) ** 3
     inertia = np.sum(matter**2) * np.eye(3) - matter.T @ matter
-    lump = solid(shape, size)
-    assert lump.mass == pytest.approx(mass, rel=0.02)
-    np.testing.assert_allclose(np.diag(lump.inertia), np.diag(inertia) * (0.6 / 120) ** 3, rtol=0.03)
+    mass_properties = solid(shape, size)
+    assert mass_properties.mass == pytest.approx(mass, rel=0.02)
+    np.testing.assert_allclose(np.diag(mass_properties.inertia), np.diag(inertia) * (0.6 / 120) ** 3, rtol=0.03)
 
 
 @pytest.mark.parametrize("flags", ['spring="disable"', 'damper="disable"', 'spring="disable" damper="disable"'])

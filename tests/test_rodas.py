@@ -94,7 +94,7 @@ def test_the_step_is_of_order_five_on_every_joint_compiled_or_not(name: str) -> 
     model = catalog.double_pendulum() if name == "plain" else random_tree(1, 4, SOUND)
     q, v = start_of(model, 0)
     dyns = {"lanes": dynamics(model, "lagrangian", compile=True), "stages": dynamics(model, "pinocchio")}
-    space, w = Space(model), Space(model).enter(q, v)
+    space, w = Space(model), Space(model).to_integrator_velocity(q, v)
     lengths = np.array([0.02, 0.01, 0.005]) if name == "floating" else np.array([0.08, 0.04, 0.02])
     exact = simulate(dyns["lanes"], q, v, lengths[0], "rk853", rtol=1e-14, save=lengths[::-1])
     for trials in both(dyns).values():
@@ -103,7 +103,7 @@ def test_the_step_is_of_order_five_on_every_joint_compiled_or_not(name: str) -> 
         row = AcceptedSteps(np.zeros(3), np.tile(q, (3, 1)), np.tile(w, (3, 1)), 0)
         ends, speeds = trials.within(0, row, lengths)
         errors = [
-            max(np.abs(model.difference(a, b)).max(), np.abs(space.leave(b, c) - d).max())
+            max(np.abs(model.difference(a, b)).max(), np.abs(space.to_body_velocity(b, c) - d).max())
             for a, b, c, d in zip(exact.q[::-1], ends, speeds, exact.v[::-1], strict=True)
         ]
         orders = np.log2(np.array(errors[:-1]) / errors[1:])

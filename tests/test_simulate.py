@@ -120,14 +120,14 @@ def test_dexp_inverse_is_the_rate_of_the_rotation_vector() -> None:
 def test_space_round_trip_and_parent_axes() -> None:
     model, q, v = tumbling()
     space = Space(model)
-    w = space.enter(q, v)
+    w = space.to_integrator_velocity(q, v)
     assert w[:3] == pytest.approx(closed_rotation(q[3:7]) @ v[:3], abs=1e-14)
     assert np.array_equal(w[3:], v[3:])
-    assert space.leave(q, w) == pytest.approx(v, abs=1e-14)
+    assert space.to_body_velocity(q, w) == pytest.approx(v, abs=1e-14)
     many = np.stack([q, q]), np.stack([v, 2 * v])
-    assert space.enter(*many) == pytest.approx(np.stack([w, 2 * w]), abs=1e-14)
-    moved = space.move(*many)
-    assert moved[0] == pytest.approx(space.move(q, v), abs=1e-14)
+    assert space.to_integrator_velocity(*many) == pytest.approx(np.stack([w, 2 * w]), abs=1e-14)
+    moved = space.retract(*many)
+    assert moved[0] == pytest.approx(space.retract(q, v), abs=1e-14)
     model.check_q(moved)
 
 
@@ -314,7 +314,7 @@ def test_energy_and_momentum_are_kept() -> None:
     box = catalog.free_body()
     q, v = box.neutral(), np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1])
     flight = simulate(dynamics(box), q, v, 2.0)
-    world = Space(box).enter(flight.q, flight.v)
+    world = Space(box).to_integrator_velocity(flight.q, flight.v)
     assert np.abs(world[:, :3] - v[:3]).max() < 1e-12
     assert flight.q[-1, :3] == pytest.approx(2 * v[:3], abs=1e-12)
 

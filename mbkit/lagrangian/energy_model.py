@@ -211,7 +211,7 @@ class EnergyModel(Model):
             return super().integrate(q, dq)
         q, dq = self.check_q(q), self.check_v(dq, "dq")
         batch_of(q=q, dq=dq)
-        return np.asarray(q + self.velocity_map.enter(q, dq))
+        return np.asarray(q + self.velocity_map.to_integrator_velocity(q, dq))
 
     def difference(self, q0: ArrayLike, q1: ArrayLike) -> Array:
         """Return the dq with ``integrate(q0, dq) = q1``."""
@@ -219,7 +219,7 @@ class EnergyModel(Model):
             return super().difference(q0, q1)
         q0, q1 = self.check_q(q0, "q0"), self.check_q(q1, "q1")
         batch_of(q0=q0, q1=q1)
-        return np.asarray(self.velocity_map.leave(q0, q1 - q0))
+        return np.asarray(self.velocity_map.to_body_velocity(q0, q1 - q0))
 
     def frame(self, name: str) -> Frame:
         """Refuse: energies have no frames."""

@@ -82,7 +82,7 @@ def model_of_mjcf(
         read.fault("no bodies; expected <worldbody> with <body> elements")
     elif not any(b.joints for b in scene.bodies):
         read.fault("no joints, so nothing moves (nq = 0); add a joint, or load with floating_base=True")
-    wanted, total = scene.compiler.settotalmass, sum(b.lump.mass for b in scene.bodies)
+    wanted, total = scene.compiler.settotalmass, sum(b.mass_properties.mass for b in scene.bodies)
     scale = wanted / total if wanted > 0 and total > 0 else 1.0
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
@@ -114,7 +114,7 @@ class _Tree:
         anchors: dict[str, Array] = {"world": np.zeros(3)}
         for body in scene.bodies:
             anchors[body.name] = body.anchor
-            at = body.lump.scaled(scale) if scale != 1 else body.lump
+            at = body.mass_properties.scaled(scale) if scale != 1 else body.mass_properties
             R, p = body.pose.R, body.pose.p - anchors[body.parent]
             parent = body.parent
             if not body.joints:

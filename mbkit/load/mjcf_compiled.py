@@ -18,7 +18,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit.load.mjcf_attributes import mesh_assets, read_mesh
 from mbkit.load.mjcf_reader import Scene
-from mbkit.load.shapes import Lump
+from mbkit.load.shapes import MassProperties
 from mbkit.load.xml_reader import Element, element_text
 from mbkit.model.validation import listing
 
@@ -43,7 +43,7 @@ def infer_inertias(mujoco: Element, path: Path, scene: Scene) -> str:
         return ""
     for body in scene.bodies:
         if body.name in scene.inferred:
-            body.lump = _lump(compiled.body(body.name))
+            body.mass_properties = _mass_properties(compiled.body(body.name))
     bounds = [s for s in ("boundmass", "boundinertia", "balanceinertia") if s in text.settings]
     within = f", within {' and '.join(bounds)}" if bounds else ""
     files = f"; mesh files read: {name_list(text.opened)}" if text.opened else ""
@@ -165,11 +165,11 @@ class _Text:
         return element_text(tag, own, "".join(self._written(e, childclass) for e in kept))
 
 
-def _lump(body: Any) -> Lump:
+def _mass_properties(body: Any) -> MassProperties:
     """Return the inertia of a compiled body in its own axes."""
     w, x, y, z = (float(c) for c in body.iquat)
     axes = spatial.matrix_from_quaternion(np.array([x, y, z, w]))
-    return Lump(float(body.mass[0]), np.array(body.ipos), axes @ np.diag(body.inertia) @ axes.T)
+    return MassProperties(float(body.mass[0]), np.array(body.ipos), axes @ np.diag(body.inertia) @ axes.T)
 
 
 def name_list(names: Iterable[str]) -> str:

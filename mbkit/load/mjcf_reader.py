@@ -16,7 +16,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.mjcf_attributes import HERE, ORIENTATIONS, Compiler, Defaults, Pose, has_length, pose, z_to
-from mbkit.load.shapes import NOTHING, SIZES, Lump, solid, together
+from mbkit.load.shapes import NOTHING, SIZES, MassProperties, solid, together
 from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.load.xml_reader import Element, Reader, unused
 
@@ -52,7 +52,7 @@ class MjcfBody:
     parent: str
     pose: Pose  # in the parent's axes, with the <frame> elements around it
     joints: list[MjcfJoint]
-    lump: Lump  # in its own axes; nothing while `Scene.inferred` has the body
+    mass_properties: MassProperties  # in its own axes; nothing while `Scene.inferred` has the body
     sites: list[tuple[str, Pose]]
 
     @property
@@ -190,12 +190,14 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
     inertials = [(e, Y) for e, Y, _ in parts if e.tag == "inertial"]
     geoms = [(e, scene.defaults.filled(e, c), Y) for e, Y, c in parts if e.tag == "geom"]
     geoms = [(e, full, Y) for e, full, Y in geoms if counts(full, compiler, read, item)]
-    lump, changed = _body_lump(inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, item)
-    if lump is None:
+    mass_properties, changed = _body_mass_properties(
+        inertials, [(full, Y) for _, full, Y in geoms], own.p, compiler, read, item
+    )
+    if mass_properties is None:
         scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
     for setting in changed:
         scene.bounded.setdefault(setting, []).append(name)
-    body = MjcfBody(name, parent, X @ own, joints, lump or NOTHING, [])
+    body = MjcfBody(name, parent, X @ own, joints, mass_properties or NOTHING, [])
     scene.bodies.append(body)
     _read_children(parts, name, item, body.sites, scene)
 
@@ -227,14 +229,14 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
 # Mass and inertia
 
 
-def _body_lump(
+def _body_mass_properties(
     inertials: list[tuple[Element, Pose]],
     geoms: list[tuple[Element, Pose]],
     place: Array,
     compiler: Compiler,
     read: Reader,
     item: str,
-) -> tuple[Lump | None, list[str]]:
+) -> tuple[MassProperties | None, list[str]]:
     """Return a body's inertia in its own axes, and the settings that changed it; None where it is a mesh's or shell's.
 
     Elements have their defaults and the pose of their <frame>; geoms are those for which `counts` is true. `place`
@@ -244,25 +246,29 @@ def _body_lump(
         read.fault(f"{item}: {len(inertials)} <inertial> elements; keep one", inertials[1][0])
     infer = compiler.inertiafromgeom
     if infer or (infer is None and not inertials):
-        lumps = [_geom(e, X, compiler, read, item) for e, X in geoms]
-        if any(x is None for x in lumps):
+        masses = [_geom(e, X, compiler, read, item) for e, X in geoms]
+        if any(x is None for x in masses):
             return None, []
-        heavy = [x for x in lumps if x and x.mass > _LEAST_MASS]
+        heavy = [x for x in masses if x and x.mass > _LEAST_MASS]
         if heavy:
             # A flat body's A + B and C differ by rounding.
             return _bounded(together(heavy), compiler, slack=1e-14)
     if not inertials:
-        lump, changed = _bounded(NOTHING, compiler)
+        mass_properties, changed = _bounded(NOTHING, compiler)
         # MuJoCo takes that place for the centre of mass in the body.
-        return replace(lump, com=place) if changed else lump, changed
+        return replace(mass_properties, com=place) if changed else mass_properties, changed
     principal, X = _written(*inertials[0], compiler, read, item)
-    lump, changed = _bounded(principal, compiler, slack=1e-14 if "fullinertia" in inertials[0][0].attributes else 0.0)
-    return lump.moved(X.R, X.p), changed
+    mass_properties, changed = _bounded(
+        principal, compiler, slack=1e-14 if "fullinertia" in inertials[0][0].attributes else 0.0
+    )
+    return mass_properties.moved(X.R, X.p), changed
 
 
-def _bounded(lump: Lump, compiler: Compiler, slack: float = 0.0) -> tuple[Lump, list[str]]:
-    """Return a lump after the compiler's bounds, and the settings that changed it; moments have a relative `slack`."""
-    mass, inertia, changed = lump.mass, lump.inertia, list[str]()
+def _bounded(
+    mass_properties: MassProperties, compiler: Compiler, slack: float = 0.0
+) -> tuple[MassProperties, list[str]]:
+    """Return the properties after the compiler's bounds, and the settings that changed them; `slack` is relative."""
+    mass, inertia, changed = mass_properties.mass, mass_properties.inertia, list[str]()
     if mass < compiler.boundmass > 0:
         mass = compiler.boundmass
         changed.append("boundmass")
@@ -274,10 +280,10 @@ def _bounded(lump: Lump, compiler: Compiler, slack: float = 0.0) -> tuple[Lump, 
     if compiler.balanceinertia and moments[0] + moments[1] < moments[2] * (1 - slack):
         inertia = float(np.mean(moments)) * np.eye(3)
         changed.append("balanceinertia")
-    return (Lump(mass, lump.com, inertia) if changed else lump), changed
+    return (MassProperties(mass, mass_properties.com, inertia) if changed else mass_properties), changed
 
 
-def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> tuple[Lump, Pose]:
+def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> tuple[MassProperties, Pose]:
     """Return an <inertial> about its own centre, and its pose in the body."""
     mass = read.number(element, "mass", item)
     if mass < 0:
@@ -292,7 +298,7 @@ def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, item: 
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     else:
         inertia = np.diag(read.numbers(element, "diaginertia", item, count=3, default=(0, 0, 0)))
-    return Lump(mass, np.zeros(3), inertia), placed
+    return MassProperties(mass, np.zeros(3), inertia), placed
 
 
 def counts(geom: Element, compiler: Compiler, read: Reader, item: str) -> bool:
@@ -304,7 +310,7 @@ def counts(geom: Element, compiler: Compiler, read: Reader, item: str) -> bool:
     return inside and amount != 0 and geom.attributes.get("type", "sphere") not in ("plane", "hfield")
 
 
-def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> Lump | None:
+def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> MassProperties | None:
     """Return what a geom adds to its body; None for a mesh or a shell."""
     own = element.attributes
     amount = read.number(element, "mass" if "mass" in own else "density", item, 1000.0)
@@ -321,8 +327,8 @@ def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str
     size, own_pose = _sized(element, shape, compiler, read, item)
     if len(read.faults) > before:
         return NOTHING
-    lump, placed = solid(shape, size), X @ own_pose
-    return lump.scaled(amount / lump.mass if "mass" in own else amount).moved(placed.R, placed.p)
+    mass_properties, placed = solid(shape, size), X @ own_pose
+    return mass_properties.scaled(amount / mass_properties.mass if "mass" in own else amount).moved(placed.R, placed.p)
 
 
 def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, item: str) -> tuple[tuple[float, ...], Pose]:

@@ -16,26 +16,26 @@ SIZES: Final = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box":
 
 
 @dataclass(frozen=True)
-class Lump:
+class MassProperties:
     """Mass, centre of mass, and inertia about it, in some common axes."""
 
     mass: float
     com: Array
     inertia: Array
 
-    def moved(self, R: Array, p: Array) -> Lump:
-        """Return the same lump in another frame, in which this one has the pose R, p."""
-        return Lump(self.mass, p + R @ self.com, R @ self.inertia @ R.T)
+    def moved(self, R: Array, p: Array) -> MassProperties:
+        """Return the same mass properties in another frame, in which this one has the pose R, p."""
+        return MassProperties(self.mass, p + R @ self.com, R @ self.inertia @ R.T)
 
-    def scaled(self, factor: float) -> Lump:
+    def scaled(self, factor: float) -> MassProperties:
         """Return the same shape with `factor` times the density."""
-        return Lump(factor * self.mass, self.com, factor * self.inertia)
+        return MassProperties(factor * self.mass, self.com, factor * self.inertia)
 
 
-NOTHING: Final = Lump(0.0, np.zeros(3), np.zeros((3, 3)))
+NOTHING: Final = MassProperties(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
-def solid(shape: str, size: tuple[float, ...]) -> Lump:
+def solid(shape: str, size: tuple[float, ...]) -> MassProperties:
     """Return a shape of density 1 kg/m³ about its centre; half lengths and radii as in MuJoCo, the long axis is z."""
     if shape in ("box", "ellipsoid"):
         a, b, c = size
@@ -55,18 +55,18 @@ def solid(shape: str, size: tuple[float, ...]) -> Lump:
         tube, ball = 2 * pi * r * r * h, 4 / 3 * pi * r**3
         along = tube * r * r / 2 + ball * 2 / 5 * r * r
         across = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
-        return Lump(tube + ball, np.zeros(3), np.diag([across, across, along]))
-    return Lump(mass, np.zeros(3), mass * np.diag(moments))
+        return MassProperties(tube + ball, np.zeros(3), np.diag([across, across, along]))
+    return MassProperties(mass, np.zeros(3), mass * np.diag(moments))
 
 
-def together(lumps: list[Lump]) -> Lump:
-    """Return several lumps of positive mass, in the same axes, as one."""
-    if len(lumps) == 1:
-        return lumps[0]
-    mass = sum(x.mass for x in lumps)
-    com = sum((x.mass * x.com for x in lumps), np.zeros(3)) / mass
+def together(masses: list[MassProperties]) -> MassProperties:
+    """Return the mass properties of several of positive mass, in the same axes, as one."""
+    if len(masses) == 1:
+        return masses[0]
+    mass = sum(x.mass for x in masses)
+    com = sum((x.mass * x.com for x in masses), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
-    for x in lumps:
+    for x in masses:
         d = skew(x.com - com)
         inertia += x.inertia - x.mass * d @ d
-    return Lump(mass, com, inertia)
+    return MassProperties(mass, com, inertia)

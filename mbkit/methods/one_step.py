@@ -88,7 +88,7 @@ class SemiImplicitEuler:
         _, a = rates(t, q, None, w)
         w = w + h * a
         u = h * w
-        return space.move(q, u), w, u
+        return space.retract(q, u), w, u
 
 
 # Errors and lengths of adaptive steps
@@ -201,7 +201,7 @@ def first_length(
     Hairer, Nørsett, Wanner 1993, II.4, as in SciPy. The error of a step grows with its length to the power `grows`.
     """
     rtol, atol = tolerances
-    sizes = np.concatenate([space.sizes(q, w), np.abs(w)], axis=-1)
+    sizes = np.concatenate([space.magnitude(q, w), np.abs(w)], axis=-1)
     scale = atol + rtol * sizes
 
     def norm(x: Array) -> Array:
@@ -210,7 +210,7 @@ def first_length(
     d0, d1 = norm(sizes), norm(np.concatenate([w, k], axis=-1))
     h0 = np.where((d0 < 1e-5) | (d1 < 1e-5), 1e-6, 0.01 * d0 / d1)
     by = h0[:, None]
-    bent = probe(space.move(q, by * w), w + by * k)
+    bent = probe(space.retract(q, by * w), w + by * k)
     d2 = norm(np.concatenate([by * k, bent - k], axis=-1)) / h0
     steep = np.maximum(d1, d2)
     h1 = np.where(steep <= 1e-15, np.maximum(1e-6, h0 * 1e-3), (0.01 / steep) ** (1 / grows))

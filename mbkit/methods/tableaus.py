@@ -184,9 +184,9 @@ class Tableau:
             stages.append(*rates(t, q, None, w))
         for c, weights in self._rows[max(known, 1) :]:
             u, dw = stages.moved(h, weights)
-            stages.append(*rates(t + c * h, space.move(q, u), u, w + dw))
+            stages.append(*rates(t + c * h, space.retract(q, u), u, w + dw))
         u, dw = stages.moved(h, self.b)
-        return space.move(q, u), w + dw, u
+        return space.retract(q, u), w + dw, u
 
     def __reduce__(self) -> tuple[type, tuple[str, Array, Array, int]]:
         return type(self), (self.name, self.A, self.b, self.order)

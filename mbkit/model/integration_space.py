@@ -38,7 +38,7 @@ class Space:
                 if joint.type.floating:
                     self._free.append((turn[0], slice(v.start, v.start + start), turn[1]))
 
-    def move(self, q: Any, u: Any) -> Any:
+    def retract(self, q: Any, u: Any) -> Any:
         """Return q moved by u: positions add, rotations turn by exp(u) in body axes."""
         if self._adds:
             return q + u
@@ -59,7 +59,7 @@ class Space:
             self.put(out, b, rotation.dexp_inverse(m, self.components(u, b), self.components(w, b)))
         return out
 
-    def sizes(self, q: Any, u: Any) -> Any:
+    def magnitude(self, q: Any, u: Any) -> Any:
         """Return the size of q along each component of a u: |q| where positions add, 1 for a rotation."""
         if self._adds:
             return abs(q)
@@ -68,21 +68,21 @@ class Space:
             self.put(out, b, abs(self.part(q, a)))
         return out
 
-    def enter(self, q: Any, v: Any) -> Any:
+    def to_integrator_velocity(self, q: Any, v: Any) -> Any:
         """Return w of mbkit's v."""
-        return self._changed(q, v, rotation.rotate) if self._rates is None else self._rates.enter(q, v)
+        return self._changed(q, v, rotation.rotate) if self._rates is None else self._rates.to_integrator_velocity(q, v)
 
-    def leave(self, q: Any, w: Any) -> Any:
+    def to_body_velocity(self, q: Any, w: Any) -> Any:
         """Return mbkit's v of w."""
-        return self._changed(q, w, rotation.rotate_back) if self._rates is None else self._rates.leave(q, w)
+        return self._changed(q, w, rotation.rotate_back) if self._rates is None else self._rates.to_body_velocity(q, w)
 
-    def enter_force(self, q: Any, f: Any) -> Any:
+    def to_integrator_force(self, q: Any, f: Any) -> Any:
         """Return the momentum or force on w of one on mbkit's v; on free joints they turn as velocities do."""
-        return self.enter(q, f) if self._rates is None else self._rates.enter_force(q, f)
+        return self.to_integrator_velocity(q, f) if self._rates is None else self._rates.to_integrator_force(q, f)
 
-    def leave_force(self, q: Any, f: Any) -> Any:
+    def to_body_force(self, q: Any, f: Any) -> Any:
         """Return the momentum or force on mbkit's v of one on w."""
-        return self.leave(q, f) if self._rates is None else self._rates.leave_force(q, f)
+        return self.to_body_velocity(q, f) if self._rates is None else self._rates.to_body_force(q, f)
 
     def _changed(self, q: Any, v: Any, change: Any) -> Any:
         if not self._free:

@@ -88,7 +88,7 @@ class AttemptParts:
 
         def make() -> ca.Function:
             q, w, u = self.at.values()
-            v = space.leave(q, w)
+            v = space.to_body_velocity(q, w)
             a = self.equations.function("forward_dynamics")(q, v, self.symbols["tau"], *trailing.values())
             return function_of("field", arguments, {"k": space.acceleration(q, v, a), "r": space.rate(u, w)})
 
@@ -99,7 +99,7 @@ class AttemptParts:
         s, space = self.symbols, self.space
         by_u, by_w = (
             s["atol"] + s["rtol"] * larger(SYMBOLS, *sizes)
-            for sizes in ((space.sizes(s["q"], u), space.sizes(q1, u)), (abs(s["w"]), abs(w1)))
+            for sizes in ((space.magnitude(s["q"], u), space.magnitude(q1, u)), (abs(s["w"]), abs(w1)))
         )
         return by_u, by_w
 

@@ -127,8 +127,10 @@ def step(equations: Equations, method: str) -> ca.Function:
     """
     s, space = _symbols(equations), SymbolicSpace(equations.model)
     names = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.trailing)}
-    q1, w1 = _stepped(equations, method, s, space.enter(s["q"], s["v"]), _acceleration(equations, space, s))
-    return function_of(f"{method}_step", names, {"q1": q1, "v1": space.leave(q1, w1)})
+    q1, w1 = _stepped(
+        equations, method, s, space.to_integrator_velocity(s["q"], s["v"]), _acceleration(equations, space, s)
+    )
+    return function_of(f"{method}_step", names, {"q1": q1, "v1": space.to_body_velocity(q1, w1)})
 
 
 def march(equations: Equations, method: str) -> tuple[Part, ...]:
@@ -160,7 +162,7 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
 
     def acceleration(q: Any, w: Any) -> Any:
         i = sum(part.name == "forward_dynamics" for part in parts)
-        v = space.leave(q, w)
+        v = space.to_body_velocity(q, w)
         at = ("q", "w")
         if i or not space.flat:
             at = (f"q_{i}", f"v_{i}")
@@ -201,7 +203,7 @@ def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Call
     forward, behind = equations.function("forward_dynamics"), [s["tau"], *equations.trailing.values()]
 
     def acceleration(q: Any, w: Any) -> Any:
-        v = space.leave(q, w)
+        v = space.to_body_velocity(q, w)
         return space.acceleration(q, v, forward(q, v, *behind))
 
     return acceleration

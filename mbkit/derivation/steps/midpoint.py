@@ -150,10 +150,12 @@ class Midpoint:
         """(q, w, tau) -> μ = ∂L/∂w and f = ∂L/∂q + τ + damping, along `move`."""
         eq, space = self._equations, self._space
         w = self._s["w"]
-        v = space.leave(eq.q, w)
+        v = space.to_body_velocity(eq.q, w)
         kinetic = ca.substitute(eq.kinetic_energy, eq.v, v)
         applied = eq.tau + ca.substitute(eq.damping, eq.v, v)
-        f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.enter_force(eq.q, applied)
+        f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.to_integrator_force(
+            eq.q, applied
+        )
         arguments = [eq.q, w, eq.tau, *eq.trailing.values()]
         return ca.Function("forces", arguments, [ca.gradient(kinetic, w), f], {"cse": True})
 
@@ -181,7 +183,7 @@ class Midpoint:
     def _end(self) -> tuple[Any, ...]:
         s, h = self._s, self._s["dt"]
         q_m, _, f = self._at_midpoint(s["w"])
-        q1 = self._space.move(s["q"], h * s["w"])
+        q1 = self._space.retract(s["q"], h * s["w"])
         pi1 = s["pi"] + h * self._space.to_fixed(q_m, f)
         guess = sum(weight * s[n] for weight, n in zip(GUESS, ("w", "w_1", "w_2"), strict=True))
         lost = 1 - (ca.sumsqr(q1) + ca.sumsqr(pi1) < _RUNAWAY)
@@ -190,13 +192,13 @@ class Midpoint:
     def _momentum(self) -> tuple[Any]:
         eq, s = self._equations, self._s
         p = ca.substitute(eq.momentum, ca.vertcat(eq.q, eq.v), ca.vertcat(s["q"], s["v"]))
-        return (self._space.to_fixed(s["q"], self._space.enter_force(s["q"], p)),)
+        return (self._space.to_fixed(s["q"], self._space.to_integrator_force(s["q"], p)),)
 
     def _velocity_system(self) -> tuple[Any, Any]:
         eq, s = self._equations, self._s
         at_rest = ca.substitute(eq.momentum, eq.v, ca.SX.zeros(eq.model.nv))
         M, b = (ca.substitute(x, eq.q, s["q"]) for x in (eq.mass_matrix, at_rest))
-        return M, self._space.leave_force(s["q"], self._space.to_body(s["q"], s["pi"])) - b
+        return M, self._space.to_body_force(s["q"], self._space.to_body(s["q"], s["pi"])) - b
 
     def _velocity(self) -> tuple[Any]:
         return (solve(*self._velocity_system(), self._equations.elimination_order),)

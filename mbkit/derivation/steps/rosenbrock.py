@@ -74,7 +74,7 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
 
     def go(name: str, weights: Array, more: dict[str, Any]) -> None:
         u, dw = stages.sums(weights)
-        results = {"q_i": parts.space.move(s["q"], u), "w_i": s["w"] + dw, "u_i": u, **more}
+        results = {"q_i": parts.space.retract(s["q"], u), "w_i": s["w"] + dw, "u_i": u, **more}
         parts.add(name, {**parts.named("q", "w"), **increments}, results)
 
     parts.begin()
@@ -122,12 +122,12 @@ class _Space(SymbolicSpace):
 def _linear_system(eq: Equations, space: SymbolicSpace, q: Any, w: Any, k: Any) -> tuple[Any, Any, Any]:
     """Return M, D and K at a state, without entries that are zeros after all."""
     u, a = ca.SX.sym("u", eq.model.nv), ca.SX.sym("a", eq.model.nv)
-    v, moved = space.leave(q, w), space.move(q, u)
+    v, moved = space.to_body_velocity(q, w), space.retract(q, u)
     by_w = ca.jacobian(v, w)
     # v̇ of ẇ: the axes may turn below it.
     qdot = ca.substitute(eq.kin.qdot, ca.vertcat(eq.q, eq.v), ca.vertcat(q, v))
     rate = ca.mtimes(by_w, k) + ca.jtimes(v, q, qdot)
-    there = space.leave(moved, w)
+    there = space.to_body_velocity(moved, w)
     force = eq.function("inverse_dynamics")(moved, there, a, *eq.trailing.values())
     led = space.acceleration(moved, there, a)
     M = ca.mtimes(ca.substitute(eq.mass_matrix, eq.q, q), by_w)

@@ -258,19 +258,19 @@ class VelocityMap:
                 "or take other coordinates"
             )
 
-    def enter(self, q: Any, v: Any) -> Any:
+    def to_integrator_velocity(self, q: Any, v: Any) -> Any:
         """Return q̇ = D v."""
         return self._column("enter", q, v)
 
-    def leave(self, q: Any, w: Any) -> Any:
+    def to_body_velocity(self, q: Any, w: Any) -> Any:
         """Return v = D⁻¹ q̇."""
         return self._column("leave", q, w)
 
-    def enter_force(self, q: Any, f: Any) -> Any:
+    def to_integrator_force(self, q: Any, f: Any) -> Any:
         """Return the force or momentum on q̇ of one on v: D⁻ᵀ f."""
         return self._column("enter_force", q, f)
 
-    def leave_force(self, q: Any, f: Any) -> Any:
+    def to_body_force(self, q: Any, f: Any) -> Any:
         """Return the force or momentum on v of one on q̇: Dᵀ f."""
         return self._column("leave_force", q, f)
 

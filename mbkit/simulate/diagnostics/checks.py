@@ -203,7 +203,7 @@ def step_size(dyn: Dynamics, method: Method, h: float, duration: float, q: Array
     space = Space(model)
 
     def accelerations(q: Array, w: Array) -> Array:
-        v = space.leave(q, w)
+        v = space.to_body_velocity(q, w)
         return np.asarray(space.acceleration(q, v, dyn.forward_dynamics(q, v, np.zeros_like(v))))
 
     signs: list[tuple[float, str]] = []
@@ -212,7 +212,7 @@ def step_size(dyn: Dynamics, method: Method, h: float, duration: float, q: Array
         if not (np.isfinite(q[k]).all() and np.isfinite(v[k]).all()):
             continue
         # By differences on any engine: deriving would take longer than most runs.
-        J = linearized(space, q[k], space.enter(q[k], v[k]), accelerations)
+        J = linearized(space, q[k], space.to_integrator_velocity(q[k], v[k]), accelerations)
         A, B = J[model.nv :, : model.nv], J[model.nv :, model.nv :]
         rates = np.linalg.eigvals(J)
         fastest = float(np.abs(rates).max())

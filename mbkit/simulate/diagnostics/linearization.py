@@ -149,12 +149,12 @@ def _twin(dyn: Dynamics) -> Dynamics:
 def linearized(space: Space, q: Array, w: Array, rates: Callable[[Array, Array], Array]) -> Array:
     """Return J by central differences, (2 nv, 2 nv); w is the integrators' own velocity, rates(q, w) is ẇ of rows."""
     nv = space.nv
-    length = _STEP * np.maximum(1.0, np.abs(space.sizes(q, w)))
+    length = _STEP * np.maximum(1.0, np.abs(space.magnitude(q, w)))
     speed = np.full(nv, _WIDE * max(1.0, float(np.abs(w).max(initial=0.0))))
     changes = np.diag(np.concatenate([length, speed]))
     both = np.concatenate([changes, -changes])
     u, there = both[:, :nv], w + both[:, nv:]
-    places = space.move(np.broadcast_to(q, (len(u), len(q))), u)
+    places = space.retract(np.broadcast_to(q, (len(u), len(q))), u)
     slopes = np.concatenate([space.rate(u, there), rates(places, there)], axis=1)
     return np.asarray((slopes[: 2 * nv] - slopes[2 * nv :]).T / (2 * np.diag(changes)))
 
@@ -297,11 +297,13 @@ def _of_one(
     space, own = Space(model), at_time(dyn, t)
 
     def rates(q: Array, w: Array) -> Array:
-        v = space.leave(q, w)
+        v = space.to_body_velocity(q, w)
         rows = force if isinstance(force, np.ndarray) else np.array([force(t, *x) for x in zip(q, v, strict=True)])
         return np.asarray(space.acceleration(q, v, own.forward_dynamics(q, v, rows)))
 
-    return stiffness_of(linearized(space, q, space.enter(q, v), rates), enough, exact=False, member=member)
+    return stiffness_of(
+        linearized(space, q, space.to_integrator_velocity(q, v), rates), enough, exact=False, member=member
+    )
 
 
 def stiffness_of(J: Array, enough: float, *, exact: bool, member: int | None = None) -> Stiffness:

@@ -187,7 +187,7 @@ class RungeKuttaAttempts:
         """Return q and w after a step, and its error in units of the tolerance."""
         q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
         space, (rtol, atol) = self._space, self._tolerances
-        sizes = np.maximum(space.sizes(self._q, u), space.sizes(q, u)), np.maximum(np.abs(self._w), np.abs(w))
+        sizes = np.maximum(space.magnitude(self._q, u), space.magnitude(q, u)), np.maximum(np.abs(self._w), np.abs(w))
         by_u, by_w = (self._slack * (atol + rtol * x) for x in sizes)
         error = embedded_error(SCALARS, self._tableau.errors, self._stages, (by_u, by_w), step, 2 * space.nv)
         return q, w, float(error)
@@ -315,12 +315,12 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return self._own_rates(t, y, self._force)
 
     def _vector(self, q: Array, w: Array) -> Array:
-        return np.concatenate([q, self._space.leave(q, w)])
+        return np.concatenate([q, self._space.to_body_velocity(q, w)])
 
     def _state(self, y: Array) -> tuple[Array, Array]:
         nq = self._model.nq
         q = unit_quaternions(self._model, y[:nq])[0]
-        return q, self._space.enter(q, y[nq:])
+        return q, self._space.to_integrator_velocity(q, y[nq:])
 
     def _increments(self, t: float, y: Array, h: float, there: Array, J: Array) -> Array:
         """Return what the stages of a step of length h come to, (s, n)."""
@@ -402,7 +402,7 @@ def run_groups(
                 for record, q, v in zip(group, q0[part], v0[part], strict=True):
                     record.begin(q, v)
                 which = range(first, first + len(group))
-                attempts.start(which, q0[part], space.enter(q0[part], v0[part]), problem.start)
+                attempts.start(which, q0[part], space.to_integrator_velocity(q0[part], v0[part]), problem.start)
                 to_end(group, partial(_report, problem, group, first))
             except FunctionError as error:
                 # Where the torque is a function, trajectories run one by one.

@@ -360,7 +360,7 @@ class SwitchingController:
         try:
             k = attempts.rates(place, q[None], w[None])
             ahead = near * step * _AHEAD
-            moved = space.move(np.broadcast_to(q, (len(ahead), len(q))), ahead * w)
+            moved = space.retract(np.broadcast_to(q, (len(ahead), len(q))), ahead * w)
             rates = attempts.rates(place, moved, w + ahead * k)
         except FunctionError:
             return 0.0, 0.0

@@ -93,7 +93,7 @@ class BlockLoop:
         """Make the last state the first one of the next block."""
         raise NotImplementedError
 
-    def leave(self, q: Array, w: Array) -> Array:  # noqa: ARG002
+    def to_body_velocity(self, q: Array, w: Array) -> Array:  # noqa: ARG002
         """Return what is kept of w, (n, steps, nv)."""
         return w
 
@@ -135,7 +135,7 @@ def run_blocks(
             rows, good, last = record.rows(k + 1, k + n), loop.good, dict[int, list[Array]]()
             if rows.start < rows.stop:
                 q, w = (loop.states(name, kept[rows] - k) for name in loop.carried)
-                record.q[which, rows], record.v[which, rows] = q, loop.leave(q, w)
+                record.q[which, rows], record.v[which, rows] = q, loop.to_body_velocity(q, w)
             if good is None:
                 record.steps[which] = k + n
             else:
@@ -256,13 +256,13 @@ class Chunk(BlockLoop):
             q, w = (self.states(name, np.arange(1, steps + 1)) for name in self.carried)
             self.good = np.logical_and.accumulate(are_bounded(q, w), axis=1).sum(axis=1)
 
-    def leave(self, q: Array, w: Array) -> Array:
+    def to_body_velocity(self, q: Array, w: Array) -> Array:
         if self._space.flat:
             return w
         flat = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, w))
         # What a lost state has become is nobody's concern here.
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(self._space.leave(*flat).reshape(w.shape))
+            return np.asarray(self._space.to_body_velocity(*flat).reshape(w.shape))
 
     def again(self) -> None:
         for name in _STATE.values():
@@ -275,7 +275,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     dyn, method, grid, record = problem.dyn, problem.method, problem.grid, GridRecord(problem)
     assert isinstance(dyn, LagrangianDynamics)
     plan, space, n = _plan(dyn, method), Space(dyn.model), len(problem.q)
-    w0, values = space.enter(problem.q, problem.v), dyn.parameter_values
+    w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
     squares = np.zeros(n)
 
     def new_chunk(most: int, *, all_kept: bool, watched: bool = False) -> Chunk:

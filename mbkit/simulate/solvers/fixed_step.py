@@ -95,7 +95,7 @@ class Stepper:
         """Return the state to go on from."""
         return q, w
 
-    def leave(self, q: Array, w: Array) -> Array:  # noqa: ARG002
+    def to_body_velocity(self, q: Array, w: Array) -> Array:  # noqa: ARG002
         """Return what is kept of w."""
         return w
 
@@ -121,8 +121,8 @@ class _FieldStepper(Stepper):
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         return self.field.settled(t, q, w)
 
-    def leave(self, q: Array, w: Array) -> Array:
-        return np.asarray(self.space.leave(q, w))
+    def to_body_velocity(self, q: Array, w: Array) -> Array:
+        return np.asarray(self.space.to_body_velocity(q, w))
 
 
 def run_fixed(problem: IntegrationProblem) -> SolverResult:
@@ -132,7 +132,7 @@ def run_fixed(problem: IntegrationProblem) -> SolverResult:
     them, with what they have.
     """
     stepper = _FieldStepper(problem)
-    run = SteppedRun(problem, stepper, stepper.space.enter(problem.q0, problem.v0))
+    run = SteppedRun(problem, stepper, stepper.space.to_integrator_velocity(problem.q0, problem.v0))
     error = run.to_end()
     return run.record.result(lambda _: run.why, stepper.field.evaluations, error=error)
 
@@ -185,7 +185,7 @@ class SteppedRun:
         which: Any = slice(None) if self._members is None else self._members
         record.steps[which] = k + 1
         if self._row < len(record.kept) and k + 1 == record.kept[self._row]:
-            record.q[which, self._row], record.v[which, self._row] = self._q, step.leave(self._q, self._w)
+            record.q[which, self._row], record.v[which, self._row] = self._q, step.to_body_velocity(self._q, self._w)
             self._row += 1
         return True
 

@@ -69,7 +69,7 @@ class CollocationStep:
         start, past = _Start(t, h, q, w, force), self._past if self._past is not None and self._past.q is q else None
         rates, inverse = self._solved(start, self._guess(h, w, past), past.inverse if past and past.h == h else None)
         moved = _mixed(h * self._b, rates)
-        q1 = self._space.move(q, moved[..., : self._nv])
+        q1 = self._space.retract(q, moved[..., : self._nv])
         self._past = _Past(q1, rates[..., self._nv :], h, inverse)
         return q1, w + moved[..., self._nv :]
 
@@ -184,7 +184,7 @@ class CollocationStep:
 
     def _rates(self, start: _Start, c: float, u: Array, w: Array, out: Array) -> None:
         out[..., : self._nv] = self._space.rate(u, w)
-        out[..., self._nv :] = self._field(start.t + c * start.h, self._space.move(start.q, u), w, start.force)
+        out[..., self._nv :] = self._field(start.t + c * start.h, self._space.retract(start.q, u), w, start.force)
 
     def _slopes(self, start: _Start, c: float, u: Array, w: Array) -> Array:
         """Return J = ∂(u̇, ẇ)/∂(u, w) by differences: half of the digits are enough for the iteration."""

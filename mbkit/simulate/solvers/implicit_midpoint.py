@@ -45,7 +45,7 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
     midpoint, q0 = Midpoint(dyn.equations), problem.q
     why: Callable[[int], str]
     error: FunctionError | None = None
-    w0 = Space(dyn.model).enter(q0, problem.v)
+    w0 = Space(dyn.model).to_integrator_velocity(q0, problem.v)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         (pi0,) = called(dyn, midpoint.momentum, None, problem.start, q0, problem.v)
         if _machine_code(dyn, midpoint, problem):
@@ -172,8 +172,8 @@ class MidpointStepper(Stepper):
             if not len(todo):
                 break
             if not isinstance(force, np.ndarray):
-                q_m = self._space.move(q[todo], (h / 2) * w[todo])
-                state = q_m, self._space.leave(q_m, w[todo])
+                q_m = self._space.retract(q[todo], (h / 2) * w[todo])
+                state = q_m, self._space.to_body_velocity(q_m, w[todo])
                 tau[todo] = force(t + h / 2, *(x[0] for x in state)) if self._single else force(t + h / 2, *state)
             w1, solved = self._newton(self._members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
             change = np.abs(w1 - w[todo]).max(axis=1, initial=0.0)

@@ -136,7 +136,7 @@ class TrajectoryRecord:
     def _state(self, q: Array, w: Array) -> tuple[Array, Array]:
         """Return q and mbkit's v."""
         if self._space is not None:
-            return q, self._space.leave(q, w)
+            return q, self._space.to_body_velocity(q, w)
         if self._model.quaternions:
             # Row by row: NumPy rounds the norms of several rows otherwise.
             q = np.array([unit_quaternions(self._model, x)[0] for x in np.atleast_2d(q)]).reshape(q.shape)

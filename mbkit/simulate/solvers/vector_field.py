@@ -83,7 +83,7 @@ class Field:
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""
-        v = w if self._space is None else self._space.leave(q, w)
+        v = w if self._space is None else self._space.to_body_velocity(q, w)
         if not isinstance(force, np.ndarray):
             # Never call the user's function on a state that is not finite.
             if not are_bounded(q, v).all():
@@ -149,7 +149,7 @@ class Rates:
 
     def _qdot(self, q: Array, v: Array, lengths: Array) -> Array:
         if self._model.velocity_map is not None:
-            return np.asarray(self._model.velocity_map.enter(q, v))
+            return np.asarray(self._model.velocity_map.to_integrator_velocity(q, v))
         if not self._model.quaternions:
             return v
         out = np.empty(len(q))

@@ -19,11 +19,11 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
-from mbkit.load.shapes import NOTHING, Lump
+from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Model
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes, number_text
-from mbkit.studies.explain.merged_model import MergedModel, merge, with_lump
+from mbkit.studies.explain.merged_model import MergedModel, merge, with_mass_properties
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, model_terms, velocity_joints
 
@@ -35,8 +35,8 @@ _MORE_TERMS: Final = (("C v", "coriolis_force"), ("kinetic energy", "kinetic_ene
 _INERTIAS: Final = [np.maximum(x := np.outer(np.eye(3)[i], np.eye(3)[j]), x.T) for i in range(3) for j in range(i, 3)]
 #: Bodies whose terms span those of any matter: a mass at the origin and at a distance of one each way, and inertias.
 _PROBES: Final = (
-    *(Lump(1.0, x, np.zeros((3, 3))) for x in (np.zeros(3), *np.eye(3))),
-    *(Lump(0.0, np.zeros(3), I) for I in _INERTIAS),
+    *(MassProperties(1.0, x, np.zeros((3, 3))) for x in (np.zeros(3), *np.eye(3))),
+    *(MassProperties(0.0, np.zeros(3), I) for I in _INERTIAS),
 )
 
 
@@ -340,9 +340,9 @@ class _Engines:
             fitted = self._fitted_matter(whole, joint.child, own)
             if fitted is None:
                 continue
-            subject, a = f"body {joint.child!r}", whole.lump(joint.child)
+            subject, a = f"body {joint.child!r}", whole.mass_properties(joint.child)
             for x in body_mistakes(whole.links[joint.child], joint.rotation):
-                changed = with_lump(whole.model, joint.child, replace(a, **x.fields))
+                changed = with_mass_properties(whole.model, joint.child, replace(a, **x.fields))
                 yield _Trial(x.kind, subject, x.says, self._terms(changed))
             more, values = fitted
             says = f"has other matter in it: {number_text(more)} kg more than {number_text(a.mass)}"
@@ -352,7 +352,7 @@ class _Engines:
         """Return the added mass and the terms with the body's ten numbers fitted, if these explain M."""
         bodies = tuple(replace(b, **vars(NOTHING)) for b in whole.model.bodies)
         empty = replace(whole.model, bodies=bodies).without("armature", "damping", "springs")
-        columns = [self._terms(with_lump(empty, name, lump)) for lump in _PROBES]
+        columns = [self._terms(with_mass_properties(empty, name, mass_properties)) for mass_properties in _PROBES]
         common = set(own).intersection(*columns)
         if "M" not in common:
             # The engine refuses bodies without matter.
@@ -365,7 +365,7 @@ class _Engines:
         if np.abs((A @ x - off) * weight).max() > self.tolerance:
             return None
         moved = {t: own[t] + sum(w * c[t] for w, c in zip(x, columns, strict=True)) for t in common - {"passive"}}
-        return float(x @ [lump.mass for lump in _PROBES]), own | moved
+        return float(x @ [mass_properties.mass for mass_properties in _PROBES]), own | moved
 
     def _joints(self) -> Iterator[_Trial]:
         whole = merge(self.model)

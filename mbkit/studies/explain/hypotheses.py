@@ -15,7 +15,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.load.shapes import NOTHING, Lump
+from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Joint, Mimic, Model
 from mbkit.studies.explain.merged_model import LinkInBody, MergedModel, Tolerances, composite
 
@@ -175,7 +175,7 @@ def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dic
         for kind, how, change in ways:
             yield kind, f"fuses {which} {how}", vars(composite([change(x) if x in some else x for x in links]))
     if heavy:
-        total = sum((x.lump.inertia for x in links), np.zeros((3, 3)))
+        total = sum((x.mass_properties.inertia for x in links), np.zeros((3, 3)))
         says = "adds the inertias of its links, each about its own centre of mass"
         yield "inertia about the wrong point", says, {"inertia": total}
 
@@ -203,7 +203,7 @@ def _product_mistakes(I: Array) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def _body_differences(
-    links: Sequence[LinkInBody], R_PJ: Array, b: Lump, near: Tolerances, *, base: bool = False
+    links: Sequence[LinkInBody], R_PJ: Array, b: MassProperties, near: Tolerances, *, base: bool = False
 ) -> list[Mistake]:
     """Return the mistakes that turn a body's matter into that of the other side, named as exactly as possible.
 
@@ -212,9 +212,9 @@ def _body_differences(
     a = composite(links)
     mistakes = body_mistakes(links, R_PJ, base=base)
     for mistake in mistakes:
-        if near.lump(replace(a, **mistake.fields), b):
+        if near.mass_properties(replace(a, **mistake.fields), b):
             return [mistake._replace(fields=vars(b))]
-    if a.mass and b.mass and b.mass != a.mass and near.lump(a.scaled(b.mass / a.mass), b):
+    if a.mass and b.mass and b.mass != a.mass and near.mass_properties(a.scaled(b.mass / a.mass), b):
         says = f"has {number_text(b.mass / a.mass)} times the mass, and the inertia with it"
         return [Mistake("mass", says, vars(b))]
     if not a.mass and not a.inertia.any():
@@ -228,14 +228,16 @@ def _body_differences(
             ours, theirs = getattr(a, name), getattr(b, name)
             wanted = replace(a, **{name: theirs})
             says = f"has the {what} {number_text(theirs)} {unit} for {number_text(ours)}"
-            fitting = (x for x in mistakes if near.lump(replace(a, **x.fields), wanted))
+            fitting = (x for x in mistakes if near.mass_properties(replace(a, **x.fields), wanted))
             out.append(next(fitting, Mistake(what, says, {}))._replace(fields={name: theirs}))
     if not near.inertia(a.inertia, b.inertia, a.mass):
         out.append(Mistake(*_inertia_difference(a, b, mistakes, near), {"inertia": b.inertia}))
     return out
 
 
-def _inertia_difference(a: Lump, b: Lump, mistakes: Sequence[Mistake], near: Tolerances) -> tuple[str, str]:
+def _inertia_difference(
+    a: MassProperties, b: MassProperties, mistakes: Sequence[Mistake], near: Tolerances
+) -> tuple[str, str]:
     """Return kind and sentence of another inertia, whatever else of the body differs."""
     for mistake in mistakes:
         I = mistake.fields.get("inertia", a.inertia)
@@ -260,7 +262,7 @@ def link_differences(
         return None
     out = []
     for x in ours:
-        if not near.lump(x.matter, there[x.name]):
+        if not near.mass_properties(x.matter, there[x.name]):
             alone = replace(x, R=np.eye(3), p=np.zeros(3))
             out += [(x.name, mistake) for mistake in _body_differences([alone], np.eye(3), there[x.name], near)]
     return out
@@ -278,7 +280,8 @@ def links_in_common_axes(one: MergedModel, other: MergedModel, near: Tolerances)
         apart = {x.name for x, y in pairs if not (near.vector(x.R, y.R) and near.point(x.p, y.p))}
         for side in sides:
             side[name] = tuple(
-                LinkInBody(x.name, np.eye(3), np.zeros(3), x.lump) if x.name in apart else x for x in side[name]
+                LinkInBody(x.name, np.eye(3), np.zeros(3), x.mass_properties) if x.name in apart else x
+                for x in side[name]
             )
     return MergedModel(one.model, sides[0]), MergedModel(other.model, sides[1])
 
@@ -453,8 +456,8 @@ def _hypothesis(x: Mistake, subject: str, put: Callable[..., MergedModel], a: ob
 
 def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
     body = joint.child
-    a, b = one.lump(body), other.lump(body)
-    if near.lump(a, b):
+    a, b = one.mass_properties(body), other.mass_properties(body)
+    if near.mass_properties(a, b):
         return []
     links = link_differences(one.links[body], other.links[body], near)
     if not links:

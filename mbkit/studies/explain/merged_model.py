@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.load.shapes import NOTHING, Lump, together
+from mbkit.load.shapes import NOTHING, MassProperties, together
 from mbkit.model import Body, Joint, Model
 from mbkit.studies._targets import with_values
 
@@ -55,7 +55,7 @@ class Tolerances:
         floor = 1e-3 * mass * self.length**2 * self.relative
         return bool(np.abs(a - b).max() <= self.relative * np.abs(a).max() + floor)
 
-    def lump(self, a: Lump, b: Lump) -> bool:
+    def mass_properties(self, a: MassProperties, b: MassProperties) -> bool:
         """Return whether mass, centre of mass and inertia are equal."""
         com = self.point(a.com, b.com) or not (a.mass or b.mass)
         return self.number(a.mass, b.mass) and com and self.inertia(a.inertia, b.inertia, a.mass)
@@ -68,10 +68,10 @@ class LinkInBody:
     name: str
     R: Array
     p: Array
-    matter: Lump
+    matter: MassProperties
 
     @property
-    def lump(self) -> Lump:
+    def mass_properties(self) -> MassProperties:
         """Its matter in the body's axes."""
         return self.matter.moved(self.R, self.p)
 
@@ -90,14 +90,14 @@ class MergedModel:
     links: Mapping[str, tuple[LinkInBody, ...]]
 
     @property
-    def ground(self) -> Lump:
+    def ground(self) -> MassProperties:
         """The matter that stands still, in the world's axes."""
         return composite(self.links["world"])
 
-    def lump(self, body: str) -> Lump:
+    def mass_properties(self, body: str) -> MassProperties:
         """Return the matter of a body."""
         x = self.model.body(body)
-        return Lump(x.mass, x.com, x.inertia)
+        return MassProperties(x.mass, x.com, x.inertia)
 
     def with_fields(self, **fields: Any) -> MergedModel:
         """Return the description with other fields of the model."""
@@ -109,12 +109,14 @@ class MergedModel:
 
     def with_body(self, fields: Mapping[str, Any], name: str) -> MergedModel:
         """Return the description with another mass, centre of mass or inertia in one body."""
-        return replace(self, model=with_lump(self.model, name, replace(self.lump(name), **fields)))
+        return replace(
+            self, model=with_mass_properties(self.model, name, replace(self.mass_properties(name), **fields))
+        )
 
     def with_link(self, fields: Mapping[str, Any], body: str, link: str) -> MergedModel:
         """Return the description with other matter in one link of a body, in the link's axes."""
         links = tuple(replace(x, matter=replace(x.matter, **fields)) if x.name == link else x for x in self.links[body])
-        return MergedModel(with_lump(self.model, body, composite(links)), {**self.links, body: links})
+        return MergedModel(with_mass_properties(self.model, body, composite(links)), {**self.links, body: links})
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,7 @@ def merge(model: Model) -> MergedModel:
         else:
             at[joint.child] = FrameChange(placed.parent, placed.rotation, t=placed.translation)
         here = at[joint.child]
-        links[here.body].append(LinkInBody(own.name, here.A, here.t, Lump(own.mass, own.com, own.inertia)))
+        links[here.body].append(LinkInBody(own.name, here.A, here.t, MassProperties(own.mass, own.com, own.inertia)))
     joints = tuple(moving[j.name] for j in model.joints if j.name in moving)
     matter = tuple(_body(j.child, composite(links[j.child])) for j in joints)
     merged = replace(reattached(model, at), bodies=matter, joints=joints, frames=())
@@ -180,21 +182,23 @@ def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
     return replace(model, springs=tuple(map(moved, model.springs)), loops=tuple(map(moved, model.loops)))
 
 
-def composite(links: Iterable[LinkInBody]) -> Lump:
-    """Return several links as one lump, in the body's axes."""
-    lumps = [x.lump for x in links if x.massive]
-    if not lumps:
+def composite(links: Iterable[LinkInBody]) -> MassProperties:
+    """Return several links as one rigid body, in the body's axes."""
+    masses = [x.mass_properties for x in links if x.massive]
+    if not masses:
         return NOTHING
-    if len(lumps) > 1 and not any(x.mass for x in lumps):
-        return Lump(0.0, np.zeros(3), np.asarray(sum(x.inertia for x in lumps)))
-    return together(lumps)
+    if len(masses) > 1 and not any(x.mass for x in masses):
+        return MassProperties(0.0, np.zeros(3), np.asarray(sum(x.inertia for x in masses)))
+    return together(masses)
 
 
-def with_lump(model: Model, name: str, lump: Lump) -> Model:
+def with_mass_properties(model: Model, name: str, mass_properties: MassProperties) -> Model:
     """Return the description with other matter in one body."""
-    return replace(model, bodies=tuple(_body(name, lump) if b.name == name else b for b in model.bodies))
+    return replace(model, bodies=tuple(_body(name, mass_properties) if b.name == name else b for b in model.bodies))
 
 
-def _body(name: str, lump: Lump) -> Body:
+def _body(name: str, mass_properties: MassProperties) -> Body:
     # A rotation of an inertia leaves rounding on one side of the diagonal.
-    return Body(name, lump.mass, lump.com, 0.5 * (lump.inertia + lump.inertia.T))
+    return Body(
+        name, mass_properties.mass, mass_properties.com, 0.5 * (mass_properties.inertia + mass_properties.inertia.T)
+    )

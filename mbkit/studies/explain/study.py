@@ -230,7 +230,7 @@ class _Descriptions:
     def _ground_causes(self, one: MergedModel, other: MergedModel, near: Tolerances) -> Iterator[Cause]:
         """Yield the difference in the matter that stands still."""
         a, b = one.ground, other.ground
-        if near.lump(a, b):
+        if near.mass_properties(a, b):
             return
         if not b.mass and a.mass:
             says = f"has no mass in what stands still, where {self.names[0]} has {number_text(a.mass)} kg"
