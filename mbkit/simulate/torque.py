@@ -107,8 +107,9 @@ class TorqueCallback:
 Applied = PiecewiseConstantTorque | TorqueCallback | SampledTorque
 
 
-#: The force during one step: an array, or a function of (t, q, v) of one state or a batch.
-Force = Array | Callable[[float, Array, Array], Array]
+#: The force during one step: an array, or a function of (t, q, v) of one state or a batch. A function of a batch takes
+#: as a fourth argument which of its trajectories the states are of, where they are not all.
+Force = Array | Callable[..., Array]
 
 
 class Torque:
@@ -146,7 +147,9 @@ class Torque:
         """Return the force during step k on a single state, or on these members of a batch."""
         if self._callback is not None:
             callback = self._callback
-            return callback.one if members is None else lambda t, q, v: callback.many(t, q, v, members)
+            if members is None:
+                return callback.one
+            return lambda t, q, v, part=slice(None): callback.many(t, q, v, members[part])
         row = self._of_all if self._rows is None else self._rows[..., k, :]
         if members is None:
             return row

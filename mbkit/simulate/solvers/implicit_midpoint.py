@@ -174,7 +174,7 @@ class MidpointStepper(Stepper):
             if not isinstance(force, np.ndarray):
                 q_m = self._space.retract(q[todo], (h / 2) * w[todo])
                 state = q_m, self._space.to_body_velocity(q_m, w[todo])
-                tau[todo] = force(t + h / 2, *(x[0] for x in state)) if self._single else force(t + h / 2, *state)
+                tau[todo] = force(t + h / 2, *(x[0] for x in state)) if self._single else force(t + h / 2, *state, todo)
             w1, solved = self._newton(self._members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
             change = np.abs(w1 - w[todo]).max(axis=1, initial=0.0)
             if not isinstance(force, np.ndarray):
