@@ -69,11 +69,13 @@ def rows(name: str, value: ArrayLike, n: int, owner: str, size: str) -> Array:
 
 def batch_of(**arrays: Array) -> int | None:
     """Return the common batch size, or None when every array is a single state; one beside a batch is repeated."""
-    sizes = {name: a.shape[0] for name, a in arrays.items() if a.ndim == 2}
+    sizes: dict[str, int] = {name: a.shape[0] for name, a in arrays.items() if a.ndim == 2}
+    if not sizes:
+        return None
     if len(set(sizes.values())) > 1:
         each = ", ".join(f"{k} has {v}" for k, v in sizes.items())
         raise InputError(f"batches of different sizes: {each}; give every array the same N, or one state")
-    return next(iter(sizes.values()), None)
+    return next(iter(sizes.values()))
 
 
 def count(name: str, value: Any, *, least: int = 0) -> int:

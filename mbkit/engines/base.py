@@ -316,7 +316,9 @@ class Dynamics:
         method = self._method(quantity)
         states, size = self._states(arguments)
         try:
-            out = np.asarray(self._value(method, [*states.values()], more, size), dtype=np.float64)
+            value = self._value(method, [*states.values()], more, size)
+            # One state's value may be the engine's own memory.
+            out = np.array(value, dtype=np.float64, copy=None if self._batches or size is not None else True)
         except np.linalg.LinAlgError:
             raise NumericalError(
                 f"{self.engine}: {quantity} of {self.model.name}: the mass matrix is singular{self._suspects()}"
@@ -337,10 +339,8 @@ class Dynamics:
         return checked, size
 
     def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
-        if self._batches:
+        if self._batches or size is None:
             return method(*states, *more)
-        if size is None:
-            return np.array(method(*states, *more))
         if not size:
             one = method(self.model.neutral(), *(np.zeros(x.shape[1]) for x in states[1:]), *more)
             return np.empty((0, *np.shape(one)))
@@ -411,14 +411,20 @@ class MappedDynamics(Dynamics):
 
     def _columns(self, J: Array) -> Array:
         """Return J T, in the description's order and reduced."""
-        J, full = J.copy(), np.empty_like(J)
+        full = np.empty_like(J)
+        if self._turned:
+            J = J.copy()
         for R, part in self._turned:
             J[:, part] = J[:, part] @ R
         full[:, self._v_index] = J
         return np.asarray(full @ self.model.layout.G) if self.model.layout.reduced else full
 
     def _force(self, f: Array) -> Array:
-        return np.asarray(self._columns(f[None, :])[0])
+        if self._turned or self.model.layout.reduced:
+            return np.asarray(self._columns(f[None, :])[0])
+        out = np.empty_like(f)
+        out[self._v_index] = f
+        return out
 
     def _pose(self, q: Array, frame: Frame) -> Array:
         X = np.eye(4)

@@ -14,7 +14,6 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines import known_defects
@@ -164,12 +163,12 @@ class PinocchioDynamics(Dynamics):
             direct = _FACTORIES[name](call, checked, _sound(self.model, unread.get(name, set())))
             vars(self)[name] = functools.update_wrapper(direct, checked)
 
-    def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
+    def _method(self, quantity: str) -> Callable[..., Any]:
         if quantity.startswith("coriolis") and self._coriolis_fault:
             known_defects.announce(known_defects.CORIOLIS, self._coriolis_fault)
         if quantity == "kinetic_energy" and self._kinetic_fault:
             known_defects.announce(known_defects.KINETIC_ENERGY, self._kinetic_fault)
-        return super()._evaluate(quantity, *more, **arguments)
+        return super()._method(quantity)
 
     # Between the description's coordinates and Pinocchio's.
 
