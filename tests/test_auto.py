@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import warnings
 from typing import Any
 
@@ -122,6 +123,22 @@ def test_rodas5_is_tried_where_many_steps_are_to_come_though_stability_does_not_
     assert np.abs(run.q - problem.exact(times)).max() < 1e-6 * problem.scale
     assert "rodas5 got further with a trial" in run.stats.chosen
     assert run.stats.evaluations < 100_000
+
+
+@pytest.mark.parametrize(
+    ("case", "value", "engine", "methods", "steps"),
+    [
+        # Steps are short in passing; taken for a mean, they would let rodas5 begin where it has long ones ahead.
+        ("light_cart_pole", 1e-9, "lagrangian", ["rk853"], 5000),
+        # Accuracy holds rk853 at h|λ| = 0.4, so that it would not come back to larger steps.
+        ("damped_point_spring", 1e4, "pinocchio", ["rk853", "rodas5"], 400),
+    ],
+)
+def test_methods_do_not_take_turns(case: str, value: float, engine: str, methods: list[str], steps: int) -> None:
+    problem = cases.get(case).make(value)
+    run = simulate(dynamics(problem.model, engine), problem.q, problem.v, problem.duration, "auto", rtol=1e-8)
+    assert ["rk853", *re.findall(r"; (\w+) from there", run.stats.chosen)] == methods
+    assert run.stats.steps < steps
 
 
 def test_an_oscillation_is_followed_and_its_errors_do_not_add_up() -> None:

@@ -38,7 +38,7 @@ _RECENT: Final = 8
 #: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative and 5 on the imaginary
 #: axis; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
 _EDGE: Final = 3.0
-#: h|λ| that rk853 would have, where rodas5 is compared with it.
+#: h|λ| that rk853 would have at most, where rodas5 is compared with it.
 _KEPT: Final = 5.0
 #: Time of an attempt of rodas5 over that of one of rk853, and how much faster rodas5 must be.
 _DEARER: Final = 1.2
@@ -187,6 +187,8 @@ class SwitchingController:
         # The first is the user's or loosened, the second for the number of steps.
         self._base, self._tolerances = self._user, loosest(EXPLICIT, self._user)
         self._least, self._tightest = LEAST, math.inf
+        # rk853's h|λ| when it was left: where accuracy kept its steps short, it would do so again.
+        self._kept = _KEPT
         self._segments = [Segment(EXPLICIT, problem.start)]
         self._monitor: StepRateMonitor | None = None
         self._at: tuple[float, Array, Array] = problem.start, np.empty(0), np.empty(0)
@@ -266,10 +268,13 @@ class SwitchingController:
             if self._rounding_limited(attempts, place, step):
                 return
             held = rates is not None and step * rates.stable >= _EDGE
-            if (held or to_come >= costs.guess) and (trial := self._faster_trial(rate)):
+            # Where steps are short now, and not only on the average.
+            if (held or to_come >= costs.guess) and (trial := self._faster_trial(min(rate, 1 / step))):
                 why = "stability held its steps" if held else "rodas5 got further with a trial"
                 size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
                 self._switch(IMPLICIT, trial, why + size)
+                if rates is not None:
+                    self._kept = min(_KEPT, step * rates.stable) or _KEPT
                 return
         # By the mean rate, which passing changes hardly touch.
         self._adapt_tolerance(attempts, place, monitor.overall() * self._rest)
@@ -302,7 +307,7 @@ class SwitchingController:
         to_come = rate * self._rest
         if _DEARER * to_come >= self._context.costs.worth:
             rates = self._spectrum(attempts, place, 0.0)
-            if rates is not None and rates.stable / _KEPT < _DEARER * rate:
+            if rates is not None and rates.stable / self._kept < _DEARER * rate:
                 self._returns += 1
                 self._switch(EXPLICIT, self._started(EXPLICIT), f"stability no longer held rk853's steps ({rates})")
                 return
