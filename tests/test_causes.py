@@ -232,6 +232,17 @@ def test_a_planted_difference_is_named(name: str, plant: Callable[[Model], Plant
     assert found.agree == (kind in SILENT)
 
 
+def test_an_inertia_whose_quaternion_was_read_in_the_wrong_order_is_named() -> None:
+    a = robot("panda")
+    body = carried(a)
+    moments, axes = np.linalg.eigh(body.inertia)
+    x, y, z, w = spatial.quaternion_from_matrix(axes * np.linalg.det(axes))
+    R = spatial.matrix_from_quaternion(np.array([w, x, y, z]))
+    (cause,) = mb.explain(a, with_body(a, body.name, inertia=R @ np.diag(moments) @ R.T), samples=1).causes
+    assert cause.kind == "quaternion order"
+    assert body.name in str(cause)
+
+
 def test_a_robot_agrees_with_itself_and_with_its_frames_drawn_elsewhere() -> None:
     a = robot("panda")
     assert mb.explain(a, a).agree

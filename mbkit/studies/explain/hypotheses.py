@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import permutations, product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -245,12 +246,26 @@ def _inertia_difference(
             return mistake.kind, mistake.says
     moments = np.linalg.eigvalsh(a.inertia), np.linalg.eigvalsh(b.inertia)
     if near.inertia(np.diag(moments[0]), np.diag(moments[1]), a.mass):
+        if _has_reordered_axes(a.inertia, b.inertia, a.mass, near):
+            return "quaternion order", "has the inertia in axes whose quaternion was read in the wrong order"
         axes = f"{number_text(b.inertia)} for {number_text(a.inertia)}"
         return "inertia axes", f"has the same principal moments in other axes: {axes}"
     factor = np.trace(b.inertia) / np.trace(a.inertia) if np.trace(a.inertia) else 0.0
     if near.inertia(factor * a.inertia, b.inertia, a.mass):
         return "inertia", f"has {number_text(float(factor))} times the inertia"
     return "inertia", f"has the inertia {number_text(b.inertia)} kg m² for {number_text(a.inertia)}"
+
+
+def _has_reordered_axes(a: Array, b: Array, mass: float, near: Tolerances) -> bool:
+    """Return whether b is a in principal axes whose quaternion was read in another order."""
+    moments, axes = np.linalg.eigh(a)
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        Q = axes[:, order] * signs
+        for R in _reordered(Q) if np.linalg.det(Q) > 0 else ():
+            turned = R @ np.diag(moments[list(order)]) @ R.T
+            if angle_of(R.T @ Q) > near.relative and near.inertia(turned, b, mass):
+                return True
+    return False
 
 
 def link_differences(

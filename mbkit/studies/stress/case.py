@@ -11,7 +11,6 @@ import numpy as np
 from mbkit._check import Array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
-from mbkit.studies.study_runs import require_motion
 
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "long", "step"]
 #: The error of q along a run, of the energy along a run, or of terms at states.
@@ -131,8 +130,12 @@ def problem_of(case: Case, value: float) -> Problem:
     what = f"{case.name} at {value:g}"
     if not isinstance(problem, Problem):
         raise InputError(f"{what}: expected make to return a Problem, got {type(problem).__name__}")
-    model = require_motion(problem.model, "integrate")
+    model: Any = problem.model
+    if not isinstance(model, Model):
+        raise InputError(f"{what}: model: expected a Model, got {type(model).__name__}")
     model.require_values("a study of stress")
+    if not model.nv:
+        raise InputError(f"{what}: nothing moves in {model.name} (nv = 0)")
     q, v = model.check_q(problem.q), model.check_v(problem.v)
     if case.measure == "terms":
         if problem.tau is not None:
