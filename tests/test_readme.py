@@ -74,6 +74,20 @@ def test_the_cost_of_the_checks_is_the_measured_one():
     assert sentence in TEXT
 
 
+def test_what_auto_reaches_is_the_measured_one():
+    auto = json.loads((TOP / "validation" / "auto.json").read_text(encoding="utf-8"))
+    ended = [row for row in auto["rows"] if row["auto"]["ratio"] is not None]
+    own = [row["auto"]["ratio"] for row in ended if row["engine"] == "lagrangian"]
+    error = max(row["auto"]["error"] for row in ended)
+    sentence = (
+        f"is at most {error:.1e} on each of the {len(ended)} where any method gets there in the time allowed, "
+        f"its time within 3 times the best's on {auto['within_3']} of them "
+        f"(on the own derivation {sum(x <= 3 for x in own)} of {len(own)}, {max(own):.1f} at the most), "
+        f"{auto['median']:.1f} times in the median and {auto['largest']:.1f} times at the most."
+    )
+    assert sentence in TEXT
+
+
 def test_no_file_for_others_tells_where_it_was_made():
     kinds = {".json", ".md", ".ipynb", ".html", ".svg", ".toml", ".csv"}
     files = [
