@@ -1,4 +1,4 @@
-r"""Text from names, made safe for where it goes: one function for each kind of output.
+r"""Safe text from names: one function for each kind of output.
 
 Names of robots, links, joints and symbols come from untrusted files. Each function here returns text that the
 reader of its output (a terminal, a browser, TeX, Python, a C compiler, an XML parser) takes as text alone. Characters
@@ -23,7 +23,7 @@ def terminal(text: str) -> str:
 
 
 def one_line(text: str, most: int = 0) -> str:
-    """Return text for a terminal on one line, cut after `most` characters if given."""
+    """Return text for a terminal on one line, cut after `most` characters if that is a number."""
     one = " ".join(terminal(text).split())
     return one if not most or len(one) <= most else one[: most - 1].rstrip() + "…"
 

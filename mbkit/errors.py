@@ -162,7 +162,7 @@ class MbkitWarning(UserWarning):
 
 
 class DoubtfulRunWarning(MbkitWarning):
-    """A run finished with plausible numbers, but a check found a reason for doubt."""
+    """A run finished with plausible numbers, but a check doubts them."""
 
 
 class KnownDefectWarning(MbkitWarning):

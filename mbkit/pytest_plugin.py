@@ -42,7 +42,7 @@ _STRICT = "MBKIT_TEST_STRICT"
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options."""
     group = parser.getgroup("mbkit", "robots and their engines (mbkit)")
-    group.addoption("--mbkit-regen", action="store_true", help="record the baselines of the tests anew")
+    group.addoption("--mbkit-regen", action="store_true", help="record the baselines of the tests again")
     group.addoption("--mbkit-strict", action="store_true", help="fail, and do not skip, where an engine is missing")
 
 

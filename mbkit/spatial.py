@@ -78,7 +78,7 @@ def matrix_from_quaternion(quaternion: Array) -> Array:
 def quaternion_from_matrix(R: Array) -> Array:
     """Return the unit quaternion of one rotation matrix, with w >= 0.
 
-    Shepperd's method: the largest of the four squares is taken, so that no component is found by a small divisor.
+    Shepperd's method: it starts from the largest of the four squares, so that no divisor is small.
     """
     trace = float(np.trace(R))
     squares = np.array([*(1 + 2 * np.diag(R) - trace), 1 + trace])
@@ -108,7 +108,7 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 def rpy_from_matrix(R: Array) -> tuple[float, float, float]:
     """Return roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll), pitch within ±π/2.
 
-    Yaw is found first and taken out of R, so that roll makes up for what yaw lost near a pitch of ±π/2.
+    Yaw comes first and is removed from R, so that roll makes up for what yaw lost near a pitch of ±π/2.
     """
     yaw = float(np.arctan2(R[1, 0], R[0, 0]))
     c, s = np.cos(yaw), np.sin(yaw)

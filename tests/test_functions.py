@@ -417,7 +417,7 @@ def equations(rates: Callable[[Any, Any], Any], n: int) -> Any:
         q=q,
         v=v,
         tau=tau,
-        trailing={},
+        extra_arguments={},
         model=double_pendulum(),
         kin=SimpleNamespace(qdot=v),
         function=lambda _: forward,

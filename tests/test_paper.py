@@ -443,7 +443,7 @@ WRONG = [
     (lambda: Lagrangian(m * w**2, 0, [th], [sp.Symbol("thetadot", positive=True)]), "to be nonnegative"),
     (lambda: Lagrangian((1 + sp.I) * w**2, 0, [th]), "imaginary unit"),
     (lambda: Lagrangian(w**2 * sp.IndexedBase("m")[0], 0, [th]), "m\\[0\\] is no plain symbol"),
-    (lambda: Lagrangian(w**2, th * t, [th]), "the time is given as time=t"),
+    (lambda: Lagrangian(w**2, th * t, [th]), "pass the time as time=t"),
     (lambda: Lagrangian(w**2, 0, [th], forces=[k]), "expected {coordinate: force}"),
     (lambda: Lagrangian(w**2, 0, [th], forces={th: -k}), "an input is a symbol that is all of one force"),
     (lambda: Lagrangian(w**2, 0, [th], dissipation=th**2), "holds none of the velocities thetadot"),

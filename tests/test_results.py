@@ -12,7 +12,7 @@ import pytest
 
 from mbkit.errors import InputError, OutputError
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.baseline.result import BaselineResult, Moved, VersionChange
+from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, VersionChange
 from mbkit.studies.compare.result import Comparison
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.result import Cause, Explanation
@@ -47,7 +47,7 @@ CHECKED = BaselineResult(
     status="numbers",
     engines=("pinocchio",),
     changes=(Change("bodies", "a", "mass", 1.0, 2.0, "mass of a: 1 → 2"),),
-    moved=(Moved("M", "pinocchio", "a", "neutral", 1.0, 2.0, 0.5, 1e-15),),
+    moved=(ChangedNumber("M", "pinocchio", "a", "neutral", 1.0, 2.0, 0.5, 1e-15),),
     versions=(VersionChange("pin", "4.0.0", "4.1.0"),),
     processors=("x", "y"),
     skipped=(Refusal("drake", "", "not installed"),),

@@ -332,7 +332,7 @@ def test_steps_are_set_against_linear_theory_and_make_a_rule():
     ]
     told = {r.method: (*(b.held for b in r.bounds.values()), r.words) for r in rules(found)}
     assert told == {
-        "gauss4": (8.0, "no limit found up to 8 / ω"),
+        "gauss4": (8.0, "no limit up to 8 / ω"),
         "rk4": (2.0, "dt ≤ 2 / ω"),
         "semi_implicit_euler": (0.0, "none tried held, the least 1 / ω"),
     }

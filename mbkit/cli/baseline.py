@@ -90,7 +90,7 @@ def check(
 
     A changed parameter of the description is named first; then a number that moved, with its
     term, joint and engine, and the version that did. New versions alone ask, on a terminal, whether to
-    record anew. Exit status: 0 as recorded, 1 something differs (or with --strict an engine is
+    record again. Exit status: 0 as recorded, 1 something differs (or with --strict an engine is
     missing), 2 misuse, a file that cannot be read, or nothing that could be checked; 0 too for
     what --rebaseline recorded.
     """
@@ -143,7 +143,7 @@ def _check_one(
     if result.skipped:
         names = ", ".join(r.engine for r in result.skipped)
         why = f"what it has of {names} would be lost; install that first"
-        shared.say("error", f"{file}: not recorded anew, because {why}")
+        shared.say("error", f"{file}: not recorded again, because {why}")
         return result, False
     baselines.record(
         model,
@@ -163,7 +163,7 @@ def _check_one(
 def _confirmed(file: Path) -> bool:
     """Return whether a person at a terminal wants a baseline recorded again."""
     there = sys.stdin.isatty() and sys.stdout.isatty()
-    return there and click.confirm(f"Record {file} anew with these versions?", default=False)
+    return there and click.confirm(f"Record {file} again with these versions?", default=False)
 
 
 @baseline.command()

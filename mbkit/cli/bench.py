@@ -39,7 +39,7 @@ def bench(
     """Measure error against run time on TARGET: every engine, every method.
 
     TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written.
-    Ctrl-C ends the study early, and what is finished is written.
+    Ctrl-C ends the study early and writes the finished part.
     """
     from mbkit.methods.registry import METHODS, QUICK_METHODS
     from mbkit.report import work_precision_view

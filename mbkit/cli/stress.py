@@ -42,7 +42,7 @@ def stress(
 
     All cases where none is named; --list tells them. A page, JSON and CSV are written.
     Every run is in a process of its own with a bound of time and memory. Ctrl-C ends the
-    study early, and what is finished is written.
+    study early and writes the finished part.
     """
     if listing:
         _list(as_json=report.as_json)

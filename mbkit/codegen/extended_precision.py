@@ -103,7 +103,7 @@ def _mpmath() -> Arithmetic:
     context = mpmath_context()
 
     def divide(a: Any, b: Any) -> Any:
-        # As IEEE 754 has it, so that a singular matrix is found where results are checked.
+        # As IEEE 754 has it, so that the check of results sees a singular matrix.
         return a / b if b != 0 else context.sign(a) * context.inf
 
     def real(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -155,7 +155,7 @@ def digits(x: Any, own: Arithmetic) -> Any:
 # Run a program on arrays of 113-bit numbers, a batch of states at once.
 #
 # Nothing is compiled: each operation is one loop over the states. Temporaries are dropped with their last use. What
-# does not depend on the state is computed once: an argument that is the same for all states is given as one row, and
+# does not depend on the state is computed once: an argument that is the same for all states is one row, and
 # NumPy's broadcasting does the rest.
 
 # States per pass: enough to share the interpreter's work, few enough for memory.

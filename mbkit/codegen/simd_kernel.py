@@ -8,7 +8,7 @@ Entry j of argument i is the vector at ``in[i] + j * in_strides[i]``; entries of
 output count along the rows. Products and sums may be contracted to one rounding,
 which the derivation's expressions leave open; nothing else is reordered.
 
-The first vector of the work space gathers 0 times the numbers given and returned: it
+The first vector of the work space gathers 0 times the numbers read and returned: it
 stays zero in a lane until one of them is not finite, whether a graph reads it or not.
 """
 

@@ -111,14 +111,14 @@ def order_of(tolerance: float) -> int:
 
 
 def rates(equations: Equations) -> ca.Function:
-    """Return (q, v, tau) -> (q̇, v̇), with the equations' trailing arguments behind; quaternions of any norm."""
+    """Return (q, v, tau) -> (q̇, v̇), with the equations' extra arguments behind; quaternions of any norm."""
     eq, q = equations, ca.SX(equations.q)
     for start, _ in eq.model.quaternions:
         part = eq.q[start : start + 4]
         q[start : start + 4] = part / ca.sqrt(ca.sumsqr(part))
     forward = eq.function("forward_dynamics")
-    a = forward(q, eq.v, eq.tau, *eq.trailing.values())
-    inputs = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.trailing}
+    a = forward(q, eq.v, eq.tau, *eq.extra_arguments.values())
+    inputs = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.extra_arguments}
     outs = [ca.densify(eq.kin.qdot), ca.densify(a)]
     return ca.Function("rates", list(inputs.values()), outs, list(inputs), ["qdot", "a"])
 
@@ -218,7 +218,7 @@ class TaylorSystem:
 
 
 def taylor_system(equations: Equations) -> TaylorSystem:
-    """Return the Taylor system of equations, made once for all dynamics that share them."""
+    """Return the Taylor system of equations, once for all dynamics that share them."""
     if "series" not in equations.kept:
         equations.kept["series"] = TaylorSystem(equations)
     system: TaylorSystem = equations.kept["series"]

@@ -181,7 +181,7 @@ class Equations:
         return half + 0.5 * ca.mtimes(self.mass_matrix, A)
 
     @cached_property
-    def applied(self) -> Any:
+    def generalized_force(self) -> Any:
         """τ_passive - C v - g: what accelerates a system without τ."""
         return self.passive - self.nle
 
@@ -190,7 +190,7 @@ class Equations:
         """M⁻¹ (τ + τ_passive - C v - g), by the tree's sparse factorization or by `least_constraint`."""
         if self.least_constraint is not None:
             return self.least_constraint.accelerations(self.tau + self.passive)
-        return self.over_mass(self.tau + self.applied)
+        return self.over_mass(self.tau + self.generalized_force)
 
     @cached_property
     def least_constraint(self) -> LeastConstraint | None:
@@ -243,20 +243,20 @@ class Equations:
         names = FUNCTIONS[name]
         return self.named(name, names, [symbols[n] for n in names], getattr(self, name))
 
-    def side_by_side(self, name: str) -> ca.Function:
+    def stacked(self, name: str) -> ca.Function:
         """Return a quantity's several results as one matrix."""
         f = self.function(name)
         given = f.sx_in()
         return ca.Function(name, given, [ca.horzcat(*f.call(given))], f.name_in(), [name])
 
-    def applied_function(self) -> ca.Function:
+    def mass_and_force(self) -> ca.Function:
         """Return M and τ_passive - nle together, for a numerical solution."""
-        outs = [ca.densify(self.mass_matrix), ca.densify(self.applied)]
-        given = {"q": self.q, "v": self.v, **self.trailing}
+        outs = [ca.densify(self.mass_matrix), ca.densify(self.generalized_force)]
+        given = {"q": self.q, "v": self.v, **self.extra_arguments}
         return ca.Function("mass_and_force", list(given.values()), outs, list(given), ["M", "f"])
 
     @property
-    def trailing(self) -> dict[str, ca.SX]:
+    def extra_arguments(self) -> dict[str, ca.SX]:
         """The last arguments of every function, by name."""
         given = {"parameters": self.parameters, "constants": self.constants}
         return {name: symbols for name, symbols in given.items() if symbols.numel()}
@@ -264,12 +264,12 @@ class Equations:
     def named(self, name: str, argument_names: Any, arguments: list[ca.SX], out: Any) -> ca.Function:
         """Return one dense output as a function, or a tuple of derivatives by the first arguments.
 
-        The function takes the `trailing` arguments too.
+        The function takes the `extra_arguments` arguments too.
         """
         outs = out if isinstance(out, tuple) else (out,)
         labels = [f"by_{n}" for n in argument_names[: len(outs)]] if isinstance(out, tuple) else [name]
         dense = [ca.densify(x) for x in outs]
-        given = {**dict(zip(argument_names, arguments, strict=True)), **self.trailing}
+        given = {**dict(zip(argument_names, arguments, strict=True)), **self.extra_arguments}
         return ca.Function(name, list(given.values()), dense, list(given), labels)
 
     def pose(self, frame: str) -> ca.Function:

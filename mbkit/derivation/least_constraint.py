@@ -36,7 +36,7 @@ from mbkit.spatial import skew
 # An inertia as a sum of squares of rates, in rational numbers.
 #
 # The description's doubles are rounded once, however thin the body: LᵀDL in doubles, or principal axes, would lose an
-# inertia about the long axis of a rod as it loses what is left of a mass matrix.
+# inertia about the long axis of a rod as it loses the remainder of a mass matrix.
 
 _PAIRS: Final = tuple(combinations_with_replacement(range(3), 2))
 
@@ -55,7 +55,7 @@ _Form = dict[tuple[int, int], Fraction]
 
 @lru_cache(maxsize=1024)
 def inertia_squares(inertia: tuple[float, ...]) -> tuple[InertiaSquare, ...] | None:
-    """Return the squares of an inertia given row by row; None if inconsistent."""
+    """Return the squares of an inertia from its rows; None if inconsistent."""
     exact = [Fraction(x) for x in inertia]
     I = [exact[3 * i : 3 * i + 3] for i in range(3)]
     torque = _torque(I)

@@ -111,7 +111,7 @@ class Parts:
 def checked(engine: str, model: Model) -> Model:
     """Return an importer's model; raise `UnsupportedError` where nothing moves in it or a number is not sound."""
     if not model.nv:
-        raise UnsupportedError(f"{engine}: nothing moves in what it made of the file (nv = 0)")
+        raise UnsupportedError(f"{engine}: nothing moves in the model that it built from the file (nv = 0)")
     joint_numbers = ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness")
     for what, part, names in (
         *((f"body {x.name!r} with a", x, ("mass", "com", "inertia")) for x in model.bodies),
@@ -121,7 +121,7 @@ def checked(engine: str, model: Model) -> Model:
         for name in names:
             # Not a number, or memory that nobody wrote to.
             if not (np.abs(getattr(part, name)) <= _MAX_NUMBER).all():
-                raise UnsupportedError(f"{engine}: made {what} {name} that nothing has: {getattr(part, name)}")
+                raise UnsupportedError(f"{engine}: built {what} with an impossible {name}: {getattr(part, name)}")
     return model
 
 

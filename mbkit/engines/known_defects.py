@@ -11,7 +11,7 @@ from typing import Final
 from mbkit._warn import warn
 from mbkit.errors import KnownDefectWarning
 
-# Engine, version in which it was reproduced, quantity; what is wrong; what is right.
+# Engine, version in which it was reproduced, quantity; the wrong value; the right one.
 CORIOLIS: Final = (
     "known defect of pinocchio 4.1.0, coriolis_matrix: computeCoriolisMatrix leaves C v + g different from nle for "
     "some joint types (pinocchio#2053); nle is right"

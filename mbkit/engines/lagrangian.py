@@ -171,7 +171,7 @@ class LagrangianDynamics(Dynamics):
     def elimination(self) -> str:
         """What accelerations come from: ``"mass matrix"``, or ``"least constraint"`` where that would lose digits.
 
-        The sparse LᵀDL of M loses M_kk/D_k of its digits, where D_k is what is left of a diagonal entry once all beyond
+        The sparse LᵀDL of M loses M_kk/D_k of its digits, D_k being the remainder of a diagonal entry once all beyond
         joint k gives way. Where that is more than six digits at some pose, as of a light cart below a heavy pole, the
         accelerations, and the products with M⁻¹ in their derivatives, come from Gauss's principle of least constraint,
         in which no M is formed. It is decided from the description, at the nominal values of parameters when the
@@ -184,7 +184,7 @@ class LagrangianDynamics(Dynamics):
 
     @cached_property
     def form(self) -> str:
-        """The digest of what is derived: that of the description without its parameters' values, and `elimination`."""
+        """The digest of the derivation: that of the description without its parameters' values, and `elimination`."""
         digest = self.model.form_digest
         return f"{digest} by {self.elimination}" if self.model.parameters else digest
 
@@ -199,7 +199,7 @@ class LagrangianDynamics(Dynamics):
             def derive() -> Any:
                 if make is not None:
                     return make()
-                if name in ("pose", "jacobian", "applied_function", "side_by_side"):
+                if name in ("pose", "jacobian", "mass_and_force", "stacked"):
                     return getattr(self.equations, name)(*extra)
                 return self.equations.function(name)
 
@@ -261,7 +261,7 @@ class LagrangianDynamics(Dynamics):
         if not self._batched:
             return self
         index = np.asarray(which)
-        # A mask would be taken for the samples 0 and 1.
+        # A mask would be read as the samples 0 and 1.
         if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
             raise InputError(
                 f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask"
@@ -271,7 +271,7 @@ class LagrangianDynamics(Dynamics):
 
     def _with(self, model: Model, batched: dict[str, Array]) -> LagrangianDynamics:
         out = object.__new__(type(self))
-        # Both share what is derived and compiled, now and later.
+        # Both share derived and compiled functions, now and later.
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
         out.__dict__.pop("parameter_values", None)
         out.model, out._batched = model, batched
@@ -314,7 +314,7 @@ class LagrangianDynamics(Dynamics):
         return self._number("energy_rate", q=q, v=v, a=a)
 
     def _stacked(self, name: str, *arguments: Array) -> Array:
-        out = self._machine("side_by_side", name)(*arguments)[0]
+        out = self._machine("stacked", name)(*arguments)[0]
         return out.reshape(*out.shape[:-1], 3, self.model.nv).swapaxes(-2, -3)
 
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
@@ -336,7 +336,7 @@ class LagrangianDynamics(Dynamics):
             self.model.require_independent(q, once=True)
         if self.written_out:
             return self._trimmed("forward_dynamics", q, v, tau)
-        M, f = self._machine("applied_function")(q, v)
+        M, f = self._machine("mass_and_force")(q, v)
         return np.asarray(np.linalg.solve(M, f + tau[..., None])[..., 0])
 
     def _pose(self, q: Array, frame: Frame) -> Array:

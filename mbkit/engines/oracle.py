@@ -139,7 +139,7 @@ class OracleDynamics(Dynamics):
     def at(self, /, **values: float) -> OracleDynamics:
         """Return the same dynamics at other values of the model's named parameters."""
         if self._given is not None:
-            raise InputError("at: this oracle was given its constants; give the parameters' values among them")
+            raise InputError("at: this oracle already has its constants; put the parameters' values among them")
         return type(self)(self.model.with_nominal(values), backend=self._arithmetic.name)
 
     # The methods of quantities take batches, and return 113-bit numbers.
@@ -185,7 +185,7 @@ class OracleDynamics(Dynamics):
         if name != "terms":
             return getattr(eq, name)(*extra) if name in ("pose", "jacobian") else eq.function(name)
         outs = [ca.densify(getattr(eq, x)) for x in _TERMS]
-        return ca.Function("terms", [eq.q, eq.v, *eq.trailing.values()], outs)
+        return ca.Function("terms", [eq.q, eq.v, *eq.extra_arguments.values()], outs)
 
     def _terms(self, q: Array, v: Array | None = None) -> dict[str, Any]:
         """Return M, C v, g, the passive forces and nle; the last answer is kept, M and g for any v."""

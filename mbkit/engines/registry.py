@@ -183,7 +183,7 @@ def register_engine(info: EngineInfo) -> EngineInfo:
             raise InputError(f"engine {name!r}: {adapter.__name__}.engine is {got!r}; expected the same name")
     known = ENGINES.get(name)
     if name in _OWN or (known is not None and _place(known) != _place(info)):
-        raise InputError(f"engine {name!r}: the name is taken; use another one")
+        raise InputError(f"engine {name!r}: the name is in use; choose another one")
     if info.reference or info.derived:
         raise InputError(f"engine {name!r}: reference and derived are for mbkit's own derivation; leave them False")
     ENGINES[name] = info
@@ -221,7 +221,7 @@ def load_entry_points() -> None:
 
 
 def find_engine(name: str) -> EngineInfo:
-    """Return what is known of an engine; `UnknownNameError` where there is none of this name."""
+    """Return an engine's `EngineInfo`; `UnknownNameError` for an unknown name."""
     if name not in ENGINES:
         load_entry_points()
     if name not in ENGINES:

@@ -25,7 +25,7 @@ from mbkit.model import Model
 _EPS: Final = float(np.finfo(float).eps)
 #: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
 _CONSISTENT: Final = 1e-8
-# Newton's iteration squares what is left: from here it ends at rounding.
+# Newton's iteration squares the residual: from here it ends at rounding.
 _NEAR: Final = 1e-8
 _MOST: Final = 60
 _TWIN: Final = "_constrained_twin"
@@ -53,11 +53,17 @@ def _function(eq: EnergyEquations, name: str) -> ca.Function:
         inputs["tau"] = eq.tau
         outputs = {"lambda": eq.multipliers}
     elif name == "embedded":
-        outputs = {"J": c.jacobian, "by_time": c.by_time, "gamma": c.gamma, "M": eq.mass_matrix, "force": eq.applied}
+        outputs = {
+            "J": c.jacobian,
+            "by_time": c.by_time,
+            "gamma": c.gamma,
+            "M": eq.mass_matrix,
+            "force": eq.generalized_force,
+        }
     else:
         # curvature: ∂(Jᵀ λ)/∂q; λ takes the place of v's first entries.
         outputs = {"H": ca.jacobian(ca.mtimes(c.jacobian.T, eq.v[:m]), eq.q)}
-    inputs |= eq.trailing
+    inputs |= eq.extra_arguments
     dense = [ca.densify(x) for x in outputs.values()]
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs), {"cse": True})
 
@@ -153,7 +159,7 @@ class Manifold:
         return q, v
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the nearest consistent state, in the metric of the mass matrix there; InputError if none is found."""
+        """Return the nearest consistent state, in the metric of the mass matrix there; InputError if there is none."""
         x = self.restored(q, v)
         M, n = self._terms(q, v).M, len(q)
         # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
@@ -190,7 +196,7 @@ class Manifold:
             x, terms, best = x + length * step, beyond, size
         if not best <= 1e-10 * (1 + float(np.abs(x).max())):
             raise InputError(
-                f"q: no consistent state of {self.dyn.model.name} found near it; f = {_residuals(terms.f)} is the "
+                f"q: {self.dyn.model.name} has no consistent state near it; f = {_residuals(terms.f)} is the "
                 "least reached"
             )
         return np.asarray(x)
@@ -311,7 +317,7 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
             least, left = size, f
     against = np.flatnonzero(np.abs(left) > 1e-6 * np.abs(left).max())
     raise InputError(
-        f"constraints: no configuration that satisfies them all was found from {len(starts)} starts; it seems that "
+        f"constraints: no configuration satisfies them all, from {len(starts)} starts; it seems that "
         f"{_named(against, form)} {'contradict each other' if len(against) > 1 else 'cannot hold'}: the least that is "
         f"left of them is {least:.3g}"
     )
@@ -328,13 +334,13 @@ def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array
     flat = np.flatnonzero((np.max([np.linalg.norm(J, axis=1) for J in slopes], axis=0) < _FLAT) & (sizes > _ROUNDED))
     if len(flat):
         raise InputError(
-            f"constraints: {_named(flat, form)} has no slope where it holds, here and at the poses found around, so "
+            f"constraints: {_named(flat, form)} has no slope where it holds, here and at the poses around, so "
             "that no force can hold it; write a square as f = 0 instead of f**2 = 0, or start from another pose"
         )
     dependent, others = min((_dependent(J) for J in slopes), key=lambda pair: len(pair[0]))
     if len(dependent):
         raise InputError(
-            f"constraints: the set is redundant, here and at poses found around; {_named(dependent, form)} "
+            f"constraints: the set is redundant, here and at poses around; {_named(dependent, form)} "
             f"{_reason(others, form, 'holds by itself')}; leave it out, as its multiplier is not determined, or start "
             "from another pose"
         )

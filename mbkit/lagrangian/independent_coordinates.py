@@ -4,7 +4,7 @@ A chart divides q into independent and dependent coordinates. The dependent ones
 iteration, velocities from J v + ∂f/∂t = 0 as v = N(q) u + v_t, and the equation is pulled back by N (Wehage and Haug
 1982, Generalized coordinate partitioning; Shabana 2013, Dynamics of Multibody Systems, ch. 5)::
 
-    Nᵀ M N u̇ = Nᵀ (τ + applied - M a_t)
+    Nᵀ M N u̇ = Nᵀ (τ + force - M a_t)
 
 A chart serves while its dependent block of J is not much nearer to singular than J is.
 """
@@ -189,12 +189,12 @@ class EmbeddedDynamics(Dynamics):
         return self._reduced(q, np.zeros(len(q)))[1]
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        _, M, applied = self._reduced(q, v)
-        return np.asarray(np.linalg.solve(M, tau + applied))
+        _, M, force = self._reduced(q, v)
+        return np.asarray(np.linalg.solve(M, tau + force))
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        _, M, applied = self._reduced(q, v)
-        return np.asarray(M @ a - applied)
+        _, M, force = self._reduced(q, v)
+        return np.asarray(M @ a - force)
 
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
         return self._manifold.dyn.kinetic_energy(*self.state(q, v))

@@ -40,7 +40,7 @@ class Lagrangian(EnergyForm):
     coordinates : sequence of sympy symbols
         Plain symbols, or `sympy.physics.mechanics.dynamicsymbols`.
     velocities : sequence of sympy symbols, optional
-        One per coordinate: q̇. When not given, the derivatives of dynamicsymbols, or
+        One per coordinate: q̇. By default the derivatives of dynamicsymbols, or
         symbols named like the coordinates: ``theta1`` has ``thetadot1``.
     time : sympy.Symbol, optional
         Where T, V, a force or a constraint depends on it. Dynamicsymbols bring their own.
@@ -121,7 +121,7 @@ class Lagrangian(EnergyForm):
         return hamilton.energy_function(self)
 
     def routhian(self, cyclic: sp.Symbol | Sequence[sp.Symbol] | None = None) -> Routhian[Lagrangian]:
-        """Return Routh's reduction: the same system less its cyclic coordinates, or those given.
+        """Return Routh's reduction: the same system without its cyclic coordinates, or without the named ones.
 
         Raises
         ------

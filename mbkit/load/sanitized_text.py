@@ -208,7 +208,7 @@ class _Writer:
         self.parts.append(f"</{element.tag}>")
 
     def _shapeless(self, element: Element, kept: list[Element]) -> bool:
-        """Return whether a body has lost shapes from which MuJoCo would have taken its inertia."""
+        """Return whether a body has lost shapes from which MuJoCo would have inferred its inertia."""
         if self._meshes is not None:
             return element.tag == "body" and any(self._meshes.lost.get(id(e)) for e in element.all("geom"))
         lost = any(e.tag in ("collision", "visual") and e not in kept for e in element.children)

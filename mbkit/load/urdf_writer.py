@@ -39,7 +39,7 @@ def urdf_text(model: Model, comment: str) -> str:
 
 
 def _element(tag: str, attributes: Mapping[str, Any], *inside: str) -> str:
-    """Return an element, with what is inside on lines of its own; values are texts or numbers."""
+    """Return an element, with its content on lines of its own; values are texts or numbers."""
     texts = {k: v if isinstance(v, str) else _numbers(v) for k, v in attributes.items()}
     head = tag + "".join(f" {k}={xml_attribute(v)}" for k, v in texts.items())
     lines = "".join(indent(text, "  ") + "\n" for text in inside)

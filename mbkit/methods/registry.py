@@ -1,6 +1,6 @@
 """The methods of integration, as data, and their names.
 
-What other code asks of a method is an attribute of it: no method is told apart by its name elsewhere.
+What other code asks of a method is an attribute of it: no other code tests a method's name.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Method:
     stages : int
         Evaluations of the forward dynamics per step; 0 where that varies.
     about, lacks : str
-        One line, with the source; why other engines do not have it, empty for what is an engine's own.
+        One line, with the source; why other engines do not have it, empty for an engine's own method.
     engines : tuple of str
         Those that have it; any engine with forward dynamics where empty.
     events, callables : bool
@@ -212,13 +212,13 @@ _STIFF: Final[dict[str, Any]] = {"jacobian": True, "fills_tolerance": True}
 _STIFF_OWN: Final[dict[str, Any]] = {**_STIFF, "compiled": True}
 _MOMENTA: Final[dict[str, Any]] = {
     "engines": ("lagrangian",),
-    "lacks": "gives neither momenta nor ∂T/∂q with their derivatives, which the rule in (q, p) is made of",
+    "lacks": "gives neither momenta nor ∂T/∂q with their derivatives, which the rule in (q, p) needs",
     "solver": "implicit_midpoint:run_midpoint",
 }
 _SERIES: Final[dict[str, Any]] = {
     "engines": ("lagrangian", "oracle"),
     "callables": False,
-    "lacks": "gives numbers and no expressions, which a series is made of",
+    "lacks": "gives numbers and no expressions, which a series needs",
 }
 _EXPRESSIONS: Final[dict[str, Any]] = {
     **_STIFF_OWN,
@@ -301,7 +301,7 @@ def register_method(method: Method | Tableau) -> Method:
     Raises
     ------
     InputError
-        The name is taken or no identifier of lower-case letters, digits and single underscores; or the method is no
+        The name is in use or no identifier of lower-case letters, digits and single underscores; or the method is no
         Runge-Kutta method with a fixed step.
 
     Examples

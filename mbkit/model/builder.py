@@ -158,7 +158,7 @@ class ArgumentReader:
         axes: list[ArrayLike] = [a for a in vectors if a is not None]
         if len(axes) != n:
             names = ("no axis", "axis", "axis and axis2")[n]
-            self.faults.append(f"{item}: a {type_.name} joint takes {names}; {len(axes)} given")
+            self.faults.append(f"{item}: a {type_.name} joint: expected {names}, got {len(axes)}")
             axes = list(np.eye(3)[:n])
         out = np.zeros((n, 3))
         for i, a in enumerate(axes):
@@ -508,7 +508,7 @@ class ModelBuilder:
         Raises
         ------
         ModelError
-            With every fault found.
+            With every fault.
         """
         if not isinstance(nonphysical, str) or nonphysical not in ("error", "warn"):
             raise InputError(f"nonphysical: expected 'error' or 'warn', got {shown(nonphysical)}")

@@ -468,7 +468,7 @@ def _sample(joint_type: JointType, seed: int) -> tuple[SimpleNamespace, list[flo
 
 
 class _Angle:
-    """A coordinate of which only sine and cosine can be taken."""
+    """A coordinate that knows only its sine and cosine."""
 
     def __init__(self, value: float) -> None:
         self.value = value
@@ -481,7 +481,7 @@ _OF_ANGLES: Final = SimpleNamespace(
 
 
 def _formula_faults(joint_type: JointType) -> Iterator[str]:
-    """Yield what is wrong with the formulas, measured at one random state."""
+    """Yield the faults of the formulas at one random state."""
     joint, q, v = _sample(joint_type, 7)
     nq, nv, k = joint_type.nq, joint_type.nv, joint_type.quaternion
     try:

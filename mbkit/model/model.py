@@ -60,7 +60,7 @@ class Model(Description):
     def require_independent(self, q: Array, *, once: bool = False) -> None:
         """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows.
 
-        With `once`, constraints that were independent at some configuration are taken to be so everywhere.
+        With `once`, constraints that were independent at some configuration are not tested again.
         """
 
     # Earlier names of the same, for scripts.
@@ -82,7 +82,7 @@ class Model(Description):
         rng : numpy.random.Generator or int
             Or the seed of one.
         size : int, optional
-            Number of states; one without batch axis when not given.
+            Number of states; without it, one state and no batch axis.
 
         Returns
         -------
@@ -204,7 +204,7 @@ class Model(Description):
         return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._mass_text()}; {self.needs}{between}>"
 
     def _mass_text(self) -> str:
-        return "mass not given yet" if any(np.isnan(b.mass) for b in self.bodies) else f"{self.mass:.4g} kg"
+        return "mass without a value" if any(np.isnan(b.mass) for b in self.bodies) else f"{self.mass:.4g} kg"
 
     def _repr_html_(self) -> str:
         cells = "".join(

@@ -235,7 +235,7 @@ def _rollouts(result: Comparison) -> list[doc.Block]:
         out.append(doc.Paragraph("The same integrator with the same step, step for step.", on="page"))
         out.append(doc.Table(columns, judged, dense=True))
         about = (
-            "Condition is how far q moves when the forces are disturbed anew in every step, per relative disturbance: "
+            "Condition is how far q moves when the forces are disturbed in every step, per relative disturbance: "
             "rounding disturbs them so, in any engine, by some eps."
         )
         out.append(doc.Paragraph(about, on="page", note=True))

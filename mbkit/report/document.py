@@ -46,7 +46,7 @@ class Column:
     """A column of a table: its head, in which a line feed breaks it, and the text of a row's cell.
 
     `group` is shown only where it differs from the row before, which begins a group. On a terminal, `width` is the
-    least width and is never folded, texts longer than `most` are cut, and `fill` takes what is left of the line.
+    least width and is never folded, texts longer than `most` are cut, and `fill` takes the rest of the line.
     """
 
     head: str
@@ -94,7 +94,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Bullet:
-    """An entry of a list; on a page also `aside`, and the title and text of what is folded away."""
+    """An entry of a list; on a page also `aside`, and the title and text of a folded part."""
 
     head: str
     text: str

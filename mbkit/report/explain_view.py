@@ -121,7 +121,7 @@ def _importer(p: Parsed) -> Column:
 
 def _setting(result: ParserComparison, read: list[Parsed], alone: list[Parsed]) -> str:
     """Return what was done with the file, in words."""
-    head = f"The same {'URDF' if result.format == 'urdf' else 'MJCF'} was given to each engine's own importer"
+    head = f"The same {'URDF' if result.format == 'urdf' else 'MJCF'} was read by each engine's own importer"
     because = ", because mbkit itself does not read the file"
     if not read:
         why = because if not result.reference else ""
@@ -174,7 +174,7 @@ _MARKS: Final[dict[str, tuple[str, Style]]] = {
 
 
 def baseline_view(result: BaselineResult, again: str = "") -> Document:
-    """Return the document of a check or a diff; `again` is the command that records anew."""
+    """Return the document of a check or a diff; `again` is the command that records again."""
     name = result.path if result.question == "check" else f"{result.path} → {result.against}"
     skipped = {r.engine for r in result.skipped}
     bullets = []
@@ -182,7 +182,7 @@ def baseline_view(result: BaselineResult, again: str = "") -> Document:
         mark, style = ("–", "allowed") if what in skipped else _MARKS.get(what, ("✗", "bad"))
         bullets.append(Bullet(what, line, mark, style))  # type: ignore[arg-type]
     if again and result.question == "check" and result.status in ("description", "numbers", "versions"):
-        bullets.append(Bullet("if this is meant" if result.status != "versions" else "to record anew", again))
+        bullets.append(Bullet("if this is meant" if result.status != "versions" else "to record again", again))
     return Document(
         name=f"{result.model} ({name})",
         verdict=result.verdict,

@@ -46,7 +46,7 @@ _FAMILIES: Final = {
 _MEASURES: Final = {
     "motion": "the largest difference of q along the run, over the size of the motion",
     "energy": "the largest relative error of the energy along the run",
-    "terms": "that of each term at given states, relative to the term",
+    "terms": "that of each term at the case's states, relative to the term",
 }
 #: What a truth's floor stands behind.
 _KNOWN: Final = "; known to "
@@ -292,7 +292,7 @@ class Bound(NamedTuple):
     def words(self) -> str:
         """The rule for a step."""
         if math.isnan(self.failed):
-            return f"no limit found up to {_two(self.held)} / ω"
+            return f"no limit up to {_two(self.held)} / ω"
         return f"dt ≤ {_two(self.held)} / ω" if self.held else f"none tried held, the least {_two(self.failed)} / ω"
 
 
@@ -350,7 +350,7 @@ def _limit(line: Line) -> float:
 
 
 def _least(group: list[Bound]) -> Bound:
-    """Return what is safe in all the cases measured."""
+    """Return the settings that are safe in all the cases measured."""
     failed, theory = (
         min((x for x in numbers if not math.isnan(x)), default=math.nan)
         for numbers in ([b.failed for b in group], [b.theory for b in group])

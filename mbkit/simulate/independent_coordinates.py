@@ -38,7 +38,7 @@ _NEAR: Final = "near a singular pose"
 _BLOCK: Final = 100
 # How far behind a singular pose charts serve again, in terms of how near they end.
 _FAR: Final = 20
-# Least measure, whose logarithm is taken.
+# Least measure; its logarithm must be finite.
 _LEAST: Final = 1e-16
 _MOST: Final = 10_000
 

@@ -55,7 +55,7 @@ class RunCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether no sign was found."""
+        """Whether there is no sign of an error."""
         return bool(self)
 
     def __str__(self) -> str:
@@ -84,7 +84,7 @@ class Trajectory(RunData):
     """
 
     def check(self) -> RunCheck:
-        """Return the signs that the run is wrong, also found by integrating again; true where there are none.
+        """Return the signs that the run is wrong, also by integrating again; true where there are none.
 
         Beside those that `simulate` finds at once (energy from nowhere, a singular mass matrix, coordinates without
         digits, gimbal lock, tolerances that add up): a step too long for a mode of the linearized motion, and of a
@@ -137,7 +137,7 @@ class Trajectory(RunData):
         members = len(self.q) if self.q.ndim == 3 else 1
         if member >= members:
             raise InputError(f"member: expected less than {members}, the number of trajectories, got {member}")
-        # The description is enough: no engine is made.
+        # The description is enough; no engine is built.
         model = self.model if self._dyn is None else dynamics_of_trajectory(self._dyn, member).model
         return picture(self, model, count, view, member)
 

@@ -133,7 +133,7 @@ def columns_of(kind: type) -> tuple[Column, ...]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of any kind, and what is read of each."""
+    """Rows of any kind, and the columns to read from each."""
 
     columns: Sequence[Column]
     rows: Iterable[Any]
@@ -200,7 +200,7 @@ class ResultTable:
         return {name: _data(getattr(self, name)) for name in _names(self)}
 
     def to_json(self, path: str | Path | None = None) -> str:
-        """Return the result as JSON, and write it to `path` if given.
+        """Return the result as JSON; with `path`, write it there too.
 
         Infinity and NaN become null; an entry ``infinite`` then lists which are infinite.
         """
@@ -234,7 +234,7 @@ class ResultTable:
         return result
 
     def to_csv(self, path: str | Path | None = None) -> str:
-        """Return one line a row, with all digits, and write it to `path` if given."""
+        """Return one line a row, with all digits; with `path`, write it there too."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(c.head for c in self._csv_columns)

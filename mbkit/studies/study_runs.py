@@ -72,7 +72,7 @@ def patience(seconds: float, clock: Callable[[], float] = time.perf_counter) -> 
 
     def look(done: float) -> None:
         if clock() > end:
-            raise TooLongError(f"given up after {seconds:g} s, {done:.0%} done: stiff, or very fast motion")
+            raise TooLongError(f"stopped after {seconds:g} s, {done:.0%} done: stiff, or very fast motion")
 
     return look
 
@@ -97,7 +97,7 @@ def cpu_limit(seconds: float) -> Iterator[None]:
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         sent.set()
-        raise TooLongError(f"given up after {seconds:.2g} s")
+        raise TooLongError(f"stopped after {seconds:.2g} s")
 
     before = signal.signal(signal.SIGPROF, stop)
     signal.setitimer(signal.ITIMER_PROF, seconds, _REPEAT)
@@ -107,7 +107,7 @@ def cpu_limit(seconds: float) -> Iterator[None]:
         if not sent.is_set():
             raise
         # CasADi answers any signal with it.
-        raise TooLongError(f"given up after {seconds:.2g} s") from None
+        raise TooLongError(f"stopped after {seconds:.2g} s") from None
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.signal(signal.SIGPROF, before)

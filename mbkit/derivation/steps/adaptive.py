@@ -27,7 +27,7 @@ def embedded_parts(equations: Equations, tableau: EmbeddedTableau) -> list[Part]
     """Return the parts of one attempt of a method of order 8, with errors of order 5 and of order 3, in order.
 
     They read the names of `STATE`, tau, rtol, atol, least (the shortest step that is worth an attempt) and the
-    equations' trailing arguments. The part "field", which holds the forward dynamics, stands once for each stage, and
+    equations' extra arguments. The part "field", which holds the forward dynamics, stands once for each stage, and
     writes the rates k_i = ẇ and r_i = u̇ of stage i.
     """
     parts, stages = AttemptParts(equations), SymbolicStages(equations.model.nv)
@@ -83,13 +83,13 @@ class AttemptParts:
 
     def add_field(self, k: str, r: str) -> None:
         """Evaluate the rates ẇ and u̇ of a stage, under these names."""
-        space, trailing = self.space, self.equations.trailing
-        arguments = {**self.at, **self.named("tau"), **trailing}
+        space, extra = self.space, self.equations.extra_arguments
+        arguments = {**self.at, **self.named("tau"), **extra}
 
         def make() -> ca.Function:
             q, w, u = self.at.values()
             v = space.to_body_velocity(q, w)
-            a = self.equations.function("forward_dynamics")(q, v, self.symbols["tau"], *trailing.values())
+            a = self.equations.function("forward_dynamics")(q, v, self.symbols["tau"], *extra.values())
             return function_of("field", arguments, {"k": space.acceleration(q, v, a), "r": space.rate(u, w)})
 
         self.parts.append(Part("field", tuple(arguments), (k, r), make))

@@ -120,13 +120,13 @@ class Part:
 
 
 def step(equations: Equations, method: str) -> ca.Function:
-    """Return (q, v, tau, dt) -> (q1, v1), with the equations' trailing arguments behind.
+    """Return (q, v, tau, dt) -> (q1, v1), with the equations' extra arguments behind.
 
     The state after dt seconds under the torque tau, by an explicit method with a fixed step; q1 has unit quaternions
     and v1 is mbkit's velocity, body axes on a free joint. An `InputError` where the method has no explicit step.
     """
     s, space = _symbols(equations), SymbolicSpace(equations.model)
-    names = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.trailing)}
+    names = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.extra_arguments)}
     q1, w1 = _stepped(
         equations, method, s, space.to_integrator_velocity(s["q"], s["v"]), _acceleration(equations, space, s)
     )
@@ -139,7 +139,7 @@ def march(equations: Equations, method: str) -> tuple[Part, ...]:
     It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
     far: a number that once was not finite, or beyond all bounds, shows in it for ever.
     """
-    name, reads = f"{method_of(method).code_name}_march", (*_MARCH, *equations.trailing)
+    name, reads = f"{method_of(method).code_name}_march", (*_MARCH, *equations.extra_arguments)
 
     def make() -> ca.Function:
         s, space = _symbols(equations), SymbolicSpace(equations.model)
@@ -167,7 +167,7 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
         if i or not space.flat:
             at = (f"q_{i}", f"v_{i}")
             parts.append(Part.of(f"{prefix}_stage_{i}", known, dict(zip(at, (q, v), strict=True))))
-        reads = (*at, "tau", *equations.trailing)
+        reads = (*at, "tau", *equations.extra_arguments)
         parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
         a = known[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
         return space.acceleration(q, v, a)
@@ -196,11 +196,11 @@ def _stepped(
 def _symbols(equations: Equations) -> dict[str, Any]:
     nq, nv = equations.model.nq, equations.model.nv
     sizes = {"q": nq, "v": nv, "w": nv, "tau": nv, "dt": 1, "squares": 1}
-    return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.trailing}
+    return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
 
 
 def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Callable[[Any, Any], Any]:
-    forward, behind = equations.function("forward_dynamics"), [s["tau"], *equations.trailing.values()]
+    forward, behind = equations.function("forward_dynamics"), [s["tau"], *equations.extra_arguments.values()]
 
     def acceleration(q: Any, w: Any) -> Any:
         v = space.to_body_velocity(q, w)

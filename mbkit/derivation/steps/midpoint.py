@@ -47,7 +47,7 @@ SMALL: Final = 1e-8
 LEAST: Final = 1e-12
 #: Newton's iterations of a step, at most: what has not converged by then wanders about.
 MOST: Final = 12
-# Beyond 1e100 a state is none any more.
+# A state beyond 1e100 counts as diverged.
 _RUNAWAY: Final = 1e200
 
 
@@ -106,7 +106,7 @@ class _MomentumSpace(SymbolicSpace):
 class Midpoint:
     """The parts of a step of the implicit midpoint rule, and the way between v and momenta.
 
-    Every function takes the equations' trailing arguments behind its own.
+    Every function takes the equations' extra arguments behind its own.
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -114,7 +114,7 @@ class Midpoint:
         nq, nv = equations.model.nq, equations.model.nv
         sizes = {"q": nq, **dict.fromkeys(("v", "pi", "w", "w_1", "w_2", "tau"), nv)}
         sizes |= dict.fromkeys(("dt", "miss", "misses"), 1)
-        self._s = {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.trailing}
+        self._s = {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
         step = ("q", "pi", "w", "tau", "dt")
         #: One step of Newton's iteration, and 0 where it was the last one needed.
         self.newton = self._part("newton", step, ("w1", "miss"), self._newton)
@@ -131,7 +131,7 @@ class Midpoint:
         self.velocity_system = self._part("velocity_system", ("q", "pi"), ("M", "p"), self._velocity_system)
 
     def _part(self, name: str, own: tuple[str, ...], writes: tuple[str, ...], make: Any) -> Part:
-        name, reads = f"midpoint_{name}", (*own, *self._equations.trailing)
+        name, reads = f"midpoint_{name}", (*own, *self._equations.extra_arguments)
 
         def function() -> ca.Function:
             return function_of(name, {n: self._s[n] for n in reads}, dict(zip(writes, make(), strict=True)))
@@ -142,7 +142,7 @@ class Midpoint:
         """Return q_m, μ and f of a step with this velocity."""
         s = self._s
         q_m = self._space.toward(s["q"], (s["dt"] / 2) * w)
-        mu, f = self._forces(q_m, w, s["tau"], *self._equations.trailing.values())
+        mu, f = self._forces(q_m, w, s["tau"], *self._equations.extra_arguments.values())
         return q_m, mu, f
 
     @cached_property
@@ -156,7 +156,7 @@ class Midpoint:
         f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.to_integrator_force(
             eq.q, applied
         )
-        arguments = [eq.q, w, eq.tau, *eq.trailing.values()]
+        arguments = [eq.q, w, eq.tau, *eq.extra_arguments.values()]
         return ca.Function("forces", arguments, [ca.gradient(kinetic, w), f], {"cse": True})
 
     def _residual(self) -> Any:

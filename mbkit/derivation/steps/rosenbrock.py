@@ -54,7 +54,7 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
         pull = g * ca.mtimes(K, space.spun(s["w"], g))
         factors = Factors.of(M + g * D + g * pull, equations.elimination_order)
         results = {"mass": _entries(M), "pull": _entries(pull), "factors": ca.vertcat(*factors.values)}
-        return function_of("matrix", {**parts.named("q", "w", "k", "step"), **equations.trailing}, results)
+        return function_of("matrix", {**parts.named("q", "w", "k", "step"), **equations.extra_arguments}, results)
 
     solved = ("w", "k", "r", "sum_u", "sum_w", "step")
 
@@ -85,7 +85,7 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
             go(f"stage_{i}", tableau.A[i, :i], {"sum_u": sum_u, "sum_w": sum_w})
         parts.add_field("k", "r")
         if not i:
-            reads = ("q", "w", "k", "step", *equations.trailing)
+            reads = ("q", "w", "k", "step", *equations.extra_arguments)
             parts.parts.append(Part("matrix", reads, ("mass", "pull", "factors"), matrix))
         stage = {name: ca.SX.sym(name, nv) for name in (f"du_{i}", f"dw_{i}")}
         parts.parts.append(Part("solve", (*solved, "mass", "pull", "factors"), tuple(stage), solve))
@@ -128,7 +128,7 @@ def _linear_system(eq: Equations, space: SymbolicSpace, q: Any, w: Any, k: Any) 
     qdot = ca.substitute(eq.kin.qdot, ca.vertcat(eq.q, eq.v), ca.vertcat(q, v))
     rate = ca.mtimes(by_w, k) + ca.jtimes(v, q, qdot)
     there = space.to_body_velocity(moved, w)
-    force = eq.function("inverse_dynamics")(moved, there, a, *eq.trailing.values())
+    force = eq.function("inverse_dynamics")(moved, there, a, *eq.extra_arguments.values())
     led = space.acceleration(moved, there, a)
     M = ca.mtimes(ca.substitute(eq.mass_matrix, eq.q, q), by_w)
     K = ca.jacobian(force, u) - ca.mtimes(M, ca.jacobian(led, u))
@@ -153,7 +153,7 @@ class Factors:
     values: list[Any]
     # (i, k): row i loses a multiple of row k, in this order.
     steps: list[tuple[int, int]]
-    # (k, j): what is left in row k before its pivot.
+    # (k, j): the remainder of row k before its pivot.
     rest: list[tuple[int, int]]
     # Of each coordinate its row.
     rows: tuple[int, ...]

@@ -119,7 +119,7 @@ def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel]:
         kind = _KINDS.get(joint.type_name())
         if kind is None:
             raise UnsupportedError(
-                f"drake: made a {joint.type_name()} joint of {joint.name()!r}, which has no counterpart here"
+                f"drake: built a {joint.type_name()} joint from {joint.name()!r}, which has no counterpart here"
             )
         parent, child, name = int(joint.parent_body().index()), joint.child_body(), str(joint.name())
         index = int(child.index())
@@ -155,7 +155,7 @@ def _in_order(plant: Any) -> list[Any]:
     while waiting:
         ready = [j for j in waiting if int(j.parent_body().index()) in known]
         if not ready:
-            raise UnsupportedError("drake: made joints that no tree connects to the world")
+            raise UnsupportedError("drake: built joints that no tree connects to the world")
         out += ready
         known |= {int(j.child_body().index()) for j in ready}
         waiting = [j for j in waiting if j not in ready]

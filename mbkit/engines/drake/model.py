@@ -132,7 +132,7 @@ def _add(plant: Any, joint: Joint, bodies: dict[str, Any]) -> list[Any]:
     return out
 
 
-#: `STACKS`, a screw, and what is one joint of Drake's.
+#: `STACKS`, a screw, and joints that Drake has as one.
 _STEPS: Final[dict[str, Callable[[Joint], Sequence[tuple[str, Array]]]]] = {
     **STACKS,
     **dict.fromkeys(("fixed", "ball", "free"), lambda _: ()),

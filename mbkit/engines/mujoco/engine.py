@@ -76,7 +76,7 @@ class MujocoDynamics(MappedDynamics):
 
     @cached_property
     def _torn_couplings(self) -> tuple[str, ...]:
-        """Names of the couplings whose armature MuJoCo leaves out of M between branches, found by evaluating M."""
+        """Names of the couplings whose armature MuJoCo leaves out of M between branches, from an evaluation of M."""
         layout, q = self.model.layout, self.model.neutral()
         rows = {c.name: c.armature**0.5 * layout.coupling_row(c) @ layout.G for c in self.model.couplings if c.armature}
         if not rows:
@@ -275,7 +275,7 @@ class MujocoDynamics(MappedDynamics):
         Returns
         -------
         q, v : (steps + 1, n) or (N, steps + 1, n) arrays
-            NaN from the step on that MuJoCo found to diverge.
+            NaN from the step at which MuJoCo reports divergence.
 
         Raises
         ------
@@ -323,7 +323,7 @@ class Variant:
         self._maps, self._layout = maps, dyn.model.layout
 
     def set(self, q: Array, v: Array) -> None:
-        """Put a state in; the velocities' frame does not matter for what is measured."""
+        """Put a state in; the velocities' frame does not matter for these quantities."""
         self._d.qpos[:] = self._layout.expand_q(q)[self._maps.q_index]
         self._d.qvel[:] = self._layout.expand_v(v)[self._maps.v_index]
 

@@ -208,7 +208,7 @@ class _Description:
         for i in range(1, m.nbody):
             self._body(i)
         self._tree = self._parts.model("mujoco", np.zeros(3) if self._off("GRAVITY") else np.array(m.opt.gravity))
-        #: By key of `Beside`: what is described of tendons and actuators.
+        #: By key of `Beside`: the descriptions of tendons and actuators.
         self.parts: dict[str, PointSpring | JointCoupling] = {**dict(self._point_springs()), **dict(self._couplings())}
         self.model = self.without("")
 

@@ -113,7 +113,7 @@ def _allowed(moments: Array) -> Array:
     out = np.maximum(moments, _LEAST)
     low, middle, high = np.argsort(out)
     if out[low] + out[middle] < out[high]:
-        # Half of what is missing on each side; a thin plate misses a rounding.
+        # Half of the missing amount on each side; a thin plate misses a rounding.
         out[low] += out[high] - out[low] - out[middle]
     while out[low] + out[middle] < out[high]:
         out[low] = np.nextafter(out[low], np.inf)

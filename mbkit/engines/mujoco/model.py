@@ -238,7 +238,7 @@ def _give_inertia(new: Any, body: Body, description: Model, placed: Placed) -> N
     low, middle, high = np.sort(moments)
     harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
     if harmless and (low < _SMALLEST or low + middle < high):
-        # A point mass, a thin rod or a plate is a fair idealization, and what is fixed to the world may have any
+        # A point mass, a thin rod or a plate is a fair idealization, and a body fixed to the world may have any
         # inertia. The compiler refuses them: they are compiled with a placeholder and get their own moments afterwards.
         placed.degenerate[body.name] = moments
         new.inertia = np.ones(3)

@@ -26,7 +26,7 @@ from mbkit.model import Frame, Model
 # Arguments have to be plain vectors of native doubles: Pinocchio reads the memory of a byte-swapped array, and the data
 # of a masked one, as if they were such vectors. One sum finds NaN and infinity in the answer, and so in the arguments;
 # Pinocchio itself objects to wrong sizes. On any doubt the checked method of `Dynamics` takes over: it converts the
-# arguments, or says what is wrong with them.
+# arguments, or names their fault.
 
 Call = Callable[..., Any]
 Sound = Callable[[Array], bool]
@@ -303,7 +303,7 @@ class PinocchioDynamics(Dynamics):
     # Known defects, measured on this very model.
 
     def _tiny_bodies(self) -> str:
-        """Return the names of bodies so light that Pinocchio's sum of inertias, which M is made of, is wrong."""
+        """Return the names of bodies so light that Pinocchio's sum of inertias, and so M, is wrong."""
         out = []
         for body in self.model.bodies:
             if 0 < body.mass < np.finfo(float).eps:

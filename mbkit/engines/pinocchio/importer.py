@@ -1,7 +1,7 @@
 """Pinocchio's own importers of URDF and MJCF, and the models that they read, described.
 
 The only place that knows what a parsed `pinocchio.Model` holds: links that are fixed to each other
-are merged and survive as frames, what is fixed to the world is in joint 0, a continuous joint
+are merged and survive as frames, bodies fixed to the world are in joint 0, a continuous joint
 is (cos, sin), a planar joint's velocity is in the body's axes.
 """
 

@@ -179,7 +179,9 @@ class EnergyEquations(Equations):
 
     @cached_property
     def _constrained(self) -> tuple[Any, Any]:
-        return _constrained_motion(self.constraints, self.mass_matrix, self.tau + self.applied, self.elimination_order)
+        return _constrained_motion(
+            self.constraints, self.mass_matrix, self.tau + self.generalized_force, self.elimination_order
+        )
 
     @property
     def multipliers(self) -> Any:

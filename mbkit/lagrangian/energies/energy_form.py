@@ -332,7 +332,7 @@ def _check_declared(d: EnergyForm) -> None:
     if all(name.startswith("forces") for name in where):
         message += " (an input is a symbol that is all of one force, and stands nowhere else)"
     elif "t" in {s.name for s in unknown} and d.time is None:
-        message += " (the time is given as time=t)"
+        message += " (pass the time as time=t)"
     else:
         message += f" (the velocities are {', '.join(map(str, d.velocities))})"
     raise InputError(message)

@@ -134,7 +134,7 @@ class SystemSummary:
         cyclic = [written(q.name) for q in self.system.cyclic_coordinates()]
         out = [f"Cyclic: {', '.join(cyclic) or 'no coordinate'}"]
         if not self._kept:
-            return [*out, "Conserved: nothing that is told by the coordinates or the time"]
+            return [*out, "Conserved: nothing that follows from missing coordinates or time"]
         for name, x, meaning in self._kept:
             # T and V stand above.
             text = "T + V" if x == self.system.T + self.system.V else self._board.text(self._short(x))

@@ -132,7 +132,7 @@ def numbers_at(system: EnergyForm, t: float, values: Mapping[str, float], what: 
 
 
 def momentum_symbols(system: EnergyForm, coordinates: Iterable[sp.Symbol]) -> tuple[sp.Symbol, ...]:
-    """Return a symbol for each coordinate's momentum: theta -> p_theta, or P_theta where that is taken already."""
+    """Return a symbol for each coordinate's momentum: theta -> p_theta, or P_theta where that name is in use."""
     used = {s.name for s in symbols_of(system)}
     out = []
     for q in coordinates:

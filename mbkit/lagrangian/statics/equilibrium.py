@@ -118,7 +118,7 @@ def equilibrium(
     forces: Mapping[str, ArrayLike] | None = None,
     seed: int = 0,
 ) -> Equilibrium:
-    """Return where a system rests under given forces, or the forces that hold it in a configuration.
+    """Return where a system rests under forces, or the forces that hold it in a configuration.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def equilibrium(
         `tau` or `q0` beside `holding`, a wrong shape, forces that depend on the time, or a `holding` that constraints
         do not allow.
     NumericalError
-        No equilibrium found, with the least force that is left over and where.
+        No equilibrium; names the least remaining force and where it is.
 
     Notes
     -----
@@ -304,7 +304,7 @@ class _Balance:
     # The search: Newton's iteration, damped after Levenberg and Marquardt far from the end
 
     def at_rest(self, starts: list[Array], tau: Array) -> tuple[Array, Array]:
-        """Return the first configuration at rest that is found, and λ there; NumericalError names the least force."""
+        """Return the first configuration at rest, and λ there; NumericalError names the least force."""
         ends: list[tuple[float, Array, Array]] = []
         for start in starts:
             q, multipliers, residual, left = self._solved(start, tau)

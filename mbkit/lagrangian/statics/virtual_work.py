@@ -1,4 +1,4 @@
-"""Generalized forces by virtual work: the work of given forces along each coordinate."""
+"""Generalized forces by virtual work: the work of forces along each coordinate."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ def _rational(x: Fraction) -> sp.Rational:
 #
 # With z = exp(i θ) a cosine is (z + 1/z)/2 and a sine (z - 1/z)/(2 i), so a sum is a polynomial in the z's and the
 # generators with exponents of either sign. Such polynomials factor in one way only: whether one divides another is
-# found term by term, modulo sin² + cos² = 1 and without a search.
+# computed term by term, modulo sin² + cos² = 1 and without a search.
 
 #: Terms of a quotient that is useful.
 _MOST: Final = 400

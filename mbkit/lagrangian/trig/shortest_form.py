@@ -56,7 +56,7 @@ def _without(n: int, p: int) -> int:
 def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = True) -> sp.Expr:
     """Return a sum of cosines and sines as a SymPy expression that is short to read.
 
-    With `whole`, factors that all terms share are taken out; without `decimals`, 9.81 is a fraction.
+    With `whole`, factors that all terms share are factored out; without `decimals`, 9.81 is a fraction.
     """
     if not x:
         return sp.Integer(0)
@@ -125,7 +125,7 @@ class _Writer:
         return number(x) if self._decimals else sp.Rational(x.numerator, x.denominator)
 
     def _written(self, poly: Poly) -> sp.Expr:
-        """Return a polynomial with the shared factors of its terms taken out, most shared first."""
+        """Return a polynomial with the shared factors of its terms in front, most shared first."""
         if len(poly) == 1:
             ((atoms, value),) = poly.items()
             return sp.Mul(self._number(value), *(a**e for a, e in atoms))

@@ -211,7 +211,7 @@ class _Reading:
 
     def _read_power(self, x: Any) -> TrigPolynomial:
         root = sp.sqrt(x.base)
-        # One over what is under a root is a power of the root.
+        # 1 / (the argument of a root) is a power of the root.
         written = root if root in self._powers else 1 / x.base
         generator = self._powers[written]
         if generator not in self._known:

@@ -42,7 +42,7 @@ _FOLLOWED: Final = 1e-3
 #: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by 2 to 4 times that.
 _LOST: Final = 0.02
 _SUM: Final = 1e-3
-#: Of a run: what is gone after that is a transient.
+#: Of a run: motion that has decayed by then is a transient.
 _BRIEF: Final = 0.01
 #: Smallest eigenvalue of the mass matrix beside its largest, where a random configuration has a unit diagonal.
 _IDLE: Final = 1e-7

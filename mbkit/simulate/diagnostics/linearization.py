@@ -239,7 +239,7 @@ def stiffness(
     Parameters
     ----------
     dyn : Dynamics
-        The own derivation differentiates exactly; for other engines differences are taken, in one call.
+        The own derivation differentiates exactly; other engines use finite differences, in one call.
     q, v : (nq,) and (nv,), or (N, nq) and (N, nv) array_like
         Of a batch, the member with the fastest rate counts.
     tau : (nv,) array_like or callable, optional

@@ -339,7 +339,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
             if by_time is not None:
                 right += (g * self._d[i]) * by_time
             k[i], _ = lapack.dgetrs(lu, pivots, right)
-        # What was no number anywhere is none here.
+        # A value that was NaN anywhere is NaN here.
         if not np.isfinite(k).all():
             raise DivergenceError(self._own_rates.why)
         return k

@@ -29,7 +29,7 @@ from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason
 from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
 from mbkit.simulate.time_grid import Indices
 
-#: Steps that are made without a look at them, at most.
+#: Largest number of steps between two checks.
 BLOCK: Final = 16
 
 # Above this many operations the forward dynamics is compiled once and called for each stage: LLVM's time grows faster
@@ -94,7 +94,7 @@ class BlockLoop:
         raise NotImplementedError
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:  # noqa: ARG002
-        """Return what is kept of w, (n, steps, nv)."""
+        """Return the saved w, (n, steps, nv)."""
         return w
 
     def states(self, name: str, which: Sequence[int] | Indices) -> Array:
@@ -396,7 +396,7 @@ class MidpointChunk(BlockLoop):
         held = {name: at(name, j) for name in ("q", "pi", "tau", "misses", "parameters")}
         held |= {name: at(name, 0) for name in ("dt", "miss")}
         new = {"q1": at("q", j + 1), "pi1": at("pi", j + 1), "misses1": at("misses", j + 1), "guess": at("guess", 1)}
-        # The block's first guess stays where it is, so that the block can be made again.
+        # The block's first guess stays unchanged, so that the block can be repeated.
         tries = [at("guess", min(j, 1)), *(at("trial", i) for i in range(iterations - 1)), at("w", j + self._back)]
         calls = []
         for w, w1 in pairwise(tries):

@@ -47,7 +47,7 @@ def run_cvodes(problem: IntegrationProblem) -> SolverResult:
             known = np.concatenate([np.asarray(force(k)), solve.parameters(member)])
             at, intervals, failing = 0, 1, 0
             while at < len(piece) - 1:
-                # Of intervals that fail together, those that can be reached are found by halves.
+                # Where intervals fail together, bisection finds those that can be reached.
                 n = failing // 2 or min(intervals, len(piece) - 1 - at)
                 try:
                     states, steps = solve(piece[at : at + n + 1], y, known, record)
@@ -132,7 +132,7 @@ class _Solve:
 
 
 def _graph(dyn: LagrangianDynamics) -> ca.Function:
-    """Return s, x, p -> dx/ds with p = (τ, parameters, length), made once.
+    """Return s, x, p -> dx/ds with p = (τ, parameters, length), cached.
 
     t is length s beyond the parameter that is the time, where the equation depends on it.
     """

@@ -40,7 +40,7 @@ class GridRecord:
             self.q[:, 0], self.v[:, 0] = problem.q, problem.v
 
     def rows(self, first: int, last: int) -> slice:
-        """Return the rows of what is kept of the states from the first to the last."""
+        """Return the saved rows of the states from the first to the last."""
         return slice(*self.kept.searchsorted((first, last + 1)).tolist())
 
     def result(
@@ -96,7 +96,7 @@ class Stepper:
         return q, w
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:  # noqa: ARG002
-        """Return what is kept of w."""
+        """Return the saved w."""
         return w
 
     def reason(self, q: Array, w: Array) -> str:  # noqa: ARG002
@@ -105,7 +105,7 @@ class Stepper:
 
 
 class _FieldStepper(Stepper):
-    """Steps of a method that is made of evaluations of ẇ."""
+    """Steps of a method that only evaluates ẇ."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
         self.space = Space(problem.dyn.model)

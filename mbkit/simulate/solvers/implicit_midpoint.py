@@ -167,7 +167,7 @@ class MidpointStepper(Stepper):
             tau[:] = force
         last, todo = np.full(len(q), np.inf), np.arange(len(q))
         for _ in range(MOST if isinstance(force, np.ndarray) else _WITH_FUNCTION):
-            # A user's function never sees a state that is none.
+            # Never call the user's function with a non-finite state.
             todo = todo[np.isfinite(w[todo]).all(axis=1) & ~good[todo]]
             if not len(todo):
                 break

@@ -86,7 +86,7 @@ class _Solve:
     def _solver(self, t: float, y: Array, force: Force, stop: float, first: float | None) -> Any:
         from scipy import integrate
 
-        # SciPy would start from a rate that is none.
+        # SciPy would start from a rate that is not finite.
         if not np.isfinite(self.rates(t, y, force)).all():
             return None
         jacobian, (rtol, atol) = self.jacobian, self._problem.tolerances
@@ -109,7 +109,7 @@ class _Solve:
             attempts = (self.rates.evaluations - before) // _STAGES
             record.rejected += max(0, attempts - (solver.status != "failed"))
         while self._method.scheme == "LSODA" and solver.status != "failed" and not is_bounded(solver.y):
-            # It takes a step into what is no state; the others try a shorter one by themselves.
+            # It steps into non-finite states; the others shorten the step by themselves.
             first = (solver.t - t) / 4
             again = self._solver(t, y, force, stop, first) if first > duration * _EPS else None
             if again is None:

@@ -80,7 +80,7 @@ def rounded(y: Any) -> Array:
 class TaylorSteps:
     """Steps of one trajectory at a time, with a borrowed integrator; t0, y0 and t, y are the ends of the last one.
 
-    `behind` are the values of the equations' trailing argument; settled(t, y) is the state to go on from after a step.
+    `behind` are the values of the equations' extra arguments; settled(t, y) is the state to go on from after a step.
     """
 
     def __init__(

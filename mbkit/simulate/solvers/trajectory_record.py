@@ -110,7 +110,7 @@ class TrajectoryRecord:
             steps = int(np.searchsorted(accepted.t, hit.t))
         until = float(accepted.t[steps]) if hit is None else hit.t
         if not self._keep(accepted, steps, until, within):
-            # A shorter step than one that was good met what is no number.
+            # A step shorter than a good one met NaN.
             steps, hit, lost = 0, None, True
             until = float(accepted.t[0])
         self.steps += steps

@@ -5,7 +5,21 @@
 
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.file import Baseline, read
-from mbkit.studies.baseline.result import BaselineResult, Moved, VersionChange
+from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, VersionChange
 from mbkit.studies.baseline.study import check, diff, record
 
-__all__ = ["Baseline", "BaselineResult", "Change", "Moved", "VersionChange", "check", "diff", "read", "record"]
+#: An earlier name, kept for scripts.
+Moved = ChangedNumber
+
+__all__ = [
+    "Baseline",
+    "BaselineResult",
+    "Change",
+    "ChangedNumber",
+    "Moved",
+    "VersionChange",
+    "check",
+    "diff",
+    "read",
+    "record",
+]

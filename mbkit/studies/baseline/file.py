@@ -1,7 +1,7 @@
 """Baselines and their files: TOML, written as a whole and guarded by a checksum.
 
 Why TOML: the standard library reads it, a name stands beside each number, it has comments and infinities, and no text
-is taken for a number. Below a section every line is the whole path to a number or row, so that a changed line says
+is read as a number. Below a section every line is the whole path to a number or row, so that a changed line says
 what changed.
 """
 
@@ -37,7 +37,7 @@ _MAX_STEPS: Final = 10_000
 _HEAD: Final = "# mbkit baseline: "
 _NOTE: Final = (
     f"{_HEAD}what engines said of one robot. Written by mbkit and guarded by the checksum in its last line:\n"
-    "# do not edit it, record it anew. A line below [section] is the whole name of a number or row; a row has a\n"
+    "# do not edit it, record it again. A line below [section] is the whole name of a number or row; a row has a\n"
     "# number for each of the states; a row of M is what stands before the diagonal, from its first that is not zero,\n"
     "# and the diagonal.\n"
 )
@@ -45,7 +45,7 @@ _SUM: Final = "# sha256 "
 _FORMAT: Final = re.compile(r"^format = (\d+)$", re.MULTILINE)
 _MODEL: Final = re.compile(r"^model = (\".*\")$", re.MULTILINE)
 _CONFLICT: Final = re.compile(r"^(<<<<<<<|>>>>>>>)", re.MULTILINE)
-_REMEDY: Final = "restore it from version control, or record it anew"
+_REMEDY: Final = "restore it from version control, or record it again"
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Baseline:
 
 
 def _to_table(b: Baseline) -> dict[str, Any]:
-    """Return what is written."""
+    """Return the file's text."""
     names = {"q": b.coordinates, "v": b.velocities, "a": b.velocities, "tau": b.velocities}
     refused: dict[str, dict[str, str]] = {}
     for r in b.left_out:
@@ -137,7 +137,7 @@ def _columns(names: Sequence[str], x: Array) -> dict[str, list[float]]:
 
 
 def _values(b: Baseline, term: str, x: Array, *, half: bool) -> Any:
-    """Return a term's values: what is zero in every state as one zero, and of a symmetric matrix the lower half."""
+    """Return a term's values: an array of zeros as one zero, and of a symmetric matrix the lower half."""
     if term == ROLLOUT:
         n = len(b.coordinates)
         return {"q": _columns(b.coordinates, x[:n]), "v": _columns(b.velocities, x[n:])}
@@ -152,7 +152,7 @@ def _values(b: Baseline, term: str, x: Array, *, half: bool) -> Any:
 
 
 def _half(M: Array) -> list[list[float]]:
-    """Return of each row what is left of the diagonal, from its first entry that is not zero, and the diagonal."""
+    """Return of each row the entries before the diagonal, from the first nonzero one, and the diagonal."""
     first = [int(np.flatnonzero(np.append(M[i, :i], 1.0))[0]) for i in range(len(M))]
     return [M[i, first[i] : i + 1].tolist() for i in range(len(M))]
 
@@ -273,7 +273,7 @@ def read(path: str | os.PathLike[str]) -> Baseline:
     Raises
     ------
     BaselineError
-        There is no such file, or it is none, cut short, edited, or of another format.
+        The file does not exist, is not a baseline, is cut short or edited, or has another format.
 
     Examples
     --------
@@ -296,11 +296,11 @@ def read(path: str | os.PathLike[str]) -> Baseline:
     if not text.startswith(_HEAD):
         raise BaselineError(f"{where}: no baseline of mbkit's; its first line would begin with {_HEAD.strip()!r}")
     if _CONFLICT.search(text):
-        raise BaselineError(f"{where}: a merge has left conflict marks in it; take either side, or record it anew")
+        raise BaselineError(f"{where}: a merge has left conflict marks in it; take either side, or record it again")
     number = _format(text)
     if number != FORMAT:
         by, advice = (
-            ("a newer", "update mbkit, or record it anew") if number > FORMAT else ("an older", "record it anew")
+            ("a newer", "update mbkit, or record it again") if number > FORMAT else ("an older", "record it again")
         )
         reads = f"this one reads format {FORMAT}"
         raise BaselineError(f"{where}: of format {number}, by {by} mbkit; {reads}: {advice}")
@@ -380,7 +380,7 @@ def store(path: Path, text: str, model: str, *, force: bool) -> None:
 
 
 def _dumps(table: Mapping[str, Any]) -> str:
-    """Return a table as TOML: first what is no table itself, then a section for each that is."""
+    """Return a table as TOML: first the entries that are not tables, then a section for each table."""
     sections = ["\n".join(f"{_key(k)} = {_value(x)}" for k, x in table.items() if not isinstance(x, Mapping))]
     for name, part in table.items():
         if isinstance(part, Mapping) and part:

@@ -19,7 +19,7 @@ _MOST_CHANGES: Final = 20
 
 
 @dataclass(frozen=True)
-class Moved:
+class ChangedNumber:
     """A term that is not what was recorded, at its worst state and joint.
 
     `joint` is the name of the velocity, or of the two of an entry of M, and empty for energies; `state` is one of the
@@ -69,7 +69,7 @@ class BaselineResult(ResultTable):
     "skipped" where no engine was there. `engines` are those that were checked. `changes` are parameters of the
     description, causes before effects; `moved` are numbers that are not as recorded, by more than rounding;
     `processors` are those of then and now. `skipped` are engines that are not there, with the reason, which fails if
-    `strict`. `effect` says what a changed description does to the terms, and `worst` is the largest error of what is
+    `strict`. `effect` says what a changed description does to the terms, and `worst` is the largest error of numbers
     as recorded.
     """
 
@@ -80,7 +80,7 @@ class BaselineResult(ResultTable):
     engines: tuple[str, ...] = ()
     against: str = ""
     changes: tuple[Change, ...] = ()
-    moved: tuple[Moved, ...] = ()
+    moved: tuple[ChangedNumber, ...] = ()
     versions: tuple[VersionChange, ...] = ()
     processors: tuple[str, str] = ("", "")
     skipped: tuple[Refusal, ...] = ()
@@ -124,7 +124,7 @@ class BaselineResult(ResultTable):
         return ", ".join(map(str, self.versions))
 
     def lines(self, everything: bool = False) -> Iterator[tuple[str, str]]:
-        """Iterate over what was found, gravest first: (what it is about, what is to be said).
+        """Iterate over the findings, gravest first: (subject, message).
 
         Unless `everything` is set, the first 20 parameters and of each engine the 5 numbers that
         are off most.
@@ -166,9 +166,9 @@ class BaselineResult(ResultTable):
         return "\n".join(out)
 
     _derived = ("passed", "verdict")
-    _csv_columns = columns_of(Moved)
+    _csv_columns = columns_of(ChangedNumber)
 
-    def _csv_rows(self) -> tuple[Moved, ...]:
+    def _csv_rows(self) -> tuple[ChangedNumber, ...]:
         return self.moved
 
     def _blocks(self) -> Iterator[Block]:

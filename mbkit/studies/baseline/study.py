@@ -1,7 +1,7 @@
 """`record`, `check` and `diff`: engines' numbers into a file, and what moved since.
 
 Errors are those of `mbkit.studies.compare.errors`, on the recorded values' own scales, so nothing but the file and an
-engine is needed. An engine's own error against 34 digits, found when it was recorded, says what its rounding is: 16
+engine is needed. An engine's own error against 34 digits, measured at recording, says what its rounding is: 16
 times that is allowed, because the error is the worst of a handful of states and another processor rounds elsewhere;
 and of an error below 8 eps (`FINE`) 16 times 8 eps, because a handful of states can by chance show almost none. What
 differed by more than `ROUNDING` when it was recorded is no rounding; it is held against the engine's own values, to
@@ -40,7 +40,7 @@ from mbkit.studies._targets import checked_target, engine_names, with_values
 from mbkit.studies.baseline import description, file
 from mbkit.studies.baseline.description import Change, changes, described, links_of, moving_mass, without_consequences
 from mbkit.studies.baseline.file import ROLLOUT, Baseline, Rollout, path_of, read
-from mbkit.studies.baseline.result import BaselineResult, Moved, Status, VersionChange
+from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, Status, VersionChange
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.results import Refusal
@@ -83,7 +83,7 @@ def record(
     model : Model
         Whose named parameters have values.
     path : path
-        A TOML file, of which folders are made. The baseline of the same model is replaced.
+        A TOML file; missing folders are created. The baseline of the same model is replaced.
     engines : sequence of str, optional
         By default all that are installed and hold the model.
     samples : int
@@ -313,7 +313,7 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
     )
 
 
-def _moved_numbers(a: Baseline, b: Baseline, moved: tuple[VersionChange, ...]) -> tuple[Moved, ...]:
+def _moved_numbers(a: Baseline, b: Baseline, moved: tuple[VersionChange, ...]) -> tuple[ChangedNumber, ...]:
     comparator = _Comparator(a)
     rows = [comparator.moved(REFERENCE, t, b.terms[t], x, FINE) for t, x in a.terms.items() if t in b.terms]
     for engine, terms in a.own.items():
@@ -432,7 +432,7 @@ class _Comparator:
 
     def moved(
         self, engine: str, term: str, value: Array, reference: Array, allowed: float, cause: str = "", reason: str = ""
-    ) -> Moved | None:
+    ) -> ChangedNumber | None:
         """Return where a term is off by more than allowed, or None."""
         errors = self.errors(term, value, reference)
         error = float(errors.relative[errors.worst])
@@ -449,7 +449,7 @@ class _Comparator:
                 state, index = self._states[n], (n, j, *more)
                 joint += "".join(f", {self._velocities[i]}" for i in more if i != j)
         numbers = float(reference[index]), float(value[index])
-        return Moved(term, engine, joint, state, *numbers, error, allowed, cause, reason)
+        return ChangedNumber(term, engine, joint, state, *numbers, error, allowed, cause, reason)
 
 
 def _allowed(baseline: Baseline, engine: str, term: str) -> float:
@@ -465,8 +465,8 @@ def _allowed(baseline: Baseline, engine: str, term: str) -> float:
 
 def _differences(
     recorded: Baseline, name: str, dyn: Dynamics, moved: tuple[VersionChange, ...]
-) -> tuple[list[Moved], float]:
-    """Return what is not as recorded of one engine, and the worst error of what is."""
+) -> tuple[list[ChangedNumber], float]:
+    """Return one engine's changed numbers, and the worst error of the unchanged ones."""
     comparator = _Comparator(recorded)
     values, refusals = _evaluate(dyn, recorded.states, recorded.rollout)
     before, own = recorded.errors[name], recorded.own.get(name, {})
@@ -492,11 +492,13 @@ def _differences(
     return rows, worst
 
 
-def _unavailable(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChange, ...]) -> Moved:
+def _unavailable(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChange, ...]) -> ChangedNumber:
     """Return the failure of an engine that gives no number any more."""
     cause = _cause(refusal.engine, recorded.versions, moved)
     numbers = np.nan, np.nan, np.inf, 0.0
-    return Moved(refusal.term or "everything", refusal.engine, "", "", *numbers, cause, f"no longer: {refusal.reason}")
+    return ChangedNumber(
+        refusal.term or "everything", refusal.engine, "", "", *numbers, cause, f"no longer: {refusal.reason}"
+    )
 
 
 # The description and the versions against recorded ones.
@@ -541,7 +543,7 @@ def _versions_of(engines: Iterable[str]) -> dict[str, str]:
 
 
 def _version_changes(old: Mapping[str, str], new: Mapping[str, str]) -> tuple[VersionChange, ...]:
-    """Return what differs among the packages of both; what is not installed has no version."""
+    """Return the packages whose versions differ; a missing package has no version."""
     return tuple(VersionChange(p, x, new[p]) for p, x in old.items() if new.get(p, _ABSENT) not in (x, _ABSENT))
 
 

@@ -84,7 +84,7 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
 
 
 def _row(model: Model, ours: Trajectory, theirs: Trajectory, condition: Array, beyond: bool, note: str) -> RolloutRow:
-    """Return two runs compared up to the last step of which a condition is given; beyond it may have grown too much."""
+    """Return two runs compared up to the last step that has a condition; beyond it may have grown too much."""
     last = len(condition) - 1
     n = min(len(ours.t), last + 1)
     grown = float(condition[:n].max(initial=0.0))

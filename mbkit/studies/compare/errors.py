@@ -73,7 +73,7 @@ def force_errors(error: Array, reference: Array, scales: Scales, *, heavy: bool 
     e = np.abs(error)
     floor = np.maximum(scales.inertial, scales.weight) if heavy else scales.inertial
     relative = ratio(np.linalg.norm(e, axis=1), np.maximum(np.linalg.norm(reference, axis=1), floor))
-    # A joint's own scale: its force, or its share of what is at play.
+    # A joint's own scale: its force, or its share of the forces at play.
     trace = scales.diagonal.sum(axis=1, keepdims=True)
     share = np.sqrt(scales.diagonal / np.where(trace > 0, trace, 1.0))
     own = np.maximum(np.abs(reference), floor[:, None] * share)

@@ -1,7 +1,7 @@
 """Differences between two descriptions as tables of usual mistakes: kind, sentence, changed fields.
 
 A mistake is compared with the other side, field by field. Each field belongs to one difference alone, so that any of
-them can be put into the first description or taken out of the second without the others.
+them can be added to the first description or removed from the second without the others.
 """
 
 from __future__ import annotations

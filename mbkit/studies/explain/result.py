@@ -24,7 +24,7 @@ class Cause:
     Its `kind` names the usual mistake, such as ``"armature"`` or ``"inertia about the wrong point"``; `subject` is the
     body or joint, empty for the whole; `says` is a sentence about the second side; `a` and `b` are the numbers of the
     two sides, where they are numbers. `effects` has for each term the relative difference of this cause alone: the
-    larger of two, where it is put into the first side, and where it is taken out of the second. It is infinite where
+    larger of two, where it is added to the first side, and where it is removed from the second. It is infinite where
     the coordinates then differ, and empty where no term can show it: other names, matter that stands still, a
     constraint. `acts` says whether an effect is above the tolerance, or the cause is a constraint.
     """
@@ -107,7 +107,7 @@ class Explanation(ResultTable):
         if not self.explained:
             where = f"; the smallest part that still differs: {', '.join(self.subtree)}" if self.subtree else ""
             rest = f": {self.remainder:.1e} remains" if self.left else ""
-            some = f"{_counted(count, 'cause')} found do not explain it all" if count else "no usual cause does it"
+            some = f"{_counted(count, 'cause')} do not explain all of it" if count else "no usual cause does it"
             return f"{head}, and {some}{rest}{where}"
         left = f"; with {'it' if count == 1 else 'all of them'} applied the terms agree to {self.remainder:.1e}"
         return f"{head}, for {_counted(count, 'reason')}{left}{beside}"

@@ -50,7 +50,7 @@ def explain(
     zero or pitch, quaternion and joint order, mimic joints, velocity frames, a known defect of an engine.
     Joints are matched by structure and name, and a mere choice of frames is no difference.
 
-    The effect of each difference is measured: it is put alone into the first description, and taken alone out
+    The effect of each difference is measured: it is added alone to the first description, and removed alone from
     of the second. The remainder with all of them put into the first is measured too.
 
     Parameters
@@ -195,7 +195,7 @@ class _Descriptions:
         return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), effects, acts)
 
     def _measured_cause(self, h: Hypothesis, one: MergedModel, target: MergedModel) -> Cause:
-        """Return a difference with the larger of its two effects, put alone into one side or taken out of the other."""
+        """Return a difference with the larger of its two effects, added alone to one side or removed from the other."""
         if h.kind in CONSTRAINTS:
             return self._cause(h, {})
         effects: dict[str, float] = {}

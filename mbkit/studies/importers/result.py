@@ -66,7 +66,7 @@ class ParserComparison(ResultTable):
 
     `source` is the file, and `format` is ``"urdf"`` or ``"mjcf"``. `reference` is what the importers are compared with:
     ``"file"``, the file as written, link by link. Where mbkit does not read it, for the reason in `faults`, it is
-    ``"mujoco"`` for an MJCF that MuJoCo reads, else empty, and nothing is compared. `notes` say what was taken out of
+    ``"mujoco"`` for an MJCF that MuJoCo reads, else empty, and nothing is compared. `notes` say what was removed from
     the file before. `versions` are those of every package that took part, and `seconds` is the time of the whole.
     """
 

@@ -460,7 +460,7 @@ def _notes(stripped: Stripped) -> list[str]:
     out = []
     if stripped.gone:
         removed = ", ".join(f"{n} {tag}" for tag, n in stripped.gone)
-        out.append(f"taken out before, because they name other files or say nothing of the motion: {removed}")
+        out.append(f"removed before, because they name other files or do not affect the motion: {removed}")
     if stripped.meshes:
         out.append(f"opened, because bodies take their inertia from them: {', '.join(stripped.meshes)}")
     out += stripped.unread
@@ -468,7 +468,7 @@ def _notes(stripped: Stripped) -> list[str]:
         out.append(f"the base link 'world' is called {stripped.renamed!r}: importers take that name for the ground")
     if stripped.shapeless:
         some = ", ".join(stripped.shapeless[:6]) + (", ..." if len(stripped.shapeless) > 6 else "")
-        out.append(f"bodies without <inertial>, whose meshes MuJoCo would have given a mass: {some}")
+        out.append(f"bodies without <inertial>, to which MuJoCo would have assigned a mass from their meshes: {some}")
     return out
 
 

@@ -38,7 +38,7 @@ from mbkit.studies.work_precision.reference import gap, reference
 from mbkit.studies.worker import report_stage
 
 # Reference motions. Where there is no closed form, the difference of two runs that share as little as possible bounds
-# the error of either (Hairer, Nørsett, Wanner 1993, II.4, on why one run alone cannot). Runs are made until two agree:
+# the error of either (Hairer, Nørsett, Wanner 1993, II.4, on why one run alone cannot). Runs go on until two agree:
 # explicit methods of high order on two engines; implicit methods of different families, for stiff motion; Taylor
 # series with 34 digits, for motion that loses digits in double.
 

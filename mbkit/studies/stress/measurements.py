@@ -292,7 +292,7 @@ def furthest(case: CaseResult) -> int:
 def place(values: Sequence[float], x: float) -> float:
     """Return where a number stands among a sweep's values, as a fractional index; decades are even if all are positive.
 
-    -1 and the number of values stand for what is beyond the ends; NaN for no number, and for values in no order.
+    -1 and the number of values stand for places beyond the ends; NaN for NaN, and for unordered values.
     """
     if math.isnan(x) or not values or not np.isfinite(values).all():
         return math.nan

@@ -227,7 +227,7 @@ class CaseSweep:
                     other.add(i, cell)
 
     def result(self) -> CaseResult:
-        """Return what is known by now."""
+        """Return the result up to now."""
         prepared = [self._prepared.get(i, Prepared(OUT_OF_TIME)) for i in range(len(self.values))]
         return CaseResult(
             **(self.case.facts() | {"bar": self.bar}),
@@ -357,7 +357,7 @@ def stress(
         Processor time of a run, 2 s, quick 0.5 s; making the problem, deriving and compiling have fifteen times as
         long. And time of the whole study, 1700 s, quick 100 s; cells beyond it are "not run".
     memory : int, optional
-        Bytes of a worker process, 2 GiB when not given; enforced on Linux.
+        Bytes of a worker process, 2 GiB by default; enforced on Linux.
     jobs : int, optional
         Processes side by side, by default one per processor, at most 16. Run times are those of a busy machine.
     progress : callable, optional
@@ -465,7 +465,7 @@ def _quick_methods(engines: object) -> dict[str, tuple[str, ...]] | None:
 
 def _swept(cases: object, values: object, *, quick: bool) -> list[tuple[Case, tuple[float, ...]]]:
     """Return the cases, checked, each with its values."""
-    # With the named cases come all the models that they are made of.
+    # The named cases bring all their models.
     from mbkit.studies.stress.cases import get, names
 
     several = names() if cases is None else (cases,) if isinstance(cases, (str, Case)) else cases

@@ -166,7 +166,7 @@ def _names(front: Sequence[_Place]) -> list[tuple[_Place, bool]]:
     names: list[tuple[_Place, bool]] = []
     for k, (x, y, curve) in enumerate(front):
         if all(curve is not known for (_, _, known), _ in names):
-            # Where the front has become flat, what is left of a point is the front.
+            # Where the front has become flat, left of a point lies the front.
             flat = k > 0 and math.log10(front[k - 1][1] / y) < 2 * math.log10(x / front[k - 1][0])
             names.append(((x, y, curve), flat))
     return names

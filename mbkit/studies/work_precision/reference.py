@@ -366,7 +366,7 @@ def reference(
         (nv,), held all the time; (K - 1, nv), held over each interval of `save`, which then runs from 0 to `duration`;
         or a function of (t, q, v), for which only two engines make a reference.
     seconds : float
-        Limit of the search, without what is derived and compiled. What is known by then is returned.
+        Limit of the search, without derivation and compilation. The best reference by then is returned.
     progress : bool or callable, optional
         As in `mbkit.simulate`.
 
@@ -426,7 +426,7 @@ def checked_motion(
 def _at_rest(motion: Motion) -> Reference:
     t = motion.save
     q, v, floor = np.tile(motion.q0, (len(t), 1)), np.tile(motion.v0, (len(t), 1)), np.zeros(len(t))
-    how = "the given state, since nothing moves"
+    how = "the initial state, since nothing moves"
     return Reference(t, q, v, 0 * q, 0 * v, floor, inf, (1.0, 1.0), float(t[-1]), how)
 
 

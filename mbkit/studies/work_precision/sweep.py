@@ -69,7 +69,7 @@ def first_run(model: Model, engine: str, method: str, start: Callable[[Dynamics]
     """Return an engine on which `start` ran a method briefly, and the seconds of that beyond the run itself.
 
     Everything that belongs to the model is derived, compiled and built, whatever the caches in memory and on disk
-    hold. Imports, and what is the same for every model, are done before the clock starts.
+    hold. Imports, and work that is the same for every model, come before the clock starts.
     """
     _import_for(engine, method)
     with force_recompile(), _without_heyoka_cache() if "heyoka" in sys.modules else contextlib.nullcontext():
@@ -240,7 +240,9 @@ class CurveMeasurement:
         self._last: _Run | None = None
         self._ended = ""
         if not self._left:
-            self._refuse(f"takes no tolerance below {settings.info.least:.3g}, and every tolerance given is smaller")
+            self._refuse(
+                f"takes no tolerance below {settings.info.least:.3g}, and every tolerance asked for is smaller"
+            )
 
     @property
     def over(self) -> bool:
@@ -249,7 +251,7 @@ class CurveMeasurement:
 
     @property
     def expected(self) -> float:
-        """Estimated seconds of the next run, with what is compiled for it; 0 before the first."""
+        """Estimated seconds of the next run, with its compilation; 0 before the first."""
         return 0.0 if self._last is None else self._last.first * self._growth(self._last) + self._last.preparation
 
     @property

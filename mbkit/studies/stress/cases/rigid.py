@@ -239,7 +239,7 @@ _RUNGE_KUTTA: Final = ("rk4", "semi_implicit_euler", "implicit_midpoint", "gauss
 )
 def quaternion_drift(steps: float) -> Problem:
     """A ball turns by 0.01 rad in each of many steps: does its quaternion stay one?"""
-    # So small a step makes no error of its own: what is left is rounding.
+    # So small a step makes no error of its own: only rounding is left.
     return _ball(10.0, 1e-3 * steps, dt=1e-3)
 
 

@@ -300,7 +300,7 @@ def largest_step(_engine: str, method: str, *, frequency: float, damping: float)
 
 
 STEP_CASES: Final[list[Case]] = []
-#: Enough for what grows by a fifth a step to grow beyond any bar; few enough for what is evaluated slowly.
+#: Enough for a growth of a fifth a step to pass any bar; few enough for slow evaluations.
 _STEPS: Final = 200
 # Steps close to either side of what theory says of one of the methods, and coarse ones elsewhere.
 _AROUND: Final = (0.1, 1.0, 1.4, 1.7, 1.9, 2.1, 2.4, 2.7, 3.0, 4.0, 10.0, 100.0, 1000.0)
@@ -314,7 +314,7 @@ def _step(
     values: tuple[float, ...], quick: tuple[float, ...], frequency: float = 1.0, damping: float = 0.0
 ) -> Callable[[Make], Make]:
     """Return the decorator of a case whose linear theory is that of an oscillator with this ω and ζ."""
-    why = "growth is asked for, not accuracy: what is stable stays near its start, what is not grows in each step"
+    why = "the test is for growth, not accuracy: a stable run stays near its start, an unstable one grows in each step"
     more: dict[str, Any] = {"bar": 100.0, "why": why, "methods": _FIXED}
     theory = partial(largest_step, frequency=frequency, damping=damping)
     return register(STEP_CASES, "step", "step", "s", values, quick, theory=theory, **more)
@@ -367,7 +367,7 @@ _STEP: Final = 4e-3
     (1e3, 1e4, 1e5),
     measure="energy",
     bar=1e-3,
-    why="along a chaotic motion only what is conserved can be compared; a thousandth of the energy is half a "
+    why="along a chaotic motion only conserved quantities can be compared; a thousandth of the energy is half a "
     "thousandth of the speed, which no plot shows",
     methods=(*_FIXED, "rk853", "taylor", "auto"),
     patience=6.0,
