@@ -1,6 +1,6 @@
 """What the checks after a run cost: `simulate` beside itself with ``doubt=False``, and `Trajectory.check`.
 
-Run ``python -m validation.checks_cost``; it takes about a minute. Compiled runs of 0.3 to 20 ms, in turns in one
+Run ``python -m validation.checks_cost``; it takes about three minutes. Compiled runs of 0.3 to 20 ms, in turns in one
 process; processor times, and the median of the rounds' ratios. The budget: 1.1 with the checks that `simulate` makes.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 import mbkit as mb
 from mbkit.studies.results import processor, versions
 
-ROUNDS, BATCH = 25, 16
+ROUNDS, BATCH = 75, 16
 #: Method, setting, durations in s.
 WAYS = (
     ("rk4", {"dt": 1e-3}, (0.01, 0.1, 1.0)),

@@ -79,6 +79,11 @@ class ForwardDynamicsDerivatives(NamedTuple):
     tau: Array
 
 
+def scalar(value: Array) -> Any:
+    """Return one state's number as a float, a batch's as an array."""
+    return value if value.ndim else float(value)
+
+
 class Dynamics:
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
@@ -221,14 +226,14 @@ class Dynamics:
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
         """Return ½ vᵀ M v in J, a float or shape (N,)."""
-        return self._number("kinetic_energy", q=q, v=v)
+        return scalar(self._evaluate("kinetic_energy", q=q, v=v))
 
     def potential_energy(self, q: ArrayLike) -> Any:
         """Return the energy of gravity and springs in J, a float or shape (N,).
 
         Gravity's part is zero where every centre of mass is at the world's origin.
         """
-        return self._number("potential_energy", q=q)
+        return scalar(self._evaluate("potential_energy", q=q))
 
     def pose(self, q: ArrayLike, frame: str) -> Array:
         """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4)."""
@@ -325,10 +330,6 @@ class Dynamics:
             ) from None
         self._require_finite(quantity, out, states)
         return out
-
-    def _number(self, quantity: str, **arguments: ArrayLike) -> Any:
-        value = self._evaluate(quantity, **arguments)
-        return float(value) if value.ndim == 0 else value
 
     def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
         """Return arguments as checked arrays, all single states or all batches, and the size of the batch."""

@@ -17,7 +17,7 @@ from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.equations import Equations, equations_of
 from mbkit.derivation.least_constraint import loses_digits
 from mbkit.derivation.mass_matrix_solve import elimination_size
-from mbkit.engines.base import NEAR_UNIT, Dynamics, unit_quaternions
+from mbkit.engines.base import NEAR_UNIT, Dynamics, scalar, unit_quaternions
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Model
 
@@ -311,7 +311,7 @@ class LagrangianDynamics(Dynamics):
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
         """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
-        return self._number("energy_rate", q=q, v=v, a=a)
+        return scalar(self._evaluate("energy_rate", q=q, v=v, a=a))
 
     def _stacked(self, name: str, *arguments: Array) -> Array:
         out = self._machine("stacked", name)(*arguments)[0]

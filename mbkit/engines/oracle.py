@@ -22,7 +22,7 @@ from mbkit._check import Array
 from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digits, product, solve
 from mbkit.codegen.program import program
 from mbkit.derivation.equations import FUNCTIONS, equations_of
-from mbkit.engines.base import Dynamics
+from mbkit.engines.base import Dynamics, scalar
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Model
 
@@ -134,7 +134,7 @@ class OracleDynamics(Dynamics):
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
         """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
-        return self._number("energy_rate", q=q, v=v, a=a)
+        return scalar(self._evaluate("energy_rate", q=q, v=v, a=a))
 
     def at(self, /, **values: float) -> OracleDynamics:
         """Return the same dynamics at other values of the model's named parameters."""

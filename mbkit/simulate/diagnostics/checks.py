@@ -28,7 +28,7 @@ _EPS: Final = sys.float_info.epsilon
 CHECKED_TIMES: Final = 7
 _MEMBERS: Final = 4
 #: A quick check evaluates one state for so many evaluations of the run in machine code: a few percent of its time.
-_WORK_A_STATE: Final = 2000
+_WORK_A_STATE: Final = 3000
 #: Saved velocities among which a quick check looks for the largest kinetic energy.
 _VELOCITIES: Final = 32
 #: Change of the energy that makes a run wrong: methods of first or second order at a common step oscillate by
@@ -87,14 +87,14 @@ def diagnostics(
         # The cause before its consequences.
         checks.insert(0, step_size(dyn, method, setting, float(t[-1] - t[0]), q[0], v[0]))
     # The forces of a system on paper may drive it.
-    if not (driven or model.time_parameter or (not model.has_bodies and model.needs.damping)):
+    if most >= 2 and not (driven or model.time_parameter or (not model.has_bodies and model.needs.damping)):
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
         checks.append(energy_drift([samples[i] for i in whole], fast, model.needs.damping, limit))
     # Neither the engine nor the method may solve with the mass matrix.
-    if getattr(dyn, "elimination", "") != "least constraint" or method.mass_matrix:
-        matrices = [one.M for member in samples for one in member]
+    matrices = [one.M for member in samples for one in member]
+    if matrices and (method.mass_matrix or getattr(dyn, "elimination", "") != "least constraint"):
         checks.append(condition(matrices[-1:] if quick else matrices))
     checks.append(coordinate_magnitude(at_q, None if method.scaled_by_start else tolerances))
     if tolerances and method.scaled_by_start:
@@ -282,7 +282,7 @@ def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[st
 
 def scale_growth(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
     """Find numbers that have outgrown those of the start, which loosens the tolerance of the others."""
-    largest = max(float(np.nan_to_num(np.abs(x), posinf=0.0).max()) for x in (q, v))
+    largest = max(float(np.abs(x).max(initial=0.0, where=np.isfinite(x))) for x in (q, v))
     allowed = min(tolerances) * largest / magnitude(q[..., 0, :], v[..., 0, :])
     if allowed > max(1e3 * tolerances.atol, _POSITION):
         yield (
