@@ -439,9 +439,9 @@ FAULTS = {
     "zero axis": (bad_axis, "joint 'k': axis is zero"),
     "missing axis": (
         lambda b: b.add_joint("k", "revolute", parent="bob", child="c"),
-        "revolute joint takes axis; 0 given",
+        "revolute joint takes axis, got 0",
     ),
-    "axis too many": (joint_k("ball", axis=(1, 0, 0)), "ball joint takes no axis; 1 given"),
+    "axis too many": (joint_k("ball", axis=(1, 0, 0)), "ball joint takes no axis, got 1"),
     "NaN axis": (joint_k(axis=(np.nan, 0, 0)), "joint 'k': axis: nan at index"),
     "two joints of a name": (
         lambda b: b.add_joint("hinge", "ball", parent="bob", child="c"),

@@ -116,7 +116,7 @@ def test_names_of_no_engine_are_refused():
         (ClosedForm, "expected an EngineInfo"),
         (replace(INFO, name="closed form"), "expected a word"),
         (replace(INFO, name="other"), "closed_form'; expected the same name"),
-        (replace(INFO, name="pinocchio", adapter=type("P", (ClosedForm,), {"engine": "pinocchio"})), "name is taken"),
+        (replace(INFO, name="pinocchio", adapter=type("P", (ClosedForm,), {"engine": "pinocchio"})), "name is in use"),
         (replace(INFO, adapter=None), "expected an adapter"),
         (replace(INFO, adapter=int), "expected a subclass of Dynamics"),
         (replace(INFO, reference=True), "reference and derived"),

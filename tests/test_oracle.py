@@ -331,7 +331,7 @@ def test_parameters_are_taken_at_their_values():
     model = mb.catalog.pendulum(mass=mb.Parameter("m", 2.0))
     oracle = mb.dynamics(model, "oracle")
     assert oracle.at(m=3.0).mass_matrix([0.0]) == pytest.approx(1.5 * oracle.mass_matrix([0.0]))
-    with pytest.raises(InputError, match="given its constants"):
+    with pytest.raises(InputError, match="already has its constants"):
         OracleDynamics(model, oracle.equations.constant_values).at(m=3.0)
 
 

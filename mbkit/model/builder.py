@@ -158,7 +158,7 @@ class ArgumentReader:
         axes: list[ArrayLike] = [a for a in vectors if a is not None]
         if len(axes) != n:
             names = ("no axis", "axis", "axis and axis2")[n]
-            self.faults.append(f"{item}: a {type_.name} joint: expected {names}, got {len(axes)}")
+            self.faults.append(f"{item}: a {type_.name} joint takes {names}, got {len(axes)}")
             axes = list(np.eye(3)[:n])
         out = np.zeros((n, 3))
         for i, a in enumerate(axes):

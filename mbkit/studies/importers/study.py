@@ -468,7 +468,7 @@ def _notes(stripped: Stripped) -> list[str]:
         out.append(f"the base link 'world' is called {stripped.renamed!r}: importers take that name for the ground")
     if stripped.shapeless:
         some = ", ".join(stripped.shapeless[:6]) + (", ..." if len(stripped.shapeless) > 6 else "")
-        out.append(f"bodies without <inertial>, to which MuJoCo would have assigned a mass from their meshes: {some}")
+        out.append(f"bodies without <inertial>, whose meshes would give them a mass in MuJoCo: {some}")
     return out
 
 
