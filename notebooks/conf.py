@@ -1,0 +1,85 @@
+"""The book, built by Sphinx from pages whose cells run: ``sphinx-build -W -j auto notebooks build/book``."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.application import Sphinx
+
+import mbkit
+
+project = "mbkit"
+author = "the authors of mbkit"
+copyright = "2026, the authors of mbkit"  # noqa: A001  # Sphinx's name
+version = release = mbkit.__version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "sphinx_design"]
+exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+# A name in backquotes that is no reference stays code.
+default_role = "code"
+
+# Text
+myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+
+# Cells
+nb_execution_mode = "cache"
+nb_execution_timeout = 180
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_merge_streams = True
+nb_render_image_options = {"align": "center"}
+
+# Signatures
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+autodoc_default_options = {"members": True, "show-inheritance": False}
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+
+# Pages: nothing is loaded from a network.
+html_theme = "furo"
+html_title = "mbkit"
+html_static_path = ["_static"]
+html_css_files = ["book.css"]
+html_math_renderer = "mathml"
+html_copy_source = False
+html_show_sourcelink = False
+
+# For cells: where the repository is, and figures as SVG.
+os.environ["MBKIT_TOP"] = str(Path(__file__).resolve().parent.parent)
+_profile = Path(os.environ.setdefault("IPYTHONDIR", tempfile.mkdtemp(prefix="mbkit-book-"))) / "profile_default"
+if not _profile.exists():
+    _profile.mkdir()
+    (_profile / "ipython_kernel_config.py").write_text(
+        "c.InlineBackend.figure_formats = {'svg'}\nc.HistoryManager.enabled = False\n", encoding="utf-8"
+    )
+    atexit.register(shutil.rmtree, _profile.parent, ignore_errors=True)
+
+
+def _mathml(translator: Any, node: nodes.Element, *, block: bool) -> None:
+    """Write a formula as MathML, which a browser shows without a script and a screen reader reads."""
+    # The converter knows one name for lines that are aligned.
+    tex = node.astext().replace("{aligned}", "{align*}").replace("{align}", "{align*}")
+    if block and "\\begin{" not in tex and "\\\\" in tex:
+        tex = f"\\begin{{align*}}{tex}\\end{{align*}}"
+    text = convert(tex, display="block" if block else "inline")
+    translator.body.append(f'<div class="math">{text}</div>' if block else text)
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """Register the writer of formulas."""
+    app.add_html_math_renderer(
+        "mathml",
+        (lambda self, node: _mathml(self, node, block=False), None),
+        (lambda self, node: _mathml(self, node, block=True), None),
+    )
