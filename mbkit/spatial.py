@@ -49,24 +49,24 @@ def multiply(a: Array, b: Array) -> Array:
 
 
 def conjugate(a: Array) -> Array:
-    """Return the conjugate, the inverse of a unit quaternion."""
+    """Return the conjugate (..., 4), the inverse of a unit quaternion."""
     return np.asarray(a * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
 def normalized(a: Array) -> Array:
-    """Return a / |a|."""
+    """Return a divided by its norm, (..., n)."""
     return np.asarray(a / np.linalg.norm(a, axis=-1, keepdims=True))
 
 
 def rotate(quaternion: Array, x: Array) -> Array:
-    """Rotate the vector x by a unit quaternion."""
+    """Return the vectors x (..., 3), rotated by unit quaternions (..., 4)."""
     u, w = quaternion[..., :3], quaternion[..., 3:]
     t = 2.0 * np.cross(u, x)
     return np.asarray(x + w * t + np.cross(u, t))
 
 
 def matrix_from_quaternion(quaternion: Array) -> Array:
-    """Return R with R x = q x q*, shape (..., 3, 3)."""
+    """Return R, shape (..., 3, 3), of unit quaternions q (..., 4), with R x = q x conj(q)."""
     x, y, z, w = (quaternion[..., i] for i in range(4))
     out = np.empty((*quaternion.shape[:-1], 3, 3))
     out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
@@ -76,7 +76,7 @@ def matrix_from_quaternion(quaternion: Array) -> Array:
 
 
 def quaternion_from_matrix(R: Array) -> Array:
-    """Return the unit quaternion of one rotation matrix, with w >= 0.
+    """Return the unit quaternion (4,) of one rotation matrix (3, 3), with w >= 0.
 
     Shepperd's method: it starts from the largest of the four squares, so that no divisor is small.
     """
@@ -94,7 +94,7 @@ def quaternion_from_matrix(R: Array) -> Array:
 
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Return Rz(yaw) Ry(pitch) Rx(roll), URDF's convention."""
+    """Return Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3), of angles in radians: URDF's convention."""
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     return np.array(
         [
@@ -106,7 +106,7 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def rpy_from_matrix(R: Array) -> tuple[float, float, float]:
-    """Return roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll), pitch within ±π/2.
+    """Return roll, pitch, yaw in radians with R = Rz(yaw) Ry(pitch) Rx(roll), pitch within ±π/2.
 
     Yaw comes first and is removed from R, so that roll makes up for what yaw lost near a pitch of ±π/2.
     """
@@ -117,7 +117,7 @@ def rpy_from_matrix(R: Array) -> tuple[float, float, float]:
 
 
 def exp_quaternion(w: Array) -> Array:
-    """Return the quaternion of the rotation vector w."""
+    """Return the unit quaternions (..., 4) of rotation vectors w (..., 3), in radians."""
     theta = np.linalg.norm(w, axis=-1, keepdims=True)
     half = theta / 2
     safe = np.where(theta < _SMALL, 1.0, theta)
@@ -128,7 +128,7 @@ def exp_quaternion(w: Array) -> Array:
 
 
 def log_quaternion(quaternion: Array) -> Array:
-    """Return the rotation vector, |w| <= pi, of a unit quaternion."""
+    """Return the rotation vectors (..., 3), of length π at most, of unit quaternions (..., 4)."""
     q = np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
     n = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     safe = np.where(n == 0, 1.0, n)
@@ -138,7 +138,7 @@ def log_quaternion(quaternion: Array) -> Array:
 
 
 def left_jacobian(w: Array) -> Array:
-    """Return V with exp_se3([u, w]).p = V(w) u (Murray, Li, Sastry 1994, eq. 2.36)."""
+    """Return V, shape (..., 3, 3), with V(w) u the translation of ``exp_se3([u, w])`` (Murray, Li, Sastry 1994, eq. 2.36)."""
     theta2 = np.sum(w * w, axis=-1)
     theta = np.sqrt(theta2)
     small = theta < _SMALL
@@ -152,7 +152,7 @@ def left_jacobian(w: Array) -> Array:
 
 
 def left_jacobian_inverse(w: Array) -> Array:
-    """Return the inverse of `left_jacobian`."""
+    """Return the inverse of `left_jacobian`, shape (..., 3, 3)."""
     theta2 = np.sum(w * w, axis=-1)
     theta = np.sqrt(theta2)
     # (1 - (t/2) cot(t/2))/t^2 cancels as eps/t^2, so its series serves up to 0.1:
@@ -166,6 +166,6 @@ def left_jacobian_inverse(w: Array) -> Array:
 
 
 def exp_se3(xi: Array) -> tuple[Array, Array]:
-    """Return translation and quaternion of exp of the twist (linear, angular)."""
+    """Return translation (..., 3) and quaternion (..., 4) of exp of twists (..., 6), linear then angular."""
     u, w = xi[..., :3], xi[..., 3:]
     return np.einsum("...ij,...j->...i", left_jacobian(w), u), exp_quaternion(w)

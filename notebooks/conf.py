@@ -12,6 +12,8 @@ from typing import Any
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.domains.python import PyObject
+from sphinx.util.docfields import TypedField
 
 import mbkit
 
@@ -40,7 +42,11 @@ nb_render_image_options = {"align": "center"}
 # Signatures
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {
+    "members": True,
+    "show-inheritance": False,
+    "inherited-members": "object, tuple, dict, BaseException, Exception, OSError, LookupError",
+}
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
@@ -77,7 +83,10 @@ def _mathml(translator: Any, node: nodes.Element, *, block: bool) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Register the writer of formulas."""
+    """Register the writer of formulas; a type such as ``(nv,) array`` is text, and no reference to some `nv`."""
+    for field in PyObject.doc_field_types:
+        if isinstance(field, TypedField):
+            field.typerolename = ""
     app.add_html_math_renderer(
         "mathml",
         (lambda self, node: _mathml(self, node, block=False), None),

@@ -290,7 +290,7 @@ class Dynamics:
     def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:  # noqa: ARG002  # for the engines that override it
         """Return how far the engine's own formula amplifies rounding in M, per sample.
 
-        Σ |terms| / M_jj of the sum that makes the worst diagonal entry, (N,) or a scalar; None where the formula is not
+        ``Σ |terms| / M_jj`` of the sum that makes the worst diagonal entry, (N,) or a scalar; None where the formula is not
         known to amplify.
         """
         return None

@@ -378,7 +378,7 @@ def sliding_block(
 
 
 def falling_body(*, mass: Value = 1.0, drag: Value = 0.25, gravity: Value = 9.81) -> Lagrangian:
-    """Return a body that falls through air: Q = -c ż |ż|.
+    """Return a body that falls through air: ``Q = -c ż |ż|``.
 
     One coordinate, ``z``, the height. c is ½ ρ c_w A; the fall ends at the speed √(m g/c).
 

@@ -182,12 +182,12 @@ class Stiffness:
 
     @property
     def rate(self) -> float:
-        """Fastest |λ|, 1/s; the bound where no eigenvalues were asked for."""
+        """Fastest ``|λ|``, 1/s; the bound where no eigenvalues were asked for."""
         return float(np.abs(self.eigenvalues[0])) if len(self.eigenvalues) else self.bound
 
     @property
     def stable(self) -> float:
-        """Fastest |λ| of what decays or oscillates, 1/s: what grows is followed by any method's steps."""
+        """Fastest ``|λ|`` of what decays or oscillates, 1/s: what grows is followed by any method's steps."""
         if not len(self.eigenvalues):
             return self.bound
         size = np.abs(self.eigenvalues)
@@ -205,7 +205,7 @@ class Stiffness:
 
     @property
     def oscillation(self) -> float:
-        """Fastest |Im λ|, rad/s."""
+        """Fastest ``|Im λ|``, rad/s."""
         return self._fastest(self.eigenvalues.imag)
 
     @staticmethod
