@@ -41,7 +41,7 @@ def skew(w: Array) -> Array:
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Return the quaternion product a b."""
+    """Return the quaternion product a b, (..., 4)."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     vector = aw * bv + bw * av + np.cross(av, bv)
     scalar = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
@@ -138,7 +138,10 @@ def log_quaternion(quaternion: Array) -> Array:
 
 
 def left_jacobian(w: Array) -> Array:
-    """Return V, shape (..., 3, 3), with V(w) u the translation of ``exp_se3([u, w])`` (Murray, Li, Sastry 1994, eq. 2.36)."""
+    """Return V, shape (..., 3, 3), with V(w) u the translation of ``exp_se3([u, w])``.
+
+    Murray, Li, Sastry 1994, eq. 2.36.
+    """
     theta2 = np.sum(w * w, axis=-1)
     theta = np.sqrt(theta2)
     small = theta < _SMALL

@@ -64,6 +64,7 @@ class InverseDynamicsDerivatives(NamedTuple):
 
     #: ∂τ/∂q along the manifold: column k is that of q ⊕ t e_k.
     q: Array
+    #: ∂τ/∂v.
     v: Array
     #: ∂τ/∂a, the mass matrix.
     a: Array
@@ -74,6 +75,7 @@ class ForwardDynamicsDerivatives(NamedTuple):
 
     #: ∂v̇/∂q along the manifold: column k is that of q ⊕ t e_k.
     q: Array
+    #: ∂v̇/∂v.
     v: Array
     #: ∂v̇/∂τ, the inverse of the mass matrix.
     tau: Array
@@ -290,8 +292,8 @@ class Dynamics:
     def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:  # noqa: ARG002  # for the engines that override it
         """Return how far the engine's own formula amplifies rounding in M, per sample.
 
-        ``Σ |terms| / M_jj`` of the sum that makes the worst diagonal entry, (N,) or a scalar; None where the formula is not
-        known to amplify.
+        ``Σ |terms| / M_jj`` of the sum that makes the worst diagonal entry, (N,) or a scalar; None where the formula is
+        not known to amplify.
         """
         return None
 

@@ -74,7 +74,14 @@ class Body(_Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Mimic(_Frozen):
-    """A joint that follows another: y = ratio * q + offset."""
+    """A joint that follows another: y = ratio * q + offset.
+
+    Attributes
+    ----------
+    joint : str
+        The joint that leads, with coordinate q.
+    ratio, offset : float
+    """
 
     joint: str
     ratio: float = 1.0
@@ -143,7 +150,14 @@ def _of_type(joint_type: JointType, values: tuple[Any, ...]) -> Joint:
 
 @dataclass(frozen=True, eq=False)
 class Frame(_Frozen):
-    """A named frame fixed to a body: R_BF and p_BF_B."""
+    """A named frame fixed to a body.
+
+    Attributes
+    ----------
+    name, body : str
+    rotation, translation : (3, 3) and (3,) arrays
+        R_BF and p_BF_B, m.
+    """
 
     name: str
     body: str
@@ -161,6 +175,14 @@ class PointSpring(_Frozen):
     The pull is stiffness * (l - rest_length) + damping * dl/dt, with l the distance. Points are in body axes; a body
     may be ``"world"``. Where l = 0 a spring without damping and rest length has zero force; the force of any other one
     is not defined, and every engine raises `NumericalError` for the quantities that contain it.
+
+    Attributes
+    ----------
+    name, body_a, body_b : str
+    point_a, point_b : (3,) arrays
+        m, in the axes of their bodies.
+    stiffness, rest_length, damping : float
+        N/m, m and N s/m.
     """
 
     name: str
@@ -187,6 +209,15 @@ class JointCoupling(_Frozen):
 
     With the length l = Σ factor q over `joints` of one velocity it has the potential energy
     ½ stiffness (l - rest_length)², dissipates damping (dl/dt)² and has the kinetic energy ½ armature (dl/dt)².
+
+    Attributes
+    ----------
+    name : str
+    joints : tuple of str
+    factors : (k,) array
+        One for each joint.
+    stiffness, rest_length, damping, armature : float
+        SI units of the length l, which may be radians or metres.
     """
 
     name: str
@@ -210,7 +241,16 @@ class JointCoupling(_Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Loop(_Frozen):
-    """A loop closure: two points (`kind` "point", 3 equations) or frames ("frame", 6) of two bodies stay together."""
+    """A loop closure: two points (`kind` "point", 3 equations) or frames ("frame", 6) of two bodies stay together.
+
+    Attributes
+    ----------
+    name, kind, body_a, body_b : str
+    rotation_a, rotation_b : (3, 3) arrays
+        Axes of the frames in body axes; unused by a loop of points.
+    translation_a, translation_b : (3,) arrays
+        The two points in body axes, m.
+    """
 
     name: str
     kind: str
@@ -224,7 +264,16 @@ class Loop(_Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Prescribed(_Frozen):
-    """A coordinate moved in time: offset + rate t + amplitude sin(frequency t + phase)."""
+    """A coordinate moved in time: offset + rate t + amplitude sin(frequency t + phase).
+
+    Attributes
+    ----------
+    joint : str
+    offset, rate, amplitude : float
+        rad or m, per second for the rate.
+    frequency, phase : float
+        rad/s and rad.
+    """
 
     joint: str
     offset: float = 0.0
