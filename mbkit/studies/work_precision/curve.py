@@ -33,8 +33,8 @@ class PrecisionPoint:
         Largest difference of q to the reference over the saved times, rad or m; NaN where the run did not reach the
         end.
     energy : float
-        Largest ``|E(t) - E(0)|`` at the saved times, relative to the larger of the largest kinetic energy and the change
-        of potential energy; NaN with dampers or applied forces, whose work is not known well enough.
+        Largest ``|E(t) - E(0)|`` at the saved times, relative to the larger of the largest kinetic energy and the
+        change of potential energy; NaN with dampers or applied forces, whose work is not known well enough.
     seconds, spread : float
         Run time, median of the repetitions and half their interquartile range (NaN for one run), without derivation and
         compilation.
