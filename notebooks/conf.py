@@ -66,7 +66,9 @@ _profile = Path(os.environ.setdefault("IPYTHONDIR", tempfile.mkdtemp(prefix="mbk
 if not _profile.exists():
     _profile.mkdir()
     (_profile / "ipython_kernel_config.py").write_text(
-        "c.InlineBackend.figure_formats = {'svg'}\nc.HistoryManager.enabled = False\n", encoding="utf-8"
+        # Figures made without pyplot are shown too.
+        "c.IPKernelApp.matplotlib = 'inline'\nc.InlineBackend.figure_formats = {'svg'}\nc.HistoryManager.enabled = False\n",
+        encoding="utf-8",
     )
     atexit.register(shutil.rmtree, _profile.parent, ignore_errors=True)
 
