@@ -67,7 +67,8 @@ if not _profile.exists():
     _profile.mkdir()
     (_profile / "ipython_kernel_config.py").write_text(
         # Figures made without pyplot are shown too.
-        "c.IPKernelApp.matplotlib = 'inline'\nc.InlineBackend.figure_formats = {'svg'}\nc.HistoryManager.enabled = False\n",
+        "c.IPKernelApp.matplotlib = 'inline'\n"
+        "c.InlineBackend.figure_formats = {'svg'}\nc.HistoryManager.enabled = False\n",
         encoding="utf-8",
     )
     atexit.register(shutil.rmtree, _profile.parent, ignore_errors=True)
