@@ -118,7 +118,7 @@ def failures(result: Comparison) -> list[doc.Bullet]:
 
 
 def _terms(result: Comparison) -> list[doc.Block]:
-    by_term = figures.by_term(result)
+    by_term = result.by_term()
     short = [doc.Column("term", lambda rows: next(iter(rows.values())).term)]
     short += [_of_engine(engine, result.reference) for engine in result.engines]
     entries = [(term, engine, rows.get(engine)) for term, rows in by_term.items() for engine in result.engines]

@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import html, one_line
-from mbkit.studies._figure_style import Palette, engine_index, engine_mark, log_ticks, style
+from mbkit.simulate.plotting.style import CROSS, Palette, drawing, engine_index, engine_mark, log_ticks
 from mbkit.studies.compare.all_robots import Sweep
-from mbkit.studies.compare.result import Comparison, Row
+from mbkit.studies.compare.result import Comparison, figure
 from mbkit.studies.stress.measurements import CaseResult, Line, name_of
 
 if TYPE_CHECKING:
@@ -35,18 +35,13 @@ _VARIABLES: Final = {
     **{colour: f"var(--series{k})" for k, colour in enumerate(PAGE.series, 1)},
 }
 _DASHES: Final = (0, (2, 2))
-#: A cross over what failed.
-_CROSS: Final[dict[str, Any]] = {"color": PAGE.bad, "markersize": 11, "markeredgewidth": 2.2}
 _WIDTH: Final = 10.4
 
 
 @contextmanager
 def page_style(salt: str) -> Iterator[None]:
     """Give the page's style, and the same names inside an SVG every time."""
-    from matplotlib import rc_context
-
-    settings: Any = {**style(PAGE), "svg.hashsalt": f"mbkit {salt}"}
-    with rc_context(settings):
+    with drawing(PAGE, {"svg.hashsalt": f"mbkit {salt}"}):
         yield
 
 
@@ -97,60 +92,11 @@ def _legend(
 
 # The digits of each term.
 
-#: Where an error of exactly zero stands on an axis of digits.
-_SAME: Final = 17.0
-
-
-def by_term(result: Comparison) -> dict[str, dict[str, Row]]:
-    """Return term -> engine -> row, terms in their order."""
-    out: dict[str, dict[str, Row]] = {}
-    for row in result.rows:
-        out.setdefault(row.term, {})[row.engine] = row
-    return out
-
 
 def digits(result: Comparison) -> str:
     """Draw the digits of agreement of each term and engine: worst sample, and median behind it."""
-    terms, engines = by_term(result), result.engines
-    size = 0.9 + 0.36 * len(terms)
-    with _canvas("digits", 7.2, size) as (fig, (ax,)):
-        for k, engine in enumerate(engines):
-            colour, mark = PAGE.engine(engine), engine_mark(engine)
-            label: str | None = f"{engine} against {result.reference}"
-            for place, rows in enumerate(terms.values()):
-                if (row := rows.get(engine)) is None:
-                    continue
-                worst, median = _digits(row.relative), _digits(row.median)
-                y = place + (k - (len(engines) - 1) / 2) * 0.26
-                ax.plot([worst, median], [y, y], color=colour, linewidth=1.2)
-                ax.plot([median], [y], "|", color=colour, markersize=8)
-                ax.plot([worst], [y], mark, color=colour, label=label, linestyle="none")
-                label = None
-                if not row.passed:
-                    ax.plot([worst], [y], "x", **_CROSS)
-        limit = -math.log10(result.tolerance)
-        ax.axvline(limit, color=PAGE.muted, linestyle=_DASHES, linewidth=1.0)
-        ax.text(limit, -0.75, f"tolerance {result.tolerance:g} ", color=PAGE.muted, ha="right", va="center", fontsize=9)
-        ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])
-        ax.set_ylim(len(terms) - 0.4, -1.1)
-        _digit_axis(ax, min(_digits(row.relative) for row in result.rows))
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06 - 0.55 / size), ncols=len(engines))
-        return svg(fig, "Digits of agreement of each term and engine")
-
-
-def _digits(error: float) -> float:
-    return 0.0 if math.isnan(error) else _SAME if error == 0 else min(max(-math.log10(error), 0.0), 16.5)
-
-
-def _digit_axis(ax: Axes, least: float) -> None:
-    # The digits that all have say nothing; the tolerance's stay in sight.
-    begin = max(0, min(10, 2 * (math.floor(least) // 2) - 2))
-    ticks = range(begin, 17, 2)
-    ax.set_xlim(begin - 0.1, _SAME + 0.3)
-    ax.set_xticks([*ticks, _SAME], [*map(str, ticks), "same"])
-    ax.set_xlabel("digits of agreement, −log₁₀ of the relative error")
-    ax.grid(axis="x")
-    ax.tick_params(axis="y", length=0)
+    with page_style("digits"):
+        return svg(figure(result, PAGE), "Digits of agreement of each term and engine")
 
 
 # Many robots.
@@ -218,7 +164,7 @@ def term_costs(result: Comparison) -> str:
                     place = [row.ns], [_shown(row.relative, _LEAST)]
                     ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
                     if not row.passed:
-                        ax.plot(*place, "x", **_CROSS)
+                        ax.plot(*place, "x", color=PAGE.bad, **CROSS)
             ax.set_title(one_line(term, 28), loc="left", fontsize=9.5, pad=3)
         panels[0].set_xscale("log")
         panels[0].set_yscale("log")

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Table
 from mbkit.report.figures import stable_steps
 from mbkit.report.formatting import choice, error_text, time_text
-from mbkit.studies._figure_style import engine_index
+from mbkit.simulate.plotting.style import engine_index
 from mbkit.studies.stress import measurements as stress
 from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
 from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, name_of, place

@@ -23,7 +23,8 @@ from mbkit.simulate.integrate import integrate
 from mbkit.simulate.run_data import RunData, RunSettings, dynamics_of_trajectory
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 #: Times of an event that `repr` shows.
 _SHOWN: Final = 4
@@ -105,17 +106,24 @@ class Trajectory(RunData):
 
     # Pictures and files
 
-    def plot(self) -> Figure:
+    def plot(self, fig: Figure | SubFigure | None = None) -> Figure:
         """Draw coordinates, velocities, energies and the power balance over time with Matplotlib.
 
         Lengths, angles and quaternions have a panel each; of a batch, the first ten trajectories are drawn. Events and
         the end of a run that diverged are marked.
+
+        Parameters
+        ----------
+        fig : Figure or SubFigure, optional
+            An empty one to draw into, best with ``layout="constrained"``. By default a new figure.
         """
         from mbkit.simulate.plotting.time_series import plot
 
-        return plot(self)
+        return plot(self, fig)
 
-    def picture(self, count: int = 8, view: str | ArrayLike | None = None, member: int = 0) -> Figure:
+    def picture(
+        self, count: int = 8, view: str | ArrayLike | None = None, member: int = 0, ax: Axes | None = None
+    ) -> Figure:
         """Draw the motion as a strip of stick figures at equal times, with Matplotlib.
 
         Links run from joint to joint, at the ends to the centre of mass or the last frame; the path of one point is
@@ -130,6 +138,8 @@ class Trajectory(RunData):
             is against gravity, and to the right is where the motion is widest.
         member : int
             Index of the trajectory in a batch.
+        ax : Axes, optional
+            Where to draw; by default in a figure of its own.
         """
         from mbkit.simulate.plotting.motion_strip import picture
 
@@ -139,7 +149,7 @@ class Trajectory(RunData):
             raise InputError(f"member: expected less than {members}, the number of trajectories, got {member}")
         # The description is enough; no engine is built.
         model = self.model if self._dyn is None else dynamics_of_trajectory(self._dyn, member).model
-        return picture(self, model, count, view, member)
+        return picture(self, model, count, view, member, ax)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
         """Write t, q and v with all their digits, one line per state; OutputError where the file cannot be written.

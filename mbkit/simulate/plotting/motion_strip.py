@@ -12,18 +12,25 @@ from mbkit._check import Array, count
 from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.simulate.plotting.stick_figure import Skeleton, direction_name, plane_of, skeleton
-from mbkit.simulate.plotting.time_series import ACCENT, BAD, FAINT, GHOST, INK, MUTED, drawing
+from mbkit.simulate.plotting.style import PLAIN, drawing, figure_of
 from mbkit.simulate.run_data import RunData, integrate_finite
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Inches, at most.
-_WIDTH: Final = 11.0
-_HEIGHT: Final = 8.0
+INK: Final = PLAIN.ink
+MUTED: Final = PLAIN.muted
+FAINT: Final = PLAIN.grid
+ACCENT: Final = PLAIN.series[1]
+GHOST: Final = "#c4ccd4"
+#: Inches, at most.
+_SIZE: Final = (11.0, 8.0)
 #: Width by height of the whole that reads best.
 _SHAPE: Final = 3.0
+#: Inches that a time needs below its window, and from one to the next.
+_LINE: Final = 0.3
+_TIME: Final = 0.85
 #: Edges of a box whose corners are counted with x slowest, and its side at -x.
 _EDGES: Final = [(i, i | b) for i in range(8) for b in (1, 2, 4) if not i & b]
 _SIDE: Final = [0, 1, 3, 2]
@@ -35,28 +42,30 @@ _FAR: Final = 6.0
 
 
 class _Strip:
-    """Windows of one size, side by side, each of which holds the points `seen`, (P, 2); `size` is in inches."""
+    """Windows of one size, side by side, each of which holds the points `seen`, (P, 2); sizes are in inches."""
 
-    def __init__(self, drawn: Skeleton, plane: Array, seen: Array, figures: int) -> None:
+    def __init__(self, drawn: Skeleton, plane: Array, seen: Array, figures: int, most: tuple[float, float]) -> None:
         self._drawn, self._plane = drawn, plane
         low, high = seen.min(axis=0), seen.max(axis=0)
         largest = float((high - low).max()) or 1.0
         # Room around the figure, and never a window that is a line.
         room = np.maximum(0.06 * largest, (0.35 * largest - (high - low)) / 2)
         self._low, self._window = low - room, high - low + 2 * room
-        self._gap = 0.12 * largest
-        self._cell = self._window + np.array([0.3, 1.2]) * self._gap
-
-        def waste(columns: int) -> float:
-            rows = -(-figures // columns)
-            shape = columns * self._cell[0] / (rows * self._cell[1])
-            return abs(math.log(shape / _SHAPE)) + 2 * math.log(columns * rows / figures)
-
-        self._columns = min(range(1, figures + 1), key=waste)
-        self._rows = -(-figures // self._columns)
-        whole = self._cell * [self._columns, self._rows]
-        scale = min(_WIDTH / whole[0], _HEIGHT / whole[1])
+        scale, self._gap, self._columns = math.inf, 0.12 * largest, 1
+        # Texts keep their size, so that their room depends on the scale, and the scale on their room.
+        for _ in range(4):
+            self._gap = max(0.12 * largest, _LINE / scale)
+            self._cell = np.maximum(self._window + np.array([0.3, 1.2]) * self._gap, [_TIME / scale, 0])
+            self._columns = min(range(1, figures + 1), key=lambda columns: self._waste(figures, columns))
+            self._rows = -(-figures // self._columns)
+            whole = self._cell * [self._columns, self._rows]
+            scale = min(most[0] / whole[0], most[1] / whole[1])
         self.size = (max(4.5, whole[0] * scale), whole[1] * scale + 0.6)
+
+    def _waste(self, figures: int, columns: int) -> float:
+        rows = -(-figures // columns)
+        shape = columns * self._cell[0] / (rows * self._cell[1])
+        return float(abs(math.log(shape / _SHAPE)) + 2 * math.log(columns * rows / figures))
 
     def draw(self, axis: Axes, k: int, t: float, before: int, now: int) -> None:
         """Draw figure k at t (s), the one before it and the path between, by their indices of time."""
@@ -126,7 +135,9 @@ class _Strip:
         axis.set_axis_off()
 
 
-def picture(run: RunData, model: Model, figures: int, view: str | ArrayLike | None, member: int) -> Figure:
+def picture(
+    run: RunData, model: Model, figures: int, view: str | ArrayLike | None, member: int, axis: Axes | None = None
+) -> Figure:
     """Draw a run of a model with numbers for its parameters; see `Trajectory.picture`."""
     from matplotlib.figure import Figure
 
@@ -145,18 +156,21 @@ def picture(run: RunData, model: Model, figures: int, view: str | ArrayLike | No
     points = drawn.points()
     seen = points.transpose(1, 0, 2)[_near(points, run.stats.ended == "diverged")].reshape(-1, 3)
     plane = plane_of(view, seen, model.gravity)
-    strip = _Strip(drawn, plane, seen @ plane.T, figures)
-    with drawing():
-        figure = Figure(figsize=strip.size, layout="constrained")
-        axis = figure.add_subplot()
+    most = _SIZE
+    if axis is not None:
+        most = tuple(np.array(axis.get_window_extent().size) / figure_of(axis).dpi)
+    strip = _Strip(drawn, plane, seen @ plane.T, figures, most)
+    with drawing(more={"font.size": 9.0}):
+        if axis is None:
+            axis = Figure(figsize=strip.size, layout="constrained").add_subplot()
         for k in range(figures):
             strip.draw(axis, k, float(at[k * _FINE]), max(k - 1, 0) * _FINE, k * _FINE)
         strip.frame(axis)
         title = f"{model.name}: {run.method} on {run.engine}"
         axis.set_title(title + (f", trajectory {member}" if run.q.ndim == 3 else ""), loc="left")
         if not run.stats.finished:
-            axis.set_title(run.stats.ended.replace("_", " "), loc="right", color=BAD)
-    return figure
+            axis.set_title(run.stats.ended.replace("_", " "), loc="right", color=PLAIN.bad)
+    return figure_of(axis)
 
 
 def _between(model: Model, t: Array, q: Array, v: Array, at: Array) -> Array:

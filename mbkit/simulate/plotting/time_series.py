@@ -2,61 +2,34 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 import textwrap
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.errors import MbkitError
+from mbkit.errors import InputError, MbkitError
 from mbkit.model import Model
+from mbkit.simulate.plotting.style import PLAIN, drawing
 from mbkit.simulate.run_data import RunData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
-INK: Final = "#22303c"
-MUTED: Final = "#7b8794"
-FAINT: Final = "#e3e7eb"
-GHOST: Final = "#c4ccd4"
-ACCENT: Final = "#e8590c"
-BAD: Final = "#c92a2a"
-
-
-def style(ink: str, muted: str, grid: str, **more: Any) -> dict[str, Any]:
-    """Return Matplotlib's settings for figures of this package, in these colours."""
-    labels = dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), ink)
-    return {
-        # A dollar sign in a name does not begin a formula.
-        "text.parse_math": False,
-        "font.family": "sans-serif",
-        **labels,
-        **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), muted),
-        **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
-        **dict.fromkeys(("axes.linewidth", "grid.linewidth"), 0.8),
-        "axes.titlesize": 10.0,
-        "axes.axisbelow": True,
-        "grid.color": grid,
-        **more,
-    }
-
-
-def drawing() -> Any:
-    """Return a context that draws in this style, and leaves the user's own as it was."""
-    import matplotlib as mpl
-
-    sizes = {"font.size": 9.0, "lines.linewidth": 1.4, "legend.fontsize": 8.0}
-    settings: Any = style(INK, MUTED, FAINT, **{"axes.grid": True, **sizes})
-    return mpl.rc_context(settings)
-
+    from matplotlib.figure import Figure, SubFigure
 
 #: Trajectories of a batch that are drawn.
 _DRAWN: Final = 10
-#: Lines that a legend tells apart.
-_NAMED: Final = 10
+#: Lines differ by colour, then by dashes; more than so many have no legend.
+_DASHES: Final = ("-", (0, (4, 2)), (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5)))
+_NAMED: Final = len(_DASHES) * len(PLAIN.series)
+_LEGEND_ROWS: Final = 8
 _MARKED: Final = 20
+#: Width of a letter above a panel, as a part of the panel.
+_LETTER: Final = 0.023
+_SIZES: Final[dict[str, Any]] = {"axes.grid": True, "font.size": 9.0, "lines.linewidth": 1.4, "legend.fontsize": 8.0}
 
 
 def _panels(model: Model) -> list[tuple[tuple[str, str, str], list[int], list[int]]]:
@@ -73,54 +46,114 @@ def _panels(model: Model) -> list[tuple[tuple[str, str, str], list[int], list[in
     return [group for group in zip(titles, of_q, of_v, strict=True) if group[1]]
 
 
-def plot(run: RunData) -> Figure:
+def plot(run: RunData, fig: Figure | SubFigure | None = None) -> Figure:
     """Draw a run; see `Trajectory.plot`."""
-    from matplotlib.figure import Figure
-
     panels = _panels(run.model)
     rows = len(panels) + 1
-    with drawing(), np.errstate(over="ignore", invalid="ignore"):
-        figure = Figure(figsize=(11, 0.6 + 2.2 * rows), layout="constrained")
-        axes = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    with drawing(more=_SIZES), np.errstate(over="ignore", invalid="ignore"):
+        fig = fig or _figure(rows)
+        axes = fig.subplots(rows, 2, sharex=True, squeeze=False)
         names, speeds = run.model.coordinate_names, run.model.velocity_names
         for (left, right), ((title, unit, rate), q, v) in zip(axes, panels, strict=False):
-            _lines(left, run, run.q[..., q], [names[i] for i in q], f"{title} ({unit})")
-            _lines(right, run, run.v[..., v], [speeds[i] for i in v], f"their velocities ({rate})")
+            own, rates = [names[i] for i in q], [speeds[i] for i in v]
+            # One legend at the right is for both.
+            _lines(left, run.t, run.q[..., q], own, f"{title} ({unit})", legend=own != rates)
+            _lines(right, run.t, run.v[..., v], rates, f"their velocities ({rate})")
         left, right = axes[-1]
         _energies(left, right, run)
+        if run.stats.ended == "diverged":
+            for axis in axes.flat:
+                _show_beginning(axis, len(run.t))
         for axis in axes[-1]:
             axis.set_xlabel("t (s)")
         _mark(axes, run)
         title = f"{run.model.name}: {run.method} on {run.engine}"
         if run.q.ndim == 3:
             title += f", {len(run.q)} trajectories" + (f", the first {_DRAWN}" if len(run.q) > _DRAWN else "")
-        figure.suptitle(title, fontsize=11)
-    return figure
+        fig.suptitle(title, fontsize=11)
+    return _whole(fig)
 
 
-def _lines(axis: Axes, run: RunData, values: Array, names: list[str], label: str, colours: Any = None) -> None:
+def plot_csv(text: str, title: str) -> Figure:
+    """Draw a table that `Trajectory.to_csv` wrote: coordinates and velocities over time.
+
+    Raises
+    ------
+    InputError
+        The table is no such one.
+    """
+    rows: list[list[str]]
+    head, *rows = [*csv.reader(io.StringIO(text)), []]
+    batch = head[:1] == ["trajectory"]
+    names = head[batch + 1 :]
+    try:
+        data = np.array([row for row in rows if row], dtype=float)
+        if head[batch : batch + 1] != ["t"] or {name[:2] for name in names} != {"q.", "v."} or not len(data):
+            raise ValueError("its columns are " + ", ".join(head[:4]) + ", ...")
+        data = data.reshape(len(np.unique(data[:, 0])) if batch else 1, -1, len(head))[:, :, int(batch) :]
+    except ValueError as error:
+        raise InputError(
+            f"expected the table of a trajectory (t, q.NAME, ..., v.NAME, ...), which mbkit simulate writes; {error}"
+        ) from None
+    with drawing(more=_SIZES):
+        fig = _figure(2)
+        axes = fig.subplots(2, 1, sharex=True)
+        for axis, kind, label in zip(axes, "qv", ("q (m or rad)", "v (m/s or rad/s)"), strict=True):
+            which = [k for k, name in enumerate(names, 1) if name[0] == kind]
+            _lines(axis, data[0, :, 0], data[:, :, which], [names[k - 1][2:] for k in which], label)
+        axes[-1].set_xlabel("t (s)")
+        fig.suptitle(title, fontsize=11)
+    return fig
+
+
+def _figure(rows: int) -> Figure:
+    # Figure without pyplot: no window system, nothing to close.
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(11, 0.6 + 2.2 * rows), layout="constrained")
+
+
+def _whole(fig: Figure | SubFigure) -> Figure:
+    from matplotlib.figure import Figure
+
+    return fig if isinstance(fig, Figure) else _whole(fig.figure)
+
+
+def _lines(
+    axis: Axes,
+    t: Array,
+    values: Array,
+    names: list[str],
+    label: str,
+    colours: tuple[str, ...] = PLAIN.series,
+    *,
+    legend: bool = True,
+) -> None:
     """Draw one line for each name and trajectory, coloured by name."""
-    from matplotlib import colormaps
-
-    n = len(names)
-    if colours is None:
-        tab: Any = colormaps["tab10"]
-        colours = tab.colors[:n] if n <= _NAMED else colormaps["turbo"](np.linspace(0.05, 0.95, n))
     members = values[:_DRAWN] if values.ndim == 3 else values[None]
-    style: dict[str, Any] = {"alpha": 1.0 if len(members) == 1 else 0.6, "marker": "." if len(run.t) == 1 else None}
+    style: dict[str, Any] = {"alpha": 1.0 if len(members) == 1 else 0.6, "marker": "." if len(t) == 1 else None}
     for i, member in enumerate(members):
-        for x, name, colour in zip(member.T, names, colours, strict=True):
-            axis.plot(run.t, x, color=colour, label=name if name and not i and n <= _NAMED else None, **style)
+        for k, (x, name) in enumerate(zip(member.T, names, strict=True)):
+            again, which = divmod(k, len(colours))
+            style |= {"color": colours[which], "linestyle": _DASHES[again % len(_DASHES)]}
+            axis.plot(t, x, label=None if i else name or None, **style)
     axis.set_ylabel(label)
-    # The last states of a run that diverged would flatten all the others; its growth has
-    # no scale, so that of its beginning is taken.
-    if run.stats.ended == "diverged" and members.size:
-        early = members[:, : max(3, len(run.t) // 20)]
-        low, high = np.nanmin(early), np.nanmax(early)
-        room = 20 * max(high - low, 0.05 * abs(low), 0.05 * abs(high), np.finfo(float).tiny)
-        axis.set_ylim(max(low - room, np.nanmin(members)), min(high + room, np.nanmax(members)))
-    if n <= _NAMED and all(names) and len(members):
-        axis.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=1.2)
+    if legend and len(names) <= _NAMED and all(names) and len(members):
+        columns = math.ceil(len(names) / _LEGEND_ROWS)
+        axis.legend(loc="center left", bbox_to_anchor=(1, 0.5), ncols=columns, handlelength=1.8)
+
+
+def _show_beginning(axis: Axes, count: int) -> None:
+    """Set the limits by the first of so many states: the last of a run that diverged would flatten all others."""
+    lines = [np.asarray(line.get_ydata(), dtype=float) for line in axis.lines]
+    values = np.array([y for y in lines if len(y) == count])
+    if not np.isfinite(values).any():
+        return
+    # Its growth has no scale, so that of its beginning is taken.
+    early = values[:, : max(3, count // 20)]
+    low, high = np.nanmin(early), np.nanmax(early)
+    room = 20 * max(high - low, 0.05 * abs(low), 0.05 * abs(high), np.finfo(float).tiny)
+    axis.set_ylim(max(low - room, np.nanmin(values)), min(high + room, np.nanmax(values)))
 
 
 def _energies(left: Axes, right: Axes, run: RunData) -> None:
@@ -133,30 +166,42 @@ def _energies(left: Axes, right: Axes, run: RunData) -> None:
         parts = {"total": kinetic + potential}
         if run.q.ndim == 2:
             parts = {"kinetic": kinetic, "potential": potential, **parts}
-        colours = [*("tab:blue", "tab:orange")[: len(parts) - 1], INK]
-        _lines(left, run, np.stack(list(parts.values()), axis=-1), list(parts), titles[0], colours)
-        _lines(right, run, run.power_balance()[..., None], [""], titles[1], [INK])
+        colours = *PLAIN.series[: len(parts) - 1], PLAIN.ink
+        _lines(left, run.t, np.stack(list(parts.values()), axis=-1), list(parts), titles[0], colours)
+        _lines(right, run.t, run.power_balance()[..., None], [""], titles[1], (PLAIN.ink,))
     except MbkitError as error:
         text = textwrap.fill(str(error), 60, max_lines=5)
         for axis in (left, right):
             if not axis.lines:
-                axis.text(0.5, 0.5, text, transform=axis.transAxes, ha="center", va="center", color=MUTED)
+                axis.text(0.5, 0.5, text, transform=axis.transAxes, ha="center", va="center", color=PLAIN.muted)
 
 
 def _mark(axes: Any, run: RunData) -> None:
     """Draw a line at each event and at an early end, with its name above the first row."""
-    marks = [(hit.t, hit.name, MUTED) for hit in run.events if (hit.member or 0) < _DRAWN]
+    marks = [(hit.t, hit.name, PLAIN.muted) for hit in run.events if (hit.member or 0) < _DRAWN]
     if not run.stats.finished:
         reached = run.stats.reached
         ends = reached if isinstance(reached, tuple) else (reached,)
         shown = sorted(set(ends[:_DRAWN]))
         early = [end for end in shown if len(shown) == 1 or end != max(ends)]
-        marks += [(end, run.stats.ended.replace("_", " "), BAD) for end in early]
+        marks += [(end, run.stats.ended.replace("_", " "), PLAIN.bad) for end in early]
+    start, span = (run.t[0], run.t[-1] - run.t[0] or 1.0) if len(run.t) else (0.0, 1.0)
+    # Names that would meet stand one above the other; (left, right) of each, row by row.
+    taken: list[list[tuple[float, float]]] = []
     named: set[str] = set()
     for t, name, colour in marks[:_MARKED]:
         for axis in axes.flat:
             axis.axvline(t, color=colour, linewidth=0.9, linestyle=(0, (3, 2)))
-        if name not in named:
-            named.add(name)
-            style: dict[str, Any] = {"color": colour, "ha": "right", "va": "bottom"}
-            axes[0, 0].annotate(f"{textwrap.shorten(name, 30)} ", (t, 1), xycoords=("data", "axes fraction"), **style)
+        if name in named:
+            continue
+        named.add(name)
+        text = textwrap.shorten(name, 30)
+        at, width = (t - start) / span, _LETTER * (len(text) + 1)
+        own = (at, at + width) if at < 0.5 else (at - width, at)
+        free = (k for k, row in enumerate(taken) if all(own[1] <= x or y <= own[0] for x, y in row))
+        row = next(free, len(taken))
+        taken[row:] = taken[row:] or [[]]
+        taken[row].append(own)
+        style: dict[str, Any] = {"color": colour, "ha": "left" if at < 0.5 else "right", "va": "bottom"}
+        place: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        axes[0, 0].annotate(text, (t, 1), (0.0, 11.0 * row), **place, **style)

@@ -6,11 +6,19 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from mbkit._escape import one_line
+from mbkit.simulate.plotting.style import CROSS, PLAIN, Palette, drawing, engine_mark, figure_of, legend
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
 from mbkit.studies.work_precision.result import WorkPrecision
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Where an error of exactly zero stands on an axis of digits.
+_SAME: Final = 17.0
 
 
 @dataclass(frozen=True)
@@ -235,6 +243,21 @@ class Comparison(ResultTable):
             return math.nan
         return -math.log10(max(*errors, 1e-16))
 
+    def by_term(self) -> dict[str, dict[str, Row]]:
+        """Return the rows by term and engine, terms in their order."""
+        out: dict[str, dict[str, Row]] = {}
+        for row in self.rows:
+            out.setdefault(row.term, {})[row.engine] = row
+        return out
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Draw the digits of each engine and term with Matplotlib: the worst state, and the median behind it.
+
+        What failed is crossed out. `ax` is where to draw; by default in a figure of its own.
+        """
+        with drawing():
+            return figure(self, PLAIN, ax)
+
     _derived = ("passed", "verdict", "digits", "shortened")
     _csv_columns = columns_of(Row)
 
@@ -248,3 +271,50 @@ class Comparison(ResultTable):
 
     def __repr__(self) -> str:
         return f"<Comparison of {self.model!r}: {one_line(self.verdict)}>"
+
+
+def figure(result: Comparison, palette: Palette, ax: Axes | None = None) -> Figure:
+    """Draw the digits of agreement of each term and engine, in the style that is set."""
+    from matplotlib.figure import Figure
+
+    terms, engines = result.by_term(), result.engines
+    own = ax is None
+    if ax is None:
+        ax = Figure(figsize=(7.2, 1.3 + 0.36 * len(terms)), layout="constrained").add_subplot()
+    step = 0.8 / max(len(engines), 3)
+    for k, engine in enumerate(engines):
+        colour, label = palette.engine(engine), f"{one_line(engine, 30)} against {result.reference}"
+        ax.plot([], [], engine_mark(engine), color=colour, label=label)
+        for place, rows in enumerate(terms.values()):
+            if (row := rows.get(engine)) is None:
+                continue
+            worst, median = _shown_digits(row.relative), _shown_digits(row.median)
+            y = place + (k - (len(engines) - 1) / 2) * step
+            ax.plot([worst, median], [y, y], color=colour, linewidth=1.2)
+            ax.plot([median], [y], "|", color=colour, markersize=8)
+            ax.plot([worst], [y], engine_mark(engine), color=colour)
+            if not row.passed:
+                ax.plot([worst], [y], "x", color=palette.bad, **CROSS)
+    ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])
+    ax.set_ylim(len(terms) - 0.4, -1.1)
+    # The digits that all have say nothing; the tolerance's stay in sight.
+    least = min((_shown_digits(row.relative) for row in result.rows), default=0.0)
+    begin = max(0, min(10, 2 * (math.floor(least) // 2) - 2))
+    ticks = range(begin, 17, 2)
+    limit = -math.log10(result.tolerance)
+    ax.axvline(limit, color=palette.muted, linestyle=(0, (2, 2)), linewidth=1.0)
+    side = "left" if limit < (begin + _SAME) / 2 else "right"
+    text = f" tolerance {result.tolerance:g} "
+    ax.text(limit, -0.75, text, color=palette.muted, ha=side, va="center", fontsize=9)
+    ax.set_xlim(begin - 0.1, _SAME + 0.3)
+    ax.set_xticks([*ticks, _SAME], [*map(str, ticks), "same"])
+    ax.set_xlabel("digits of agreement, −log₁₀ of the relative error")
+    ax.grid(axis="x")
+    ax.tick_params(axis="y", length=0)
+    handles = ax.get_legend_handles_labels()[0]
+    legend(ax, handles, "upper", own=own, columns=3 if own and len(max(engines, key=len, default="")) < 12 else 2)
+    return figure_of(ax)
+
+
+def _shown_digits(error: float) -> float:
+    return 0.0 if math.isnan(error) else _SAME if error == 0 else min(max(-math.log10(error), 0.0), 16.5)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from mbkit._escape import one_line
 from mbkit.errors import UnknownNameError
-from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, style
+from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend
 from mbkit.studies.stress.measurements import (
     CaseResult,
     Measurement,
@@ -28,7 +29,10 @@ from mbkit.studies.stress.measurements import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
 #: Where one shade ends and the next begins, in digits of error.
 _DIGITS: Final = (12.0, 9.0, 6.0, 3.0)
@@ -66,8 +70,6 @@ _MARKS: Final[dict[Outcome, str]] = {"silent": "✗ ", "warned": "! ", "unjudged
 #: More columns than these have no room for words.
 ROOMY: Final = 14
 _WIDTH: Final = 10.4
-#: The width of a letter of a row's name, in.
-_LETTER: Final = 0.075
 _DASHED: Final = (0, (1.5, 1))
 
 
@@ -109,32 +111,34 @@ def _exponent(text: str) -> str:
     return re.sub(r"e([+-])0*(?=\d)", lambda m: "e" + m.group(1).strip("+"), text)
 
 
-def figure(cases: Sequence[CaseResult], case: str | None = None, palette: Palette = PLAIN) -> Figure:
+def figure(
+    cases: Sequence[CaseResult], case: str | None = None, palette: Palette = PLAIN, ax: Axes | None = None
+) -> Figure:
     """Draw the map of one case, by default of the only one, or how far each engine held in every case."""
-    # Figure without pyplot: no window system, nothing to close.
-    from matplotlib import rc_context
-
     known = {c.name: c for c in cases}
     if case is not None and case not in known:
         raise UnknownNameError("case", case, known)
     if case is None and len(known) == 1:
         case = next(iter(known))
-    with rc_context(style(palette)):  # type: ignore[arg-type]
-        return _overview(cases, palette) if case is None else _map(known[case], palette)
+    with drawing(palette):
+        return _overview(cases, palette, ax) if case is None else _map(known[case], palette, ax)
 
 
-def _map(case: CaseResult, palette: Palette) -> Figure:
-    """Draw one case."""
+def _axes(ax: Axes | None, rows: int, height: float) -> Axes:
+    """Return an axes with so many rows of a height, in, in a figure of its own where there is none."""
+    # Figure without pyplot: no window system, nothing to close.
     from matplotlib.figure import Figure
+
+    return ax or Figure(figsize=(_WIDTH, 1.5 + height * max(rows, 1)), layout="constrained").add_subplot()
+
+
+def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
+    """Draw one case."""
     from matplotlib.patches import Rectangle
 
     ranked, count = lines(case), len(case.values)
-    height = 1.5 + 0.24 * max(len(ranked), 1)
-    fig = Figure(figsize=(_WIDTH, height))
     names = [one_line(f"{name_of(x.row)}  {x.row.setting}".rstrip(), 44) for x in ranked]
-    left = 0.02 + _LETTER * max(map(len, names), default=0) / _WIDTH
-    margins = {"left": left, "right": 0.995, "top": 1 - 0.55 / height, "bottom": 0.9 / height}
-    ax = fig.subplots(gridspec_kw=margins)
+    ax = _axes(given, len(ranked), 0.24)
     for y, line in enumerate(ranked):
         for x, (cell, how) in enumerate(zip(line.row.cells[:count], line.outcomes, strict=False)):
             face, weight = SHADES[shade(cell, how)], "bold" if how == "silent" else "normal"
@@ -157,19 +161,23 @@ def _map(case: CaseResult, palette: Palette) -> Figure:
     ax.spines[["left", "bottom"]].set_visible(False)
     unit = f", {case.unit}" if case.unit else ""
     ax.set_xlabel(one_line(f"{case.parameter}{unit}", 90))
-    # From the figure's left edge, for a sentence is longer than the axes.
-    fig.text(0.01, 1 - 0.3 / height, one_line(f"{case.name}: {case.about}", 125), va="center")
     if not ranked:
         ax.text(0.5, 0.5, "nothing was run", transform=ax.transAxes, ha="center", color=palette.muted)
-    _legend(fig, case.bar, palette)
-    return fig
+    about = one_line(f"{case.name}: {case.about}", 125)
+    if given is None:
+        # From the figure's left edge, for a sentence is longer than the axes.
+        figure_of(ax).suptitle(about, x=0.01, ha="left", fontsize=10.0)
+    else:
+        ax.set_title(textwrap.fill(about, 45), loc="left")
+    legend(ax, _kinds(case.bar, palette), "lower", own=given is None, columns=6 if given is None else 2)
+    return figure_of(ax)
 
 
-def _legend(fig: Figure, bar: float, palette: Palette) -> None:
+def _kinds(bar: float, palette: Palette) -> list[Patch | Line2D]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Patch | Line2D] = [
+    return [
         Patch(facecolor=SHADES["h2"], label=f"held: error ≤ {number_text(bar)}"),
         Patch(facecolor=SHADES["w2"], label="inaccurate"),
         Patch(facecolor=SHADES["gross"], label="wrong: ! with a warning, ✗ in silence"),
@@ -177,30 +185,27 @@ def _legend(fig: Figure, bar: float, palette: Palette) -> None:
         Line2D([], [], color=palette.ink, linewidth=2.2, label="breaks"),
         Line2D([], [], color=palette.series[3], linewidth=1.8, linestyle=_DASHED, label="linear theory"),
     ]
-    fig.legend(handles=handles, loc="lower left", ncols=len(handles), columnspacing=1.2, handlelength=1.4)
 
 
-def _overview(cases: Sequence[CaseResult], palette: Palette) -> Figure:
+def _overview(cases: Sequence[CaseResult], palette: Palette, given: Axes | None) -> Figure:
     """Draw how much of each sweep every engine's furthest method held, and mbkit's own choice."""
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     cases = [c for c in cases if c.values]
-    height = 1.3 + 0.26 * max(len(cases), 1)
-    fig = Figure(figsize=(_WIDTH, height))
-    margins = {"left": 0.25, "right": 0.8, "top": 1 - 0.6 / height, "bottom": 0.55 / height}
-    ax = fig.subplots(gridspec_kw=margins)
+    ax = _axes(given, len(cases), 0.32)
     engines, chosen = engines_of(cases), False
+    # Marks of a row stand one below the other, none on another.
+    apart = 0.8 / max(len(engines), 3)
     for y, case in enumerate(cases):
         size, leaders, choice = len(case.values), best(case), recommended(case)
         for k, engine in enumerate(engines):
             if engine in leaders:
-                shift = (k - (len(engines) - 1) / 2) * 0.2
+                shift = (k - (len(engines) - 1) / 2) * apart
                 colour, mark = palette.engine(engine), engine_mark(engine)
-                ax.plot([leaders[engine].reach / size], [y + shift], mark, color=colour, markersize=5.5)
+                ax.plot([leaders[engine].reach / size], [y + shift], mark, color=colour, markersize=5.0)
         if choice is not None:
             chosen = True
-            ax.plot([choice.reach / size], [y], "|", color=palette.ink, markersize=13, markeredgewidth=1.6)
+            ax.plot([choice.reach / size], [y], "|", color=palette.ink, markersize=22, markeredgewidth=1.4, zorder=1)
         span = f"{case.parameter} {number_text(case.values[0])} … {number_text(case.values[-1])} {case.unit}".rstrip()
         ax.text(1.03, y, one_line(span, 44), va="center", fontsize=8.0, color=palette.muted)
     ax.set_yticks(range(len(cases)), [one_line(c.name, 34) for c in cases])
@@ -218,5 +223,5 @@ def _overview(cases: Sequence[CaseResult], palette: Palette) -> Figure:
         auto = Line2D([], [], color=palette.ink, marker="|", linestyle="none", markersize=12, label="method auto")
         handles.append(auto)
     if handles:
-        fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.02, 1.0), ncols=len(handles))
-    return fig
+        legend(ax, handles, "upper", own=given is None, columns=4 if given is None else 2)
+    return figure_of(ax)

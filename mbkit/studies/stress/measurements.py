@@ -13,7 +13,7 @@ import numpy as np
 
 from mbkit.engines.registry import DERIVED, PINOCCHIO
 from mbkit.methods.registry import AUTOMATIC_METHOD
-from mbkit.studies._figure_style import engine_index
+from mbkit.simulate.plotting.style import engine_index
 
 #: How a run or an evaluation ended, before its error is judged.
 End = Literal["finished", "diverged", "nan", "refused", "slow", "died", "not run"]

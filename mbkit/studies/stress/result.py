@@ -17,6 +17,7 @@ from mbkit.studies.stress.measurements import CaseResult, Measurement, Outcome, 
 from mbkit.studies.study_runs import OUT_OF_TIME
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -169,9 +170,12 @@ class StressResult(ResultTable):
             columns = (*names, held, then, Column("how", attrgetter("how")))
             yield Table(columns, [_breaking(case, row, case.bar) for row in rows])
 
-    def plot(self, case: str | None = None) -> Figure:
-        """Return the map of one case, or how far each engine held in all of them."""
-        return figure(self.cases, case)
+    def plot(self, case: str | None = None, ax: Axes | None = None) -> Figure:
+        """Draw the map of one case, or how far each engine held in all of them, with Matplotlib.
+
+        `ax` is where to draw; by default in a figure of its own.
+        """
+        return figure(self.cases, case, ax=ax)
 
     def __repr__(self) -> str:
         counts = Counter(item.outcome for item in self._csv_rows())

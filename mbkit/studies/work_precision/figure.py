@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import one_line
 from mbkit.methods.registry import METHODS
-from mbkit.studies._figure_style import PLAIN, Palette, engine_mark, log_ticks, style
+from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend, log_ticks
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 #: Run time, s, error or energy drift, and whose they are.
 _Place = tuple[float, float, Curve]
@@ -37,14 +38,15 @@ _EPS: Final = 2.0**-52
 _DASHED: Final = (0, (4, 3))
 
 
-def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Palette = PLAIN) -> Figure:
+def figure(
+    curves: Sequence[Curve], duration: float, floor: float, palette: Palette = PLAIN, only: Axes | None = None
+) -> Figure:
     """Draw all curves of error against run time, thin, the best of each engine, and the front.
 
-    At the right stands the same for energy, below one panel for each method. The floor says how well the reference is
-    known, rad or m.
+    At the right stands the same for energy, below one panel for each method; of these there is none where the errors
+    are drawn into the axes `only`. The floor says how well the reference is known, rad or m.
     """
     # Figure without pyplot: no window system, nothing to close.
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     floor = floor if math.isfinite(floor) and floor > 0 else 0.0
@@ -55,7 +57,11 @@ def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Pale
         # Below the reference's floor nothing is known; a logarithm has no zero.
         return max(p.error, floor / 10, _MIN_ERROR) if math.isfinite(p.error) else math.nan
 
-    with rc_context(style(palette)):  # type: ignore[arg-type]
+    with drawing(palette):
+        if only is not None:
+            _errors(only, curves, duration, floor, palette, error)
+            legend(only, _handles(curves, floor, palette), "lower", own=False, columns=2)
+            return figure_of(only)
         height = _TOP + (0.75 + _ROW * rows if rows else 0.0)
         fig = Figure(figsize=(_WIDTH, height))
         split = 1 - _TOP / height
@@ -65,15 +71,12 @@ def figure(curves: Sequence[Curve], duration: float, floor: float, palette: Pale
         ratios = (1.55, 1.0) if conserved else (1.0,)
         gridspec = margins | {"wspace": 0.2}
         axes = fig.subplots(1, len(ratios), width_ratios=ratios, squeeze=False, gridspec_kw=gridspec)[0]
-        _overview(axes[0], curves, error, floor, palette, show_floor=floor > 0)
-        axes[0].set_title("error: lower left is better", loc="left")
-        axes[0].set_ylabel("largest error of q, rad or m")
+        _errors(axes[0], curves, duration, floor, palette, error)
         if conserved:
             _overview(axes[1], curves, lambda p: p.energy, _EPS, palette)
             axes[1].set_title("energy over the same runs", loc="left")
             axes[1].set_ylabel("energy drift, relative")
-        for ax in axes:
-            ax.set_xlabel(f"run time of {duration:g} s of motion, s")
+            axes[1].set_xlabel(axes[0].get_xlabel())
         _legend(fig, curves, floor, palette)
         if rows:
             caption = "Method by method, each engine in its colour, the front behind"
@@ -146,19 +149,30 @@ def _overview(
     _write_names(ax, names, palette)
 
 
+def _errors(
+    ax: Axes, curves: Sequence[Curve], duration: float, floor: float, palette: Palette, error: _Measure
+) -> None:
+    _overview(ax, curves, error, floor, palette, show_floor=floor > 0)
+    ax.set_title("error: lower left is better", loc="left")
+    ax.set_ylabel("largest error of q, rad or m")
+    ax.set_xlabel(f"run time of {duration:g} s of motion, s")
+
+
 def _limits(ax: Axes, places: Sequence[_Place], floor: float, names: Sequence[tuple[_Place, bool]]) -> None:
     """Set the limits to hold all places, and at the left the names of the front: nothing else can be there."""
     if not places:
         return
     xs, ys = _xy(places)
     low, high = math.log10(min(xs)) - 0.15, math.log10(max(xs)) + 0.15
-    width = float(ax.get_window_extent().width) / ax.get_figure(root=True).dpi  # type: ignore[union-attr]
+    width = float(ax.get_window_extent().width) / figure_of(ax).dpi
     for (x, _, curve), below in names:
         share = min(0.6, (_LETTER * len(_short(curve)) + (-0.2 if below else 0.2)) / width)
         low = min(low, (math.log10(x) - share * high) / (1 - share))
     ax.set_xlim(10**low, 10**high)
     room = 0.7 + 0.9 * sum(below for _, below in names)
-    ax.set_ylim(min([*ys, floor] if floor > 0 else ys) / 10**room, max(ys) * 2)
+    lowest = min([*ys, floor] if floor > 0 else ys) / 10**room
+    # Above, the half of a marker.
+    ax.set_ylim(lowest, max(ys) * max(2.0, (max(ys) / lowest) ** 0.05))
 
 
 def _names(front: Sequence[_Place]) -> list[tuple[_Place, bool]]:
@@ -174,7 +188,7 @@ def _names(front: Sequence[_Place]) -> list[tuple[_Place, bool]]:
 
 def _write_names(ax: Axes, names: Sequence[tuple[_Place, bool]], palette: Palette) -> None:
     """Write the names of the front's methods where all is empty: left of the front, or below it."""
-    scale = ax.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
+    scale = figure_of(ax).dpi / 72
     last = math.inf
     for (x, y, curve), below in names:
         at = float(ax.transData.transform((x, y))[1]) / scale
@@ -189,7 +203,7 @@ def _short(curve: Curve) -> str:
     return one_line(curve.method, 30)
 
 
-def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette) -> None:
+def _handles(curves: Sequence[Curve], floor: float, palette: Palette) -> list[Line2D]:
     from matplotlib.lines import Line2D
 
     handles = []
@@ -201,13 +215,18 @@ def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette
     if floor > 0:
         label = f"reference known to {floor:.0e}"
         handles.append(Line2D([], [], color=palette.muted, linestyle=_DASHED, linewidth=1.0, label=label))
+    return handles
+
+
+def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette) -> None:
+    handles = _handles(curves, floor, palette)
     place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.02, 1.0), "columnspacing": 1.6}
     # On one line, in letters as small as long names need.
     for size in (10.0, 9.0, 8.0, 7.0, 6.0, 5.0):
-        legend = fig.legend(handles=handles, ncols=len(handles), prop={"size": size}, **place)
-        if size == 5.0 or legend.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
+        drawn = fig.legend(handles=handles, ncols=len(handles), prop={"size": size}, **place)
+        if size == 5.0 or drawn.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
             return
-        legend.remove()
+        drawn.remove()
 
 
 def _by_method(

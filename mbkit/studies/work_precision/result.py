@@ -13,6 +13,7 @@ from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_fro
 from mbkit.studies.work_precision.figure import figure
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -142,9 +143,12 @@ class WorkPrecision(ResultTable):
         notes = [f"{r.engine} {r.term}: {r.reason}" for r in self.refusals]
         yield Items([*notes, *([] if self.complete else ["Interrupted: this is what was finished."])])
 
-    def plot(self) -> Figure:
-        """Return the log-log figure of error against run time."""
-        return figure(self.curves, self.duration, self.floor)
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Draw error and energy drift against run time with Matplotlib, and a panel for each method.
+
+        With `ax` the error alone is drawn there.
+        """
+        return figure(self.curves, self.duration, self.floor, only=ax)
 
     def __repr__(self) -> str:
         count = sum(len(c.points) for c in self.curves)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from mbkit.engines import ENGINES
-from mbkit.simulate.plotting import time_series
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _MARKS: Final = "osD^vP"
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+#: A cross over what failed.
+CROSS: Final[dict[str, Any]] = {"linestyle": "none", "markersize": 11.0, "markeredgewidth": 2.2}
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,50 @@ def engine_mark(name: str) -> str:
 
 def style(palette: Palette) -> dict[str, Any]:
     """Return Matplotlib's settings for figures of this package."""
-    sizes = {"font.size": 10.0, "lines.linewidth": 1.6, "lines.markersize": 6.0, "legend.fontsize": 9.5}
-    return time_series.style(palette.ink, palette.muted, palette.grid, **{"svg.fonttype": "none", **sizes})
+    return {
+        # A dollar sign in a name does not begin a formula.
+        "text.parse_math": False,
+        "font.family": "sans-serif",
+        "font.size": 10.0,
+        "svg.fonttype": "none",
+        **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), palette.ink),
+        **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), palette.muted),
+        **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+        **dict.fromkeys(("axes.linewidth", "grid.linewidth"), 0.8),
+        "axes.titlesize": 10.0,
+        "axes.axisbelow": True,
+        "grid.color": palette.grid,
+        "legend.fontsize": 9.5,
+        "lines.linewidth": 1.6,
+        "lines.markersize": 6.0,
+    }
+
+
+def drawing(palette: Palette = PLAIN, more: Mapping[str, Any] | None = None) -> Any:
+    """Return a context that draws in this style, and leaves the user's own as it was; `more` are further settings."""
+    from matplotlib import rc_context
+
+    settings: Any = {**style(palette), **(more or {})}
+    return rc_context(settings)
+
+
+def figure_of(ax: Axes) -> Figure:
+    """Return the whole figure of an axes, also of one in a subfigure."""
+    from matplotlib.figure import Figure
+
+    fig = ax.get_figure(root=True)
+    assert isinstance(fig, Figure)
+    return fig
+
+
+def legend(ax: Axes, handles: Sequence[Artist], side: Literal["upper", "lower"], *, own: bool, columns: int) -> None:
+    """Put a legend above or below an axes; in a figure of `own`, with constrained layout, from its left edge."""
+    place: Any = {"loc": f"outside {side} left"}
+    if not own:
+        at = ("lower left", (0.0, 1.0)) if side == "upper" else ("upper left", (0.0, -0.2))
+        place = {**dict(zip(("loc", "bbox_to_anchor"), at, strict=True)), "fontsize": 8.0}
+    whose: Any = figure_of(ax) if own else ax
+    whose.legend(handles=handles, ncols=columns, columnspacing=1.2, handlelength=1.4, **place)
 
 
 def log_ticks(ax: Axes, most: int = 9) -> None:
