@@ -37,6 +37,7 @@ nb_execution_timeout = 180
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+nb_render_markdown_format = "myst"
 nb_render_image_options = {"align": "center"}
 
 # Signatures
