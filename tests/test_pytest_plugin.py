@@ -113,14 +113,15 @@ def run(project: Path, *arguments: str) -> tuple[int, str]:
     return made.returncode, made.stdout + made.stderr
 
 
-def test_the_example_in_the_book_records_and_checks(project):
-    page = (TOP / "notebooks" / "start" / "robot_ci.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.M | re.S)
+@pytest.mark.parametrize(("page", "robots", "passed"), [("README.md", 2, 4), ("notebooks/start/robot_ci.md", 1, 4)])
+def test_the_examples_of_the_documentation_record_and_check(project, page, robots, passed):
+    blocks = re.findall(r"^```python\n(.*?)^```$", (TOP / page).read_text(encoding="utf-8"), flags=re.M | re.S)
+    (example,) = (code for code in blocks if "mbkit_baseline" in code)
     (project / "test_robots.py").write_text(example)
     status, out = run(project, "--mbkit-regen")
     assert status == 0, out
-    assert "4 passed" in out
-    assert len(list((project / "baselines" / "test_robots").iterdir())) == 1
+    assert f"{passed} passed" in out
+    assert len(list((project / "baselines" / "test_robots").iterdir())) == robots
 
 
 def test_a_project_records_under_xdist_and_is_told_what_changed(project):

@@ -1,13 +1,15 @@
-"""Draw the README's figure: right digits of every robot, and error against run time.
+"""Draw the front page's figure: how many digits of each engine are right, robot by robot.
 
-Run ``python -m validation.readme_figure``; it compares everything anew and writes
-``validation/figures/overview.png`` and ``validation/check_all.json`` beside it.
+Run ``python -m validation.readme_figure``; it compares every robot again and writes ``validation/check_all.json``
+and ``validation/figures/digits_{light,dark}.svg``. With ``--draw`` it only draws what the file has.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
+from collections import Counter
 from pathlib import Path
 
 import matplotlib
@@ -15,21 +17,15 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-import mbkit as mb
 from mbkit.studies.compare.all_robots import all_robots
 from mbkit.studies.results import processor, versions
 
 HERE = Path(__file__).parent
-COLOURS = {"pinocchio": "#0072b2", "lagrangian": "#d55e00", "mujoco": "#009e73"}
-LABELS = {"pinocchio": "Pinocchio", "lagrangian": "own derivation, in double", "mujoco": "MuJoCo"}
-MARKS = {
-    "rk4": "o",
-    "mujoco_rk4": "o",
-    "dop853": "D",
-    "rk853": "^",
-    "mujoco_euler": "s",
-    "mujoco_implicitfast": "^",
-    "semi_implicit_euler": "s",
+ENGINES = {"lagrangian": "mbkit's own\nderivation", "pinocchio": "Pinocchio", "mujoco": "MuJoCo"}
+NAMES = ("ink", "faint", *ENGINES)
+COLOURS = {
+    "light": dict(zip(NAMES, ("#1f2328", "#6e7781", "#b84a00", "#0067a5", "#00795a"), strict=True)),
+    "dark": dict(zip(NAMES, ("#e6edf3", "#8b949e", "#ff9e57", "#58b3f0", "#3fcf9d"), strict=True)),
 }
 
 
@@ -51,55 +47,66 @@ def summary(outcomes):
     return rows
 
 
-def draw(rows, result, path):
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
-    fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), width_ratios=(1.15, 1))
-    compared = sorted((r for r in rows if "worst" in r), key=lambda r: r["nv"])
-    for engine, mark in (("lagrangian", "s"), ("pinocchio", "o"), ("mujoco", "D")):
-        at = [(k, digits(r["worst"][engine][0])) for k, r in enumerate(compared) if engine in r["worst"]]
-        left.plot(*zip(*at, strict=True), mark, ms=4, color=COLOURS[engine], label=LABELS[engine])
-    left.axhline(12, color="grey", lw=0.8, ls="--")
-    left.text(0, 11.85, "tolerance", va="top", color="grey", fontsize=8)
-    ticks = [*range(0, len(compared) - 8, 8), len(compared) - 1]
-    left.set_xticks(ticks, [str(compared[k]["nv"]) for k in ticks])
-    left.set(
-        xlabel="robots of example-robot-data, by degrees of freedom",
-        ylabel="digits that are right, worst term and state",
+def draw(rows, theme):
+    """Return the figure: a row for each engine, a dot for each robot."""
+    colours = COLOURS[theme]
+    compared = [r for r in rows if "worst" in r]
+    plt.rcParams.update({"font.size": 12, "svg.hashsalt": "mbkit", "text.color": colours["ink"]})
+    fig, ax = plt.subplots(figsize=(8.6, 3.9), layout="constrained")
+    fig.patch.set_alpha(0)
+    ax.patch.set_alpha(0)
+    for row, engine in enumerate(reversed(ENGINES)):
+        # Dots of nearly the same number stand above each other.
+        column: Counter[int] = Counter()
+        places = []
+        for r in sorted((r for r in compared if engine in r["worst"]), key=lambda r: r["worst"][engine][0]):
+            x = digits(r["worst"][engine][0])
+            place = round(x * 10)
+            places.append((place / 10, row - 0.25 + 0.05 * column[place]))
+            column[place] += 1
+        ax.plot(*zip(*places, strict=True), "o", ms=5, color=colours[engine], mew=0)
+    worst = min(compared, key=lambda r: digits(max(e for e, _ in r["worst"].values())))
+    engine, (error, term) = max(worst["worst"].items(), key=lambda item: item[1][0])
+    ax.annotate(
+        f"{worst['robot'].split('/')[-1]}: {term}",
+        (digits(error), list(reversed(ENGINES)).index(engine) - 0.25),
+        (digits(error) - 0.05, list(reversed(ENGINES)).index(engine) + 0.2),
+        color=colours["faint"],
+        fontsize=10,
+        arrowprops={"arrowstyle": "-", "color": colours["faint"]},
+        ha="center",
     )
-    left.set_ylim(10.5, 17)
-    left.legend(frameon=False, loc="upper right", fontsize=8)
-    study = result.precision
-    for curve in study.curves:
-        engine, method, points = curve.engine, curve.method, curve.points
-        right.loglog(
-            [p.seconds * 1e3 for p in points],
-            [p.error for p in points],
-            MARKS[method] + ("-" if "rk4" in method or method.endswith("853") else ":"),
-            ms=4,
-            lw=1.2,
-            color=COLOURS[engine],
-            label=f"{method}, {engine}" if not method.startswith(engine) else method,
-        )
-    low = study.floor
-    right.axhline(low, color="grey", lw=0.8, ls="--")
-    right.text(
-        0.02, low * 1.3, "reference known to here", color="grey", fontsize=8, transform=right.get_yaxis_transform()
-    )
-    right.set_ylim(low / 4, 1e6)
-    right.set(xlabel=f"run time of 0.5 s of {result.model}, ms", ylabel="largest error of q, rad")
-    right.legend(frameon=False, fontsize=7, loc="upper right", bbox_to_anchor=(1.02, 1.02))
-    fig.tight_layout()
-    path.parent.mkdir(exist_ok=True)
-    fig.savefig(path, dpi=110)
+    ax.axvline(-math.log10(2**-53), color=colours["faint"], lw=1, ls="--")
+    ax.text(-math.log10(2**-53) + 0.04, 2.72, "all that a\ndouble holds", color=colours["faint"], fontsize=10, va="top")
+    ax.set_yticks(range(len(ENGINES)), [ENGINES[e] for e in reversed(ENGINES)], color=colours["ink"])
+    ax.set(xlim=(10.8, 16.6), ylim=(-0.45, 2.75))
+    ax.set_xticks(range(11, 17), [str(n) for n in range(11, 17)], color=colours["ink"])
+    ax.set_xlabel("digits that are right, in the worst term at the worst state", color=colours["ink"])
+    ax.tick_params(color=colours["faint"], length=0)
+    for side in ("top", "left", "right"):
+        ax.spines[side].set_visible(False)
+    ax.spines["bottom"].set_color(colours["faint"])
+    ax.grid(axis="x", color=colours["faint"], alpha=0.25, lw=0.6)
+    ax.set_axisbelow(True)
+    ax.set_title(f"{len(compared)} robots, one dot each", loc="left", fontsize=13, color=colours["ink"])
+    return fig
 
 
 def main():
-    outcomes = sorted(all_robots(samples=64), key=lambda o: o.robot)
-    rows = summary(outcomes)
-    result = mb.compare(mb.load("ur5"))
-    draw(rows, result, HERE / "figures" / "overview.png")
-    stamped = {"versions": versions(), "processor": processor(), "robots": rows}
-    (HERE / "check_all.json").write_text(json.dumps(stamped, indent=1) + "\n", encoding="utf-8")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--draw", action="store_true", help="draw what check_all.json has")
+    kept = HERE / "check_all.json"
+    if not parser.parse_args().draw:
+        rows = summary(sorted(all_robots(samples=64), key=lambda o: o.robot))
+        stamped = {"versions": versions(), "processor": processor(), "robots": rows}
+        kept.write_text(json.dumps(stamped, indent=1) + "\n", encoding="utf-8")
+    rows = json.loads(kept.read_text(encoding="utf-8"))["robots"]
+    for theme in COLOURS:
+        fig = draw(rows, theme)
+        path = HERE / "figures" / f"digits_{theme}.svg"
+        fig.savefig(path, metadata={"Date": None})
+        # matplotlib leaves spaces at the ends of lines.
+        path.write_text("\n".join(x.rstrip() for x in path.read_text(encoding="utf-8").splitlines()) + "\n")
 
 
 if __name__ == "__main__":
