@@ -37,7 +37,12 @@ nb_execution_timeout = 180
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+<<<<<<< HEAD
 nb_render_markdown_format = "myst"
+=======
+nb_render_markdown_format = "gfm"
+nb_execution_excludepatterns = ["examples/*"]
+>>>>>>> 23407ac (Numbers as pages made from the files of results, with day and versions; python -m validation remakes all of them; a map, extending, testing, releasing, changelog and citation)
 nb_render_image_options = {"align": "center"}
 
 # Signatures
@@ -63,6 +68,7 @@ html_show_sourcelink = False
 
 # For cells: where the repository is, and figures as SVG.
 os.environ["MBKIT_TOP"] = str(Path(__file__).resolve().parent.parent)
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ["MBKIT_TOP"], os.environ.get("PYTHONPATH"))))
 _profile = Path(os.environ.setdefault("IPYTHONDIR", tempfile.mkdtemp(prefix="mbkit-book-"))) / "profile_default"
 if not _profile.exists():
     _profile.mkdir()

@@ -112,7 +112,7 @@ def test_massless_inertia_and_impossible_inertia_as_each_importer_takes_them(tmp
 
 
 def test_real_robots_differ_as_the_table_says() -> None:
-    table = json.loads((VALIDATION / "importers.json").read_text(encoding="utf-8"))
+    table = json.loads((VALIDATION / "importers.json").read_text(encoding="utf-8"))["robots"]
     result = mb.compare_parsers("bolt", samples=1)
     # Who reads the result has the robot, and another machine.
     assert result.source == "bolt"
@@ -368,7 +368,7 @@ def test_a_quadruped_and_a_humanoid_with_a_floating_base() -> None:
     talos = mb.compare_parsers("talos", floating_base=True, samples=1)
     assert [p.agrees for p in talos.importers] == [True, True, False]
     assert "cannot mimic" in talos.importers[2].refused
-    table = json.loads((VALIDATION / "importers_floating.json").read_text(encoding="utf-8"))
+    table = json.loads((VALIDATION / "importers_floating.json").read_text(encoding="utf-8"))["robots"]
     assert [p["status"] for p in table["talos_data/talos_reduced"].values()] == ["agrees", "agrees", "refuses"]
     assert all(p.get("explained", True) for r in table.values() for p in r.values())
 

@@ -32,9 +32,9 @@ from mbkit.errors import MbkitError, MbkitWarning, ModelError
 from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS as ALL_TERMS
 from mbkit.studies.compare.terms import states
-from mbkit.studies.results import processor, versions
 from mbkit.studies.worker import run
 from tests.random_trees import random_tree
+from validation.stamp import stamp
 
 HERE = Path(__file__).parent
 EPS = float(np.finfo(float).eps)
@@ -173,8 +173,7 @@ def main():
     over = missed(lines)
     compiled = mb.dynamics(mb.catalog.pendulum(), JUDGED).compile
     stamped = {
-        "versions": versions(),
-        "processor": processor(),
+        **stamp(),
         "compiled": compiled,
         "bars": BARS,
         "summary": lines,

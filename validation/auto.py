@@ -25,9 +25,9 @@ import numpy as np
 import mbkit as mb
 from mbkit.methods.registry import METHODS
 from mbkit.simulate.solvers.auto import EXPLICIT, IMPLICIT
-from mbkit.studies.results import processor, versions
 from mbkit.studies.stress.cases import CASES
 from mbkit.studies.study_runs import start_state
+from validation.stamp import stamp
 
 GOAL, RTOL = 1e-6, 1e-8
 #: A way that takes more s than this for one run has lost.
@@ -271,8 +271,7 @@ def main():
         "costs_us": costs(),
         "seconds": time.perf_counter() - begun,
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "versions": versions(),
-        "processor": processor(),
+        **stamp(),
     }
     with open("validation/auto.json", "w", encoding="utf-8") as f:
         json.dump({"rows": rows, **about}, f, indent=1, default=str)

@@ -1,6 +1,6 @@
 """How long the equations of a chain of pendulums take to derive, beside sympy.physics.mechanics.
 
-    python validation/bench_derivation.py [--links 6] [--seconds 60] [--out derivation.json]
+    python -m validation.bench_derivation [--links 6] [--seconds 60] [--out derivation.json]
 
 n point masses on n massless rods, in angles from the vertical, from 1 to n links, each way in a process of its own
 that is ended after so many seconds. Ours is timed in three ways: T and V written as sympy.physics.mechanics would,
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,8 @@ from typing import Any
 
 import sympy as sp
 from sympy.physics import mechanics as me
+
+from validation.stamp import stamp
 
 
 def _symbols(n: int) -> tuple[list[Any], list[Any], list[Any], Any]:
@@ -130,10 +131,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("derivation.json"))
     asked = parser.parse_args()
-    import casadi
-
-    from mbkit._version import __version__
-
     rows: list[dict[str, Any]] = []
     lost: set[str] = set()
     for n in range(1, asked.links + 1):
@@ -148,21 +145,14 @@ def main() -> None:
                 row[way] = took
         rows.append(row)
         print(json.dumps(row), flush=True)
+    about = stamp()
+    about["versions"]["sympy"] = sp.__version__
     told = {
         "seconds": rows,
         "limit": asked.seconds,
-        "versions": {"mbkit": __version__, "sympy": sp.__version__, "casadi": str(casadi.CasadiMeta.version())},
-        "python": platform.python_version(),
-        "processor": _processor(),
+        **about,
     }
     asked.out.write_text(json.dumps(told, indent=1) + "\n")
-
-
-def _processor() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else ():
-        if line.startswith("model name"):
-            return line.split(":", 1)[1].strip()
-    return platform.processor()
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import mujoco.rollout
 import numpy as np
 
 import mbkit as mb
-from mbkit.studies.results import processor, versions
+from validation.stamp import stamp
 
 ROUNDS, STEPS, DT = 7, 200, 1e-3
 SIZES = (1024, 4096, 16384)
@@ -142,7 +142,7 @@ def main():
         whole = one_call(pool)
         for name, told in whole["calls"].items():
             print(f"{whole['model']}, 1 s: {name}: {told['rollouts_per_second']:.0f} rollouts per second")
-    about = {"rk4_dt": DT, "steps": STEPS, "cores": cores(), "versions": versions(), "processor": processor()}
+    about = {"rk4_dt": DT, "steps": STEPS, "cores": cores(), **stamp()}
     with open("validation/rollouts.json", "w", encoding="utf-8") as f:
         json.dump({"rows": rows, "one_call": whole, **about}, f, indent=1)
 

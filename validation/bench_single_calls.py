@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
-from mbkit.studies.results import processor, versions
+from validation.stamp import stamp
 
 ROUNDS, CALLS = 41, 2000
 
@@ -95,7 +95,7 @@ def main():
     imports = import_seconds()
     print(f"import mbkit {imports['mbkit']:.3f} s (numpy alone {imports['numpy']:.3f} s)")
     with open("validation/single_calls.json", "w", encoding="utf-8") as f:
-        json.dump({"rows": rows, "import_s": imports, "versions": versions(), "processor": processor()}, f, indent=1)
+        json.dump({"rows": rows, "import_s": imports, **stamp()}, f, indent=1)
 
 
 if __name__ == "__main__":

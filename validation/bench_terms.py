@@ -43,8 +43,8 @@ from mbkit.codegen.compiled import cores
 from mbkit.codegen.program import program
 from mbkit.engines.mujoco import model as mujoco_model
 from mbkit.engines.pinocchio import model as pinocchio_model
-from mbkit.studies.results import processor, versions
 from tests.random_trees import random_tree
+from validation.stamp import stamp
 
 HERE = Path(__file__).parent
 QUANTITIES = ("inverse_dynamics", "forward_dynamics")
@@ -342,8 +342,7 @@ def main():
         "samples": given.samples,
         "rounds": given.rounds,
         "threads": cores(),
-        "versions": versions(),
-        "processor": processor(),
+        **stamp(),
         "robots": robots(given.samples, given.rounds, given.robots.split(",")),
         "growth": growth(given.samples, given.rounds, given.most),
     }

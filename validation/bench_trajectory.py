@@ -27,8 +27,8 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import mbkit as mb
-from mbkit.studies.results import processor, versions
 from mbkit.studies.study_runs import start_state
+from validation.stamp import stamp
 
 ROUNDS, GOAL, TIMES = 9, 1e-9, 10
 #: A way that needs more s than this for one run has lost, and is not timed again.
@@ -244,7 +244,7 @@ def main():
     for label, make, duration in SCENES:
         rows.append(measure(Scene(label, make(), duration)))
         show(rows[-1])
-    about = {"rounds": ROUNDS, "versions": versions(), "processor": processor()}
+    about = {"rounds": ROUNDS, **stamp()}
     with open("validation/trajectory.json", "w", encoding="utf-8") as f:
         json.dump({"rows": rows, **about}, f, indent=1)
 

@@ -14,7 +14,7 @@ import warnings
 import numpy as np
 
 import mbkit as mb
-from mbkit.studies.results import processor, versions
+from validation.stamp import stamp
 
 ROUNDS, BATCH = 75, 16
 #: Method, setting, durations in s.
@@ -76,7 +76,7 @@ def main():
                     )
     print(f"median {statistics.median(r['ratio'] for r in rows):.3f}, largest {max(r['ratio'] for r in rows):.3f}")
     with open("validation/checks_cost.json", "w", encoding="utf-8") as f:
-        json.dump({"rows": rows, "versions": versions(), "processor": processor()}, f, indent=1)
+        json.dump({"rows": rows, **stamp()}, f, indent=1)
 
 
 if __name__ == "__main__":

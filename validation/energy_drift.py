@@ -26,7 +26,7 @@ import numpy as np
 import mbkit as mb
 from mbkit import catalog
 from mbkit.errors import MbkitWarning
-from mbkit.studies.results import processor, versions
+from validation.stamp import stamp
 
 HERE = Path(__file__).parent
 STEPS, WINDOWS = 1_000_000, 10
@@ -118,7 +118,8 @@ def curve(error):
 
 
 def draw(result):
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "mbkit"})
+    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+    plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "mbkit"})
     fig, panels = plt.subplots(1, 2, figsize=(11, 5.0))
     for axes, scene in zip(panels, result["scenes"].values(), strict=True):
         axes.axvspan(1e5, STEPS, color="#eeeeee", lw=0, zorder=0)
@@ -141,14 +142,14 @@ def draw(result):
     fig.tight_layout()
     (HERE / "figures").mkdir(exist_ok=True)
     fig.savefig(HERE / "figures" / "energy_drift.png", dpi=110)
-    fig.savefig(HERE / "figures" / "energy_drift.svg", metadata={"Date": None})
+    fig.savefig(HERE / "figures" / "energy_drift.svg", transparent=True, metadata={"Date": None})
     plt.close(fig)
 
 
 def main():
     path = HERE / "energy_drift.json"
     if "--figure" not in sys.argv[1:]:
-        result = {"versions": versions(), "processor": processor(), "steps": STEPS, "window": STEPS // WINDOWS}
+        result = {**stamp(), "steps": STEPS, "window": STEPS // WINDOWS}
         result["scenes"] = {}
         for name, (model, q, v, dt, about) in scenes().items():
             result["scenes"][name] = {"about": about, "dt": dt, **measured(model, q, v, dt)}

@@ -19,13 +19,11 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import platform
 import sys
 import tempfile
 import time
 import warnings
 from collections import Counter
-from importlib import metadata
 from pathlib import Path
 
 import mujoco
@@ -39,6 +37,7 @@ from tests.random_files import EPS, errors, mujoco_terms, mutant, random_mjcf
 from tests.random_trees import ALL, random_tree, states
 from validation import newton_euler
 from validation.plain_model import plain
+from validation.stamp import stamp
 
 HERE = Path(__file__).parent
 URDFS = ("double_pendulum", "asr_twodof", "finger_edu", "so100", "ur5", "panda", "borinot", "hextilt")
@@ -302,8 +301,7 @@ def main() -> int:
         }
         print(f"{part}: {found.total()} in {time.perf_counter() - begun:.0f} s")
         print(json.dumps(table[part]["outcomes"], indent=1), flush=True)
-    versions = {name: metadata.version(name) for name in ("mujoco", "pin", "numpy", "casadi")}
-    told = {"versions": versions | {"python": platform.python_version()}, **table}
+    told = {**stamp(), **table}
     (HERE / "fuzz.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return int(any(x["failures"] for x in table.values()))
 

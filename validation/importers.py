@@ -21,6 +21,7 @@ from mbkit.load.xml_reader import Element
 from mbkit.studies.explain.result import Cause, effect, grouped
 from mbkit.studies.importers import Parsed, compare_parsers
 from mbkit.studies.results import to_plain
+from validation.stamp import stamp
 
 HERE = Path(__file__).parent
 QUOTED = re.compile(r"'([^']+)'")
@@ -89,7 +90,8 @@ def main() -> None:
         table[robot.name] = {p.engine: told(p, root, lines) for p in result.importers}
         print(f"{robot.name}: {result.verdict}", flush=True)
     for name, told_of in (("importers", table), ("importers_floating", floating)):
-        (HERE / f"{name}.json").write_text(json.dumps(to_plain(told_of), indent=1) + "\n", encoding="utf-8")
+        text = json.dumps(stamp() | {"robots": to_plain(told_of)}, indent=1) + "\n"
+        (HERE / f"{name}.json").write_text(text, encoding="utf-8")
     for engine in IMPORTERS:
         agree = [sum(row[engine]["status"] == "agrees" for row in x.values()) for x in (table, floating)]
         print(f"{engine} agrees on {agree[0]}, and on {agree[1]} with a floating base")

@@ -113,9 +113,9 @@ def main():
         with context.Pool(1) as pool:
             row = rows[name] = pool.apply(measure, (name, asked.models))
         print(f"{name:12} {row['kB_per_model']:8.2f} kB a model  {row['first_MB']:6.0f} to {row['last_MB']:.0f} MB")
-        from mbkit.studies.results import processor, versions
+        from validation.stamp import stamp
 
-        whole = {"rows": list(rows.values()), "versions": versions(), "processor": processor()}
+        whole = {"rows": list(rows.values()), **stamp()}
         path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
 
 

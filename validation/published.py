@@ -32,10 +32,10 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitWarning
 from mbkit.model import Model
 from mbkit.simulate import Event, Trajectory, at_section
-from mbkit.studies.results import processor, versions
 from validation import elliptic
 from validation.closed_forms import published
 from validation.scenes import SCENES, Scene
+from validation.stamp import stamp
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).parent
@@ -251,7 +251,7 @@ def main() -> int:
     console = Console(width=160 if not sys.stdout.isatty() else None)
     found = rows()
     lines = ",\n".join(f"  {json.dumps(row, ensure_ascii=False)}" for row in found)
-    head = json.dumps({"versions": versions(), "processor": processor()}, indent=1).removesuffix("\n}")
+    head = json.dumps(stamp(), indent=1).removesuffix("\n}")
     (HERE / "published_checks.json").write_text(f'{head},\n "checks": [\n{lines}\n ]\n}}\n', encoding="utf-8")
     console.print(table(found))
     missed = unreached(found)

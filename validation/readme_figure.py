@@ -18,7 +18,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from mbkit.studies.compare.all_robots import all_robots
-from mbkit.studies.results import processor, versions
+from validation.stamp import stamp
 
 HERE = Path(__file__).parent
 ENGINES = {"lagrangian": "mbkit's own\nderivation", "pinocchio": "Pinocchio", "mujoco": "MuJoCo"}
@@ -98,7 +98,7 @@ def main():
     kept = HERE / "check_all.json"
     if not parser.parse_args().draw:
         rows = summary(sorted(all_robots(samples=64), key=lambda o: o.robot))
-        stamped = {"versions": versions(), "processor": processor(), "robots": rows}
+        stamped = {**stamp(), "robots": rows}
         kept.write_text(json.dumps(stamped, indent=1) + "\n", encoding="utf-8")
     rows = json.loads(kept.read_text(encoding="utf-8"))["robots"]
     for theme in COLOURS:

@@ -15,6 +15,7 @@ from typing import Any
 
 import mbkit as mb
 from mbkit.studies.stress import Breaking, CaseResult, StressResult
+from validation.stamp import stamp
 
 FILE = Path(__file__).with_suffix(".json")
 OURS = ("lagrangian", "pinocchio")
@@ -31,6 +32,7 @@ def main() -> None:
         result = mb.stress(quick=asked.quick)
     rows = list(result.breaking())
     told: dict[str, Any] = {
+        **({} if asked.data else {"date": stamp()["date"]}),
         "processor": result.processor,
         "versions": result.versions,
         "seconds": result.seconds,

@@ -78,14 +78,15 @@ def draw_growth(axes, rows, value, title, unit, colours):
     axes.legend(frameon=False, fontsize=7)
 
 
-def draw(data, folder):
-    """Write ``terms.png`` and ``terms.svg`` to a folder."""
-    # Text as text, and the same bytes for the same data.
-    plt.rcParams.update({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False})
-    plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "mbkit"})
-    fig = plt.figure(figsize=(12, 11))
-    upper = fig.add_gridspec(1, 2, left=0.17, right=0.985, top=0.965, bottom=0.42, wspace=0.5)
-    lower = fig.add_gridspec(1, 3, left=0.06, right=0.985, top=0.335, bottom=0.05, wspace=0.28)
+def drawn(data, tall):
+    """Return the figure: wide, or as wide as a page of the book."""
+    fig = plt.figure(figsize=(7.2, 15.5) if tall else (12, 11))
+    if tall:
+        upper = fig.add_gridspec(2, 1, left=0.29, right=0.97, top=0.98, bottom=0.4, hspace=0.18)
+        lower = fig.add_gridspec(2, 2, left=0.09, right=0.97, top=0.355, bottom=0.035, hspace=0.32, wspace=0.25)
+    else:
+        upper = fig.add_gridspec(1, 2, left=0.17, right=0.985, top=0.965, bottom=0.42, wspace=0.5)
+        lower = fig.add_gridspec(1, 3, left=0.06, right=0.985, top=0.335, bottom=0.05, wspace=0.28)
     for k, quantity in enumerate(TITLES):
         rows = [r for r in data["robots"] if r["quantity"] == quantity]
         draw_bars(fig.add_subplot(upper[k]), rows, data["threads"])
@@ -99,10 +100,18 @@ def draw(data, folder):
         draw_growth(
             axes, grown, lambda r, _: r["derive_and_compile_s"], "Derive and compile", "s", {TITLES[quantity]: colour}
         )
+    return fig
+
+
+def draw(data, folder):
+    """Write ``terms.png``, and ``terms.svg`` for the book, to a folder."""
+    # Text as text, and the same bytes for the same data.
+    plt.rcParams.update({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False})
+    plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "mbkit"})
     folder.mkdir(parents=True, exist_ok=True)
-    fig.savefig(folder / "terms.png", dpi=110)
-    fig.savefig(folder / "terms.svg", metadata={"Date": None})
-    plt.close(fig)
+    drawn(data, tall=False).savefig(folder / "terms.png", dpi=110)
+    drawn(data, tall=True).savefig(folder / "terms.svg", transparent=True, metadata={"Date": None})
+    plt.close("all")
 
 
 def main():

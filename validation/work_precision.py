@@ -20,8 +20,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 import mbkit as mb
-from mbkit.studies.results import processor, versions
 from validation.scenes import SCENES
+from validation.stamp import stamp
 
 HERE = Path(__file__).parent
 DATA = HERE / "work_precision.json"
@@ -46,6 +46,7 @@ def measured(scene):
     out = json.loads(result.to_json())
     for name in ("versions", "processor"):
         del out[name]
+    out["date"] = stamp()["date"]
     out["fastest"] = {f"{level:g}": fastest(result, level) for level in LEVELS}
     return {"scene": scene.name, "about": scene.about, **out}
 
@@ -73,8 +74,16 @@ def envelope(curves, engine):
 
 
 def draw(scenes):
+    """Draw the wide PNG, and the SVG as wide as a page of the book."""
     plt.rcParams.update({"font.size": 8.5, "axes.spines.top": False, "axes.spines.right": False})
-    fig, axes = plt.subplots(2, 5, figsize=(13, 5.6), sharey=True, layout="constrained")
+    plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "mbkit"})
+    drawn(scenes, 5, (13, 5.6)).savefig(HERE / "figures" / "work_precision.png", dpi=130)
+    tall = drawn(scenes, 2, (7.2, 13))
+    tall.savefig(HERE / "figures" / "work_precision.svg", transparent=True, metadata={"Date": None})
+
+
+def drawn(scenes, columns, size):
+    fig, axes = plt.subplots(10 // columns, columns, figsize=size, sharey=True, layout="constrained")
     for ax, scene in zip(axes.flat, scenes, strict=False):
         for curve in scene["curves"]:
             points = [p for p in curve["points"] if p["error"]]
@@ -98,8 +107,7 @@ def draw(scenes):
         ax.set_ylabel("largest error of q, rad or m")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    for suffix in ("png", "svg"):
-        fig.savefig(HERE / "figures" / f"work_precision.{suffix}", dpi=130)
+    return fig
 
 
 def table(scenes):
@@ -141,7 +149,7 @@ def main(arguments):
         print(f"{scene.name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
         # Kept at once: what follows may be interrupted.
         done = [known[s.name] for s in SCENES if s.name in known]
-        told = {"versions": versions(), "processor": processor(), "scenes": done}
+        told = {**stamp(), "scenes": done}
         DATA.write_text(json.dumps(told) + "\n", encoding="utf-8")
     done = [known[s.name] for s in SCENES if s.name in known]
     draw(done)

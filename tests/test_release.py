@@ -1,0 +1,80 @@
+"""What a release needs: one version everywhere, and every file of results made by a part of `python -m validation`."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import mbkit as mb
+from validation.__main__ import PARTS
+
+TOP = Path(__file__).parent.parent
+PAGES = sorted((TOP / "notebooks" / "numbers").glob("*.md"))
+
+
+def read(name: str) -> str:
+    return (TOP / name).read_text(encoding="utf-8")
+
+
+def test_the_version_is_the_same_everywhere():
+    changes = re.findall(r"^## (\d+\.\d+\.\d+) - (unreleased|\d{4}-\d\d-\d\d)$", read("CHANGELOG.md"), re.MULTILINE)
+    assert changes[0][0] == mb.__version__
+    assert len({version for version, _ in changes}) == len(changes)
+    cited = dict(re.findall(r"^([\w-]+): (.+)$", read("CITATION.cff"), re.MULTILINE))
+    assert cited["version"] == mb.__version__
+    assert cited["cff-version"] == "1.2.0"
+    project = tomllib.loads(read("pyproject.toml"))
+    assert cited["license"] == project["project"]["license"]
+    packed = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    assert all((TOP / name).exists() for name in packed)
+    assert {"CHANGELOG.md", "CITATION.cff"} <= set(packed)
+
+
+def test_every_file_of_results_is_made_by_a_part():
+    written = {name for part in PARTS.values() for name in part.writes}
+    kept = {path.name for path in (TOP / "validation").glob("*.json")}
+    # What was published elsewhere is measured by nobody here.
+    assert written == kept - {"published.json"}
+    assert all((TOP / "validation" / f"{name}.py").exists() for name in PARTS)
+
+
+def test_pages_name_files_and_parts_that_exist():
+    text = "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
+    assert {f"{name}.json" for name in re.findall(r"(?<!\.)\bload\(\"(\w+)\"\)", text)} <= {
+        path.name for path in (TOP / "validation").glob("*.json")
+    }
+    assert set(re.findall(r"\borigin\(\w+, \"(\w+)\"\)", text)) <= set(PARTS)
+    # Each file is shown somewhere with its day, processor and versions.
+    assert set(re.findall(r"\borigin\(\w+, \"(\w+)\"\)", text)) == set(PARTS)
+
+
+def test_parts_are_listed_and_chosen_by_name():
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "validation", *arguments]
+        return subprocess.run(command, cwd=TOP, capture_output=True, text=True, check=False)
+
+    listed = run("--list")
+    assert listed.returncode == 0
+    assert [line.split()[0] for line in listed.stdout.splitlines()] == list(PARTS)
+    unknown = run("--only", "nothing")
+    assert unknown.returncode == 2
+    assert "accuracy" in unknown.stderr
+
+
+def test_results_are_stamped():
+    from validation.stamp import stamp
+
+    told = json.loads(json.dumps(stamp()))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", told["date"])
+    assert told["versions"]["mbkit"] == mb.__version__
+    assert told["processor"]
+
+
+def test_the_map_leads_somewhere():
+    places = re.findall(r"`([\w/]+(?:\.py|/))`", read("notebooks/carry_on/map.md"))
+    assert len(places) > 10
+    assert [place for place in places if not ((TOP / "mbkit" / place).exists() or (TOP / place).exists())] == []

@@ -1,0 +1,68 @@
+"""Measure everything again: every file and figure that the pages of numbers are made of.
+
+``python -m validation`` runs all parts, one after the other, in about three hours on two cores; ``--only NAME``, more
+than once if wanted, runs some; ``--list`` names them. A part that fails does not stop the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+TOP = Path(__file__).resolve().parent.parent
+
+
+class Part(NamedTuple):
+    """A script of this folder: about how many minutes it takes on two cores, what it writes, and what it measures."""
+
+    minutes: float
+    writes: tuple[str, ...]
+    about: str
+
+
+#: Those whose result is a time come last; let nothing else run beside them.
+PARTS = {
+    "accuracy": Part(20, ("accuracy.json",), "terms against 34 digits: robots, floating robots, random trees"),
+    "readme_figure": Part(2, ("check_all.json",), "every robot of example-robot-data in three engines"),
+    "published": Part(2, ("published_checks.json",), "published problems, to their printed digits"),
+    "energy_drift": Part(1, ("energy_drift.json",), "a million steps of a symplectic method"),
+    "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
+    "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),
+    "memory": Part(25, ("memory.json",), "memory that released models leave behind"),
+    "stress": Part(25, ("stress.json",), "what holds to where: stiff and extreme cases"),
+    "auto": Part(15, ("auto.json",), "method auto beside the best method of each hard problem"),
+    "bench_terms": Part(10, ("terms.json",), "one sample of inverse and forward dynamics"),
+    "bench_single_calls": Part(1, ("single_calls.json",), "a single call, beside the bare call of the engine"),
+    "bench_rollouts": Part(5, ("rollouts.json",), "batches of rollouts, beside mujoco.rollout"),
+    "bench_trajectory": Part(5, ("trajectory.json",), "one trajectory to an error of 1e-9"),
+    "bench_derivation": Part(1, ("derivation.json",), "equations to read, beside sympy.physics.mechanics"),
+    "checks_cost": Part(3, ("checks_cost.json",), "the checks after a run"),
+    "work_precision": Part(14, ("work_precision.json",), "error against run time of ten scenes"),
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m validation", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", action="append", choices=PARTS, metavar="NAME", help="run this part; may be repeated")
+    parser.add_argument("--list", action="store_true", help="name the parts and end")
+    asked = parser.parse_args()
+    if asked.list:
+        for name, part in PARTS.items():
+            print(f"{name:20} {part.minutes:3.0f} min  {part.about}")
+        return 0
+    failed = []
+    for name in asked.only or PARTS:
+        print(f"{name}: about {PARTS[name].minutes:g} min", flush=True)
+        begun = time.perf_counter()
+        status = subprocess.run([sys.executable, "-m", f"validation.{name}"], cwd=TOP, check=False).returncode
+        print(f"{name}: {'done' if status == 0 else f'exit status {status}'} in {time.perf_counter() - begun:.0f} s")
+        failed += [name] if status else []
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

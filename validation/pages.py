@@ -1,0 +1,49 @@
+"""Tables and figures of the book's pages, made from the files of results beside this one."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from IPython.display import SVG, Markdown
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+#: Packages whose versions matter for what is measured.
+NAMED = ("mbkit", "python", "pin", "mujoco", "drake", "casadi", "sympy", "llvmlite", "heyoka", "numpy", "scipy")
+
+
+def load(name: str) -> Any:
+    """Return a file of results, such as ``accuracy``."""
+    return json.loads((HERE / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def origin(data: dict[str, Any], part: str) -> Markdown:
+    """Return the line that says when, on what and with what versions a file was measured, and how to do so again."""
+    told = [f"Measured on {data['date']}" if "date" in data else "Measured (the file has no date)"]
+    told += [f"processor {data['processor']}"] if "processor" in data else []
+    found = data.get("versions", {})
+    told += [", ".join(f"{name} {found[name]}" for name in NAMED if name in found and found[name] != "not installed")]
+    return Markdown(f"*{'; '.join(x for x in told if x)}. Again: `python -m validation --only {part}`.*")
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]], align: str = "") -> Markdown:
+    """Return a table; `align` has ``l`` or ``r`` for each column, and ``r`` for those beyond."""
+    marks = ["---" if mark == "l" else "---:" for mark in (align or "l").ljust(len(head), "r")]
+    lines = [head, marks, *([str(x).replace("|", "\\|") for x in row] for row in rows)]
+    return Markdown("\n".join(f"| {' | '.join(line)} |" for line in lines))
+
+
+def figure(name: str) -> SVG:
+    """Return a stored figure, such as ``terms``."""
+    return SVG(filename=str(HERE / "figures" / f"{name}.svg"))
+
+
+def drawn(fig: Figure) -> SVG:
+    """Return a figure as SVG on transparent paper."""
+    text = io.StringIO()
+    fig.savefig(text, format="svg", transparent=True, bbox_inches="tight", metadata={"Date": None})
+    return SVG(data=text.getvalue())
