@@ -37,12 +37,8 @@ nb_execution_timeout = 180
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
-<<<<<<< HEAD
 nb_render_markdown_format = "myst"
-=======
-nb_render_markdown_format = "gfm"
 nb_execution_excludepatterns = ["examples/*"]
->>>>>>> 23407ac (Numbers as pages made from the files of results, with day and versions; python -m validation remakes all of them; a map, extending, testing, releasing, changelog and citation)
 nb_render_image_options = {"align": "center"}
 
 # Signatures
