@@ -380,7 +380,8 @@ def test_hostile_names_are_only_text():
         assert "\x1b" not in text
         assert "\u202e" not in text
     for page in map(Tags, both):
-        assert not {tag for tag, _ in page.tags} & {"script", "iframe", "object", "img", "link"}
+        assert not {tag for tag, _ in page.tags} & {"iframe", "object", "img", "link"}
+        assert [tag for tag, _ in page.tags].count("script") == 1
         assert '<script>alert("x")</script>[red]x[/red]' in page.text
     assert all("[red]x[/red]" in text for text in told)
 
@@ -405,7 +406,7 @@ def test_a_page_needs_nothing_from_elsewhere(kind):
     page = PAGES[kind]()
     tags = Tags(page).tags
     for tag, attributes in tags:
-        assert tag not in ("script", "link", "img", "iframe")
+        assert tag not in ("link", "img", "iframe")
         for name, value in attributes.items():
             if name in ("src", "href", "xlink:href"):
                 assert tag == "a" or str(value).startswith("#")
@@ -479,7 +480,7 @@ def test_the_figure_names_the_front_and_puts_same_formulas_together():
     for told in ("best of lagrangian", "reference known to 1e-13", "run time of 0.5 s", "energy drift", "dashed"):
         assert told in drawn, told
     # MuJoCo's own RK4 stands in the panel of rk4, and has none of its own.
-    assert "mujoco_rk4" not in drawn
+    assert "mujoco_rk4" not in re.sub("<title>.*?</title>", "", drawn)
     # Only the page chooses colours: the series of the three engines are all there.
     assert all(f"var(--series{k})" in drawn for k in (1, 2, 3))
 

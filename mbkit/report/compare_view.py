@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 
 from mbkit.report import document as doc
 from mbkit.report import figures, work_precision_view
-from mbkit.report.formatting import count_text, error_text, mark, model_facts, refusals, time_text
+from mbkit.report.formatting import brief, count_text, error_text, mark, model_facts, refusals, time_text
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
 
@@ -45,6 +45,7 @@ def view(result: Comparison, target: str = "") -> doc.Document:
         heading=result.model,
         title=f"{result.model}: {outcome}",
         verdict=headline(result),
+        sentence=_sentence(result),
         good=result.passed,
         summary=f"{size} · {samples} states (seed {result.seed}) · tolerance {result.tolerance:.0e}"
         f" · {result.seconds:.1f} s",
@@ -96,6 +97,21 @@ def headline(result: Comparison) -> str:
     return f"{subject}{', '.join(parts)}{by_defect}{missing}"
 
 
+def _sentence(result: Comparison) -> str:
+    """Return the headline, with what was compared with what on how many states."""
+    if result.nothing:
+        return headline(result)
+    instead = result.reference in result.engines
+    what = "which stands in for the oracle" if instead else "the own derivation evaluated with 34 digits"
+    reference = f"{'' if instead else 'the '}{result.reference}, {what}"
+    terms = len({r.term for r in result.rows})
+    measured = f"{terms} term{'s' * (terms != 1)} at {result.rows[0].samples} states"
+    if not result.passed:
+        return f"{headline(result)}; measured against {reference}, in {measured}"
+    engines = ", ".join(e for e in result.engines if e != result.reference)
+    return f"{engines} agree to {result.digits:.1f} digits with {reference}, in {measured}{brief(result.shortened)}"
+
+
 def failures(result: Comparison) -> list[doc.Bullet]:
     """Return everything that differs, with its reason."""
     out = []
@@ -106,12 +122,12 @@ def failures(result: Comparison) -> list[doc.Bullet]:
             out.append(doc.Bullet(f"{r.term}, {r.engine}", r.reason or "differs", "✗", "bad", folded=state))
     for run in result.rollouts:
         if not run.passed:
-            reason = f"differs from {run.against} by {run.error:.1e} in q, {run.tolerance:.0e} expected"
+            reason = f"differs from {run.against} by {error_text(run.error)} in q, {run.tolerance:.0e} expected"
             reason += f"; {run.note}" if run.note else ""
             out.append(doc.Bullet(f"rollout {run.method}, {run.engine}", reason, "✗", "bad"))
     changed = [o for o in result.omissions if not o.unchanged]
-    what = "changes the accelerations by {:.1e}"
-    return out + [doc.Bullet(f"leaving out {o.need}", what.format(o.change), "✗", "bad") for o in changed]
+    what = "changes the accelerations by {}"
+    return out + [doc.Bullet(f"leaving out {o.need}", what.format(error_text(o.change)), "✗", "bad") for o in changed]
 
 
 # Terms.
@@ -333,6 +349,7 @@ def robots_view(result: Sweep) -> doc.Document:
         heading="All robots of example-robot-data",
         title=f"all robots: {'agree' if result.passed else 'differ'}",
         verdict=result.verdict,
+        sentence=_robots_sentence(result),
         good=result.passed,
         opening=[doc.Figure(lambda: figures.robots(result), about)] if compared else [],
         sections=[
@@ -343,6 +360,15 @@ def robots_view(result: Sweep) -> doc.Document:
         basis=_basis(result),
         last=True,
     )
+
+
+def _robots_sentence(result: Sweep) -> str:
+    states = [c.rows[0].samples for o in result.outcomes if (c := o.comparison) and c.rows]
+    if not states:
+        return result.verdict
+    least, most = min(states), max(states)
+    span = f"{least} to {most}" if least != most else f"{least}"
+    return f"{result.verdict}; each against its own derivation evaluated with 34 digits, at {span} states"
 
 
 def _of(text: Callable[[Any], str]) -> Callable[[RobotOutcome], str]:

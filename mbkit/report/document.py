@@ -165,9 +165,10 @@ class Document:
     """All that is shown of a result.
 
     A terminal has `name` before the verdict and `summary` below it, or the verdict at the end (`last`); a page has a
-    heading and, in the browser's bar, a title, which are the name by default. `marked`: the verdict is a judgement,
-    with ✓ or ✗. At the foot of the page stand `basis` and the result's `versions`, `processor` and `seconds`. A page
-    with tables of its own names its template, and its content.
+    heading and, in the browser's bar, a title, which are the name by default, and `sentence` for the verdict: it also
+    says on how many states, and against what. `marked`: the verdict is a judgement, with ✓ or ✗. At the foot of the
+    page stand `basis` and the result's `versions`, `processor` and `seconds`. A page with tables of its own names its
+    template, and its content.
     """
 
     name: str
@@ -177,6 +178,7 @@ class Document:
     result: Any
     heading: str = ""
     title: str = ""
+    sentence: str = ""
     marked: bool = True
     summary: str = ""
     opening: Sequence[Block] = ()

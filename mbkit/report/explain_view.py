@@ -89,6 +89,7 @@ def importers_view(result: ParserComparison) -> Document:
         name=name,
         title=f"{name}: importers {outcome}",
         verdict=result.verdict,
+        sentence=_importers_sentence(result, read),
         good=result.agree,
         opening=[Paragraph(_setting(result, read, alone), on="page")],
         sections=[
@@ -113,6 +114,17 @@ def importers_view(result: ParserComparison) -> Document:
             "engine's own, on its own model",
         },
     )
+
+
+def _importers_sentence(result: ParserComparison, read: list[Parsed]) -> str:
+    """Return the verdict with the digits on which terms agree, and at how many states."""
+    terms = [s for p in read if p.agrees for s in p.stages if s.name in TERMS and s.same]
+    worst = max((s.worst for s in terms if math.isfinite(s.worst)), default=0.0)
+    if not worst:
+        return result.verdict
+    names = ", ".join(dict.fromkeys(s.name for s in terms))
+    states = f"{result.samples} state{'s' * (result.samples != 1)}"
+    return f"{result.verdict}; where they agree, {names} to {-math.log10(worst):.1f} digits or more at {states}"
 
 
 def _importer(p: Parsed) -> Column:
@@ -159,7 +171,7 @@ def _stage(stage: Stage) -> Span:
     if stage.same:
         return Span(f"✓ same to {number}" if number else "✓ same", "good", "same")
     joint = f", most at {stage.where}" if stage.where else ""
-    says = f" by {number}{joint}" if number else f" {stage.says}"
+    says = f" by {number}{joint}" if number else f": {stage.says}"
     return Span(f"✗ differs{says}", "bad", "differs") if stage.name in DECIDING else Span(f"! differs{says}", "allowed")
 
 

@@ -14,7 +14,17 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import html, one_line
-from mbkit.simulate.plotting.style import CROSS, Palette, drawing, engine_index, engine_mark, log_ticks
+from mbkit.report.formatting import error_text, time_text
+from mbkit.simulate.plotting.style import (
+    CROSS,
+    POINTS,
+    Palette,
+    drawing,
+    engine_index,
+    engine_mark,
+    log_ticks,
+    name_points,
+)
 from mbkit.studies.compare.all_robots import Sweep
 from mbkit.studies.compare.result import Comparison, figure
 from mbkit.studies.stress.measurements import CaseResult, Line, name_of
@@ -36,6 +46,8 @@ _VARIABLES: Final = {
 }
 _DASHES: Final = (0, (2, 2))
 _WIDTH: Final = 10.4
+#: Pixels of the smallest letters of a figure, however narrow the window.
+_SMALLEST: Final = 10.0
 
 
 @contextmanager
@@ -67,13 +79,30 @@ def svg(fig: Figure, title: str) -> str:
     text = text[text.index("<svg") :]
     for size in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
-    text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}"', 1)
+    width = float(re.findall(r'viewBox="\S+ \S+ (\S+)', text)[0])
+    least = width * _SMALLEST / min(map(float, re.findall(r"font(?:-size)?: ([\d.]+)px", text)), default=_SMALLEST)
+    text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}" style="--least: {math.ceil(least)}px"', 1)
     # Names of parts would otherwise stand twice on a page with two figures.
-    text = re.sub(r'<g id="[^"]*"', "<g", text)
+    first, *groups = text.split('<g id="')
+    text = first + "".join("<g" + _with_titles(*group.split('"', 1)) for group in groups)
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     for stand_in, variable in _VARIABLES.items():
         text = text.replace(stand_in, variable)
     return text
+
+
+def _with_titles(name: str, rest: str) -> str:
+    """Return a group of an SVG with the texts of its points as titles, which a browser shows on hover."""
+    if not name.startswith(POINTS):
+        return rest
+    texts = [f"<title>{each}</title>" for each in name.removeprefix(POINTS).split("\n")]
+    marks = re.findall(r"<use [^>]*/>", rest)
+    if len(marks) != len(texts):
+        # Without markers, or with some beyond the edge.
+        return rest.replace(">", f">{texts[0]}", 1)
+    head, *between = re.split(r"<use [^>]*/>", rest)
+    pieces = (f"<g>{title}{mark}</g>{after}" for title, mark, after in zip(texts, marks, between, strict=True))
+    return head + "".join(pieces)
 
 
 def _legend(
@@ -106,20 +135,22 @@ _GROUP_MARKS: Final = "osD^vP"
 
 def robots(result: Sweep) -> str:
     """Draw the worst error of each robot against its size."""
-    groups: dict[tuple[str, ...], list[tuple[int, float]]] = {}
-    compared = [o.comparison for o in result.outcomes if o.comparison is not None]
-    for c in compared:
-        if c.worst is not None:
-            place = int(c.facts["nv"]), _shown(c.worst.relative, 1e-17)
-            groups.setdefault(c.engines, []).append(place)
+    groups: dict[tuple[str, ...], list[tuple[int, float, str]]] = {}
+    compared = [(o.robot, o.comparison) for o in result.outcomes if o.comparison is not None]
+    for robot, c in compared:
+        if (worst := c.worst) is not None:
+            text = f"{robot}: {error_text(worst.relative)}, {worst.term} of {worst.engine}"
+            groups.setdefault(c.engines, []).append((int(c.facts["nv"]), _shown(worst.relative, 1e-17), text))
     with _canvas("robots", 7.2, 3.4) as (fig, (ax,)):
         for k, (engines, points) in enumerate(groups.items()):
-            ax.plot(*zip(*points, strict=True), _GROUP_MARKS[k % 6], color=PAGE.series[k % 6], label=", ".join(engines))
+            nv, errors, texts = zip(*points, strict=True)
+            look: dict[str, Any] = {"color": PAGE.series[k % 6], "label": ", ".join(engines)}
+            name_points(ax.plot(nv, errors, _GROUP_MARKS[k % 6], **look), texts)
         ax.set_yscale("log")
         ax.set_xlabel("velocities, nv")
         ax.set_ylabel("worst relative error")
         ax.grid()
-        for tolerance in {c.tolerance for c in compared}:
+        for tolerance in {c.tolerance for _, c in compared}:
             ax.axhline(tolerance, color=PAGE.muted, linestyle=_DASHES, linewidth=1.0)
         log_ticks(ax)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
@@ -162,7 +193,9 @@ def term_costs(result: Comparison) -> str:
             for row in timed:
                 if row.term == term:
                     place = [row.ns], [_shown(row.relative, _LEAST)]
-                    ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
+                    point = ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
+                    spent = time_text(row.ns * 1e-9)
+                    name_points(point, [f"{term}, {row.engine}: worst error {error_text(row.relative)} in {spent}"])
                     if not row.passed:
                         ax.plot(*place, "x", color=PAGE.bad, **CROSS)
             ax.set_title(one_line(term, 28), loc="left", fontsize=9.5, pad=3)
@@ -222,12 +255,15 @@ def _step_panel(ax: Axes, case: CaseResult, lines: Sequence[Line], names: list[s
     for line in lines:
         y, held, failed, theory = names.index(name_of(line.row)), line.broken.held, line.broken.failed, line.row.theory
         colour, mark = PAGE.engine(line.row.engine), engine_mark(line.row.engine)
+        name = name_of(line.row)
         if held is not None and failed is not None:
             ax.plot([held, failed], [y, y], color=colour, linewidth=1.4)
         if failed is not None:
-            ax.plot([failed], [y], "|", color=colour, markersize=7, markeredgewidth=1.4)
+            end = ax.plot([failed], [y], "|", color=colour, markersize=7, markeredgewidth=1.4)
+            name_points(end, [f"{name}: did not hold at {failed:g} s"])
         if held is not None:
-            ax.plot([held], [y], mark if failed is not None else ">", color=colour, markersize=5.5)
+            point = ax.plot([held], [y], mark if failed is not None else ">", color=colour, markersize=5.5)
+            name_points(point, [f"{name}: held to {held:g} s"])
         if theory is not None and 0 < theory < math.inf:
             ax.plot([theory] * 2, [y - 0.45, y + 0.45], **_THEORY)
     ax.set_yticks(range(len(names)), [one_line(n, 34) for n in names], fontsize=8.5)

@@ -9,6 +9,8 @@ from typing import Any, Final
 from mbkit.report.document import Bullet, Span, Text
 from mbkit.studies.results import Refusal
 
+#: Letters of a list that has a place in a sentence.
+_LISTED: Final = 80
 _UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
 
@@ -67,6 +69,11 @@ def choice(value: Any) -> str:
     return ", ".join(map(choice, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
+def brief(missing: Iterable[str]) -> str:
+    """Return what a study left out, to follow a sentence; of long lists their number alone, as they stand below."""
+    return "".join(f"; {x if len(x) <= _LISTED else x.partition(':')[0]}" for x in missing)
+
+
 def refusals(those: Iterable[Refusal]) -> list[Bullet]:
     """Return what engines could not do, those of one reason together."""
     terms: dict[tuple[str, str], list[str]] = {}
@@ -86,8 +93,9 @@ def model_facts(facts: Mapping[str, Any], target: str, setup: Mapping[str, float
     mass = f", {facts['mass']:.5g} kg" if "mass" in facts else ""
     yield "size", f"nq = {facts.get('nq', '?')} coordinates, nv = {facts.get('nv', '?')} velocities{mass}"
     if "needs" in facts:
-        yield "has", ", ".join(need for need, has in facts["needs"].items() if has) or "–"
-        yield "has not", Span(", ".join(need for need, has in facts["needs"].items() if not has) or "–", "muted")
+        for name, there in (("has", True), ("has not", False)):
+            needs = ", ".join(need.replace("_", " ") for need, has in facts["needs"].items() if has == there)
+            yield name, Span(needs or "–", "" if there else "muted")
     if "digest" in facts:
         yield "digest", Span(facts["digest"], "mono")
     if setup:

@@ -1,26 +1,46 @@
-"""Documents as self-contained HTML pages: no script, nothing loaded from anywhere, light and dark."""
+"""Documents as self-contained HTML pages, light, dark and printed: nothing is loaded, one script sorts tables.
+
+The script stands in the page. Its digest in the page's security policy keeps any other from running.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from datetime import datetime
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import terminal
-from mbkit.report.document import Document, spans
+from mbkit.report.document import Document, Span, spans
 from mbkit.report.formatting import count_text, error_text, time_text
 from mbkit.report.stress_view import FILTERS
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+#: Letters of a table's cell that stay on one line, and above which the cell is wide.
+_SHORT: Final = 34
+_LONG: Final = 60
+
 
 def render(shown: Document, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
     """Return a document as a page; `data` and `table` are the JSON and CSV files beside it, `when` its date."""
     stamp = (when or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M:%S %Z").strip()
     template = _environment().get_template(shown.template)
-    names = {"data": data, "table_file": table}
+    names = {"data": data, "table_file": table, "script": _script(), "digest": _digest()}
     return template.render(shown=shown, result=shown.result, when=stamp, **names, **shown.content())
+
+
+@cache
+def _script() -> str:
+    return (Path(__file__).parent / "templates" / "sort.js").read_text(encoding="utf-8")
+
+
+def _digest() -> str:
+    """Return the script's digest as a security policy writes it."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(_script().encode()).digest()).decode()}"
 
 
 @lru_cache(maxsize=1)
@@ -43,10 +63,17 @@ def _environment() -> Environment:
         count=count_text,
         spans=spans,
         kind=lambda block: type(block).__name__,
+        cellsize=_cellsize,
         markup=Markup,
         **FILTERS,
     )
     return environment
+
+
+def _cellsize(cell: list[Span]) -> str:
+    """Return the class of a cell that is not to be broken, or that needs room, by the length of its text."""
+    size = sum(len(span.text) for span in cell)
+    return "nowrap " if size <= _SHORT else "long " if size > _LONG else ""
 
 
 def _harmless(value: Any) -> Any:

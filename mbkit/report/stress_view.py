@@ -531,6 +531,7 @@ def view(result: StressResult) -> Document:
         heading="Stiff and extreme: where each engine and method breaks",
         title="Stiff and extreme",
         verdict=headline(result),
+        sentence=f"{headline(result)}; {runs} runs of {_of(len(cases))}, each against a known truth",
         good=bool(result.complete and result.cases and not silent),
         marked=False,
         summary=f"{len(cases)} cases · {runs} runs · {time_text(result.seconds)}",

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from mbkit.report import document as doc
 from mbkit.report.figures import PAGE, page_style, svg
-from mbkit.report.formatting import choice, count_text, error_text, model_facts, refusals, time_text
+from mbkit.report.formatting import brief, choice, count_text, error_text, model_facts, refusals, time_text
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import USEFUL, figure
 from mbkit.studies.work_precision.result import WorkPrecision
@@ -119,14 +119,24 @@ def front_names(result: WorkPrecision) -> list[str]:
 
 def headline(result: WorkPrecision) -> str:
     """Return the fastest curve for each error, in one sentence."""
+    return _fastest(result) + "".join(f"; {x}" for x in result.shortened if x != "interrupted")
+
+
+def _sentence(result: WorkPrecision) -> str:
+    """Return the headline with what the errors are measured against; long lists stand below it."""
+    known = f"known to {error_text(result.floor)} rad or m" if math.isfinite(result.floor) else "of unknown error"
+    measured = f"errors of q over {result.duration:g} s, against a reference {known}"
+    return f"{_fastest(result)}; {measured}{brief(x for x in result.shortened if x != 'interrupted')}"
+
+
+def _fastest(result: WorkPrecision) -> str:
     stopped = "" if result.complete else "interrupted; what was finished: "
-    missing = "".join(f"; {x}" for x in result.shortened if x != "interrupted")
     groups = itertools.groupby(levels(result), key=lambda level: _name(level.curve))
     parts = [f"{name} for an error of {_range(list(group))}" for name, group in groups]
     if not parts:
-        return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m{missing}"
+        return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m"
     count = f"{len(result.curves)} curve{'s' * (len(result.curves) != 1)}"
-    return f"{stopped}fastest of {count}: {', '.join(parts)}{missing}"
+    return f"{stopped}fastest of {count}: {', '.join(parts)}"
 
 
 def error_against_time(result: WorkPrecision) -> str:
@@ -158,6 +168,7 @@ def view(result: WorkPrecision, target: str = "") -> doc.Document:
         name=f"{result.model} ({target})" if target else result.model,
         heading=f"{result.model}: error against run time",
         verdict=headline(result),
+        sentence=_sentence(result),
         good=bool(result.complete and result.front),
         marked=False,
         summary=f"nq {facts.get('nq', '?')}, nv {facts.get('nv', '?')} · {count} settings · {result.seconds:.1f} s",
@@ -172,7 +183,7 @@ def view(result: WorkPrecision, target: str = "") -> doc.Document:
 
 def sections(result: WorkPrecision, whole: bool) -> list[doc.Section]:
     """Return the sections of a study; unless `whole`, a terminal shows the fastest only."""
-    missing = [doc.Paragraph(doc.Span(f"! {'; '.join(result.shortened)}", "allowed"))] if result.shortened else []
+    missing = brief(result.shortened).removeprefix("; ") if not whole else ""
     cut = f", cut from {result.asked:g} s where the reference stops holding" if result.duration < result.asked else ""
     known = f"known to {error_text(result.floor)}" if math.isfinite(result.floor) else "known to an unknown error"
     front = "Lower left is better. On the front, fastest first: {}. Names beside the grey band are the methods that "
@@ -188,7 +199,7 @@ def sections(result: WorkPrecision, whole: bool) -> list[doc.Section]:
         doc.Section(
             about,
             [
-                *missing,
+                *([doc.Paragraph(doc.Span(f"! {missing}", "allowed"))] if missing else []),
                 doc.Paragraph(
                     f"Errors are the largest difference of q on the manifold over the saved times{cut}.", "page"
                 ),

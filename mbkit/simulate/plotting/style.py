@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from mbkit._escape import one_line
 from mbkit.engines import ENGINES
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 _MARKS: Final = "osD^vP"
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -99,6 +101,17 @@ def legend(ax: Axes, handles: Sequence[Artist], side: Literal["upper", "lower"],
         place = {**dict(zip(("loc", "bbox_to_anchor"), at, strict=True)), "fontsize": 8.0}
     whose: Any = figure_of(ax) if own else ax
     whose.legend(handles=handles, ncols=columns, columnspacing=1.2, handlelength=1.4, **place)
+
+
+#: What the name of a line begins with whose points have texts; the texts follow, one a line.
+POINTS: Final = "points:"
+
+
+def name_points(lines: Iterable[Line2D], texts: Iterable[str]) -> None:
+    """Give each point of a line a text, which a page shows when it is pointed at; a line without markers has one."""
+    name = POINTS + "\n".join(one_line(text) for text in texts)
+    for line in lines:
+        line.set_gid(name)
 
 
 def log_ticks(ax: Axes, most: int = 9) -> None:

@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from mbkit._escape import one_line
-from mbkit.simulate.plotting.style import CROSS, PLAIN, Palette, drawing, engine_mark, figure_of, legend
+from mbkit.simulate.plotting.style import CROSS, PLAIN, Palette, drawing, engine_mark, figure_of, legend, name_points
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
 from mbkit.studies.work_precision.result import WorkPrecision
 
@@ -285,14 +285,18 @@ def figure(result: Comparison, palette: Palette, ax: Axes | None = None) -> Figu
     for k, engine in enumerate(engines):
         colour, label = palette.engine(engine), f"{one_line(engine, 30)} against {result.reference}"
         ax.plot([], [], engine_mark(engine), color=colour, label=label)
-        for place, rows in enumerate(terms.values()):
+        for place, (term, rows) in enumerate(terms.items()):
             if (row := rows.get(engine)) is None:
                 continue
             worst, median = _shown_digits(row.relative), _shown_digits(row.median)
             y = place + (k - (len(engines) - 1) / 2) * step
             ax.plot([worst, median], [y, y], color=colour, linewidth=1.2)
-            ax.plot([median], [y], "|", color=colour, markersize=8)
-            ax.plot([worst], [y], engine_mark(engine), color=colour)
+            name_points(
+                ax.plot([median], [y], "|", color=colour, markersize=8),
+                [f"{term}, {engine}: median error {row.median:.1e}"],
+            )
+            text = f"{term}, {engine}: worst error {row.relative:.1e}, {row.worst_kind} state"
+            name_points(ax.plot([worst], [y], engine_mark(engine), color=colour), [text])
             if not row.passed:
                 ax.plot([worst], [y], "x", color=palette.bad, **CROSS)
     ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])

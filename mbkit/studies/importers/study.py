@@ -197,7 +197,8 @@ def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict
             if old.shape == new.shape and not near.numbers(old, new):
                 size = float(np.max(np.where(np.isfinite(old) & np.isfinite(new), np.abs(new - old), np.inf)))
                 label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
-                out[stage].append((size, a.name, f"{label}{number_text(new)} for {number_text(old)}"))
+                read, written = ("none" if np.isinf(x).all() else number_text(x) for x in (new, old))
+                out[stage].append((size, a.name, f"{label}{read} for {written}"))
     ours, theirs = (sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other))
     if not near.number(ours, theirs):
         base = " (the base's)" if near.number(ours - theirs, one.ground.mass - other.ground.mass) else ""

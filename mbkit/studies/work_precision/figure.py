@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import one_line
 from mbkit.methods.registry import METHODS
-from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend, log_ticks
+from mbkit.simulate.plotting.style import (
+    PLAIN,
+    Palette,
+    drawing,
+    engine_mark,
+    figure_of,
+    legend,
+    log_ticks,
+    name_points,
+)
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
 
 if TYPE_CHECKING:
@@ -116,6 +125,11 @@ def _xy(places: Sequence[_Place]) -> tuple[list[float], list[float]]:
     return [x for x, _, _ in places], [y for _, y, _ in places]
 
 
+def _text(place: _Place) -> str:
+    seconds, error, curve = place
+    return f"{curve.engine} {curve.method}: {error:.1e} in {seconds:.2g} s"
+
+
 def _front(places: Sequence[_Place], floor: float) -> list[_Place]:
     return pareto_front(places, lambda place: place[:2], floor)
 
@@ -133,11 +147,13 @@ def _overview(
     """Draw all curves thin, the best of each engine, and the front with its names."""
     places = _places(curves, measure)
     for curve in curves:
-        ax.plot(*_xy(_places([curve], measure)), color=palette.engine(curve.engine), linewidth=0.7, alpha=0.4)
+        thin = ax.plot(*_xy(_places([curve], measure)), color=palette.engine(curve.engine), linewidth=0.7, alpha=0.4)
+        name_points(thin, [f"{curve.engine} {curve.method}"])
     front = _draw_front(ax, places, floor, palette, 11.0)
     for engine in _engines(curves):
-        best = _xy(_front([place for place in places if place[2].engine == engine], floor))
-        ax.plot(*best, color=palette.engine(engine), marker=engine_mark(engine), markersize=4.5, linewidth=2.0)
+        best = _front([place for place in places if place[2].engine == engine], floor)
+        look: dict[str, Any] = {"color": palette.engine(engine), "marker": engine_mark(engine)}
+        name_points(ax.plot(*_xy(best), markersize=4.5, linewidth=2.0, **look), map(_text, best))
     ax.set_xscale("log")
     ax.set_yscale("log")
     names = _names(front)
@@ -244,7 +260,8 @@ def _by_method(
             own = curve.method in _SAME_FORMULA
             mark, line = ("", (0, (2, 1))) if own else (engine_mark(curve.engine), "-")
             look: dict[str, Any] = {"color": palette.engine(curve.engine), "marker": mark, "markersize": 3.0}
-            ax.plot(*_xy(_places([curve], measure)), linestyle=line, linewidth=1.3, **look)
+            of_curve = _places([curve], measure)
+            name_points(ax.plot(*_xy(of_curve), linestyle=line, linewidth=1.3, **look), map(_text, of_curve))
         ax.set_title(one_line(method, 30), loc="left", fontsize=9.5, pad=3)
     first = panels[0]
     first.set_xscale("log")
