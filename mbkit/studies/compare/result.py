@@ -9,7 +9,17 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from mbkit._escape import one_line
-from mbkit.simulate.plotting.style import CROSS, PLAIN, Palette, drawing, engine_mark, figure_of, legend, name_points
+from mbkit.simulate.plotting.style import (
+    CROSS,
+    PLAIN,
+    Palette,
+    drawing,
+    engine_mark,
+    error_words,
+    figure_of,
+    legend,
+    name_points,
+)
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
 from mbkit.studies.work_precision.result import WorkPrecision
 
@@ -291,12 +301,11 @@ def figure(result: Comparison, palette: Palette, ax: Axes | None = None) -> Figu
             worst, median = _shown_digits(row.relative), _shown_digits(row.median)
             y = place + (k - (len(engines) - 1) / 2) * step
             ax.plot([worst, median], [y, y], color=colour, linewidth=1.2)
-            name_points(
-                ax.plot([median], [y], "|", color=colour, markersize=8),
-                [f"{term}, {engine}: median error {row.median:.1e}"],
-            )
-            text = f"{term}, {engine}: worst error {row.relative:.1e}, {row.worst_kind} state"
-            name_points(ax.plot([worst], [y], engine_mark(engine), color=colour), [text])
+            texts = [f"{kind} error {error_words(x)}" for kind, x in (("median", row.median), ("worst", row.relative))]
+            ends = [ax.plot([median], [y], "|", color=colour, markersize=8)]
+            ends += [ax.plot([worst], [y], engine_mark(engine), color=colour)]
+            for point, text in zip(ends, texts, strict=True):
+                name_points(point, [f"{term}, {engine}: {text}"])
             if not row.passed:
                 ax.plot([worst], [y], "x", color=palette.bad, **CROSS)
     ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])
