@@ -1,0 +1,166 @@
+"""The book as it is written: complete, connected, and in short sentences. It is read here, and built elsewhere."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import click
+import pytest
+
+from mbkit.cli import cli
+
+BOOK = Path(__file__).resolve().parent.parent / "notebooks"
+PAGES = sorted(p for p in BOOK.rglob("*.md") if not {"_build", ".ipynb_checkpoints"} & {*p.parts})
+NAMES = [p.relative_to(BOOK).as_posix() for p in PAGES]
+#: Of the pages for readers in a hurry.
+MOST_WORDS = 30
+DIRECTIVE = re.compile(r"^\s*(?:\.\. |```\{|:::\{)(?:auto\w+|py:\w+)(?:::|\})\s*([\w.]+)", re.MULTILINE)
+
+
+def named(path: str) -> Any:
+    """Return what a dotted path names: an attribute of `mbkit` first, as users write it, else of a module."""
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError:
+        return getattr(named(module), name)
+
+
+def prose(text: str) -> str:
+    """Return a page's text without front matter, code, tables, formulas, comments and the targets of links."""
+    text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)
+    text = re.sub(r"^( *)(```+|:::+|~~~+).*?^\1\2\s*$", "\n\n", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"\$\$.*?\$\$|<!--.*?-->|\\begin\{(\w+\*?)\}.*?\\end\{\1\}", "\n\n", text, flags=re.DOTALL)
+    text = re.sub(r"^\s*(\||#|\(\w[\w-]*\)=).*$", "\n", text, flags=re.MULTILINE)
+    text = re.sub(r"`[^`]*`|(?<!\\)\$[^$\n]+\$", "x", text)
+    return re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Yield sentences: parts of a paragraph or list item that end in . ! or ? before a space."""
+    for block in re.split(r"\n\s*\n|\n\s*(?:[-*+]|\d+\.)\s+", prose(text)):
+        line = " ".join(block.split())
+        line = re.sub(r"\b(e\.g|i\.e|ch|eq|eqs|fig|sec|no|vs|cf|al|p|pp)\.", r"\1", line)
+        yield from (s for s in re.split(r"(?<=[.!?])[)\"”*_]*\s+", line) if s)
+
+
+def words(sentence: str) -> list[str]:
+    return [w for w in sentence.split() if any(c.isalnum() for c in w)]
+
+
+def links(text: str) -> Iterator[str]:
+    text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)
+    text = re.sub(r"^( *)(```+|~~~+)(?!\{toctree|\{eval-rst).*?^\1\2\s*$", "", text, flags=re.DOTALL | re.MULTILINE)
+    yield from re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`]*`", "", text))
+
+
+def test_every_public_name_has_a_directive_in_the_reference():
+    """Aliases of a class or function count as documented with it; data and modules by their own names."""
+    listed = {n for p in (BOOK / "reference").glob("*.md") for n in DIRECTIVE.findall(p.read_text("utf-8"))}
+    unknown = []
+    documented: list[Any] = []
+    for path in sorted(listed):
+        try:
+            documented.append(named(path))
+        except (AttributeError, ModuleNotFoundError):
+            unknown.append(path)
+    assert not unknown, f"directives of names that do not exist: {unknown}"
+    public = json.loads((Path(__file__).parent / "public_names.json").read_text("utf-8"))
+    missing = []
+    for path in public:
+        value = named(path)
+        if path not in listed and not (
+            callable(value) and any(value is x or _function(value) is _function(x) for x in documented)
+        ):
+            missing.append(path)
+    assert not missing, f"public names without a directive in notebooks/reference: {missing}"
+
+
+def _function(value: Any) -> Any:
+    """Return the function behind a callable package, such as `mbkit.load`."""
+    function = getattr(value, value.__name__.rpartition(".")[2], None) if hasattr(value, "__path__") else None
+    return value if function is None else function
+
+
+def test_each_public_name_has_one_place():
+    """A second directive of one name would be a duplicate target, and a warning of Sphinx."""
+    found = [n for p in sorted((BOOK / "reference").glob("*.md")) for n in DIRECTIVE.findall(p.read_text("utf-8"))]
+    assert not (twice := {n for n in found if found.count(n) > 1}), f"documented twice: {twice}"
+
+
+def test_the_page_of_the_command_has_every_command():
+    text = (BOOK / "reference" / "command.md").read_text("utf-8")
+
+    def paths(command: click.Command, path: str) -> Iterator[str]:
+        yield path
+        for name, inside in getattr(command, "commands", {}).items():
+            yield from paths(inside, f"{path} {name}")
+
+    headings = {*re.findall(r"^#+ (mbkit .*)$", text, re.MULTILINE)}
+    shown = {f"mbkit {x}" for x in re.findall(r'^options\("([^"]+)"\)$', text, re.MULTILINE)}
+    for path in paths(cli, "mbkit"):
+        assert path == "mbkit" or path in headings, f"no heading for `{path}`"
+        group = path in ("mbkit", "mbkit baseline")
+        assert group or path in shown, f"no options of `{path}`"
+
+
+def test_every_page_is_in_a_toctree():
+    reached, open_ = set(), ["index"]
+    while open_:
+        page = open_.pop()
+        if page in reached:
+            continue
+        reached.add(page)
+        path = BOOK / f"{page}.md"
+        if not path.exists():
+            assert (BOOK / f"{page}.ipynb").exists(), f"{page} is in a toctree and does not exist"
+            continue
+        for block in re.findall(r"^```\{toctree\}\n(.*?)^```", path.read_text("utf-8"), re.DOTALL | re.MULTILINE):
+            for line in block.splitlines():
+                if line.strip() and not line.startswith(":"):
+                    target = re.sub(r"^.*<(.*)>$", r"\1", line.strip()).removesuffix(".md").removesuffix(".ipynb")
+                    open_.append((path.parent / target).resolve().relative_to(BOOK).as_posix())
+    pages = {n.removesuffix(".md") for n in NAMES}
+    pages |= {p.relative_to(BOOK).with_suffix("").as_posix() for p in (BOOK / "examples").glob("*.ipynb")}
+    assert not pages - reached, f"pages in no toctree: {sorted(pages - reached)}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_relative_links_lead_to_files(name):
+    path = BOOK / name
+    for link in links(path.read_text("utf-8")):
+        target = unquote(link.partition("#")[0])
+        if target and not re.match(r"[a-z]+:", target):
+            assert (path.parent / target).exists(), f"{name}: no such file: {link}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_with_cells_have_front_matter(name):
+    text = (BOOK / name).read_text("utf-8")
+    if "{code-cell}" in text:
+        head = re.match(r"---\n(.*?)\n---\n", text, re.DOTALL)
+        assert head, f"{name}: cells without front matter"
+        assert "file_format: mystnb" in head[1], name
+        assert re.search(r"kernelspec:\s+name: python3", head[1]), name
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n.startswith(("start/", "howto/"))])
+def test_sentences_are_short(name):
+    long = [s for s in sentences((BOOK / name).read_text("utf-8")) if len(words(s)) > MOST_WORDS]
+    assert not long, f"{name}: {len(words(long[0]))} words: {long[0]}"
+
+
+def test_the_splitter_counts_what_is_read():
+    text = (
+        "---\nx: y\n---\n# A head\n\nOne two `three four`. Five [six](seven/eight.md)\nnine:\n\n| a |\n\n- ten\n- a\n"
+    )
+    assert [len(words(s)) for s in sentences(text)] == [3, 3, 1, 1]
+    assert list(sentences("```{code-cell} ipython3\nlong = 'code. is not read'\n```\n\nRead, e.g. here.")) == [
+        "Read, e.g here."
+    ]
