@@ -120,7 +120,7 @@ def test_the_versions_of_the_faults_are_those_that_were_measured():
     named = re.findall(r"^\| (\w+) (\d[\d.]*) \|", TEXT, flags=re.M)
     assert len(named) == 5
     assert all(versions[engine] == version for engine, version in named)
-    assert f"of {len(kept('importers'))} files" in TEXT
+    assert f"of {len(kept('importers')['robots'])} files" in TEXT
 
 
 def test_no_file_for_others_tells_where_it_was_made():
