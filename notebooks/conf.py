@@ -46,7 +46,6 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 autodoc_default_options = {
     "members": True,
-    "show-inheritance": False,
     "inherited-members": "object, tuple, dict, BaseException, Exception, OSError, LookupError",
 }
 napoleon_google_docstring = False

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import re
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -86,6 +88,17 @@ def _function(value: Any) -> Any:
     """Return the function behind a callable package, such as `mbkit.load`."""
     function = getattr(value, value.__name__.rpartition(".")[2], None) if hasattr(value, "__path__") else None
     return value if function is None else function
+
+
+def test_a_property_does_not_begin_like_a_type():
+    """Sphinx reads ``"What is missing: curves"`` as a property of the type "What is missing"."""
+    read = []
+    for path in json.loads((Path(__file__).parent / "public_names.json").read_text("utf-8")):
+        if isinstance(value := named(path), type):
+            for name, thing in inspect.getmembers_static(value, lambda x: isinstance(x, (property, cached_property))):
+                if not name.startswith("_") and ": " in (inspect.getdoc(thing) or "").partition("\n")[0]:
+                    read.append(f"{path}.{name}")
+    assert not read, f"a colon in the first line: {read}"
 
 
 def test_each_public_name_has_one_place():

@@ -182,7 +182,7 @@ class Equations:
 
     @cached_property
     def generalized_force(self) -> Any:
-        """τ_passive - C v - g: what accelerates a system without τ."""
+        """τ_passive - C v - g, which accelerates a system without τ."""
         return self.passive - self.nle
 
     @cached_property

@@ -62,7 +62,7 @@ def require_tree(model: Model, user: str) -> None:
 class InverseDynamicsDerivatives(NamedTuple):
     """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv)."""
 
-    #: ∂τ/∂q along the manifold: column k is that of q ⊕ t e_k.
+    #: ∂τ/∂q along the manifold; column k is that of q ⊕ t e_k.
     q: Array
     #: ∂τ/∂v.
     v: Array
@@ -73,7 +73,7 @@ class InverseDynamicsDerivatives(NamedTuple):
 class ForwardDynamicsDerivatives(NamedTuple):
     """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv)."""
 
-    #: ∂v̇/∂q along the manifold: column k is that of q ⊕ t e_k.
+    #: ∂v̇/∂q along the manifold; column k is that of q ⊕ t e_k.
     q: Array
     #: ∂v̇/∂v.
     v: Array

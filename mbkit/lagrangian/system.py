@@ -117,7 +117,7 @@ class Lagrangian(EnergyForm):
 
     @property
     def energy_function(self) -> sp.Expr:
-        """h = vᵀ ∂L/∂v - L = T2 - T0 + V: Jacobi's integral, the energy T + V where T = T2."""
+        """h = vᵀ ∂L/∂v - L = T2 - T0 + V, Jacobi's integral, the energy T + V where T = T2."""
         return hamilton.energy_function(self)
 
     def routhian(self, cyclic: sp.Symbol | Sequence[sp.Symbol] | None = None) -> Routhian[Lagrangian]:
@@ -167,7 +167,7 @@ class Lagrangian(EnergyForm):
 
     @cached_property
     def model(self) -> EnergyModel:
-        """The system as engines take it: ``mb.dynamics(lag.model, "lagrangian")``."""
+        """The system as engines take it, for ``mb.dynamics(lag.model, "lagrangian")``."""
         return EnergyModel(self)
 
     def dynamics(

@@ -130,7 +130,7 @@ class Method:
 
     @cached_property
     def formula(self) -> Formula | None:
-        """The step in mbkit's own code: `formula_source`, constructed."""
+        """The step in mbkit's own code, from `formula_source`."""
         source = self.formula_source
         return source() if callable(source) else source
 

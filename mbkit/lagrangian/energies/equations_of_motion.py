@@ -60,7 +60,7 @@ class EquationsOfMotion(Printable):
 
     @property
     def applied(self) -> sp.ImmutableMatrix:
-        """Q - C v - d - ∂V/∂q (+ Jᵀ λ): what M v̇ is, (n, 1)."""
+        """Q - C v - d - ∂V/∂q (+ Jᵀ λ), which is M v̇, (n, 1)."""
         return sp.ImmutableMatrix(self._right_side - self.coriolis_force - self.drift - self.potential_gradient)
 
     @property

@@ -222,7 +222,7 @@ class Hamiltonian(Printable):
 
     @cached_property
     def is_energy(self) -> bool:
-        """Whether H is T + V: where T has neither terms linear in the velocities nor terms without them."""
+        """Whether H is T + V, where T has neither terms linear in the velocities nor terms without them."""
         return is_energy(self.system)
 
     @cached_property

@@ -89,7 +89,7 @@ class Routhian(Printable, Generic[FormT]):
 
     @property
     def effective_potential(self) -> sp.Expr:
-        """Vₑ: V and the part of the constant momenta."""
+        """Vₑ, which is V and the part of the constant momenta."""
         return self.lagrangian.V
 
     @cached_property

@@ -187,7 +187,7 @@ class Stiffness:
 
     @property
     def stable(self) -> float:
-        """Fastest ``|λ|`` of what decays or oscillates, 1/s: what grows is followed by any method's steps."""
+        """Fastest ``|λ|`` of what decays or oscillates, 1/s; any method's steps follow what grows."""
         if not len(self.eigenvalues):
             return self.bound
         size = np.abs(self.eigenvalues)

@@ -184,7 +184,7 @@ class Comparison(ResultTable):
 
     @property
     def verdict(self) -> str:
-        """One sentence: agree, and to how many digits, or which engine differs in what, and by which known defect."""
+        """Whether they agree, and to how many digits, or which engine differs in what, and by which known defect."""
         if self.nothing:
             return f"nothing compared: {self.nothing}"
         missing = "".join(f"; {x}" for x in self.shortened)
@@ -224,7 +224,7 @@ class Comparison(ResultTable):
 
     @property
     def shortened(self) -> tuple[str, ...]:
-        """What is missing: terms, engines, whole studies, curves, and horizons that were cut."""
+        """What is missing, of terms, engines, whole studies, curves, and horizons that were cut."""
         out = [f"not compared: {', '.join(self.not_compared)}"] if self.not_compared else []
         absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
         out += [f"{', '.join(absent)} left out"] if absent else []

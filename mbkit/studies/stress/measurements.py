@@ -67,7 +67,7 @@ class Measurement:
 
     @property
     def seen(self) -> float:
-        """The error that counts: its own, or that of the energy where there is no truth.
+        """The error that counts, its own, or that of the energy where there is no truth.
 
         A wrong energy speaks against a run, but a right one does not speak for it.
         """

@@ -87,7 +87,7 @@ class WorkPrecision(ResultTable):
 
     @property
     def shortened(self) -> tuple[str, ...]:
-        """What is missing: curves that failed, curves that time ended, a horizon that was cut."""
+        """What is missing, such as curves that failed, curves that time ended, a horizon that was cut."""
         out = [] if self.complete else ["interrupted"]
         if self.refusals:
             names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in self.refusals))
@@ -104,7 +104,7 @@ class WorkPrecision(ResultTable):
 
     @property
     def front(self) -> tuple[tuple[Curve, PrecisionPoint], ...]:
-        """The Pareto front: points that none beats in both error and run time, fastest first."""
+        """The Pareto front, points that none beats in both error and run time, fastest first."""
         known = [(c, p) for c, p in self.rows() if math.isfinite(p.error) and math.isfinite(p.seconds)]
         return tuple(pareto_front(known, lambda item: (item[1].seconds, item[1].error), self.floor))
 
