@@ -4,17 +4,30 @@ from __future__ import annotations
 
 import math
 import reprlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbkit.errors import InputError
+from mbkit.errors import InputError, UnsupportedError
 
 Array = NDArray[np.float64]
 _MAX_SUMMED: Final = 64
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
+
+
+@contextmanager
+def needed(package: str, by: str) -> Iterator[None]:
+    """Raise `UnsupportedError` that names a package, and who needs it, where an import within finds none."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != package:
+            raise
+        raise UnsupportedError(f"{by} needs {package}, which is not installed; pip install {package}") from error
 
 
 def all_finite(array: Array) -> bool:

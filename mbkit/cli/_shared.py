@@ -172,7 +172,11 @@ class CommandGroup(click.Group):
             raise
         except (click.exceptions.Exit, click.Abort):
             raise
-        except Exception:
+        except Exception as error:
+            missing = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+            if missing not in ("", "mbkit"):
+                say("error", f"{missing} is not installed, and this command needs it; pip install {missing}")
+                ctx.exit(MISUSE)
             traceback.print_exc()
             say("error", "this is a fault of mbkit's; please report it with the lines above")
             ctx.exit(INTERNAL)

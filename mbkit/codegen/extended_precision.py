@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, needed
 from mbkit.codegen.program import Program
 from mbkit.errors import InputError, UnsupportedError
 
@@ -92,7 +92,8 @@ def arithmetic(name: Backend | None = None) -> Arithmetic:
 @cache
 def mpmath_context() -> Any:
     """Return a private context of mpmath, so that the user's `mp.prec` is unchanged."""
-    import mpmath
+    with needed("mpmath", "arithmetic of 34 digits"):
+        import mpmath
 
     context = mpmath.MPContext()
     context.prec = BITS

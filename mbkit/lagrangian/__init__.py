@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from mbkit._check import needed
 from mbkit.codegen.c_source import CSource, export_c
 from mbkit.derivation import FUNCTIONS, Equations
 from mbkit.engines.base import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
@@ -49,10 +50,11 @@ __all__ += ["systems", *_HOME]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "systems":
-        return importlib.import_module("mbkit.lagrangian.systems")
-    if name in _HOME:
-        return getattr(importlib.import_module(_HOME[name]), name)
+    with needed("sympy", "mechanics on paper"):
+        if name == "systems":
+            return importlib.import_module("mbkit.lagrangian.systems")
+        if name in _HOME:
+            return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module 'mbkit.lagrangian' has no attribute {name!r}; it has: {', '.join(__all__)}")
 
 

@@ -139,8 +139,6 @@ def picture(
     run: RunData, model: Model, figures: int, view: str | ArrayLike | None, member: int, axis: Axes | None = None
 ) -> Figure:
     """Draw a run of a model with numbers for its parameters; see `Trajectory.picture`."""
-    from matplotlib.figure import Figure
-
     figures = count("count", figures, least=1)
     q, v = (run.q[member], run.v[member]) if run.q.ndim == 3 else (run.q, run.v)
     good = np.isfinite(q).all(-1) & np.isfinite(v).all(-1)
@@ -161,6 +159,8 @@ def picture(
         most = tuple(np.array(axis.get_window_extent().size) / figure_of(axis).dpi)
     strip = _Strip(drawn, plane, seen @ plane.T, figures, most)
     with drawing(more={"font.size": 9.0}):
+        from matplotlib.figure import Figure
+
         if axis is None:
             axis = Figure(figsize=strip.size, layout="constrained").add_subplot()
         for k in range(figures):

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from mbkit._check import needed
 from mbkit._escape import one_line
 from mbkit.engines import ENGINES
 
@@ -78,7 +79,8 @@ def style(palette: Palette) -> dict[str, Any]:
 
 def drawing(palette: Palette = PLAIN, more: Mapping[str, Any] | None = None) -> Any:
     """Return a context that draws in this style, and leaves the user's own as it was; `more` are further settings."""
-    from matplotlib import rc_context
+    with needed("matplotlib", "a figure"):
+        from matplotlib import rc_context
 
     settings: Any = {**style(palette), **(more or {})}
     return rc_context(settings)

@@ -55,9 +55,6 @@ def figure(
     At the right stands the same for energy, below one panel for each method; of these there is none where the errors
     are drawn into the axes `only`. The floor says how well the reference is known, rad or m.
     """
-    # Figure without pyplot: no window system, nothing to close.
-    from matplotlib.figure import Figure
-
     floor = floor if math.isfinite(floor) and floor > 0 else 0.0
     methods = _methods(curves)
     rows = math.ceil(len(methods) / _COLUMNS)
@@ -67,6 +64,9 @@ def figure(
         return max(p.error, floor / 10, _MIN_ERROR) if math.isfinite(p.error) else math.nan
 
     with drawing(palette):
+        # Figure without pyplot: no window system, nothing to close.
+        from matplotlib.figure import Figure
+
         if only is not None:
             _errors(only, curves, duration, floor, palette, error)
             legend(only, _handles(curves, floor, palette), "lower", own=False, columns=2)
