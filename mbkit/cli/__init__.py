@@ -1,6 +1,7 @@
 """The command `mbkit`: checks arguments, calls the library, prints, and says how it ended.
 
-Exit status: 0 done, and the engines agree (or are as a baseline has them), 1 they differ, 2 misuse or
+Exit status: 0 done, and the engines agree (or are as a baseline has them), 1 they differ, or a run diverged or
+is doubtful, 2 misuse or
 bad input, 70 a fault of mbkit's own, 130 interrupted.
 """
 
@@ -12,20 +13,25 @@ import sys
 import click
 
 from mbkit._version import __version__
-from mbkit.cli import baseline, bench, check, convert, derive, diff, stress
+from mbkit.cli import baseline, bench, check, convert, derive, diff, plot, simulate, stress
 from mbkit.cli._shared import CommandGroup
 
 
-@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=CommandGroup,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    examples=("mbkit check panda", "mbkit simulate cart_pole --q0 0,1", "mbkit COMMAND --help"),
+)
 @click.version_option(__version__, prog_name="mbkit")
 def cli() -> None:
     """Equations of motion that can be trusted: Pinocchio, MuJoCo and an own derivation, compared."""
 
 
-for _command in (check.check, diff.diff, baseline.baseline, derive.derive, bench.bench, stress.stress, convert.convert):
+for _command in (
+    *(check.check, diff.diff, baseline.baseline, derive.derive, derive.export, simulate.simulate, plot.plot),
+    *(bench.bench, stress.stress, convert.convert, convert.robots),
+):
     cli.add_command(_command)
-cli.add_command(derive.export)
-cli.add_command(convert.robots)
 
 
 def main() -> None:

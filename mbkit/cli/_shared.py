@@ -9,7 +9,7 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
@@ -148,10 +148,38 @@ def check_engines(names: tuple[str, ...], least: int) -> None:
         )
 
 
-# Messages.
+# Help and messages.
 
 
-class CommandGroup(click.Group):
+class _Command(click.Command):
+    """A command whose help ends in examples, and whose line in a list is its whole first sentence."""
+
+    def __init__(self, *args: Any, examples: Sequence[str] = (), **more: Any) -> None:
+        super().__init__(*args, **more)
+        self.examples = tuple(examples)
+
+    def get_short_help_str(self, limit: int = 0) -> str:  # noqa: ARG002, a sentence is never cut
+        """Return the first sentence of the help."""
+        return " ".join((self.help or "").split()).partition(". ")[0].rstrip(".")
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples."""
+        if self.examples:
+            with formatter.section("Examples"):
+                formatter.write("".join(f"{'':{formatter.current_indent}}{line}\n" for line in self.examples))
+        super().format_epilog(ctx, formatter)
+
+
+class Group(_Command, click.Group):
+    """A command of commands, with examples."""
+
+
+def command(*examples: str) -> Callable[[Command], _Command]:
+    """Return the decorator of a command, with examples for its help."""
+    return lambda function: click.command(cls=_Command, examples=examples)(function)
+
+
+class CommandGroup(Group):
     """Turns what the library raises into one message and an exit status."""
 
     def invoke(self, ctx: click.Context) -> Any:

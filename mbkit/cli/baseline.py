@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _FILE = click.Path(path_type=Path)
 
 
-@click.group()
+@click.group(cls=shared.Group, examples=("mbkit baseline record panda panda.toml", "mbkit baseline check panda.toml"))
 def baseline() -> None:
     """Record what engines say of a robot, and check later whether they still do.
 
@@ -28,7 +28,7 @@ def baseline() -> None:
     """
 
 
-@baseline.command()
+@shared.command("mbkit baseline record panda panda.toml", "mbkit baseline record ur5 arm.urdf baselines")
 @click.argument("targets", metavar="TARGET...", nargs=-1, required=True)
 @click.argument("path", type=_FILE)
 @click.option(
@@ -74,7 +74,11 @@ def _record_one(target: str, file: Path, engines: tuple[str, ...], options: dict
         shared.say("warning", disagreement)
 
 
-@baseline.command()
+@shared.command(
+    "mbkit baseline check panda.toml",
+    "mbkit baseline check baselines --strict",
+    "mbkit baseline check panda.toml --rebaseline",
+)
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--target", help="Check this instead of what was recorded, or the function that was recorded; with one file."
@@ -166,7 +170,9 @@ def _confirmed(file: Path) -> bool:
     return there and click.confirm(f"Record {file} again with these versions?", default=False)
 
 
-@baseline.command()
+@shared.command(
+    "mbkit baseline diff old.toml new.toml",
+)
 @click.argument("path_a", type=_FILE)
 @click.argument("path_b", type=_FILE)
 @shared.json_option
@@ -182,6 +188,10 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     result = baselines.diff(path_a, path_b)
     shared.show(baseline_view(result), as_json=as_json)
     shared.leave(AGREE if result.passed else DIFFER)
+
+
+for _command in (record, check, diff):
+    baseline.add_command(_command)
 
 
 # Targets and files.

@@ -13,7 +13,7 @@ from mbkit.cli import _shared as shared
 from mbkit.cli._shared import Report
 
 
-@click.command()
+@shared.command("mbkit bench double_pendulum --quick", "mbkit bench ur5 --methods rk4,rk853 --duration 2 --out results")
 @click.argument("target")
 @shared.engines_option("pinocchio,lagrangian,mujoco")
 @shared.methods_option("all there are")

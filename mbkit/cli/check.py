@@ -13,7 +13,12 @@ from mbkit.cli import _shared as shared
 from mbkit.cli._shared import AGREE, DIFFER, INTERRUPTED, MISUSE, Report
 
 
-@click.command()
+@shared.command(
+    "mbkit check panda",
+    "mbkit check arm.urdf --floating-base --engines pinocchio,mujoco",
+    "mbkit check panda --own-parsers",
+    "mbkit check --all --no-rollouts",
+)
 @click.argument("target", required=False)
 @click.option("--all", "everything", is_flag=True, help="Check every robot of example-robot-data.")
 @shared.engines_option("pinocchio,lagrangian,mujoco")

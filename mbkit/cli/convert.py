@@ -12,7 +12,7 @@ from mbkit.cli import _shared as shared
 from mbkit.errors import OutputError
 
 
-@click.command()
+@shared.command("mbkit robots", "mbkit robots --json")
 @shared.json_option
 def robots(as_json: bool) -> None:
     """List the robots and catalog systems that can be checked by name."""
@@ -29,13 +29,13 @@ def robots(as_json: bool) -> None:
     shared.console().print(terminal.robots(records(), catalog.systems()))
 
 
-@click.command()
+@shared.command("mbkit convert panda --to mjcf", "mbkit convert arm.urdf --to mjcf --out arm.xml")
 @click.argument("target")
 @click.option("--to", "to", required=True, type=click.Choice(["mjcf", "urdf"]), help="The format.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="File to write.  [default: print]")
+@click.option("--out", type=click.Path(path_type=Path), help="File to write.  [default: print]")
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
 @shared.load_options
-def convert(target: str, to: str, output: Path | None, force: bool, options: dict[str, Any]) -> None:
+def convert(target: str, to: str, out: Path | None, force: bool, options: dict[str, Any]) -> None:
     """Write TARGET as MJCF or URDF: its motion alone, without geometry.
 
     TARGET is what `mbkit check` takes. The text is read back with MuJoCo's or Pinocchio's own parser before
@@ -44,14 +44,14 @@ def convert(target: str, to: str, output: Path | None, force: bool, options: dic
     from mbkit.studies._targets import model_of
     from mbkit.studies.convert import convert as converted
 
-    if output is not None and output.exists() and not force:
-        raise OutputError(f"{output} is there already; choose another with -o, or replace it with --force")
+    if out is not None and out.exists() and not force:
+        raise OutputError(f"{out} is there already; choose another with --out, or replace it with --force")
     result = converted(model_of(target, options), to)
-    if output is None:
+    if out is None:
         shared.tell(result.text.removesuffix("\n"))
     else:
-        result.write(output)
+        result.write(out)
     for note in result.notes:
         shared.say("note", note)
-    where = "printed" if output is None else f"written to {output}"
+    where = "printed" if out is None else f"written to {out}"
     shared.say("checked", f"{result.model} as {to}, {where}: read back, every term agrees to {result.worst:.1e}")

@@ -25,7 +25,11 @@ _WIDTH: Final = 100
 _C_FOLDER: Final = "mbkit-export"
 
 
-@click.command()
+@shared.command(
+    "mbkit derive cart_pole",
+    "mbkit derive double_pendulum --latex --out equations",
+    "mbkit derive kepler --python",
+)
 @click.argument("system")
 @click.option("--latex", "form", flag_value="latex", help="Print LaTeX.")
 @click.option("--python", "form", flag_value="python", help="Print a Python module that needs NumPy only.")
@@ -142,7 +146,7 @@ def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: boo
 # As C.
 
 
-@click.command()
+@shared.command("mbkit export ur5", "mbkit export panda --quantity gravity --quantity mass_matrix --out src")
 @click.argument("target")
 @click.option(
     "--quantity",

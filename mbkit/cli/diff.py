@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mbkit.model import Model
 
 
-@click.command()
+@shared.command("mbkit diff arm.urdf arm_new.urdf", "mbkit diff panda --engines pinocchio,mujoco")
 @click.argument("first")
 @click.argument("second", required=False)
 @click.option(

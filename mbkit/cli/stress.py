@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from mbkit.studies.stress.case import Case
 
 
-@click.command()
+@shared.command(
+    "mbkit stress --list",
+    "mbkit stress --quick",
+    "mbkit stress joint_spring heavy_tip --engines lagrangian,mujoco",
+)
 @click.argument("cases", nargs=-1, metavar="[CASE]...")
 @click.option("--quick", is_flag=True, help="Fewer values and methods: under two minutes instead of thirty.")
 @shared.engines_option("lagrangian,pinocchio,mujoco")

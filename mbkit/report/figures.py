@@ -48,6 +48,7 @@ _DASHES: Final = (0, (2, 2))
 _WIDTH: Final = 10.4
 #: Pixels of the smallest letters of a figure, however narrow the window.
 _SMALLEST: Final = 10.0
+_DOTS_PER_INCH: Final = 160
 
 
 @contextmanager
@@ -76,19 +77,22 @@ def svg(fig: Figure, title: str) -> str:
     none: dict[str, None] = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     fig.savefig(stream, format="svg", transparent=True, bbox_inches="tight", pad_inches=0.05, metadata=none)
     text = stream.getvalue()
-    text = text[text.index("<svg") :]
+    text = _titled(text[text.index("<svg") :])
     for size in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
     width = float(re.findall(r'viewBox="\S+ \S+ (\S+)', text)[0])
     least = width * _SMALLEST / min(map(float, re.findall(r"font(?:-size)?: ([\d.]+)px", text)), default=_SMALLEST)
     text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}" style="--least: {math.ceil(least)}px"', 1)
-    # Names of parts would otherwise stand twice on a page with two figures.
-    first, *groups = text.split('<g id="')
-    text = first + "".join("<g" + _with_titles(*group.split('"', 1)) for group in groups)
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     for stand_in, variable in _VARIABLES.items():
         text = text.replace(stand_in, variable)
     return text
+
+
+def _titled(text: str) -> str:
+    """Return an SVG without names of its groups, which would stand twice on a page, and with titles of its points."""
+    first, *groups = text.split('<g id="')
+    return first + "".join("<g" + _with_titles(*group.split('"', 1)) for group in groups)
 
 
 def _with_titles(name: str, rest: str) -> str:
@@ -103,6 +107,16 @@ def _with_titles(name: str, rest: str) -> str:
     head, *between = re.split(r"<use [^>]*/>", rest)
     pieces = (f"<g>{title}{mark}</g>{after}" for title, mark, after in zip(texts, marks, between, strict=True))
     return head + "".join(pieces)
+
+
+def image(fig: Figure, ending: str = "png") -> bytes:
+    """Return a figure as a file, PNG or SVG, on white, the same every time."""
+    stream = io.BytesIO()
+    marks: dict[str, Any] = {"png": {"Software": "mbkit"}, "svg": {"Creator": "written by mbkit", "Date": None}}
+    with drawing(more={"svg.hashsalt": "mbkit"}):
+        fig.savefig(stream, format=ending, dpi=_DOTS_PER_INCH, facecolor="white", metadata=marks[ending])
+    content = stream.getvalue()
+    return _titled(content.decode()).encode() if ending == "svg" else content
 
 
 def _legend(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
 from collections.abc import Sequence
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from mbkit.report import document as doc
-from mbkit.report.figures import PAGE, page_style, svg
+from mbkit.report.figures import PAGE, image, page_style, svg
 from mbkit.report.formatting import brief, choice, count_text, error_text, model_facts, refusals, time_text
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import USEFUL, figure
@@ -19,7 +18,6 @@ from mbkit.studies.work_precision.result import WorkPrecision
 #: An observed order farther than this from the method's own is flagged.
 ORDER_TOLERANCE: Final = 0.2
 _EXPONENTS: Final = range(-2, -15, -2)
-_DOTS_PER_INCH: Final = 160
 
 
 @dataclass(frozen=True)
@@ -149,10 +147,7 @@ def error_against_time(result: WorkPrecision) -> str:
 
 def picture(result: WorkPrecision) -> bytes:
     """Return the same figure as PNG on white."""
-    stream = io.BytesIO()
-    fig = figure(result.curves, result.duration, result.floor)
-    fig.savefig(stream, format="png", dpi=_DOTS_PER_INCH, facecolor="white", metadata={"Software": "mbkit"})
-    return stream.getvalue()
+    return image(figure(result.curves, result.duration, result.floor))
 
 
 # The document.

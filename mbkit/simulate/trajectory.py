@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import warnings
 from collections.abc import Iterator
@@ -151,24 +152,28 @@ class Trajectory(RunData):
         model = self.model if self._dyn is None else dynamics_of_trajectory(self._dyn, member).model
         return picture(self, model, count, view, member, ax)
 
-    def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write t, q and v with all their digits, one line per state; OutputError where the file cannot be written.
+    def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
+        """Return t, q and v with all their digits, one line per state; with `path`, write it there too.
 
-        A batch has a first column with the index of its trajectory.
+        A batch has a first column with the index of its trajectory. OutputError where the file cannot be written.
         """
         batch = self.q.ndim == 3
         header = [*(["trajectory"] if batch else []), "t"]
         header += [f"q.{n}" for n in self.model.coordinate_names] + [f"v.{n}" for n in self.model.velocity_names]
+        stream = io.StringIO()
+        writer = csv.writer(stream)
+        writer.writerow(map(csv_text, header))
+        for i, (q, v) in enumerate(zip(self.q, self.v, strict=True) if batch else [(self.q, self.v)]):
+            lead = [i] if batch else []
+            rows = np.column_stack([self.t, q, v]).tolist()
+            writer.writerows([*lead, *row] for row in rows)
+        text = stream.getvalue()
         try:
-            with Path(path).open("w", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file)
-                writer.writerow(map(csv_text, header))
-                for i, (q, v) in enumerate(zip(self.q, self.v, strict=True) if batch else [(self.q, self.v)]):
-                    lead = [i] if batch else []
-                    rows = np.column_stack([self.t, q, v]).tolist()
-                    writer.writerows([*lead, *row] for row in rows)
+            if path is not None:
+                Path(path).write_text(text, encoding="utf-8", newline="")
         except OSError as error:
             raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
+        return text
 
     def _facts(self) -> list[tuple[str, str]]:
         count = f"{len(self.q)} trajectories of " if self.q.ndim == 3 else ""

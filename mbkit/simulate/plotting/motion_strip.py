@@ -30,7 +30,7 @@ _SIZE: Final = (11.0, 8.0)
 _SHAPE: Final = 3.0
 #: Inches that a time needs below its window, and from one to the next.
 _LINE: Final = 0.3
-_TIME: Final = 0.85
+_TIME: Final = 0.95
 #: Edges of a box whose corners are counted with x slowest, and its side at -x.
 _EDGES: Final = [(i, i | b) for i in range(8) for b in (1, 2, 4) if not i & b]
 _SIDE: Final = [0, 1, 3, 2]
@@ -52,11 +52,12 @@ class _Strip:
         room = np.maximum(0.06 * largest, (0.35 * largest - (high - low)) / 2)
         self._low, self._window = low - room, high - low + 2 * room
         scale, self._gap, self._columns = math.inf, 0.12 * largest, 1
+        widest = max(1, min(figures, int(most[0] / _TIME)))
         # Texts keep their size, so that their room depends on the scale, and the scale on their room.
         for _ in range(4):
             self._gap = max(0.12 * largest, _LINE / scale)
             self._cell = np.maximum(self._window + np.array([0.3, 1.2]) * self._gap, [_TIME / scale, 0])
-            self._columns = min(range(1, figures + 1), key=lambda columns: self._waste(figures, columns))
+            self._columns = min(range(1, widest + 1), key=lambda columns: self._waste(figures, columns))
             self._rows = -(-figures // self._columns)
             whole = self._cell * [self._columns, self._rows]
             scale = min(most[0] / whole[0], most[1] / whole[1])

@@ -1,0 +1,125 @@
+"""`mbkit simulate`: a motion from the command line, as a table and figures."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mbkit.cli import _shared as shared
+from mbkit.cli._shared import DIFFER, DONE, Report
+from mbkit.errors import InputError, MbkitError
+
+if TYPE_CHECKING:
+    from mbkit.engines import Dynamics
+    from mbkit.model import Model
+    from mbkit.simulate import Trajectory
+
+_START = "Start: neutral, random:SEED, or numbers with commas between."
+
+
+@shared.command(
+    "mbkit simulate cart_pole --q0 0,1 --duration 3",
+    "mbkit simulate panda --q0 random:0 --engine lagrangian --method rk853 --rtol 1e-9",
+    "mbkit simulate arm.urdf --dt 5e-4 --save 100 --out runs --json",
+)
+@click.argument("target")
+@click.option("--engine", metavar="NAME", help="[default: pinocchio; lagrangian for loops and systems on paper]")
+@click.option("--method", metavar="NAME", help="Integrator.  [default: rk4]")
+@click.option("--duration", default=1.0, show_default=True, type=float, help="Length of the motion, s.")
+@click.option("--dt", type=float, help="Step of a fixed-step method, s.  [default: 1e-3]")
+@click.option("--rtol", type=float, help="Tolerance of an adaptive method.  [default: 1e-10]")
+@click.option("--q0", default="neutral", show_default=True, metavar="STATE", help=_START)
+@click.option("--v0", default="neutral", show_default=True, metavar="STATE", help="Its velocity; neutral is rest.")
+@click.option("--save", type=click.IntRange(min=1), metavar="N", help="Keep the start and N more states, evenly.")
+@shared.load_options
+@shared.report_options
+def simulate(
+    target: str, q0: str, v0: str, save: int | None, options: dict[str, Any], report: Report, **settings: Any
+) -> None:
+    """Simulate TARGET, and write its trajectory and figures.
+
+    TARGET is what `mbkit check` takes, also with loops. A CSV file has t, q and v of each state; a figure has
+    coordinates, velocities and energies over time, and another one the motion as stick figures. Exit status:
+    0 finished, 1 diverged or doubtful, 2 misuse or bad input.
+    """
+    import numpy as np
+
+    from mbkit.simulate import simulate as integrate
+    from mbkit.studies._targets import model_of
+
+    report.prepare()
+    model = model_of(target, options)
+    stem = shared.stem_of(target, model.name)
+    for name, ending in (("trajectory", "csv"), ("plot", "png"), ("picture", "png")):
+        report.prepare(f"{stem}-{name}", ending)
+    dyn = _dynamics(model, settings.pop("engine"))
+    start = _state("--q0", q0, dyn.model, 0), _state("--v0", v0, dyn.model, 1)
+    times = None if save is None else np.linspace(0.0, settings["duration"], save + 1)
+    run = integrate(dyn, *start, save=times, progress=True, **{k: x for k, x in settings.items() if x is not None})
+    paths = _write(run, report, stem)
+    if report.as_json:
+        shared.tell(_json(run))
+        shared.say("written", " ".join(paths))
+    else:
+        _show(run)
+        shared.tell("\n".join(paths))
+    shared.leave(DONE if run.stats.finished and not run.stats.doubts else DIFFER)
+
+
+def _dynamics(model: Model, engine: str | None) -> Dynamics:
+    from mbkit.engines import ENGINES, dynamics
+
+    derived = next(name for name, info in ENGINES.items() if info.derived)
+    if model.loops and engine in (None, derived):
+        from mbkit.lagrangian.from_description import from_model
+
+        return from_model(model).dynamics()
+    own = {} if model.has_bodies else {"engine": derived}
+    return dynamics(model, **({"engine": engine} if engine else own))
+
+
+def _state(option: str, text: str, model: Model, which: int) -> Any:
+    """Return a start of coordinates (`which` is 0) or velocities (1)."""
+    import numpy as np
+
+    kind, _, seed = text.partition(":")
+    if text == "neutral":
+        return np.zeros(model.nv) if which else model.neutral()
+    with suppress(ValueError):
+        return model.random_state(int(seed))[which] if kind == "random" else np.array(text.split(","), dtype=float)
+    count = f"{model.nv if which else model.nq} numbers such as 0.1,-0.2"
+    raise InputError(f"{option}: expected neutral, random:SEED or {count}, got {text!r}")
+
+
+def _write(run: Trajectory, report: Report, stem: str) -> list[str]:
+    from mbkit.report.figures import image
+    from mbkit.report.output_folder import write
+
+    contents: dict[str, Any] = {"trajectory.csv": run.to_csv, "plot.png": lambda: image(run.plot())}
+    if run.model.has_bodies:
+        contents["picture.png"] = lambda: image(run.picture())
+    return [str(write(report.out, f"{stem}-{name}", make(), force=report.force)) for name, make in contents.items()]
+
+
+def _json(run: Trajectory) -> str:
+    from mbkit.studies.results import to_plain, versions
+
+    names = {"q": run.model.coordinate_names, "v": run.model.velocity_names}
+    last = {x: dict(zip(names[x], getattr(run, x)[-1].tolist(), strict=True)) for x in "qv"}
+    data = {"model": run.model.name, "engine": run.engine, "method": run.method, "finished": run.stats.finished}
+    data |= {"stats": asdict(run.stats), "doubts": run.stats.doubts, "final": {"t": float(run.t[-1]), **last}}
+    return json.dumps(to_plain(data | {"versions": versions()}), indent=1)
+
+
+def _show(run: Trajectory) -> None:
+    shared.tell(f"{run.model.name}: {run.method} on {run.engine}, {len(run.t)} states to {run.t[-1]:g} s; {run.stats}")
+    with suppress(MbkitError):
+        shared.tell(f"largest |E - E(0) - work|: {abs(run.power_balance()).max():.2g} J")
+    for x, names in (("q", run.model.coordinate_names), ("v", run.model.velocity_names)):
+        width = max(map(len, names), default=0)
+        for name, (start, end) in zip(names, getattr(run, x)[[0, -1]].T.tolist(), strict=True):
+            shared.tell(f"  {x} {name:<{width}}  {start:>12.6g} -> {end:>12.6g}")
