@@ -99,11 +99,11 @@ def test_roll_pitch_yaw_are_those_of_the_matrix_next_to_a_right_angle_too() -> N
 def test_the_door(tmp_path: Path) -> None:
     run = CliRunner().invoke
     out = tmp_path / "acrobot.xml"
-    done = run(cli, ["convert", "acrobot", "--to", "mjcf", "-o", str(out)])
+    done = run(cli, ["convert", "acrobot", "--to", "mjcf", "--out", str(out)])
     assert done.exit_code == 0, done.output
     assert "read back, every term agrees" in done.stderr
     assert out.read_text().startswith("<mujoco")
-    assert "is there already" in run(cli, ["convert", "acrobot", "--to", "mjcf", "-o", str(out)]).stderr
+    assert "is there already" in run(cli, ["convert", "acrobot", "--to", "mjcf", "--out", str(out)]).stderr
     assert run(cli, ["convert", "heavy_top", "--to", "urdf"]).exit_code == 2
     printed = run(cli, ["convert", "acrobot", "--to", "urdf"])
     assert printed.stdout.startswith("<robot")

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.simulate import Trajectory
 
-_START = "Start: neutral, random:SEED, or numbers with commas between."
-
 
 @shared.command(
     "mbkit simulate cart_pole --q0 0,1 --duration 3",
@@ -32,7 +30,9 @@ _START = "Start: neutral, random:SEED, or numbers with commas between."
 @click.option("--duration", default=1.0, show_default=True, type=float, help="Length of the motion, s.")
 @click.option("--dt", type=float, help="Step of a fixed-step method, s.  [default: 1e-3]")
 @click.option("--rtol", type=float, help="Tolerance of an adaptive method.  [default: 1e-10]")
-@click.option("--q0", default="neutral", show_default=True, metavar="STATE", help=_START)
+@click.option(
+    "--q0", default="neutral", show_default=True, metavar="STATE", help="neutral, random:SEED or numbers: 1,-0.5"
+)
 @click.option("--v0", default="neutral", show_default=True, metavar="STATE", help="Its velocity; neutral is rest.")
 @click.option("--save", type=click.IntRange(min=1), metavar="N", help="Keep the start and N more states, evenly.")
 @shared.load_options
@@ -71,15 +71,14 @@ def simulate(
 
 
 def _dynamics(model: Model, engine: str | None) -> Dynamics:
-    from mbkit.engines import ENGINES, dynamics
+    from mbkit.engines.registry import ENGINES, PINOCCHIO, dynamics
 
     derived = next(name for name, info in ENGINES.items() if info.derived)
     if model.loops and engine in (None, derived):
         from mbkit.lagrangian.from_description import from_model
 
         return from_model(model).dynamics()
-    own = {} if model.has_bodies else {"engine": derived}
-    return dynamics(model, **({"engine": engine} if engine else own))
+    return dynamics(model, engine or (PINOCCHIO if model.has_bodies else derived))
 
 
 def _state(option: str, text: str, model: Model, which: int) -> Any:
