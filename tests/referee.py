@@ -160,8 +160,8 @@ def texts() -> dict[str, str]:
     with tempfile.TemporaryDirectory() as folder:
         commands = {
             "c": ["export", "cart_pole", "--out", folder],
-            "mjcf": ["convert", "panda", "--to", "mjcf", "-o", f"{folder}/panda.xml"],
-            "urdf": ["convert", "ur5", "--to", "urdf", "-o", f"{folder}/ur5.urdf"],
+            "mjcf": ["convert", "panda", "--to", "mjcf", "--out", f"{folder}/panda.xml"],
+            "urdf": ["convert", "ur5", "--to", "urdf", "--out", f"{folder}/ur5.urdf"],
         }
         for name, command in commands.items():
             CliRunner().invoke(cli, command)
