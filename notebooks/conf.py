@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -76,6 +77,12 @@ if not _profile.exists():
     atexit.register(shutil.rmtree, _profile.parent, ignore_errors=True)
 
 
+# Below an exponent or an index there is no room for a space.
+_FUNCTION = re.compile(
+    r"(?<!<msup>)(?<!<msub>)(?<!<msubsup>)(<mi>(?:arctan|cos|cosh|cot|exp|log|ln|sin|sinh|tan)</mi>)"
+)
+
+
 def _mathml(translator: Any, node: nodes.Element, *, block: bool) -> None:
     """Write a formula as MathML, which a browser shows without a script and a screen reader reads."""
     # The converter knows one name for lines that are aligned.
@@ -83,6 +90,8 @@ def _mathml(translator: Any, node: nodes.Element, *, block: bool) -> None:
     if block and "\\begin{" not in tex and "\\\\" in tex:
         tex = f"\\begin{{align*}}{tex}\\end{{align*}}"
     text = convert(tex, display="block" if block else "inline")
+    # The converter sets no space beside the name of a function.
+    text = _FUNCTION.sub(r'<mspace width="0.17em" />\1<mspace width="0.17em" />', text)
     translator.body.append(f'<div class="math">{text}</div>' if block else text)
     raise nodes.SkipNode
 

@@ -380,6 +380,13 @@ def test_what_was_left_out_would_show_if_it_mattered():
     assert lean == pytest.approx(mb.dynamics(model).forward_dynamics(q, v, [0.0]), rel=1e-14)
 
 
+def test_one_engine_alone_agrees_with_the_reference():
+    model = mb.lagrangian.systems.driven_pendulum().model
+    result = mb.compare(model, ("lagrangian", "mujoco"), 1, terms_only=True)
+    assert result.passed
+    assert f"lagrangian agrees with the {result.reference}" in result.verdict
+
+
 def test_a_refused_body_is_named_and_the_others_are_compared():
     with pytest.warns(mb.errors.NonPhysicalWarning):
         model = mb.load("icub")

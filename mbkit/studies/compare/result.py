@@ -189,7 +189,8 @@ class Comparison(ResultTable):
             return f"nothing compared: {self.nothing}"
         missing = "".join(f"; {x}" for x in self.shortened)
         if self.passed:
-            return f"{', '.join(self.engines)} agree to {self.digits:.1f} digits{missing}"
+            agree = "agree" if len(self.engines) > 1 else f"agrees with the {self.reference}"
+            return f"{', '.join(self.engines)} {agree} to {self.digits:.1f} digits{missing}"
         known: dict[tuple[str, str], list[str]] = {}
         for r in self.rows:
             if r.defect:
