@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from jupyter_cache import get_cache
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.domains.python import PyObject
@@ -101,6 +102,8 @@ def setup(app: Sphinx) -> None:
     for field in PyObject.doc_field_types:
         if isinstance(field, TypedField):
             field.typerolename = ""
+    # Pages are read side by side, and each process would make the cache of their cells.
+    get_cache(Path(app.outdir).parent / ".jupyter_cache").list_cache_records()
     app.add_html_math_renderer(
         "mathml",
         (lambda self, node: _mathml(self, node, block=False), None),
