@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from mbkit.report import explain_view, figures, work_precision_view
+from mbkit.report import compare_view, explain_view, figures, work_precision_view
 from mbkit.report import page as pages
 from mbkit.studies.importers.result import Parsed, ParserComparison, Stage
 from tests import test_report as examples
@@ -69,6 +69,8 @@ def test_a_long_list_of_what_is_missing_is_a_number_in_the_sentence() -> None:
     shown = work_precision_view.view(examples.replace(examples.STUDY, refusals=tuple(many)))
     assert "; 9 curves left out; horizon" in shown.sentence
     assert "method_number_8" in shown.verdict
+    whole = examples.replace(examples.AGREEING, precision=shown.result)
+    assert "; error against run time: 9 curves left out; " in compare_view.view(whole).sentence
 
 
 @pytest.mark.parametrize("kind", PAGES)

@@ -92,9 +92,8 @@ def headline(result: Comparison) -> str:
     engines = dict.fromkeys([*(r.engine for r in rows), *(r.engine for r in runs)])
     known = [r.engine for r in rows if r.defect]
     by_defect = f" ({len(known)} by a known defect of {', '.join(dict.fromkeys(known))})" if known else ""
-    missing = "".join(f"; {x}" for x in result.shortened)
     subject = f"{', '.join(engines)} differ{'s' * (len(engines) == 1)}: " if engines else ""
-    return f"{subject}{', '.join(parts)}{by_defect}{missing}"
+    return f"{subject}{', '.join(parts)}{by_defect}{brief(result.shortened)}"
 
 
 def _sentence(result: Comparison) -> str:

@@ -71,7 +71,7 @@ def choice(value: Any) -> str:
 
 def brief(missing: Iterable[str]) -> str:
     """Return what a study left out, to follow a sentence; of long lists their number alone, as they stand below."""
-    return "".join(f"; {x if len(x) <= _LISTED else x.partition(':')[0]}" for x in missing)
+    return "".join(f"; {x if len(x) <= _LISTED else x.rpartition(':')[0] or x}" for x in missing)
 
 
 def refusals(those: Iterable[Refusal]) -> list[Bullet]:
