@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 @click.option("--duration", default=1.0, show_default=True, type=float, help="Length of the motion, s.")
 @click.option("--dt", type=float, help="Step of a fixed-step method, s.  [default: 1e-3]")
 @click.option("--rtol", type=float, help="Tolerance of an adaptive method.  [default: 1e-10]")
-@click.option(
-    "--q0", default="neutral", show_default=True, metavar="STATE", help="neutral, random:SEED or numbers: 1,-0.5"
-)
+@click.option("--q0", default="neutral", show_default=True, metavar="STATE", help="neutral, random:SEED or 1,-0.5.")
 @click.option("--v0", default="neutral", show_default=True, metavar="STATE", help="Its velocity; neutral is rest.")
 @click.option("--save", type=click.IntRange(min=1), metavar="N", help="Keep the start and N more states, evenly.")
 @shared.load_options
