@@ -20,8 +20,12 @@ if TYPE_CHECKING:
     from typing import Any
 
     from mbkit import catalog as catalog
+    from mbkit import engines as engines
     from mbkit import errors as errors
     from mbkit import lagrangian as lagrangian
+    from mbkit import model as model
+    from mbkit import spatial as spatial
+    from mbkit import studies as studies
     from mbkit import testing as testing
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
@@ -67,9 +71,13 @@ _HOME = {
 _MODULES = {
     "baseline": "mbkit.studies.baseline",
     "catalog": "mbkit.catalog",
+    "engines": "mbkit.engines",
     "errors": "mbkit.errors",
     "lagrangian": "mbkit.lagrangian",
+    "model": "mbkit.model",
     "simulate": "mbkit.simulate",
+    "spatial": "mbkit.spatial",
+    "studies": "mbkit.studies",
     "testing": "mbkit.testing",
 }
 

@@ -182,6 +182,13 @@ def test_plots_draw_into_a_users_axes_and_nowhere_else() -> None:
         figure.canvas.draw()
 
 
+def test_coordinates_of_a_system_on_paper_are_not_called_lengths() -> None:
+    run = simulate(mb.lagrangian.systems.pendulum().dynamics(), [0.5], [0.0], 0.1)
+    labels = [ax.get_ylabel() or ax.get_title(loc="left") or ax.get_title() for ax in run.plot().axes]
+    assert any("coordinates (SI)" in label for label in labels), labels
+    assert not any("lengths" in label for label in labels)
+
+
 def test_a_run_is_drawn_into_a_subfigure() -> None:
     figure = Figure(layout="constrained")
     left, right = figure.subfigures(1, 2)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 from tests import referee
@@ -20,3 +22,11 @@ def test_the_referee_sees_what_changes():
     before = {"a": {"b": [1, 2]}, "c": "x"}
     assert list(referee.differences(before, {"a": {"b": [1, 2]}, "c": "x"})) == []
     assert list(referee.differences(before, {"a": {"b": [1, 3]}, "d": 1})) == ["/a/b/1: 2 -> 3", "/c: gone", "/d: new"]
+
+
+def test_each_part_of_the_package_is_there_without_an_import_of_its_own():
+    code = (
+        "import mbkit; print(*(type(getattr(mbkit, n)).__name__ for n in ('engines', 'model', 'spatial', 'studies')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["module"] * 4

@@ -212,7 +212,7 @@ def _subtract(x: dict[int, Any], factor: Any, y: dict[int, Any]) -> None:
 
 # Where it is taken: D_k comes from an orthogonal factorization B = QR, T = ½ |B v|².
 
-#: Largest M_kk/D_k of the LᵀDL factorization, some 6 of 16 digits. Robots as their files describe them are below 1e5.
+#: Largest M_kk/D_k of the LᵀDL factorization, some 6 of 16 digits.
 _MAX_RATIO: Final = 5e5
 #: Largest count of multiplications of the sparse LᵀDL, some n³/3 for a chain: the orthogonal elimination takes several
 #: times as many, which doubles forward dynamics of 16 links.

@@ -34,7 +34,9 @@ _SIZES: Final[dict[str, Any]] = {"axes.grid": True, "font.size": 9.0, "lines.lin
 
 def _panels(model: Model) -> list[tuple[tuple[str, str, str], list[int], list[int]]]:
     """Return (title, unit, unit of velocities), coordinates and velocities of each unit that there is."""
-    titles = ("lengths", "m", "m/s"), ("angles", "rad", "rad/s"), ("quaternions", "1", "rad/s")
+    # A system on paper does not say which of its coordinates are angles.
+    plain = ("lengths", "m", "m/s") if model.has_bodies else ("coordinates", "SI", "SI")
+    titles = plain, ("angles", "rad", "rad/s"), ("quaternions", "1", "rad/s")
     of_q: tuple[list[int], ...] = ([], [], [])
     of_v: tuple[list[int], ...] = ([], [], [])
     for joint in model.independent_joints:
