@@ -6,6 +6,7 @@ import atexit
 import os
 import re
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,8 @@ html_show_sourcelink = False
 # For cells: where the repository is, and figures as SVG.
 os.environ["MBKIT_TOP"] = str(Path(__file__).resolve().parent.parent)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ["MBKIT_TOP"], os.environ.get("PYTHONPATH"))))
+# Cells run commands of this environment, which need not be activated.
+os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
 _profile = Path(os.environ.setdefault("IPYTHONDIR", tempfile.mkdtemp(prefix="mbkit-book-"))) / "profile_default"
 if not _profile.exists():
     _profile.mkdir()
