@@ -74,7 +74,8 @@ def test_everything_from_a_cold_start(tmp_path):
     made = subprocess.run(
         [sys.executable, "-m", "mbkit", "check", "panda", "--out", "out"],
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "PYTHONIOENCODING": "ascii"},
+        env=os.environ
+        | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "PYTHONIOENCODING": "ascii", "MBKIT_COMPILE": "1"},
         capture_output=True,
         timeout=120,
     )

@@ -36,7 +36,8 @@ def test_it_evaluates_and_simulates(engine):
     assert run.q[-1] == pytest.approx(other.q[-1], rel=1e-9)
 
 
-def test_it_is_compared_and_shown(engine):
+def test_it_is_compared_and_shown(engine, monkeypatch):
+    monkeypatch.setenv("MBKIT_COMPILE", "1")
     result = mb.compare(PENDULUM, ("lagrangian", engine), 2)
     assert result.passed
     assert {r.engine for r in result.rows} >= {engine}

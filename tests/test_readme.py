@@ -34,6 +34,7 @@ def test_it_is_short():
 
 
 def test_python_blocks_run_in_their_order(tmp_path, monkeypatch):
+    monkeypatch.setenv("MBKIT_COMPILE", "1")
     monkeypatch.chdir(tmp_path)
     blocks = [code for language, code in BLOCKS if language == "python"]
     assert len(blocks) == 3
