@@ -177,3 +177,12 @@ def test_the_splitter_counts_what_is_read():
     assert list(sentences("```{code-cell} ipython3\nlong = 'code. is not read'\n```\n\nRead, e.g. here.")) == [
         "Read, e.g here."
     ]
+
+
+def test_each_figure_of_a_notebook_has_a_text_for_those_who_do_not_see_it():
+    notebooks = sorted((BOOK / "examples").glob("*.ipynb"))
+    assert notebooks
+    for path in notebooks:
+        for cell in json.loads(path.read_text("utf-8"))["cells"]:
+            if any("image/svg+xml" in output.get("data", {}) for output in cell.get("outputs", [])):
+                assert len(cell["metadata"]["mystnb"]["image"]["alt"]) > 20, path.name

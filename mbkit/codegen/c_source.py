@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -247,8 +247,8 @@ class CSource:
     name: str
     digest: str
     functions: tuple[CFunction, ...]
-    header: str
-    source: str
+    header: str = field(repr=False)
+    source: str = field(repr=False)
     versions: dict[str, str]
 
     def write(self, folder: str | Path, *, force: bool = False) -> tuple[Path, Path]:

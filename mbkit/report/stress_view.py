@@ -541,7 +541,10 @@ def view(result: StressResult) -> Document:
             Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
         ],
         result=result,
-        basis={name: choice(value) for name, value in result.settings.items()},
+        basis={
+            name: f"{value / 2**30:g} GiB" if name == "memory" and value else choice(value)
+            for name, value in result.settings.items()
+        },
         template="stress.html",
         content=lambda: content(result),
     )
