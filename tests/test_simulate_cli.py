@@ -123,6 +123,7 @@ BAD = [
     (["plot", "list.json"], "list.json: expected the CSV of mbkit simulate"),
     (["plot", "half.json"], "half.json: "),
     (["plot", "half.json", "--case", "x"], "for --case"),
+    (["plot", "other.csv", "below/other.csv", "--out", "figures"], "different names"),
 ]
 
 

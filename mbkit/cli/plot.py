@@ -36,6 +36,9 @@ def plot(files: tuple[Path, ...], case: str | None, ending: str, out: Path | Non
 
     stems = [(f"{file.stem}-{case}" if case else file.stem) for file in files]
     folders = [out or file.parent for file in files]
+    if len({*zip(folders, stems, strict=True)}) < len(files):
+        names = ", ".join(map(str, files))
+        raise InputError(f"FILE...: expected files whose figures have different names, got {names}; plot them apart")
     for folder, stem in zip(folders, stems, strict=True):
         check_writable(folder)
         check_replaceable(folder, f"{stem}.{ending}", force=force)
