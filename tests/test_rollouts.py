@@ -18,7 +18,7 @@ from mbkit import catalog
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import Equations
 from mbkit.derivation.steps.fixed import march, march_in_stages, step
-from mbkit.engines import dynamics
+from mbkit.engines import compiled_calls, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import MbkitWarning, UnknownNameError
 from mbkit.model import Model, ModelBuilder
@@ -68,8 +68,10 @@ def planar() -> LagrangianDynamics:
 
 @pytest.fixture
 def in_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled_fixed_step, "_ONE_PIECE", 0)
-    monkeypatch.setattr(compiled_fixed_step, "_plan", compiled_fixed_step.Plan)
+    monkeypatch.setattr(compiled_calls, "_ONE_PIECE", 0)
+    monkeypatch.setattr(
+        LagrangianDynamics, "step_plan", lambda dyn, method: compiled_calls.Plan(dyn.equations, method, dyn._part)
+    )
 
 
 def start(dyn: LagrangianDynamics, n: int | None = None, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -191,7 +193,7 @@ def test_rollouts_in_stages_are_the_stepwise_runs(method: str, floating: Lagrang
     tau = np.random.default_rng(1).standard_normal((11, 50, floating.model.nv))
     run = simulate(floating, q, v, 0.05, method, torque=tau)
     assert_same(run, stepwise(floating, q, v, 0.05, method, torque=tau))
-    assert len(compiled_fixed_step._plan(floating, method).parts) > 1
+    assert len(floating.step_plan(method).parts) > 1
 
 
 def test_robots_are_mujocos_rollouts() -> None:
@@ -253,13 +255,13 @@ def test_no_bit_depends_on_neighbours_or_threads(
     q, v = start(floating, n)
     runs = []
     for widest, workers in ((1032, 1), (1032, 2), (72, 1), (72, 3), (8, 5)):
-        monkeypatch.setattr(compiled_fixed_step.Plan, "widest", widest)
+        monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _: widest)
         runs.append(outcome(floating, q, v, workers))
     for other in runs[1:]:
         assert np.array_equal(other.q, runs[0].q)
         assert np.array_equal(other.v, runs[0].v)
     order = np.random.default_rng(0).permutation(n)
-    monkeypatch.setattr(compiled_fixed_step.Plan, "widest", 40)
+    monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _: 40)
     shuffled = simulate(floating, q[order], v[order], 0.02)
     assert np.array_equal(shuffled.q, simulate(floating, q, v, 0.02).q[order])
     assert np.array_equal(simulate(floating, q[-1], v[-1], 0.02).v, simulate(floating, q, v, 0.02).v[-1])
@@ -358,7 +360,7 @@ def test_a_model_that_cannot_move_says_who_is_to_blame() -> None:
 
 def test_progress_is_told_up_to_the_end(planar: LagrangianDynamics, monkeypatch: pytest.MonkeyPatch) -> None:
     q, v = start(planar, 40)
-    monkeypatch.setattr(compiled_fixed_step.Plan, "widest", 8)
+    monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _: 8)
     monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
     for threads in (1, 2):
         told: list[float] = []
@@ -378,7 +380,7 @@ def test_an_error_in_the_callers_function_stops_the_threads(
         raise StopError
 
     q, v = start(planar, 40)
-    monkeypatch.setattr(compiled_fixed_step.Plan, "widest", 8)
+    monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _: 8)
     monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
     for threads in (1, 2):
         dyn = dynamics(planar.model, "lagrangian", compile=True, threads=threads)

@@ -30,19 +30,23 @@ _DOUBLE: Final = ir.DoubleType()
 _POINTER: Final = ir.PointerType()
 
 
-class _Builder(ir.IRBuilder):  # type: ignore[misc]  # llvmlite is not typed
+class Builder(ir.IRBuilder):  # type: ignore[misc]  # llvmlite is not typed
     """Loads, stores and counted loops over opaque pointers."""
 
     def at(self, pointer: Any, index: Any, kind: Any = _DOUBLE) -> Any:
+        """Return the address of an element."""
         return self.gep(pointer, [index], source_etype=kind)
 
     def get(self, pointer: Any, index: Any, kind: Any = _DOUBLE) -> Any:
+        """Load an element of eight bytes."""
         return self.load(self.at(pointer, index, kind), typ=kind, align=8)
 
     def set(self, value: Any, pointer: Any, index: Any, kind: Any = _DOUBLE) -> None:
+        """Store an element of eight bytes."""
         self.store(value, self.at(pointer, index, kind), align=8)
 
     def room(self, kind: Any, size: int) -> Any:
+        """Return the address of an array on the stack."""
         # llvmlite gives it a typed pointer, which it would not mix with the others.
         return self.inttoptr(self.ptrtoint(self.alloca(ir.ArrayType(kind, size)), _I64), _POINTER)
 
@@ -62,15 +66,15 @@ class _Builder(ir.IRBuilder):  # type: ignore[misc]  # llvmlite is not typed
         self.position_at_end(after)
 
 
-def _function(module: ir.Module, name: str, *arguments: Any) -> tuple[Any, _Builder]:
+def _function(module: ir.Module, name: str, *arguments: Any) -> tuple[Any, Builder]:
     f = ir.Function(module, ir.FunctionType(ir.VoidType(), list(arguments)), name)
     f.attributes.add("nounwind")
     # Copied into every place of use they would take longer to compile than most bodies.
     f.attributes.add("noinline")
-    return f, _Builder(f.append_basic_block("entry"))
+    return f, Builder(f.append_basic_block("entry"))
 
 
-def _transposed(b: _Builder, vectors: list[Any], width: int) -> list[Any]:
+def _transposed(b: Builder, vectors: list[Any], width: int) -> list[Any]:
     """Transpose the square blocks of a list of vectors as long as a block's side."""
     side, vectors = len(vectors), list(vectors)
     step = 1
@@ -85,7 +89,7 @@ def _transposed(b: _Builder, vectors: list[Any], width: int) -> list[Any]:
     return vectors
 
 
-def _joined(b: _Builder, parts: list[Any]) -> Any:
+def _joined(b: Builder, parts: list[Any]) -> Any:
     """Return short vectors one after another in a long one."""
     while len(parts) > 1:
         n = parts[0].type.count
@@ -94,7 +98,7 @@ def _joined(b: _Builder, parts: list[Any]) -> Any:
     return parts[0]
 
 
-def _blocks(b: _Builder, rows: Any, side: int, body: Any) -> None:
+def _blocks(b: Builder, rows: Any, side: int, body: Any) -> None:
     """Run ``body(j)`` over blocks of ``side`` rows; the last one may overlap."""
     last = b.sub(rows, _I64(side))
 

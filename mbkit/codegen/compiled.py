@@ -65,10 +65,11 @@ class Compiled:
         self.shapes = tuple((r, c) for r, c in about["shapes"])
         self.operations = int(about["operations"])
         self.loaded = jit.load(_batch_object(), code)
-        self._share = int(about["work"])
+        #: Doubles of work space of the body alone.
+        self.share = int(about["work"])
         tiles = sum(self.inputs) + sum(rows * columns for rows, columns in self.shapes)
         #: Doubles of work space that a call needs.
-        self.work_size = self._share + tiles * jit.host().width
+        self.work_size = self.share + tiles * jit.host().width
         self._local = threading.local()
 
     def __call__(self, *arguments: Array, threads: int | None = None) -> list[Array]:
@@ -139,27 +140,10 @@ class Compiled:
 
     def table(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Array:
         """Return the table of these arrays that the code reads; they must outlive its use."""
-        table = [len(inputs), len(outputs), self._share]
+        table = [len(inputs), len(outputs), self.share]
         for x in (*inputs, *outputs):
             table += [x.ctypes.data, x.shape[1], x.strides[1] >> 3, x.strides[0] >> 3]
         return np.array(table, dtype=np.int64)
-
-    def bound(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> tuple[Callable[[], None], Array]:
-        """Return a call that reads and writes these very (N, n) arrays, and a flag, for many calls of few states.
-
-        One thread may be in the call at a time. The flag is zero until a number read or written is not finite; it may
-        be reset.
-        """
-        table, work = self.table(inputs, outputs), aligned(self.work_size)
-        watch = work[: jit.host().width]
-        watch[:] = 0.0
-        run, last = self.loaded.run, inputs[0].shape[0]
-        at, scratch = table.ctypes.data, work.ctypes.data
-
-        def call(_kept: Any = (self, table, work, inputs, outputs)) -> None:
-            run(at, scratch, 0, last)
-
-        return call, watch
 
 
 @cache

@@ -12,9 +12,14 @@ from typing import Any, ClassVar, Final, NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, all_finite, batch_of
+from mbkit._check import Array, all_finite, batch_of, real
 from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
+from mbkit.methods.registry import DEFAULT_METHOD, Method, explicit_method
+from mbkit.methods.tableaus import Tableau
 from mbkit.model import Frame, Joint, Model
+from mbkit.model.integration_space import Space
+from mbkit.model.manifold import NEAR_UNIT
 
 QUANTITIES: Final = (
     *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
@@ -23,8 +28,6 @@ QUANTITIES: Final = (
 
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
-#: Largest error of a quaternion's squared norm that fast calls take.
-NEAR_UNIT: Final = 1e-9
 #: Names in a list of an error message.
 _MAX_NAMES: Final = 3
 
@@ -79,6 +82,14 @@ class ForwardDynamicsDerivatives(NamedTuple):
     v: Array
     #: ∂v̇/∂τ, the inverse of the mass matrix.
     tau: Array
+
+
+class _NotFiniteError(Exception):
+    """A stage has a state or acceleration that is not finite; its argument is which samples are, as far as known."""
+
+
+def _finite_rows(q: Array, v: Array) -> Array:
+    return np.asarray(np.isfinite(q).all(axis=-1) & np.isfinite(v).all(axis=-1))
 
 
 def scalar(value: Array) -> Any:
@@ -296,6 +307,107 @@ class Dynamics:
         not known to amplify.
         """
         return None
+
+    # Steps
+
+    def step(
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, dt: float, method: str = DEFAULT_METHOD
+    ) -> tuple[Array, Array]:
+        """Return (q, v) after one step of length dt, with the force τ held: for control loops and environments.
+
+        There is no record and no check of the run; `mbkit.simulate` has them, and every other method.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+            Units m and rad, quaternions of unit length, as are those of the result.
+        v, tau : (nv,) or (N, nv) array_like
+            Velocity and generalized force. One state beside a batch is repeated.
+        dt : float
+            s, above 0.
+        method : str
+            An explicit one with a fixed step: ``"rk4"``, ``"semi_implicit_euler"``, or an explicit tableau of
+            `mbkit.simulate.register_method`.
+
+        Returns
+        -------
+        q, v : (nq,) and (nv,), or (N, nq) and (N, nv) arrays
+            New ones. They are those of ``mbkit.simulate(dyn, q, v, dt, method, dt, torque=tau)``: the same bits, but on
+            the lagrangian engine with a free joint or quasi-velocities the same up to rounding.
+
+        Raises
+        ------
+        InputError
+            A wrong shape, state, force or step.
+        NumericalError
+            The state after the step, or an acceleration on the way, is not finite.
+        UnknownNameError
+            No method of this name.
+        UnsupportedError
+            A method without an explicit step; a model with constraints or motions prescribed in time.
+
+        Notes
+        -----
+        On the lagrangian engine the step is the same machine code as in `mbkit.simulate`: microseconds for a state, and
+        batches are shared among threads. The first step of a model compiles it. Other engines, ``compile=False`` and
+        models too large to be written out evaluate the forward dynamics stage by stage, by the same formulas.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum())
+        >>> q, v = [1.0], [0.0]
+        >>> for _ in range(1000):
+        ...     q, v = dyn.step(q, v, [0.0], dt=1e-3)
+        >>> run = mb.simulate(dyn, [1.0], [0.0], duration=1.0, dt=1e-3)
+        >>> bool(q == run.q[-1])
+        True
+        """
+        chosen, h = explicit_method(method), real("dt", dt, positive=True)
+        for has, feature in (
+            (self.model.constrained, "constraints"),
+            (self.model.time_parameter, "motions prescribed in time"),
+        ):
+            if has:
+                raise UnsupportedError(f"step: {self.model.name} has {feature}; use mbkit.simulate, which follows them")
+        self._method("forward_dynamics")
+        states, _ = self._states({"q": q, "v": v, "tau": tau})
+        # An overflow is reported as an error.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            try:
+                q1, v1 = self._step(chosen, **states, dt=h)
+                good = _finite_rows(q1, v1)
+            except _NotFiniteError as error:
+                good = error.args[0]
+        if not good.all():
+            # A mass matrix that is singular at the start has a message of its own.
+            self.forward_dynamics(**states)
+            sample = f" in sample {int(np.argmin(good))}" if good.ndim else ""
+            raise NumericalError(
+                f"{self.engine}: step of {self.model.name} by {chosen.name}: the state is not finite{sample} after "
+                f"dt = {h:g} s; take shorter steps, or look at the accelerations of forward_dynamics(q, v, tau)"
+            )
+        return q1, v1
+
+    def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
+        """Return the state after a step, stage by stage."""
+        space, formula = Space(self.model), method.formula
+        assert isinstance(formula, (Tableau, SemiImplicitEuler))
+        w = space.to_integrator_velocity(q, v)
+
+        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:  # noqa: ARG001  # no time
+            v = space.to_body_velocity(q, w)
+            if not (good := _finite_rows(q, v)).all():
+                raise _NotFiniteError(good)
+            try:
+                a = self.forward_dynamics(q, v, tau)
+            except NumericalError:
+                # Its message would blame the model for a state that has grown beyond all bounds.
+                raise _NotFiniteError(np.array(False)) from None
+            return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
+
+        q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), 0.0, dt, q, w)
+        return q1, space.to_body_velocity(q1, w1)
 
     # Quantities that follow from others
 

@@ -2,102 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from functools import cached_property
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable
+from functools import cached_property, wraps
+from inspect import signature
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, count, finite_array
+from mbkit._check import Array, count, finite_array, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.equations import Equations, equations_of
 from mbkit.derivation.least_constraint import loses_digits
 from mbkit.derivation.mass_matrix_solve import elimination_size
-from mbkit.engines.base import NEAR_UNIT, Dynamics, scalar, unit_quaternions
+from mbkit.engines.base import Dynamics, scalar
 from mbkit.errors import InputError, UnknownNameError
+from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Model
 
 if TYPE_CHECKING:
-    from mbkit.codegen.compiled import Compiled
+    from mbkit.derivation.steps.fixed import Part
+    from mbkit.engines.compiled_calls import CompiledStep, Plan, QuantityCall
 
-# Fast calls of machine code, without the checks of `Dynamics`
-#
-# The code itself finds NaN and infinity in all that it reads and writes. A fast call returns None for arguments that it
-# does not take, and `Dynamics` repeats the call with its checks and messages.
-
-_FLOAT: Final = np.dtype(np.float64)
-Call = Callable[..., Any]
-
-
-def _fast_call(model: Model, code: Compiled, trim: Callable[[Array], Array], threads: int | None) -> Call:
-    """Return a call for float64 arrays that are one state or one batch; None is its answer to all else.
-
-    `code` has one result and q as its first argument; `trim` gives (rows, columns) or (N, rows, columns) the
-    quantity's shape.
-    """
-    single = _single_call(code, trim)
-    sizes = code.inputs
-    starts = tuple(start for start, _ in model.quaternions)
-    ones = [(n,) for n in sizes]
-
-    def call(*given: Any) -> Any:
-        # A subclass may be masked, and `is` would refuse the dtype of an array that was unpickled.
-        if not all(type(x) is np.ndarray and x.dtype == _FLOAT for x in given):
-            return None
-        shapes = [x.shape for x in given]
-        if shapes == ones:
-            return single(given) if not starts or unit_quaternions(given[0], starts) else None
-        n = shapes[0][0] if shapes[0] else 0
-        if shapes != [(n, size) for size in sizes] or (starts and not _all_unit(given[0], starts)):
-            return None
-        results, finite = code.call_checked(*given, threads=threads)
-        return trim(results[0]) if finite else None
-
-    return call
-
-
-def _single_call(code: Compiled, trim: Callable[[Array], Array]) -> Callable[[tuple[Any, ...]], Any]:
-    ends = np.cumsum([0, *code.inputs]).tolist()
-    parts = [slice(a, b) for a, b in pairwise(ends)]
-    rows, columns = code.shapes[0]
-
-    def place() -> tuple[Any, ...]:
-        given, out = np.zeros((1, ends[-1])), np.zeros((1, rows * columns))
-        run, watch = code.bound([given[:, part] for part in parts], [out])
-        return [given[0, part] for part in parts], run, watch, trim(out.reshape(rows, columns)).copy
-
-    # A place belongs to one call at a time. No call waits for a place: a forked child would wait for ever
-    # if another thread held it at the fork.
-    free = [place()]
-
-    def call(arguments: tuple[Any, ...]) -> Any:
-        try:
-            held = free.pop()
-        except IndexError:
-            held = place()
-        views, run, watch, copy = held
-        try:
-            for view, x in zip(views, arguments, strict=True):
-                view[:] = x
-            run()
-            if watch[0] != 0.0:
-                watch[:] = 0.0
-                return None
-            return copy()
-        finally:
-            free.append(held)
-
-    return call
-
-
-def _all_unit(q: Array, starts: tuple[int, ...]) -> bool:
-    parts = (q[:, start : start + 4] for start in starts)
-    # A NaN is not below anything.
-    return all((np.abs(np.einsum("ni,ni->n", x, x) - 1.0) < NEAR_UNIT).all() for x in parts)
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def _column(name: str, value: ArrayLike) -> Array:
@@ -118,6 +47,27 @@ _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
     ),
     **dict.fromkeys(("kinetic_energy", "potential_energy", "energy_rate"), lambda x: x[..., 0, 0]),
 }
+
+
+def _quick(checked: _Function) -> _Function:
+    """Return this method of `Dynamics`, which first tries machine code with the arguments as they are.
+
+    A common one with *arguments would cost 0.2 µs a call.
+    """
+    name, arguments = checked.__name__, ", ".join([*signature(checked).parameters][1:])
+    text = f"""
+def {name}(self, {arguments}):
+    short = self._short.get("{name}")
+    if short is not None and not self._parametric:
+        single, shape, batch = short
+        out = empty(shape)
+        if single({arguments}, out) or (out := batch({arguments})) is not None:
+            return {"scalar(out)" if name.endswith("energy") else "out"}
+    return checked(self, {arguments})
+"""
+    scope: dict[str, Any] = {"checked": checked, "empty": np.empty, "scalar": scalar, "__name__": __name__}
+    exec(text, scope)
+    return wraps(checked)(scope[name])  # type: ignore[return-value]  # of the same signature
 
 
 def _term(name: str) -> Callable[..., Any]:
@@ -160,7 +110,9 @@ class LagrangianDynamics(Dynamics):
         #: Values of parameters that differ from sample to sample, (N,) each; the others are in the model.
         self._batched: dict[str, Array] = {}
         self._machines: dict[tuple[str, ...], Any] = {}
-        self._short: dict[str, Callable[..., Any]] = {}
+        self._short: dict[str, QuantityCall] = {}
+        self._steps: dict[str, tuple[Method, CompiledStep]] = {}
+        self._parametric = bool(model.parameters)
 
     @cached_property
     def equations(self) -> Equations:
@@ -206,7 +158,10 @@ class LagrangianDynamics(Dynamics):
             with DERIVING:
                 code = executable((self.form, *key), derive, compile=self.compile)
             if name in _TRIM and not isinstance(code, Machine):
-                self._short[name] = _fast_call(self.model, code, _TRIM[name], self.threads)
+                # Loads LLVM, which interpreting never needs.
+                from mbkit.engines.compiled_calls import quantity_call
+
+                self._short[name] = quantity_call(self.model, code, _TRIM[name], self.threads)
             self._machines[key] = code
         return self._machines[key]
 
@@ -294,13 +249,17 @@ class LagrangianDynamics(Dynamics):
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
         short = self._short.get(quantity)
         if short is not None:
-            own: Iterable[Any] = arguments.values()
-            if self.model.parameters:
-                own = (*own, *self._trailing(arguments["q"]))
-            out: Array | None = short(*own)
-            if out is not None:
+            own = (*arguments.values(), *self._trailing(arguments["q"])) if self._parametric else arguments.values()
+            out = np.empty(short.shape)
+            if short.single(*own, out) or (out := short.batch(*own)) is not None:
                 return out
         return super()._evaluate(quantity, *more, **arguments)
+
+    mass_matrix, coriolis_matrix = _quick(Dynamics.mass_matrix), _quick(Dynamics.coriolis_matrix)
+    coriolis_force, gravity = _quick(Dynamics.coriolis_force), _quick(Dynamics.gravity)
+    nle, passive = _quick(Dynamics.nle), _quick(Dynamics.passive)
+    inverse_dynamics, forward_dynamics = _quick(Dynamics.inverse_dynamics), _quick(Dynamics.forward_dynamics)
+    kinetic_energy, potential_energy = _quick(Dynamics.kinetic_energy), _quick(Dynamics.potential_energy)
 
     def _trimmed(self, name: str, *arguments: Array) -> Array:
         return _TRIM[name](self._machine(name)(*arguments)[0])
@@ -338,6 +297,56 @@ class LagrangianDynamics(Dynamics):
             return self._trimmed("forward_dynamics", q, v, tau)
         M, f = self._machine("mass_and_force")(q, v)
         return np.asarray(np.linalg.solve(M, f + tau[..., None])[..., 0])
+
+    # Steps
+
+    @property
+    def compiles_steps(self) -> bool:
+        """Whether whole steps are machine code: written out, with a compiler, without constraints or a time."""
+        model = self.model
+        # A compiled step has one value of each parameter, the time among them, and looks for no constraints behind it.
+        if not model.nv or model.constrained or model.time_parameter or not self.written_out:
+            return False
+        return not isinstance(self.code("forward_dynamics"), Machine)
+
+    def step_plan(self, method: str) -> Plan:
+        """Return the compiled parts of an explicit method's step; `compiles_steps` says whether there are some."""
+        from mbkit.engines.compiled_calls import Plan
+
+        plans: dict[str, Plan] = self.equations.kept.setdefault("rollout", {})
+        name = METHODS[method].code_name
+        if name not in plans:
+            plans[name] = Plan(self.equations, method, self._part)
+        return plans[name]
+
+    def _part(self, part: Part) -> Any:
+        return self.code(part.name, make=part.make)
+
+    def step(
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, dt: float, method: str = DEFAULT_METHOD
+    ) -> tuple[Array, Array]:
+        """Return (q, v) after one step, as `Dynamics.step` does; as machine code where `simulate` compiles the step."""
+        held = self._steps.get(method) if type(method) is str else None
+        if type(dt) is not float:
+            dt = real("dt", dt)
+        # Another method may have been registered by this name.
+        if held is not None and held[0] is METHODS.get(method) and dt > 0:
+            behind = self._trailing(q) if self._parametric else ()
+            out: tuple[Array, Array] | None = held[1].single(q, v, tau, dt, *behind)
+            if out is not None:
+                return out
+        return super().step(q, v, tau, dt, method)
+
+    def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
+        if not self.compiles_steps:
+            return super()._step(method, q, v, tau, dt)
+        held = self._steps.get(method.name)
+        if held is None or held[0] is not method:
+            from mbkit.engines.compiled_calls import CompiledStep
+
+            step = CompiledStep(self.model, self.equations, self.step_plan(method.name), self._part)
+            held = self._steps[method.name] = method, step
+        return held[1](q, v, tau, dt, *self._trailing(q), threads=self.threads)
 
     def _pose(self, q: Array, frame: Frame) -> Array:
         return self._machine("pose", frame.name)(q)[0]

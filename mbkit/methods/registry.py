@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.one_step import SemiImplicitEuler
 from mbkit.methods.stability import IMPLICIT_EULER, IMPLICIT_IN_VELOCITY, SYMPLECTIC_EULER, Stability, TableauStability
 from mbkit.methods.tableaus import (
@@ -137,6 +137,11 @@ class Method:
     def runs_compiled(self, *, derived: bool) -> bool:
         """Return whether no evaluation is a call from Python, on an engine with mbkit's own derivation or without."""
         return bool(self.engines) or (self.compiled and derived)
+
+    @property
+    def explicit(self) -> bool:
+        """Whether a fixed step is a formula in which every stage follows from those before."""
+        return self.kind == "fixed" and isinstance(self.formula, (Tableau, SemiImplicitEuler)) and self.formula.explicit
 
     @property
     def code_name(self) -> str:
@@ -281,6 +286,17 @@ def method_of(name: object) -> Method:
     if name not in METHODS:
         raise UnknownNameError("method", name, METHODS)
     return METHODS[name]
+
+
+def explicit_method(name: object) -> Method:
+    """Return the method of this name, whose fixed step must be explicit."""
+    method = method_of(name)
+    if not method.explicit:
+        there = ", ".join(m.name for m in METHODS.values() if m.explicit)
+        raise UnsupportedError(
+            f"step: {method.name} has no explicit fixed step; use {there}, or mbkit.simulate, which has every method"
+        )
+    return method
 
 
 def register_method(method: Method | Tableau) -> Method:

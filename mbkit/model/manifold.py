@@ -11,9 +11,9 @@ from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model.description import Description
 
-# A quaternion is data of the caller: rounding is accepted, a rotation that
-# engines would read differently is not.
-_UNIT = 1e-9
+#: Largest error of a caller's quaternion, in its norm or the square of that: rounding is accepted, a rotation that
+#: engines would read differently is not.
+NEAR_UNIT: Final = 1e-9
 
 
 def check_quaternions(model: Description, q: Array, name: str = "q") -> None:
@@ -21,11 +21,11 @@ def check_quaternions(model: Description, q: Array, name: str = "q") -> None:
     for start, joint in model.quaternions:
         if q.ndim == 1:
             x = q[start : start + 4]
-            if abs(x.dot(x) - 1.0) <= _UNIT:
+            if abs(x.dot(x) - 1.0) <= NEAR_UNIT:
                 continue
         norms = np.linalg.norm(q[..., start : start + 4], axis=-1)
         off = np.abs(norms - 1)
-        if np.any(off > _UNIT):
+        if np.any(off > NEAR_UNIT):
             norm = float(np.ravel(norms)[np.argmax(off)])
             raise InputError(
                 f"{name}: the quaternion of joint {joint!r} ({name}[{start}:{start + 4}], order x, y, z, w) "

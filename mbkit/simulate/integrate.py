@@ -136,14 +136,9 @@ def _compiles(dyn: Dynamics) -> bool:
     if not dyn.derived:
         return False
     # Other engines need no CasADi.
-    from mbkit.codegen.interpreter import Machine
     from mbkit.engines.lagrangian import LagrangianDynamics
 
-    # A compiled step has one value of each parameter, the time among them.
-    if not isinstance(dyn, LagrangianDynamics) or not dyn.model.nv or not dyn.written_out or dyn.model.time_parameter:
-        return False
-    # Nor does it look for constraints after each step.
-    return not dyn.model.constrained and not isinstance(dyn.code("forward_dynamics"), Machine)
+    return isinstance(dyn, LagrangianDynamics) and dyn.compiles_steps
 
 
 @runtime_checkable

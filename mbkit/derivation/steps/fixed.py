@@ -149,6 +149,16 @@ def march(equations: Equations, method: str) -> tuple[Part, ...]:
     return (Part(name, reads, _MARCHED, make),)
 
 
+def velocity_changes(equations: Equations) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
+    """Return the parts before and behind a march from (q, v) to (q1, v1); none where the integrators' w is v."""
+    s, space = _symbols(equations), SymbolicSpace(equations.model)
+    w, v1 = (change(s["q"], s[n]) for change, n in ((space.to_integrator_velocity, "v"), (space.to_body_velocity, "w")))
+    if w is s["v"]:
+        return (), ()
+    before = Part.of("integrator_velocity", {"q": s["q"], "v": s["v"]}, {"w": w})
+    return (before,), (Part.of("body_velocity", {"q1": s["q"], "w1": s["w"]}, {"v1": v1}),)
+
+
 def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
     """Return the same step cut at each evaluation of the forward dynamics.
 

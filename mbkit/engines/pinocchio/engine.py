@@ -17,9 +17,10 @@ import pinocchio as pin
 
 from mbkit._check import Array
 from mbkit.engines import known_defects
-from mbkit.engines.base import NEAR_UNIT, Dynamics, first_names, unit_quaternions
+from mbkit.engines.base import Dynamics, first_names, unit_quaternions
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
 from mbkit.model import Frame, Model
+from mbkit.model.manifold import NEAR_UNIT
 
 # Calls for one state, with the fewest checks that are safe
 #

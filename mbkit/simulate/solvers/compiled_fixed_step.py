@@ -16,9 +16,10 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import Call, Compiled, KernelSequence, aligned, cores
-from mbkit.derivation.steps.fixed import Part, march, march_in_stages
+from mbkit.codegen.compiled import Call, KernelSequence, aligned, cores
+from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import GUESS, MOST, Midpoint
+from mbkit.engines.compiled_calls import Plan
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.registry import method_of
 from mbkit.model.integration_space import Space
@@ -32,9 +33,6 @@ from mbkit.simulate.time_grid import Indices
 #: Largest number of steps between two checks.
 BLOCK: Final = 16
 
-# Above this many operations the forward dynamics is compiled once and called for each stage: LLVM's time grows faster
-# than the step, which then runs no faster than its parts.
-_ONE_PIECE: Final = 20_000
 # Half of what a core has in its second cache.
 _CACHE: Final = 2**19
 _LANES: Final = 8
@@ -191,28 +189,9 @@ def run_parts(
             stop.set()
 
 
-class Plan:
-    """A method's step for one model in machine code: its parts in order, and the rows of each array they use."""
-
-    def __init__(self, dyn: LagrangianDynamics, method: str) -> None:
-        def code(part: Part) -> Compiled:
-            compiled: Compiled = dyn.code(part.name, make=part.make)
-            return compiled
-
-        self.parts = march_in_stages(dyn.equations, method)
-        forward = next(part for part in self.parts if part.name == "forward_dynamics")
-        if method_of(method).stages * code(forward).operations <= _ONE_PIECE:
-            self.parts = march(dyn.equations, method)
-        self.codes = tuple(code(part) for part in self.parts)
-        self.sizes: dict[str, int] = {}
-        for part, own in zip(self.parts, self.codes, strict=True):
-            self.sizes.update(zip(part.reads, own.inputs, strict=True))
-            self.sizes.update(zip(part.writes, (rows for rows, _ in own.shapes), strict=True))
-
-    @property
-    def widest(self) -> int:
-        """States that the cache holds with all that belongs to them, from 72 to 1032."""
-        return min(max(padded(_CACHE // (8 * sum(self.sizes.values()))), 9 * _LANES), _MOST_STATES)
+def _widest(plan: Plan) -> int:
+    """Return how many states the cache holds with all that belongs to them, from 72 to 1032."""
+    return min(max(padded(_CACHE // (8 * sum(plan.sizes.values()))), 9 * _LANES), _MOST_STATES)
 
 
 class Chunk(BlockLoop):
@@ -274,7 +253,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core."""
     dyn, method, grid, record = problem.dyn, problem.method, problem.grid, GridRecord(problem)
     assert isinstance(dyn, LagrangianDynamics)
-    plan, space, n = _plan(dyn, method), Space(dyn.model), len(problem.q)
+    plan, space, n = dyn.step_plan(method), Space(dyn.model), len(problem.q)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
     squares = np.zeros(n)
 
@@ -286,7 +265,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
         return run_blocks(problem, record, chunk, members, ends.tolist())
 
     workers = workers or dyn.threads or cores()
-    parts = _split(n, plan.widest, workers)
+    parts = _split(n, _widest(plan), workers)
     # Every block costs some calls: worth it for a state now and then, not for most.
     dense = 2 * len(record.kept) > grid.steps
 
@@ -304,8 +283,8 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     run_parts(parts, new_worker, workers, grid.steps, problem.bar)
     # A NaN is not below anything.
     suspects, lost = np.flatnonzero(~(squares < BOUND**2)), dict[int, list[Array]]()
-    for first in range(0, len(suspects), plan.widest):
-        members = suspects[first : first + plan.widest]
+    for first in range(0, len(suspects), _widest(plan)):
+        members = suspects[first : first + _widest(plan)]
         for _, last in blocks(new_chunk(len(members), all_kept=True, watched=True), members, members[:0]):
             lost |= last
 
@@ -315,14 +294,6 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
         return divergence_reason(dyn.of_samples([i]), method, grid.time(k), grid.step(k), q[None], w[None], force[None])
 
     return record.result(why, method_of(method).stages * (int(record.steps.sum()) + len(lost)))
-
-
-def _plan(dyn: LagrangianDynamics, method: str) -> Plan:
-    plans: dict[str, Plan] = dyn.equations.kept.setdefault("rollout", {})
-    name = method_of(method).code_name
-    if name not in plans:
-        plans[name] = Plan(dyn, method)
-    return plans[name]
 
 
 def _split(n: int, widest: int, workers: int) -> list[slice]:

@@ -1,0 +1,123 @@
+"""Calls of machine code without the checks of `Dynamics`: quantities, and whole steps of explicit methods.
+
+The code itself finds NaN and infinity in all that it reads and writes. A call says whether it took the arguments; if
+not, `Dynamics` repeats it with its checks and messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.codegen.compiled import Compiled
+from mbkit.codegen.python_call import Step, python_call
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.steps.fixed import Part, march, march_in_stages, velocity_changes
+from mbkit.methods.registry import method_of
+from mbkit.model import Model
+from mbkit.model.manifold import NEAR_UNIT
+
+Call = Callable[..., Any]
+
+_FLOAT: Final = np.dtype(np.float64)
+# Above this many operations the forward dynamics is compiled once and called for each stage: LLVM's time grows faster
+# than the step, which then runs no faster than its parts.
+_ONE_PIECE: Final = 20_000
+
+
+class QuantityCall(NamedTuple):
+    """Calls for float64 arrays: `single` of one state fills an array of `shape`, `batch` returns its result or None."""
+
+    single: Callable[..., bool]
+    shape: tuple[int, ...]
+    batch: Call
+
+
+def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], threads: int | None) -> QuantityCall:
+    """Return the calls of a quantity.
+
+    `code` has one result and q as its first argument; `trim` gives (rows, columns) or (N, rows, columns) the
+    quantity's shape.
+    """
+    sizes, starts = code.inputs, tuple(start for start, _ in model.quaternions)
+    inputs = {f"argument {i}": n for i, n in enumerate(sizes)}
+    single = python_call([(code, [*inputs], ["result"])], inputs, ["result"], starts)
+
+    def batch(*given: Any) -> Any:
+        # A subclass may be masked, and `is` would refuse the dtype of an array that was unpickled.
+        if not all(type(x) is np.ndarray and x.dtype == _FLOAT for x in given):
+            return None
+        shapes = [x.shape for x in given]
+        n = shapes[0][0] if shapes and shapes[0] else 0
+        if shapes != [(n, size) for size in sizes] or not _all_unit(given[0], starts):
+            return None
+        results, finite = code.call_checked(*given, threads=threads)
+        return trim(results[0]) if finite else None
+
+    return QuantityCall(single, trim(np.empty(code.shapes[0])).shape, batch)
+
+
+def _all_unit(q: Array, starts: tuple[int, ...]) -> bool:
+    parts = (q[:, start : start + 4] for start in starts)
+    # A NaN is not below anything.
+    return all((np.abs(np.einsum("ni,ni->n", x, x) - 1.0) < NEAR_UNIT).all() for x in parts)
+
+
+class Plan:
+    """An explicit method's step for one model in machine code: its parts in order, and the rows of what they use.
+
+    `code` compiles a part.
+    """
+
+    def __init__(self, equations: Equations, method: str, code: Callable[[Part], Compiled]) -> None:
+        self.parts = march_in_stages(equations, method)
+        forward = next(part for part in self.parts if part.name == "forward_dynamics")
+        if method_of(method).stages * code(forward).operations <= _ONE_PIECE:
+            self.parts = march(equations, method)
+        self.codes = tuple(code(part) for part in self.parts)
+        self.sizes: dict[str, int] = {}
+        for part, own in zip(self.parts, self.codes, strict=True):
+            self.sizes.update(zip(part.reads, own.inputs, strict=True))
+            self.sizes.update(zip(part.writes, (rows for rows, _ in own.shapes), strict=True))
+
+
+class CompiledStep:
+    """A step from (q, v) to (q, v) by the code of a plan, which carries along the integrators' own velocity.
+
+    `single` takes q, v, tau, dt as a Python float, and the parameters' values if there are some.
+    """
+
+    def __init__(self, model: Model, equations: Equations, plan: Plan, code: Callable[[Part], Compiled]) -> None:
+        before, behind = velocity_changes(equations)
+        same = {} if before else {"w": "v", "w1": "v1"}
+        codes = [*map(code, before), *plan.codes, *map(code, behind)]
+        self._steps: list[Step] = [
+            (own, [same.get(name, name) for name in part.reads], [same.get(name, name) for name in part.writes])
+            for part, own in zip((*before, *plan.parts, *behind), codes, strict=True)
+        ]
+        nq, nv, empty = model.nq, model.nv, np.empty
+        inputs = {"q": nq, "v": nv, "tau": nv, "dt": -1, "squares": -1}
+        inputs |= {name: x.numel() for name, x in equations.extra_arguments.items()}
+        run = python_call(self._steps, inputs, ["q1", "v1"], [start for start, _ in model.quaternions])
+
+        def single(q: Any, v: Any, tau: Any, dt: float, *behind: Any) -> Any:
+            q1, v1 = empty(nq), empty(nv)
+            return (q1, v1) if run(q, v, tau, dt, 0.0, *behind, q1, v1) else None
+
+        self.single: Call = single
+        self._extra = [*equations.extra_arguments]
+
+    def __call__(
+        self, q: Array, v: Array, tau: Array, dt: float, *behind: Array, threads: int | None
+    ) -> tuple[Array, Array]:
+        """Return q and v after the step from one state or a batch, which may not be finite."""
+        one = (*q.shape[:-1], 1)
+        arrays = {"q": q, "v": v, "tau": tau, "dt": np.full(one, dt), "squares": np.zeros(one)}
+        arrays |= zip(self._extra, behind, strict=True)
+        for code, reads, writes in self._steps:
+            results = code(*(arrays[name] for name in reads), threads=threads)
+            arrays |= zip(writes, (x[..., 0] for x in results), strict=True)
+        return arrays["q1"], arrays["v1"]

@@ -1,0 +1,223 @@
+"""The built-in function that reads arrays itself: what it takes, what it refuses, and that it keeps nothing."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import sys
+import tracemalloc
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.codegen import python_call as page
+from mbkit.codegen.compiled import Compiled, compiled
+from mbkit.codegen.python_call import python_call
+
+N = 5
+
+
+def made(name: str, *expressions: Any, inputs: Any) -> Compiled:
+    return compiled((f"test of a Python call: {name}",), lambda: ca.Function(name, inputs, [*expressions]))
+
+
+@pytest.fixture(scope="module")
+def call() -> Any:
+    """y = sin(a) + 2 b, then z = y h, of vectors a and b and a float h; y is kept inside."""
+    a, b, y, h = ca.SX.sym("a", N), ca.SX.sym("b", N), ca.SX.sym("y", N), ca.SX.sym("h")
+    first, second = made("sum", ca.sin(a) + 2 * b, inputs=[a, b]), made("product", y * h, inputs=[y, h])
+    steps = [(first, ["a", "b"], ["y"]), (second, ["y", "h"], ["z"])]
+    return python_call(steps, {"a": N, "b": N, "h": -1}, ["z"])
+
+
+A, B = np.linspace(-1, 1, N), np.linspace(3, 4, N)
+RIGHT = (np.sin(A) + 2 * B) * 0.5
+
+
+def test_compiled_functions_run_one_after_another(call: Any) -> None:
+    out = np.empty(N)
+    assert call(A, B, 0.5, out) is True
+    np.testing.assert_allclose(out, RIGHT, rtol=1e-15)
+
+
+def unaligned(x: np.ndarray) -> np.ndarray:
+    room = np.empty(8 * N + 8, dtype=np.uint8)
+    out = room[3 : 3 + 8 * N].view(np.float64)
+    out[:] = x
+    return out
+
+
+@pytest.mark.parametrize(
+    "turn",
+    [
+        lambda x: np.repeat(x, 3)[::3],
+        lambda x: x[::-1].copy()[::-1],
+        lambda x: np.asfortranarray(np.tile(x, (4, 1)))[2],
+        lambda x: pickle.loads(pickle.dumps(x)),
+        lambda x: np.lib.stride_tricks.as_strided(x.copy(), x.shape, x.strides, writeable=False),
+    ],
+)
+def test_any_strides_have_the_same_bits(call: Any, turn: Any) -> None:
+    plain, out = np.empty(N), np.empty(N)
+    assert call(A, B, 0.5, plain)
+    assert call(turn(A), turn(B), 0.5, out)
+    np.testing.assert_array_equal(out, plain)
+
+
+class Subclass(np.ndarray):
+    """May read its entries in another way."""
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        A.tolist(),
+        A[:-1],
+        np.append(A, 0.0),
+        A[None],
+        np.array(1.0),
+        np.empty(0),
+        A.astype(np.float32),
+        A.astype(">f8"),
+        A.astype(np.complex128),
+        np.arange(N),
+        A.view(np.int64),
+        A.view("M8[s]"),
+        A.astype(object),
+        np.ma.masked_array(A, A > 0),
+        A.view(Subclass),
+        unaligned(A),
+        1.0,
+        None,
+        np.float64,
+    ],
+)
+def test_other_arguments_are_refused(call: Any, bad: Any) -> None:
+    out = np.empty(N)
+    assert call(bad, B, 0.5, out) is False
+    assert call(A, bad, 0.5, out) is False
+
+
+@pytest.mark.parametrize("bad", [1, True, np.float64(1.0), np.array([1.0]), None, "1", np.nan, np.inf])
+def test_a_number_must_be_a_finite_float(call: Any, bad: Any) -> None:
+    assert call(A, B, bad, np.empty(N)) is False
+
+
+@pytest.mark.parametrize("k", range(5))
+def test_the_number_of_arguments_is_checked(call: Any, k: int) -> None:
+    assert call(*([A, B, 0.5, np.empty(N), np.empty(N)] * 2)[: k if k < 4 else 5]) is False
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("i", range(N))
+def test_no_entry_that_is_not_finite_passes(call: Any, i: int, value: float) -> None:
+    bad = A.copy()
+    bad[i] = value
+    assert call(bad, B, 0.5, np.empty(N)) is False
+    assert call(A, bad, 0.5, np.empty(N)) is False
+
+
+def test_numbers_that_overflow_between_the_functions_are_seen(call: Any) -> None:
+    assert call(A, np.full(N, 1.7e308), 1e-300, np.empty(N)) is False
+
+
+@pytest.mark.parametrize("size", [1 - 1e-6, 1 - 1e-12, 1.0, 1 + 1e-12, 1 + 1e-6, np.nan])
+def test_quaternions_are_of_unit_length(size: float) -> None:
+    q = ca.SX.sym("q", 9)
+    check = python_call([(made("twice", 2 * q, inputs=[q]), ["q"], ["y"])], {"q": 9}, ["y"], (1, 5))
+    for place in (1, 5):
+        x = np.array([9, 0.6, 0, 0.8, 0, 0, 0, 0, 1.0])
+        x[place : place + 4] *= size
+        wide = np.repeat(x, 2)[::2]
+        assert check(x, np.empty(9)) is check(wide, np.empty(9)) is (abs(size - 1) < 1e-9)
+
+
+def test_nothing_is_kept_or_lost(call: Any) -> None:
+    q, out = A.copy(), np.empty(N)
+    before = [sys.getrefcount(x) for x in (q, out, True, False)]
+    tracemalloc.start()
+    try:
+        sizes = []
+        for _ in range(3):
+            for _ in range(300):
+                call(q, B, 0.5, out)
+                call(q, B, np.nan, out)
+                call(q, B, None, out)
+                call(q, B)
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert sizes[2] - sizes[1] < 1000
+    assert [sys.getrefcount(x) for x in (q, out, True, False)] == before
+
+
+def test_the_code_lives_as_long_as_the_function() -> None:
+    x = ca.SX.sym("x", 3)
+    code = made("squares", x * x, inputs=[x])
+    alone, seen = python_call([(code, ["x"], ["y"])], {"x": 3}, ["y"]), weakref.ref(code)
+    del code
+    gc.collect()
+    assert seen() is not None
+    out = np.empty(3)
+    assert alone(np.arange(3.0), out)
+    assert out.tolist() == [0, 1, 4]
+    del alone
+    gc.collect()
+    assert seen() is None
+
+
+def test_another_layout_of_arrays_leads_to_the_checked_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = mb.load("ur5")
+    q, v = model.random_state(np.random.default_rng(0))
+    expected = mb.dynamics(model, "lagrangian", compile=True).nle(q, v)
+    page._layout_is_known.cache_clear()
+    monkeypatch.setattr(page, "_DATA", page._DATA + 1)
+    try:
+        dyn = mb.dynamics(model, "lagrangian", compile=True)
+        for _ in range(2):
+            np.testing.assert_array_equal(dyn.nle(q, v), expected)
+        assert dyn._short["nle"].single(q, v, np.empty(6)) is False
+    finally:
+        monkeypatch.undo()
+        page._layout_is_known.cache_clear()
+    assert page._layout_is_known()
+
+
+def test_threads_do_not_meet() -> None:
+    model = mb.load("solo12", floating_base=True)
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    q, v = model.random_state(np.random.default_rng(1), 40)
+    expected = dyn.nle(q, v)
+    dyn.nle(q[0], v[0])
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            results = list(pool.map(lambda i: dyn.nle(q[i % 40], v[i % 40]), range(2000)))
+    finally:
+        sys.setswitchinterval(interval)
+    for i, x in enumerate(results):
+        np.testing.assert_array_equal(x, expected[i % 40])
+
+
+@pytest.mark.parametrize("name", ["mass_matrix", "gravity", "nle", "forward_dynamics", "kinetic_energy"])
+def test_results_share_no_memory(name: str) -> None:
+    model = mb.load("ur5")
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    states = np.random.default_rng(2).standard_normal((3, 6))
+    arguments = states[: {"mass_matrix": 1, "gravity": 1, "forward_dynamics": 3}.get(name, 2)]
+    held = states.copy()
+    first = getattr(dyn, name)(*arguments)
+    kept = np.array(first)
+    for _ in range(3):
+        other = getattr(dyn, name)(*arguments)
+        if np.ndim(other):
+            assert not any(np.shares_memory(other, x) for x in (first, states))
+            other[:] = 7.0
+    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(states, held)

@@ -1,0 +1,340 @@
+"""`Dynamics.step`: a run of one step of `simulate`, without the run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import mbkit as mb
+from mbkit.engines import Dynamics, compiled_calls
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.lagrangian import from_model, systems
+from mbkit.model import Model
+from mbkit.simulate import METHODS, Tableau, register_method, simulate
+from tests.random_trees import ALL, SOUND, random_tree
+from tests.test_rollouts import tumbling, unstable
+
+FIXED = ("rk4", "semi_implicit_euler")
+#: No joint of these has another velocity in the integrators.
+SAME_VELOCITY = tuple(kind for kind in ALL if kind != "free")
+H = 0.01
+EPS = np.finfo(float).eps
+
+
+def own(model: Model, *, compiled: bool = True) -> LagrangianDynamics:
+    dyn = mb.dynamics(model, "lagrangian", compile=compiled)
+    assert isinstance(dyn, LagrangianDynamics)
+    return dyn
+
+
+def states(model: Model, n: int | None = None, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    q, v = model.random_state(rng, n)
+    return q, v, rng.standard_normal(v.shape)
+
+
+def simulated(dyn: Dynamics, q: Any, v: Any, tau: Any, h: float = H, method: str = "rk4") -> Any:
+    held = tau[:, None] if np.ndim(tau) == 2 else tau
+    run = simulate(dyn, q, v, h, method, dt=h, torque=held, save=[h])
+    return run.q[..., -1, :], run.v[..., -1, :]
+
+
+def assert_equal(got: Any, expected: Any, *, rounding: bool = False) -> None:
+    for x, y in zip(got, expected, strict=True):
+        assert x.shape == y.shape
+        if rounding:
+            np.testing.assert_allclose(x, y, rtol=0, atol=64 * EPS * max(np.abs(y).max(initial=0), 1))
+        else:
+            np.testing.assert_array_equal(x, y)
+
+
+def assert_simulated(dyn: Dynamics, method: str, *, rounding: bool = False, seed: int = 0) -> None:
+    """A step of one state and of a batch, on the first and on later calls, is that of `simulate`."""
+    q, v, tau = states(dyn.model, 5, seed)
+    expected = simulated(dyn, q, v, tau, method=method)
+    for _ in range(2):
+        assert_equal(dyn.step(q[0], v[0], tau[0], H, method), [x[0] for x in expected], rounding=rounding)
+        assert_equal(dyn.step(q, v, tau, H, method), expected, rounding=rounding)
+    wide = (np.asfortranarray(x) for x in (q, v, tau))
+    assert_equal(dyn.step(*wide, np.float64(H), method=method), expected, rounding=rounding)
+    assert_equal(
+        dyn.step(q[0].tolist(), v[0].tolist(), tau[0].tolist(), H, method), [x[0] for x in expected], rounding=True
+    )
+
+
+@pytest.mark.parametrize("method", FIXED)
+@pytest.mark.parametrize("seed", range(6))
+def test_a_step_has_the_bits_of_simulate_on_random_trees(seed: int, method: str) -> None:
+    model = random_tree(seed, n=4, kinds=tuple(np.roll(SAME_VELOCITY, 3 * seed)[:4]), mimic=bool(seed % 2))
+    assert_simulated(own(model), method, seed=seed)
+
+
+@pytest.mark.parametrize("method", FIXED)
+def test_with_a_free_joint_it_is_simulate_to_rounding(method: str) -> None:
+    assert_simulated(own(tumbling()), method, rounding=True)
+
+
+@pytest.mark.parametrize("kinds", [SAME_VELOCITY[:3], ("free", "ball", "revolute")])
+def test_a_step_in_parts_too(kinds: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled_calls, "_ONE_PIECE", 0)
+    dyn = own(random_tree(3, n=3, kinds=kinds))
+    assert_simulated(dyn, "rk4", rounding="free" in kinds)
+    assert len(dyn.step_plan("rk4").parts) > 1
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco", "oracle"])
+@pytest.mark.parametrize("method", FIXED)
+def test_stage_by_stage_it_has_the_bits_of_simulate_on_any_engine(engine: str, method: str) -> None:
+    model = random_tree(5, n=3, kinds=("free", "ball", "revolute"), armature=False)
+    options = {"compile": False} if engine == "lagrangian" else {}
+    assert_simulated(mb.dynamics(model, engine, **options), method)
+
+
+def test_engines_agree() -> None:
+    model = random_tree(7, n=4, kinds=SOUND)
+    q, v, tau = states(model, 3)
+    a, b = (dyn.step(q, v, tau, H) for dyn in (own(model), mb.dynamics(model, "pinocchio")))
+    assert_equal(a, b, rounding=True)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+def test_robots_with_and_without_a_mimic_joint(name: str) -> None:
+    assert_simulated(own(mb.load(name)), "rk4")
+
+
+@pytest.fixture
+def heun() -> Iterator[str]:
+    register_method(Tableau("heun", [[0, 0], [1, 0]], [0.5, 0.5], order=2))
+    yield "heun"
+    METHODS.pop("heun", None)
+
+
+def test_a_method_of_ones_own(heun: str) -> None:
+    dyn = own(mb.catalog.double_pendulum())
+    assert_simulated(dyn, heun)
+    state = (q, v, tau) = states(dyn.model)
+    before = dyn.step(*state, H, heun)
+    del METHODS[heun]
+    with pytest.raises(UnknownNameError):
+        dyn.step(*state, H, heun)
+    # Ralston's, by the same name.
+    register_method(Tableau(heun, [[0, 0], [2 / 3, 0]], [0.25, 0.75], order=2))
+    assert_equal(dyn.step(*state, H, heun), simulated(dyn, q, v, tau, method=heun))
+    assert not np.array_equal(dyn.step(*state, H, heun)[1], before[1])
+
+
+def test_parameters_of_one_state_and_of_each() -> None:
+    dyn = own(mb.catalog.pendulum(mass=mb.Parameter("m", 2.0)))
+    q, v, tau = states(dyn.model, 4)
+    masses = np.array([1.0, 2.0, 3.0, 4.0])
+    each = dyn.at(m=masses)
+    for _ in range(2):
+        got = each.step(q, v, tau, H)
+        assert_equal(got, simulated(each, q, v, tau))
+        for i, mass in enumerate(masses.tolist()):
+            assert_equal(dyn.at(m=mass).step(q[i], v[i], tau[i], H), [x[i] for x in got])
+    assert_equal(each.step(q[0], v[0], tau[0], H), each.step(q[[0] * 4], v[[0] * 4], tau[[0] * 4], H))
+
+
+def test_one_state_beside_a_batch_is_repeated_and_an_empty_batch_stays_empty() -> None:
+    dyn = own(mb.load("ur5"))
+    q, v, tau = states(dyn.model, 4)
+    assert_equal(dyn.step(q, v[0], tau[0], H), dyn.step(q, v[[0] * 4], tau[[0] * 4], H))
+    for one in (dyn, mb.dynamics(dyn.model, "pinocchio"), own(dyn.model, compiled=False)):
+        assert [x.shape for x in one.step(q[:0], v[:0], tau[:0], H)] == [(0, 6), (0, 6)]
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_model_that_cannot_move_stays(compiled: bool) -> None:
+    b = mb.ModelBuilder("block")
+    b.add_body("block", mass=1.0, inertia=(1, 1, 1))
+    b.add_joint("weld", "fixed", parent="world", child="block")
+    q, v = own(b.build(), compiled=compiled).step([], [], [], H)
+    assert q.shape == v.shape == (0,)
+
+
+def test_quaternions_stay_of_unit_length_over_many_steps() -> None:
+    dyn = own(tumbling())
+    q, v, _ = states(dyn.model)
+    tau = np.zeros(dyn.model.nv)
+    for _ in range(5000):
+        q, v = dyn.step(q, 0.999 * v, tau, H)
+    for start, _ in dyn.model.quaternions:
+        assert abs(np.linalg.norm(q[start : start + 4]) - 1) < 4 * EPS
+
+
+def test_many_steps_are_a_run() -> None:
+    dyn = own(mb.load("ur5"))
+    q, v, tau = states(dyn.model)
+    run = simulate(dyn, q, 0.1 * v, 0.1, dt=1e-3, torque=tau)
+    v = 0.1 * v
+    for k in range(100):
+        q, v = dyn.step(q, v, tau, 1e-3)
+        np.testing.assert_array_equal(q, run.q[k + 1])
+        np.testing.assert_array_equal(v, run.v[k + 1])
+
+
+def test_nothing_is_shared_and_arguments_stay_as_they_are() -> None:
+    dyn = own(tumbling())
+    for arguments in (states(dyn.model), states(dyn.model, 3)):
+        kept = [x.copy() for x in arguments]
+        first = dyn.step(*arguments, H)
+        values = [x.copy() for x in first]
+        second = dyn.step(*arguments, H)
+        memory = [*first, *second, *arguments]
+        assert not any(np.shares_memory(x, y) for i, x in enumerate(memory) for y in memory[:i])
+        for x in second:
+            x[:] = 7.0
+        assert_equal(first, values)
+        assert_equal(arguments, kept)
+
+
+def test_threads_get_the_same_bits() -> None:
+    dyn = own(mb.load("ur5"))
+    q, v, tau = states(dyn.model, 40)
+    expected = dyn.step(q, v, tau, H)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            results = list(pool.map(lambda i: dyn.step(q[i % 40], v[i % 40], tau[i % 40], H), range(1000)))
+    finally:
+        sys.setswitchinterval(interval)
+    for i, got in enumerate(results):
+        assert_equal(got, [x[i % 40] for x in expected])
+    q, v, tau = states(dyn.model, 20_000)
+    one, two = (mb.dynamics(dyn.model, "lagrangian", compile=True, threads=n) for n in (1, 2))
+    assert_equal(one.step(q, v, tau, H), two.step(q, v, tau, H))
+
+
+# Refusals, on the fast way and on the checked one
+
+
+@pytest.fixture(scope="module", params=["compiled", "interpreted", "pinocchio"])
+def ready(request: Any) -> Dynamics:
+    """Solo12 after its first step, when the fast way is there."""
+    model = mb.load("solo12", floating_base=True)
+    engine, options = "lagrangian", {"compile": request.param == "compiled"}
+    if request.param == "pinocchio":
+        engine, options = "pinocchio", {}
+    dyn = mb.dynamics(model, engine, **options)
+    dyn.step(*states(model), H)
+    return dyn
+
+
+@pytest.mark.parametrize(
+    ("dt", "text"),
+    [
+        (0.0, "dt: expected a number above 0"),
+        (-1e-3, "dt: expected a number above 0"),
+        (0, "dt: expected a number above 0"),
+        (np.nan, "dt: expected a finite number"),
+        (np.inf, "dt: expected a finite number"),
+        (-np.inf, "dt: expected a finite number"),
+        ("1", "dt: expected a number, got '1'"),
+        (None, "dt: expected a number, got None"),
+        (True, "dt: expected a number, got True"),
+        (np.array([H]), "dt: expected a number"),
+    ],
+)
+def test_steps_that_are_none(ready: Dynamics, dt: Any, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        ready.step(*states(ready.model), dt)
+
+
+@pytest.mark.parametrize("dt", [1, np.float64(1e-3), np.float32(1e-3), np.array(1e-3)])
+def test_numbers_of_other_types_are_steps(ready: Dynamics, dt: Any) -> None:
+    q, v, tau = states(ready.model)
+    assert_equal(ready.step(q, 0 * v, tau, dt), ready.step(q, 0 * v, tau, float(dt)))
+
+
+def test_wrong_states_are_named(ready: Dynamics) -> None:
+    q, v, tau = states(ready.model)
+    longer = q.copy()
+    longer[3:7] *= 1.1
+    for bad, text in (
+        ((q[:-1], v, tau), r"q: expected shape \(19,\) or \(N, 19\), got \(18,\)"),
+        ((q, v[:-1], tau), r"v: expected shape \(18,\)"),
+        ((q, v, np.append(tau, 0.0)), r"tau: expected shape \(18,\)"),
+        ((longer, v, tau), "q: the quaternion of joint"),
+        ((np.tile(q, (2, 1)), np.tile(v, (3, 1)), tau), "batches of different sizes"),
+        ((q, v, None), "tau: "),
+        ((q, v, tau + 1j), "tau: expected real numbers"),
+    ):
+        with pytest.raises(InputError, match=text):
+            ready.step(*bad, H)
+    for i, name in enumerate(("q", "v", "tau")):
+        for value in (np.nan, np.inf):
+            bad_ = [x.copy() for x in (q, v, tau)]
+            bad_[i][-1] = value
+            with pytest.raises(InputError, match=f"{name}: {value} at index"):
+                ready.step(*bad_, H)
+
+
+def test_unknown_methods_have_a_suggestion(ready: Dynamics) -> None:
+    state = states(ready.model)
+    with pytest.raises(UnknownNameError, match=r"did you mean .*'rk4'"):
+        ready.step(*state, H, "rk5")
+    for bad in (None, 4, ["rk4"]):
+        with pytest.raises(InputError, match="method: expected a name"):
+            ready.step(*state, H, bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("method", [m.name for m in METHODS.values() if m.name not in FIXED])
+def test_methods_without_an_explicit_step_name_those_with_one(ready: Dynamics, method: str) -> None:
+    with pytest.raises(UnsupportedError, match=f"step: {method} has no explicit fixed step; use rk4"):
+        ready.step(*states(ready.model), H, method)
+
+
+def test_constraints_and_prescribed_motions_are_for_simulate() -> None:
+    for lag, feature in (
+        (from_model(mb.catalog.slider_crank()), "constraints"),
+        (systems.driven_pendulum(), "motions prescribed in time"),
+    ):
+        dyn = lag.dynamics()
+        n = dyn.model.nv
+        with pytest.raises(UnsupportedError, match=f"has {feature}; use mbkit.simulate"):
+            dyn.step(np.zeros(n), np.zeros(n), np.zeros(n), H)
+
+
+def test_quasi_velocities_too() -> None:
+    rates = systems.double_pendulum().quasi_velocities([[2, 0], [sp.cos(sp.Symbol("theta1")), 1]], ["a", "b"])
+    dyn = rates.dynamics()
+    assert dyn.model.velocity_map is not None
+    assert_simulated(dyn, "rk4", rounding=True)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_state_beyond_all_bounds_is_an_error(compiled: bool, batch: bool) -> None:
+    dyn = own(unstable(), compiled=compiled)
+    q, v, tau = (np.array([1.0, 1.0]), np.zeros(2), np.zeros(2))
+    if batch:
+        q = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 1.0]])
+    where = "in sample 1 after" if batch and compiled else "after dt = 1 s"
+
+    def run(q: np.ndarray, v: np.ndarray) -> None:
+        for _ in range(40):
+            q, v = dyn.step(q, v, tau, 1.0)
+            assert np.isfinite(q).all()
+            assert np.isfinite(v).all()
+
+    with pytest.raises(NumericalError, match=f"step of unstable by rk4: the state is not finite {where}"):
+        run(q, v)
+
+
+def test_an_acceleration_that_is_not_finite_names_the_suspect() -> None:
+    b = mb.ModelBuilder("massless")
+    b.add_body("rod", mass=0.0)
+    b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 1, 0))
+    for compiled in (True, False):
+        dyn = own(b.build(nonphysical="warn"), compiled=compiled)
+        with pytest.raises(NumericalError, match="no mass moves"):
+            dyn.step([0.0], [0.0], [1.0], H)
