@@ -255,7 +255,7 @@ def test_no_bit_depends_on_neighbours_or_threads(
     q, v = start(floating, n)
     runs = []
     for widest, workers in ((1032, 1), (1032, 2), (72, 1), (72, 3), (8, 5)):
-        monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _: widest)
+        monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _, most=widest: most)
         runs.append(outcome(floating, q, v, workers))
     for other in runs[1:]:
         assert np.array_equal(other.q, runs[0].q)
