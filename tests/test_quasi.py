@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 
 import mbkit as mb
-from mbkit.derivation.equations import equations_of
+from mbkit.derivation import equations_of
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
 from mbkit.spatial import rotate

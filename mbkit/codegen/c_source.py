@@ -18,7 +18,7 @@ from mbkit import _interrupt
 from mbkit._escape import c_comment
 from mbkit._version import __version__
 from mbkit.codegen.program import program
-from mbkit.derivation.equations import FUNCTIONS, equations_of
+from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 

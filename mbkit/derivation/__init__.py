@@ -1,5 +1,6 @@
-"""Energies to equations to functions: mbkit's own derivation."""
+"""Kinematics to equations to functions: mbkit's own derivation."""
 
-from mbkit.derivation.equations import FUNCTIONS, Equations, equations_of
+from mbkit.derivation.equations import FUNCTIONS, Equations
+from mbkit.derivation.link_equations import LinkEquations, equations_of
 
-__all__ = ["FUNCTIONS", "Equations", "equations_of"]
+__all__ = ["FUNCTIONS", "Equations", "LinkEquations", "equations_of"]

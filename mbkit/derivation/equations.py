@@ -47,12 +47,6 @@ FUNCTIONS: Final = {
 }
 
 
-def equations_of(model: Model, constants: Constants = "literal") -> Equations:
-    """Return a model's equations: derived from its bodies, or from the energies that it was written as."""
-    of_energies = model.energy_equations
-    return Equations(model, constants) if of_energies is None else of_energies(constants)
-
-
 class Equations:
     """The equations of motion of a model as CasADi expressions and functions.
 

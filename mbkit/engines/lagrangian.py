@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, count, finite_array, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
 from mbkit.codegen.interpreter import Machine
-from mbkit.derivation.equations import Equations, equations_of
+from mbkit.derivation import Equations, equations_of
 from mbkit.derivation.least_constraint import loses_digits
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.engines.base import Dynamics, scalar

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digits, product, solve
 from mbkit.codegen.program import program
-from mbkit.derivation.equations import FUNCTIONS, equations_of
+from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.engines.base import Dynamics, scalar
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Model

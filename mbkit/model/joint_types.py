@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,14 @@ Placement = tuple[Rows, list[Any]]
 Twist = tuple[list[Any], list[Any]]
 _IDENTITY: Final[Rows] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 _ZERO: Final = [0.0, 0.0, 0.0]
+
+
+class SingleMotion(NamedTuple):
+    """A turn about an axis, by a coordinate, with this advance per radian; or, without a turn, a slide along it."""
+
+    axis: Scalars
+    turns: bool = True
+    advance: Any = 0.0
 
 
 def cross3(a: Scalars, b: Scalars) -> list[Any]:
@@ -176,6 +184,13 @@ class JointType:
         """Return the linear and angular velocity of C's origin relative to J, in C's axes."""
         raise NotImplementedError
 
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        """Return the joint as motions of one coordinate each, one after the other; None where it is no such chain.
+
+        Each axis stands in the frame that the motions before it have moved; v are the rates of the coordinates.
+        """
+        return None
+
     def qdot(self, q: Scalars, v: Scalars) -> list[Any]:
         """Return D(q) v."""
         k = self.quaternion
@@ -223,6 +238,9 @@ JointKind = JointType
 class _Fixed(JointType):
     name, nq, nv, suffixes, velocity_suffixes = "fixed", 0, 0, (), ()
 
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        return []
+
     def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _IDENTITY, _ZERO
 
@@ -232,6 +250,9 @@ class _Fixed(JointType):
 
 class _Revolute(JointType):
     name, nq, nv, n_axes, angular, axial = "revolute", 1, 1, 1, (0,), True
+
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        return [SingleMotion(joint.axes[0])]
 
     def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _about(m, joint.axes[0], q[0]), _ZERO
@@ -247,6 +268,9 @@ class _Continuous(_Revolute):
 class _Prismatic(JointType):
     name, nq, nv, n_axes, lengths, axial = "prismatic", 1, 1, 1, (0,), True
 
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        return [SingleMotion(joint.axes[0], turns=False, advance=1.0)]
+
     def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _IDENTITY, [a * q[0] for a in joint.axes[0]]
 
@@ -259,6 +283,9 @@ class _Helical(_Revolute):
     # components in J and in C.
     name, pitched, screws = "helical", True, (0,)
 
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        return [SingleMotion(joint.axes[0], advance=joint.pitch)]
+
     def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _about(m, joint.axes[0], q[0]), [joint.pitch * a * q[0] for a in joint.axes[0]]
 
@@ -269,6 +296,9 @@ class _Helical(_Revolute):
 class _Universal(JointType):
     name, nq, nv, n_axes, angular = "universal", 2, 2, 2, (0, 1)
     suffixes = velocity_suffixes = ("1", "2")
+
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        return [SingleMotion(joint.axes[0]), SingleMotion(joint.axes[1])]
 
     def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _matmul(_about(m, joint.axes[0], q[0]), _about(m, joint.axes[1], q[1])), _ZERO
@@ -281,6 +311,9 @@ class _Universal(JointType):
 class _SphericalZYX(JointType):
     name, nq, nv, angular, gimbal = "spherical_zyx", 3, 3, (0, 1, 2), 1
     suffixes = velocity_suffixes = ("z", "y", "x")
+
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        return [SingleMotion((0.0, 0.0, 1.0)), SingleMotion((0.0, 1.0, 0.0)), SingleMotion((1.0, 0.0, 0.0))]
 
     def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         zy = _matmul(_about(m, (0, 0, 1), q[0]), _about(m, (0, 1, 0), q[1]))
@@ -305,6 +338,10 @@ class _Ball(JointType):
 class _Planar(JointType):
     name, nq, nv, lengths, angular = "planar", 3, 3, (0, 1), (2,)
     suffixes = velocity_suffixes = ("x", "y", "theta")
+
+    def motions(self, joint: Any) -> list[SingleMotion] | None:
+        x, y = (SingleMotion(axis, turns=False, advance=1.0) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+        return [x, y, SingleMotion((0.0, 0.0, 1.0))]
 
     def placement(self, m: Any, joint: Any, q: Scalars) -> Placement:
         return _about(m, (0, 0, 1), q[2]), [q[0], q[1], 0.0]

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.taylor import PRECISIONS, order_of, precision, taylor_system
-from mbkit.derivation.equations import Equations, equations_of
+from mbkit.derivation import Equations, equations_of
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import require_tree
 from mbkit.engines.registry import DERIVED, INDEPENDENT

@@ -1,0 +1,200 @@
+"""Accelerations of links, and d'Alembert's principle: the forces that a motion takes.
+
+A = (a, ω̇) is the acceleration of a link's origin and its angular acceleration, in the link's axes. From link to link ::
+
+    A = X A_parent + S v̇ + c        wrench: J A + (ω × (ω × h), ω × I ω)
+
+with the drift c of the joint, and the inertia J of mass, first moment h and inertia I about the origin. Gravity
+accelerates the world by -g. By d'Alembert's principle in Lagrange's form the forces of the joints are Sᵀ of all the
+wrenches that they carry (Lanczos 1970, The Variational Principles of Mechanics, ch. IV; Greenwood 2003, Advanced
+Dynamics, ch. 4.1). The operations are those of the recursive Newton-Euler algorithm (Featherstone 2008, ch. 5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+
+from mbkit.derivation.kinematics import Vector, add
+from mbkit.derivation.links import Inertia, Links
+from mbkit.derivation.model_values import is_zero, scalar
+from mbkit.derivation.rotations import SYMMETRIC, Rotation, to_child, to_parent
+from mbkit.model import JointCoupling
+from mbkit.model.joint_types import cross3
+
+
+@dataclass
+class Motion:
+    """Rates of a link at v̇ = 0: angular velocity, and the products that centripetal accelerations take."""
+
+    spin: Vector
+    #: ω ω^T, six entries.
+    products: Vector
+
+    @classmethod
+    def of(cls, w: Vector) -> Motion:
+        """Return the motion with this angular velocity."""
+        return cls(w, [w[i] * w[j] for i in range(3) for j in range(i, 3)])
+
+    def centripetal(self, r: Vector) -> Vector:
+        """Return ω × (ω × r)."""
+        xx, xy, xz, yy, yz, zz = self.products
+        return [
+            xy * r[1] + xz * r[2] - (yy + zz) * r[0],
+            xy * r[0] + yz * r[2] - (xx + zz) * r[1],
+            xz * r[0] + yz * r[1] - (xx + yy) * r[2],
+        ]
+
+    def gyroscopic(self, I: Vector) -> Vector:
+        """Return ω × I ω."""
+        xx, xy, xz, yy, yz, zz = self.products
+        return [
+            (I[5] - I[3]) * yz + I[4] * (yy - zz) + I[2] * xy - I[1] * xz,
+            (I[0] - I[5]) * xz + I[2] * (zz - xx) + I[1] * yz - I[4] * xy,
+            (I[3] - I[0]) * xy + I[1] * (xx - yy) + I[4] * xz - I[2] * yz,
+        ]
+
+
+class LinkMechanics:
+    """Motions, drifts and forces of a tree's links.
+
+    Parameters
+    ----------
+    links : Links
+    moving : bool
+        Whether velocities are those of the kinematics, or zero.
+    falling : bool
+        Whether gravity acts.
+
+    Attributes
+    ----------
+    ground : list of 6 scalars
+        Acceleration of the world.
+    motions : list of Motion
+    drifts, shifts : list of 6 scalars for each link
+        What velocities add to A in the link's axes, and at its joint in the parent's.
+    """
+
+    def __init__(self, links: Links, *, moving: bool = True, falling: bool = True) -> None:
+        self.links, self.kin = links.links, links.kin
+        g = links.kin.values.gravity if falling else [0.0] * 3
+        self.ground = [*(negative(x) for x in g), 0.0, 0.0, 0.0]
+        self.motions: list[Motion] = []
+        self.drifts: list[Vector] = []
+        self.shifts: list[Vector] = []
+        still = Motion.of([0.0] * 3)
+        for link in self.links:
+            above = self.motions[link.parent] if link.parent >= 0 else still
+            rate, inner = (link.rate, link.drift) if moving else ([0.0] * 6, [0.0] * 6)
+            spin, linear, angular = to_child(link.fixed, above.spin), rate[:3], rate[3:]
+            carried = to_child(link.turn, spin)
+            own, drift = add(carried, angular), inner[:3]
+            if not vanishes(link.slide):
+                drift = add(drift, to_child(link.turn, Motion.of(spin).centripetal(link.slide)))
+            if not vanishes(linear):
+                # 2 ω_J × u + ω_relative × u of the relative velocity u.
+                drift = add(drift, cross3([2.0 * a + b for a, b in zip(carried, angular, strict=True)], linear))
+            self.motions.append(Motion.of(own))
+            self.drifts.append([*drift, *add(cross3(own, angular), inner[3:])])
+            self.shifts.append([*above.centripetal(link.translation), 0.0, 0.0, 0.0])
+
+    @cached_property
+    def _biases(self) -> list[Vector]:
+        return [
+            [*motion.centripetal(link.inertia.moment), *motion.gyroscopic(link.inertia.inertia)]
+            for link, motion in zip(self.links, self.motions, strict=True)
+        ]
+
+    def bias(self, index: int) -> Vector:
+        """Return (ω × (ω × h), ω × I ω) of a link."""
+        return self._biases[index]
+
+    def carried(self, index: int, above: Vector, *, drifts: bool = True) -> Vector:
+        """Return X A_parent + c, from A of the parent."""
+        link = self.links[index]
+        a = add(above[:3], cross3(above[3:], link.translation))
+        a = add(a, self.shifts[index][:3]) if drifts else a
+        a, turning = to_child(link.fixed, a), to_child(link.fixed, above[3:])
+        x = [*to_child(link.turn, add(a, cross3(turning, link.slide))), *to_child(link.turn, turning)]
+        return add(x, self.drifts[index]) if drifts else x
+
+    def forces(self, a: Sequence[Any] | None = None) -> list[Any]:
+        """Return the forces of the joints, one scalar for each velocity, that a motion with accelerations `a` takes."""
+        A: list[Vector] = []
+        out: list[Any] = [0.0] * self.kin.model.nv
+        for index, link in enumerate(self.links):
+            x = self.carried(index, A[link.parent] if link.parent >= 0 else self.ground)
+            for (k, column), rotor in zip(link.columns, link.rotors, strict=True):
+                if a is not None:
+                    x = add(x, [c * a[k] for c in column])
+                    out[k] = out[k] + rotor * a[k]
+            A.append(x)
+        wrenches = [
+            add(rigid_times(link.inertia, x), bias) for link, x, bias in zip(self.links, A, self._biases, strict=True)
+        ]
+        for index in reversed(range(len(self.links))):
+            link, x = self.links[index], wrenches[index]
+            for k, column in link.columns:
+                out[k] = out[k] + dot6(column, x)
+            if link.parent >= 0:
+                x = rotated6(link.fixed, with_moment(rotated6(link.turn, x), link.slide))
+                wrenches[link.parent] = add(wrenches[link.parent], with_moment(x, link.translation))
+        for coupling in self.kin.model.couplings if a is not None else ():
+            row, armature = self.coupling(coupling)
+            rate = sum((c * a[k] for k, c in row.items()), 0.0)
+            for k, c in row.items():
+                out[k] = out[k] + armature * c * rate
+        return out
+
+    def coupling(self, coupling: JointCoupling) -> tuple[dict[int, Any], Any]:
+        """Return the factors of a coupling's rate, by velocity index, and its armature."""
+        armature = self.kin.values.couplings[coupling.name].armature
+        if is_zero(armature):
+            return {}, armature
+        gradient = ca.jacobian(ca.SX(self.kin.coupled_rate(coupling)), self.kin.v)
+        entries = {i: scalar(gradient[0, i]) for i in range(self.kin.model.nv)}
+        return {i: _float(x) for i, x in entries.items() if not x.is_zero()}, armature
+
+
+def rigid_times(inertia: Inertia, x: Vector) -> Vector:
+    """Return J x of a rigid body."""
+    m, h, a, w = inertia.mass, inertia.moment, x[:3], x[3:]
+    return add([m * c for c in a], cross3(w, h)) + add(cross3(h, a), symmetric_times(inertia.inertia, w))
+
+
+def negative(x: Any) -> Any:
+    """Return -x, and 0 of 0."""
+    return 0.0 - x if isinstance(x, float) else -x
+
+
+def rotated6(R: Rotation, x: Vector) -> Vector:
+    """Return both halves turned to the parent's axes."""
+    return [*to_parent(R, x[:3]), *to_parent(R, x[3:])]
+
+
+def with_moment(x: Vector, r: Vector) -> Vector:
+    """Return a force and moment about the origin that is at -r."""
+    return [*x[:3], *add(x[3:], cross3(r, x[:3]))]
+
+
+def dot6(a: Vector, b: Vector) -> Any:
+    """Return a · b of six entries."""
+    return sum((x * y for x, y in zip(a, b, strict=True) if not is_zero(x)), 0.0)
+
+
+def symmetric_times(A: Vector, x: Vector) -> Vector:
+    """Return A x of a symmetric matrix."""
+    return [sum((A[SYMMETRIC[i][j]] * x[j] for j in range(3)), 0.0) for i in range(3)]
+
+
+def vanishes(x: Vector) -> bool:
+    """Return whether all entries are zero for good."""
+    return all(is_zero(c) for c in x)
+
+
+def _float(x: Any) -> Any:
+    return float(x) if x.is_constant() else x
