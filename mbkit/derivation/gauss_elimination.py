@@ -286,7 +286,7 @@ class GaussElimination:
         velocities and gravity are zero.
         """
         nothing = ([0.0] * 6, dict[int, Any]())
-        p = [self.mechanics.bias(i) if drifts else [0.0] * 6 for i in range(len(self.links))]
+        p = [list(self.mechanics.bias(i)) if drifts else [0.0] * 6 for i in range(len(self.links))]
         r: list[dict[int, Any]] = [{} for _ in self.links]
         top_p, top_r = [0.0] * 6, dict[int, Any]()
         forces: dict[int, Any] = {}
