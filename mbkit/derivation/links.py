@@ -61,6 +61,8 @@ _PERMUTATIONS: Final = [
 ]
 #: Sine of the angle between axes below which a description in doubles means parallel axes.
 _PARALLEL: Final = 1e-15
+#: Rounding of numbers of 120 bits, after some operations.
+_NOISE: Final = 1e-30
 
 
 @dataclass
@@ -167,11 +169,12 @@ class Links:
 
     def __init__(self, kin: Kinematics, *, regroup: bool = True) -> None:
         self.kin = kin
-        self.links: list[Link] = []
-        #: Of each body: its link, and the rotation and translation of the body in it.
-        self._places: dict[str, tuple[int, Rows, Vector]] = {"world": (-1, _IDENTITY, [0.0] * 3)}
-        for joint in kin.model.tree:
-            self._places[joint.child] = self._carry(joint)
+        #: Of each link, what its frame is moved by: a turn about z and a slide along it.
+        self._turns: dict[int, Any] = {}
+        self._slides: dict[int, Any] = {}
+        self._place_links()
+        self._choose_frames()
+        self._place_links()
         self._literal = [Inertia() for _ in self.links]
         self._symbolic: list[Inertia | None] = [None for _ in self.links]
         for body in kin.model.bodies:
@@ -180,6 +183,62 @@ class Links:
             self._regroup()
         for link, literal, symbolic in zip(self.links, self._literal, self._symbolic, strict=True):
             link.inertia = literal.rounded if symbolic is None else literal.rounded + symbolic
+
+    def _place_links(self) -> None:
+        self.links: list[Link] = []
+        #: Of each link: R_PJ and p_PJ in 120 bits.
+        self._fixed: list[tuple[Rows, Vector]] = []
+        #: Of each body: its link, and the rotation and translation of the body in it.
+        self._places: dict[str, tuple[int, Rows, Vector]] = {"world": (-1, _IDENTITY, [0.0] * 3)}
+        for joint in self.kin.model.tree:
+            self._places[joint.child] = self._carry(joint)
+
+    def _choose_frames(self) -> None:
+        """Turn frames about their z axes, and slide them along, so that places of children have more zeros.
+
+        A child's constant turn about this link's z axis becomes part of this link's angle. An offset along an own axis
+        is pushed to the children where it meets another one, or none.
+        """
+        children: list[list[int]] = [[] for _ in self.links]
+        for index, link in enumerate(self.links):
+            if link.parent >= 0:
+                children[link.parent].append(index)
+        pushed: dict[int, Any] = {}
+        for index, link in enumerate(self.links):
+            if link.motion is None or not link.motion.turns:
+                continue
+            votes: list[tuple[int, Any]] = []
+            for child in children[index]:
+                R, _ = self._fixed[child]
+                if _literal(*(x for row in R for x in row)):
+                    votes.append((child, 0 if _is_permutation(R) else _MP.atan2(R[1][0], R[0][0])))
+            angles = [angle for _, angle in votes]
+            if angles:
+                best = max(angles, key=lambda angle: sum(_right_angles_apart(angle, x) for x in angles))
+                if best:
+                    self._turns[index] = best
+            self._slides[index] = self._slide(index, pushed.get(link.parent, 0), children[index])
+            pushed[index] = self._slides[index]
+
+    def _slide(self, index: int, pushed: Any, children: list[int]) -> Any:
+        """Return how far the frame of a link is moved along its axis."""
+        R, p = self._fixed[index]
+        if not _literal(*p, *(x for row in R for x in row)):
+            return 0
+        p = [p[0], p[1], p[2] - pushed]
+        along = [k for k in range(3) if abs(R[k][2]) == 1]
+        if not along or not p[along[0]]:
+            return 0
+        offset = -p[along[0]] * R[along[0]][2]
+        lost = 0
+        for child in children:
+            R_child, at = self._fixed[child]
+            if not _literal(*at):
+                return 0
+            # A parallel axis pushes it on.
+            if not _literal(R_child[2][2]) or abs(R_child[2][2]) != 1:
+                lost += (at[2] - offset != 0) - (at[2] != 0)
+        return offset if lost < 1 else 0
 
     def _carry(self, joint: Joint) -> tuple[int, Rows, Vector]:
         """Add the links of a joint, and return the place of its child."""
@@ -196,15 +255,25 @@ class Links:
         ratio = values.ratio if joint.mimic else 1.0
         for k, motion in enumerate(motions):
             fixed, aligned = _aligned(R_J, motion.axis)
+            index = len(self.links)
+            slide = self._slides.get(index, 0)
+            if slide:
+                p_J = [x + row[2] * slide for x, row in zip(p_J, fixed, strict=True)]
             link = Link(joint, parent, _factors(fixed), [_rounded(x) for x in p_J], motion=motion)
-            link.turn = [PlaneRotation(2, cos(q[k]), sin(q[k]))] if motion.turns else []
+            angle = q[k]
+            if index in self._turns:
+                c, s = _MP.cos(self._turns[index]), _MP.sin(self._turns[index])
+                aligned = _product(aligned, [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+                angle = angle + float(self._turns[index])
+            link.turn = [PlaneRotation(2, cos(angle), sin(angle))] if motion.turns else []
             link.slide = [0.0, 0.0, motion.advance * q[k]]
             unit = [0.0, 0.0, motion.advance, 0.0, 0.0, 1.0 if motion.turns else 0.0]
             link.columns = [(first + k, [ratio * x for x in unit])]
             link.rate = [x * v[k] for x in unit]
             link.rotors = [values.armature[k] * ratio * ratio]
             self.links.append(link)
-            parent, R_J, p_J = len(self.links) - 1, _transposed(aligned), [0.0] * 3
+            self._fixed.append((fixed, p_J))
+            parent, R_J, p_J = index, _transposed(aligned), [0.0, 0.0, -slide if slide else 0.0]
         return parent, R_J, p_J
 
     def _velocities(self, joint: Joint) -> int:
@@ -227,6 +296,7 @@ class Links:
         link.drift = _drift(link.rate, kin)
         link.rotors = [x * ratio * ratio for x in values.armature]
         self.links.append(link)
+        self._fixed.append((R_J, p_J))
         return len(self.links) - 1, _IDENTITY, [0.0] * 3
 
     def _hold(self, body: str) -> None:
@@ -321,7 +391,10 @@ def _aligned(R_J: Rows, axis: Any) -> tuple[Rows, Rows]:
     for A in _PERMUTATIONS:
         if all(row[2] == x for row, x in zip(A, z, strict=True)):
             fixed = _product(R_J, A)
-            if not _literal(*(x for row in fixed for x in row)) or _is_permutation(fixed):
+            if not _literal(*(x for row in fixed for x in row)):
+                return fixed, [[_exact(x) for x in row] for row in A]
+            fixed = [[_snapped(x) for x in row] for row in fixed]
+            if _is_permutation(fixed):
                 return fixed, [[_exact(x) for x in row] for row in A]
     if not _literal(*(x for row in R_J for x in row)):
         return _product(R_J, (A := _frame(z))), A
@@ -331,7 +404,7 @@ def _aligned(R_J: Rows, axis: Any) -> tuple[Rows, Rows]:
     x = [-up[1] / across, up[0] / across, _MP.mpf(0)] if across > _PARALLEL else [_MP.mpf(1), _MP.mpf(0), _MP.mpf(0)]
     if across <= _PARALLEL:
         up = [_MP.mpf(0), _MP.mpf(0), _MP.mpf(1 if up[2] > 0 else -1)]
-    fixed = _transposed([x, cross3(up, x), up])
+    fixed = [[_snapped(c) for c in row] for row in _transposed([x, cross3(up, x), up])]
     return fixed, _product(_transposed(R_J), fixed)
 
 
@@ -356,6 +429,17 @@ def _frame(z: Vector) -> Rows:
     x = cross3([1.0 if i == least else 0.0 for i in range(3)], z)
     x = _unit(x)
     return _transposed([x, cross3(z, x), z])
+
+
+def _right_angles_apart(a: Any, b: Any) -> bool:
+    turns = (a - b) / (_MP.pi / 2)
+    return bool(abs(turns - _MP.nint(turns)) < _NOISE)
+
+
+def _snapped(x: Any) -> Any:
+    """Return a whole number for one that differs by the rounding of 120 bits."""
+    nearest = _MP.nint(x)
+    return nearest if abs(x - nearest) < _NOISE else x
 
 
 def _is_permutation(R: Rows) -> bool:

@@ -30,6 +30,9 @@ class Factor(Protocol):
     def congruence(self, A: Vector) -> Vector:
         """Return R A Rᵀ of a symmetric matrix."""
 
+    def two_sided(self, H: Rows) -> Rows:
+        """Return R H Rᵀ of any matrix."""
+
 
 Rotation = Sequence[Factor]
 
@@ -57,6 +60,11 @@ class Permutation:
         """Return R A Rᵀ of a symmetric matrix."""
         p, s = self.places, self.signs
         return [signed(s[i] * s[j], A[SYMMETRIC[p[i]][p[j]]]) for i in range(3) for j in range(i, 3)]
+
+    def two_sided(self, H: Rows) -> Rows:
+        """Return R H Rᵀ of any matrix."""
+        p, s = self.places, self.signs
+        return [[signed(s[i] * s[j], H[p[i]][p[j]]) for j in range(3)] for i in range(3)]
 
 
 class PlaneRotation:
@@ -90,6 +98,18 @@ class PlaneRotation:
         out[ki], out[kj] = c * A[ki] - s * A[kj], s * A[ki] + c * A[kj]
         return out
 
+    def two_sided(self, H: Rows) -> Rows:
+        """Return R H Rᵀ of any matrix; the change of its diagonal is s w, with w = s (a - d) + c (b + b')."""
+        i, j, k, c, s = self._i, self._j, self.axis, self.c, self.s
+        out = [list(row) for row in H]
+        w = s * difference(H[i][i], H[j][j]) + c * (H[i][j] + H[j][i])
+        change = s * w
+        out[i][i], out[j][j] = H[i][i] - change, H[j][j] + change
+        out[i][j], out[j][i] = c * w - H[j][i], c * w - H[i][j]
+        out[k][i], out[k][j] = c * H[k][i] - s * H[k][j], s * H[k][i] + c * H[k][j]
+        out[i][k], out[j][k] = c * H[i][k] - s * H[j][k], s * H[i][k] + c * H[j][k]
+        return out
+
 
 class Matrix:
     """Any rotation, by its rows."""
@@ -112,6 +132,11 @@ class Matrix:
         columns = [self.apply([A[SYMMETRIC[i][j]] for i in range(3)]) for j in range(3)]
         rows = [[columns[j][i] for j in range(3)] for i in range(3)]
         return [sum((self.rows[j][k] * rows[i][k] for k in range(3)), 0.0) for i in range(3) for j in range(i, 3)]
+
+    def two_sided(self, H: Rows) -> Rows:
+        """Return R H Rᵀ of any matrix."""
+        half = [self.apply([H[i][j] for i in range(3)]) for j in range(3)]
+        return [self.apply([half[j][i] for j in range(3)]) for i in range(3)]
 
 
 def signed(sign: float, x: Any) -> Any:
@@ -148,6 +173,5 @@ def congruence(R: Rotation, A: Vector) -> Vector:
 def two_sided(R: Rotation, H: Rows) -> Rows:
     """Return R H Rᵀ of any matrix."""
     for factor in reversed(R):
-        half = [factor.apply([H[i][j] for i in range(3)]) for j in range(3)]
-        H = [factor.apply([half[j][i] for j in range(3)]) for i in range(3)]
+        H = factor.two_sided(H)
     return H
