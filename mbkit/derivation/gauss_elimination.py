@@ -28,8 +28,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import casadi as ca
-
 from mbkit.derivation.kinematics import Vector, add, dot3
 from mbkit.derivation.link_mechanics import (
     LinkMechanics,
@@ -42,7 +40,8 @@ from mbkit.derivation.link_mechanics import (
     with_moment,
 )
 from mbkit.derivation.links import Inertia, Link
-from mbkit.derivation.model_values import is_zero, scalar
+from mbkit.derivation.mass_matrix_solve import reciprocal
+from mbkit.derivation.model_values import is_zero
 from mbkit.derivation.rotations import SYMMETRIC, Rotation, Rows, congruence, difference, two_sided
 from mbkit.model.joint_types import cross3
 
@@ -178,14 +177,6 @@ class GaussFunction:
             change = [turned[j][i] + back[i][j] for i in range(3) for j in range(i, 3)]
             self.H, self.I = H, add(self.I, change)
         self.K = {k: with_moment(x, r) for k, x in self.K.items()}
-
-
-def reciprocal(x: Any) -> Any:
-    """Return 1/x; infinite, which the evaluation reports, where x is zero for good."""
-    if isinstance(x, ca.SX):
-        # CasADi would make a quotient of a product with 1/x, and a processor divides at a twentieth of its speed.
-        return scalar(2.0 / (x + x))
-    return 1.0 / x if x else float("inf")
 
 
 @dataclass

@@ -27,7 +27,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times, dot3
-from mbkit.derivation.mass_matrix_solve import Elimination, elimination_order, elimination_size
+from mbkit.derivation.mass_matrix_solve import Elimination, elimination_order, elimination_size, reciprocal
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model import Model
 from mbkit.model.joint_types import cross3
@@ -184,17 +184,17 @@ class LeastConstraint(Elimination):
             k = self._order[place]
             column = columns[k]
             weighted = {row: x * weights[row] for row, x in column.items()}
-            # A joint that moves nothing has no entry at all: the quotient is then infinite, and the
+            # A joint that moves nothing has no entry at all: the inverse is then infinite, and the
             # evaluation reports it.
-            diagonal = self.diagonal[k] = _dot(weighted, column)
+            inverse = self.inverse[k] = reciprocal(_dot(weighted, column))
             for i in self._order[:place]:
                 other = columns[i]
                 if not weighted.keys().isdisjoint(other):
-                    factor = self.factors[k][i] = _dot(weighted, other) / diagonal
+                    factor = self.factors[k][i] = _dot(weighted, other) * inverse
                     _subtract(other, factor, column)
             pull = self._pulls[k] = _dot(weighted, drifts)
             if column:
-                _subtract(drifts, pull / diagonal, column)
+                _subtract(drifts, pull * inverse, column)
 
     def accelerations(self, f: ca.SX) -> ca.SX:
         """Return v̇ under forces f of the joints, (n,), which hold neither gravity nor what v makes."""
@@ -212,8 +212,10 @@ def _subtract(x: dict[int, Any], factor: Any, y: dict[int, Any]) -> None:
 
 # Where it is taken: D_k comes from an orthogonal factorization B = QR, T = ½ |B v|².
 
-#: Largest M_kk/D_k of the LᵀDL factorization, some 6 of 16 digits.
-_MAX_RATIO: Final = 5e5
+#: Largest M_kk/D_k of an elimination, some 5 of 16 digits.
+_MAX_RATIO: Final = 1e5
+#: Largest M_kk/D_k where matter is moved between links, which loses up to twice as many eps.
+_MAX_REGROUPED: Final = 1e4
 #: Largest count of multiplications of the sparse LᵀDL, some n³/3 for a chain: the orthogonal elimination takes several
 #: times as many, which doubles forward dynamics of 16 links.
 _MAX_SIZE: Final = 2000
@@ -240,8 +242,24 @@ def loses_digits(model: Model) -> bool:
     return cancellation(model, enough=_MAX_RATIO) > _MAX_RATIO
 
 
+@lru_cache(maxsize=64)
+def regroups(model: Model) -> bool:
+    """Return whether matter that no motion tells apart can be moved to parents without a loss of digits.
+
+    Decided at nominal parameters; False where one has no value.
+    """
+    if any(x is None for x in model.parameters.values()):
+        return False
+    if any(joint.type.gimbal is not None for joint in model.joints):
+        return False
+    rng = np.random.default_rng(0)
+    with np.errstate(all="ignore"):
+        poses = np.concatenate([model.random_state(rng, _STATES)[0], _right_angles(model, rng)])
+        return bool(model.nv and _bound(model, poses) <= _MAX_REGROUPED)
+
+
 def cancellation(model: Model, enough: float = np.inf) -> float:
-    """Return about the largest M_kk/D_k of any pose, or an upper bound if that is below 5e5.
+    """Return about the largest M_kk/D_k of any pose, or an upper bound if that is below 1e5.
 
     Infinite where a joint can lock; 1 where M is singular at every pose. The search goes from the worst of a few poses
     along the velocities, and ends beyond `enough`; it may miss a pose where several have to be right at once.

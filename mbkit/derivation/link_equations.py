@@ -7,18 +7,23 @@ principle (`mbkit.derivation.link_mechanics`), M and forward dynamics from Gauss
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import casadi as ca
 
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
+from mbkit.derivation.least_constraint import regroups
 from mbkit.derivation.link_mechanics import LinkMechanics
 from mbkit.derivation.links import Links
 from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.model_values import Constants, scalar
 from mbkit.model import Model
+
+#: Carrying the velocities of so many more links is tried in vain before the search for the fewest operations ends.
+_PATIENCE: Final = 2
 
 
 def equations_of(model: Model, constants: Constants = "literal") -> Equations:
@@ -28,19 +33,18 @@ def equations_of(model: Model, constants: Constants = "literal") -> Equations:
     """
     of_energies = model.energy_equations
     if of_energies is not None:
-        return of_energies(constants)
+        written: Equations = of_energies(constants)
+        return written
     return LinkEquations(model) if constants == "literal" else Equations(model, constants)
 
 
 class LinkEquations(Equations):
     """The equations of motion of a model with bodies, its numbers as floats; parameters may be symbols."""
 
-    regroup = True
-
     @cached_property
     def links(self) -> Links:
         """The tree in axes of its own."""
-        return Links(self.kin, regroup=self.regroup)
+        return Links(self.kin, regroup=regroups(self.model))
 
     @cached_property
     def mechanics(self) -> LinkMechanics:
@@ -81,10 +85,38 @@ class LinkEquations(Equations):
 
     @cached_property
     def forward_dynamics(self) -> Any:
-        """M⁻¹ (τ + τ_passive - C v - g)."""
+        """M⁻¹ (τ + τ_passive - C v - g), in the form with the fewest operations.
+
+        All accelerations are eliminated link by link, or those next to the root are carried and come from the factors
+        of a small matrix.
+        """
         if self.least_constraint is not None:
             return self.least_constraint.accelerations(self.tau + self.passive)
-        return self._reduced(())
+        best = self._reduced(())
+        if not regroups(self.model):
+            # A matrix of what is left would lose digits too.
+            return best
+        worse, least = 0, ca.n_nodes(best)
+        for carried in self._carried():
+            other = self._reduced(carried)
+            size = ca.n_nodes(other)
+            worse = 0 if size < least else worse + 1
+            if not worse:
+                best, least = other, size
+            if worse == _PATIENCE:
+                break
+        return best
+
+    def _carried(self) -> Iterator[tuple[int, ...]]:
+        """Yield the velocities of the links next to the root, deeper and deeper."""
+        links = self.links.links
+        depths: list[int] = []
+        for link in links:
+            depths.append(depths[link.parent] + 1 if link.parent >= 0 else 1)
+        by_depth = sorted(zip(depths, range(len(links)), strict=True), reverse=True)
+        least = {k: depth for depth, index in by_depth for k, _ in links[index].columns}
+        for depth in range(1, max(depths, default=0) + 1):
+            yield tuple(k for k in self.elimination_order if least[k] <= depth)
 
     def _reduced(self, carried: tuple[int, ...]) -> Any:
         """Return the accelerations, those in `carried` from the factors of a matrix that is left."""

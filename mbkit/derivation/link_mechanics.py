@@ -143,11 +143,12 @@ class LinkMechanics:
             if link.parent >= 0:
                 x = rotated6(link.fixed, with_moment(rotated6(link.turn, x), link.slide))
                 wrenches[link.parent] = add(wrenches[link.parent], with_moment(x, link.translation))
-        for coupling in self.kin.model.couplings if a is not None else ():
-            row, armature = self.coupling(coupling)
-            rate = sum((c * a[k] for k, c in row.items()), 0.0)
-            for k, c in row.items():
-                out[k] = out[k] + armature * c * rate
+        if a is not None:
+            for coupling in self.kin.model.couplings:
+                row, armature = self.coupling(coupling)
+                rate = sum((c * a[k] for k, c in row.items()), 0.0)
+                for k, c in row.items():
+                    out[k] = out[k] + armature * c * rate
         return out
 
     def coupling(self, coupling: JointCoupling) -> tuple[dict[int, Any], Any]:

@@ -420,7 +420,8 @@ def _orthonormal(R: Rows) -> Rows:
     A = [[_exact(x) for x in row] for row in R]
     # A step of Newton's iteration for the polar factor.
     square = _product(_transposed(A), A)
-    return [[1.5 * a - 0.5 * b for a, b in zip(*rows, strict=True)] for rows in zip(A, _product(A, square), strict=True)]
+    cube = _product(A, square)
+    return [[1.5 * a - 0.5 * b for a, b in zip(*rows, strict=True)] for rows in zip(A, cube, strict=True)]
 
 
 def _frame(z: Vector) -> Rows:
