@@ -72,7 +72,7 @@ def test_factors_reproduce_the_mass_matrix_and_solve_the_equation_of_motion(mimi
     for k, row in enumerate(way.factors):
         for i, factor in row.items():
             L[k, i] = factor
-    D = ca.diag(ca.vertcat(*way.diagonal))
+    D = ca.diag(1 / ca.vertcat(*way.inverse))
     a = way.accelerations(eq.tau + eq.passive)
     rest = ca.substitute(eq.inverse_dynamics, eq.a, a) - eq.tau
     unit = ca.mtimes(eq.mass_matrix, way.solve(ca.SX.eye(n)))

@@ -244,8 +244,9 @@ class Links:
         """Add the links of a joint, and return the place of its child."""
         parent, R, p = self._places[joint.parent]
         values, kin = self.kin.values.joints[joint.name], self.kin
-        own: Rotation = [Matrix([[_exact(x) for x in row] for row in R])]
-        p_J = add(p, to_parent(own, [_exact(x) for x in values.translation]))
+        number = _exact if _literal(*(x for row in R for x in row), *p, *values.translation) else _rounded
+        own: Rotation = [Matrix([[number(x) for x in row] for row in R])]
+        p_J = add([number(x) for x in p], to_parent(own, [number(x) for x in values.translation]))
         R_J = _product(R, _orthonormal(values.rotation))
         motions = joint.type.motions(values)
         if motions is None or not all(_literal(*motion.axis) for motion in motions):
@@ -258,7 +259,7 @@ class Links:
             index = len(self.links)
             slide = self._slides.get(index, 0)
             if slide:
-                p_J = [x + row[2] * slide for x, row in zip(p_J, fixed, strict=True)]
+                p_J = [_exact(x) + row[2] * slide for x, row in zip(p_J, fixed, strict=True)]
             link = Link(joint, parent, _factors(fixed), [_rounded(x) for x in p_J], motion=motion)
             angle = q[k]
             if index in self._turns:
