@@ -181,7 +181,7 @@ def test_another_layout_of_arrays_leads_to_the_checked_way(monkeypatch: pytest.M
         dyn = mb.dynamics(model, "lagrangian", compile=True)
         for _ in range(2):
             np.testing.assert_array_equal(dyn.nle(q, v), expected)
-        assert dyn._short["nle"].single(q, v, np.empty(6)) is False
+        assert dyn._short["nle",].single(q, v, np.empty(6)) is False
     finally:
         monkeypatch.undo()
         page._layout_is_known.cache_clear()
@@ -203,6 +203,56 @@ def test_threads_do_not_meet() -> None:
         sys.setswitchinterval(interval)
     for i, x in enumerate(results):
         np.testing.assert_array_equal(x, expected[i % 40])
+
+
+ASKED: dict[str, tuple[int, tuple[str, ...]]] = {
+    "mass_matrix": (1, ()),
+    "gravity": (1, ()),
+    "kinetic_energy": (2, ()),
+    "nle": (2, ()),
+    "forward_dynamics": (3, ()),
+    "inverse_dynamics_derivatives": (3, ()),
+    "forward_dynamics_derivatives": (3, ()),
+    "pose": (1, ("tool0",)),
+    "jacobian": (1, ("tool0", "body")),
+}
+
+
+@pytest.mark.parametrize("parametric", [False, True])
+@pytest.mark.parametrize("name", ASKED)
+def test_every_way_to_ask_has_the_same_bits(name: str, parametric: bool) -> None:
+    model = mb.load("ur5")
+    if parametric:
+        model = mb.catalog.double_pendulum(mass1=mb.Parameter("m", 2.0))
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    count, frame = ASKED[name]
+    if frame and parametric:
+        frame = (model.bodies[-1].name, *frame[1:])
+    states = np.random.default_rng(2).standard_normal((3, 4, model.nv))[:count]
+    ask = getattr(dyn, name)
+    first = ask(*states[:, 1].tolist(), *frame)
+    batch = ask(*states, *frame)
+    single = ask(*states[:, 1], *frame)
+    for x, y, z in zip(*((out if isinstance(out, tuple) else (out,)) for out in (first, batch, single)), strict=True):
+        assert np.shape(x) == np.shape(z) == y.shape[1:]
+        np.testing.assert_array_equal(z, x)
+        np.testing.assert_array_equal(z, y[1])
+    for bad in (np.nan, np.inf):
+        states[-1, 1, -1] = bad
+        with pytest.raises(mb.errors.InputError, match="expected finite numbers"):
+            ask(*states[:, 1], *frame)
+
+
+def test_frames_that_are_not_there_are_named() -> None:
+    dyn = mb.dynamics(mb.load("ur5"), "lagrangian", compile=True)
+    q = np.zeros(6)
+    for _ in range(2):
+        dyn.pose(q, "tool0")
+        dyn.jacobian(q, "tool0")
+    with pytest.raises(mb.errors.UnknownNameError, match="did you mean 'tool0'"):
+        dyn.pose(q, "tool")
+    with pytest.raises(mb.errors.InputError, match="axes: expected 'world' or 'body'"):
+        dyn.jacobian(q, "tool0", "tool0")
 
 
 @pytest.mark.parametrize("name", ["mass_matrix", "gravity", "nle", "forward_dynamics", "kinetic_energy"])

@@ -1,9 +1,11 @@
-"""What a single call through mbkit costs beside the bare call of the engine.
+"""What a single call through mbkit costs beside the bare call of an engine, and a single step.
 
 Run ``python -m validation.bench_single_calls``. Both sides are timed in turn in one
 process, so that the machine's mood meets them alike; ratios are what to read. The
-budget: at most the bare call + 1 µs, and 1.5 times it for Panda's inverse dynamics,
-nle and forward dynamics.
+budget of mbkit's Pinocchio engine: at most the bare call + 1 µs, and 1.5 times it for
+Panda's inverse dynamics, nle and forward dynamics. The budget of the own derivation:
+at most Pinocchio's bare call. A step is RK4 at 1 ms; beside it stand ``mj_step`` with
+the same formula, and a run of one step.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ import statistics
 import subprocess
 import sys
 import time
+import timeit
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 
@@ -71,8 +75,21 @@ def calls(dyn, m, d, model, q, v, a):
     )
 
 
+def step_row(label, model, q, v, tau):
+    """Return the row of a step of 1 ms: of the own derivation, of mj_step, and of a run of one step, µs."""
+    dyn, mj = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "mujoco")
+    m = mj.mj_model
+    m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, 1e-3
+    d = mujoco.MjData(m)
+    mine, theirs, ratio = pair(lambda: dyn.step(q, v, tau, 1e-3), lambda: mujoco.mj_step(m, d))
+    times = timeit.repeat(lambda: mb.simulate(dyn, q, v, 1e-3, dt=1e-3, torque=tau), number=20, repeat=9)
+    run = min(times) / 20 * 1e6
+    print(f"{label:30} step {mine:7.2f} µs  mj_step {theirs:7.2f} µs  × {ratio:.2f}  simulate {run:.0f} µs")
+    return {"model": label, "step_us": mine, "mj_step_us": theirs, "ratio": ratio, "simulate_us": run}
+
+
 def main():
-    rows = []
+    rows, own_rows, steps = [], [], []
     cases = (
         ("ur5", mb.load("ur5")),
         ("panda, mimic free", mb.load("panda", mimic="free")),
@@ -86,16 +103,19 @@ def main():
         rng = np.random.default_rng(0)
         q, v = model.random_state(rng)
         a = rng.standard_normal(model.nv)
-        for name, ours, bare in calls(dyn, m, m.createData(), model, q, v, a):
-            mine, theirs, ratio = pair(ours, bare)
-            rows.append({"model": label, "call": name, "mbkit_us": mine, "bare_us": theirs, "ratio": ratio})
-            print(
-                f"{label:30} {name:18} {mine:7.2f} µs  bare {theirs:7.2f} µs  + {mine - theirs:5.2f} µs  × {ratio:.2f}"
-            )
+        for engine, kept in ((dyn, rows), (mb.dynamics(model, "lagrangian"), own_rows)):
+            for name, ours, bare in calls(engine, m, m.createData(), model, q, v, a):
+                mine, theirs, ratio = pair(ours, bare)
+                kept.append({"model": label, "call": name, "mbkit_us": mine, "bare_us": theirs, "ratio": ratio})
+                print(
+                    f"{label:30} {engine.engine:10} {name:18} {mine:7.2f} µs  bare {theirs:7.2f} µs  "
+                    f"+ {mine - theirs:5.2f} µs  × {ratio:.2f}"
+                )
+        steps.append(step_row(label, model, q, v, a))
     imports = import_seconds()
     print(f"import mbkit {imports['mbkit']:.3f} s (numpy alone {imports['numpy']:.3f} s)")
     with open("validation/single_calls.json", "w", encoding="utf-8") as f:
-        json.dump({"rows": rows, "import_s": imports, **stamp()}, f, indent=1)
+        json.dump({"rows": rows, "own": own_rows, "steps": steps, "import_s": imports, **stamp()}, f, indent=1)
 
 
 if __name__ == "__main__":

@@ -7,16 +7,16 @@ between calls: each takes its work space from Python's allocator, so that thread
 lock. It holds the interpreter's lock, because a thread that lets go of it for a microsecond may get it back only after
 milliseconds.
 
-What it does is in an array of 64-bit numbers, the function's own object::
+Each vector of numbers has a place in the work space, every entry in all lanes of a register, as the compiled functions
+take it without copies of their own. The plan of the function is an array of 64-bit numbers, its own object::
 
-    arguments, inputs, bytes of work space, first place of slots and of table in it, number of temporary vectors,
-    of quaternions, and of compiled functions; then for each
-      input: its entries, or -1 for a Python float
-      temporary vector: its first place in the work space
-      quaternion: its first entry in the first argument
-      compiled function: address of its loop, inputs, outputs, share of the work space, slots and rows of all of them
+    addresses of types and functions, numbers of arguments and of inputs, bytes of work space, place of the table in it,
+    numbers of quaternions and of compiled functions; then for each
+      argument: its entries, or -1 for a Python float, and its place
+      quaternion: the place of its first entry
+      compiled function: address of its loop, inputs, outputs, share of the work space, places and rows of all of them
 
-A slot is an address and a stride, in doubles: of the inputs, the results, and the temporary vectors, in this order.
+Places count doubles from the start of the work space.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _KIND: Final = _HEAD + 1
 _TABLE: Final = 3 + 4 * 2 * MOST_ARRAYS
 # Places in the array of numbers: what holds of every function in this process, then what is its own.
 (_ARRAY, _FLOAT, _DOUBLE_KIND, _TAKE, _GIVE, _BOOL) = range(6)
-(_ARGUMENTS, _INPUTS, _BYTES, _SLOTS_AT, _TABLE_AT, _TEMPORARY, _QUATERNIONS, _CALLS, _LISTS) = range(6, 15)
+(_ARGUMENTS, _INPUTS, _BYTES, _TABLE_AT, _QUATERNIONS, _CALLS, _LISTS) = range(6, 13)
 _METH_FASTCALL: Final = 0x80
 _I32, _I64, _F64, _PTR = ir.IntType(32), ir.IntType(64), ir.DoubleType(), ir.PointerType()
 
@@ -61,7 +61,7 @@ class _Definition(ctypes.Structure):
 
 
 class _Numbers(np.ndarray):
-    """What a function does, with the code that it runs."""
+    """The plan of a function, with the code that it runs."""
 
     kept: Any
 
@@ -85,7 +85,7 @@ def python_call(
     Returns
     -------
     callable
-        It returns False, and leaves any numbers in the results, where an input is not a float64 array of this very
+        It returns False, and leaves the results as they are, where an input is not a float64 array of this very
         shape, with words aligned, or a quaternion is not of unit length, or a number read or written on the way is not
         finite.
     """
@@ -94,24 +94,21 @@ def python_call(
     rows = {name: abs(n) for name, n in inputs.items()}
     for code, _, writes in steps:
         rows |= {name: r * c for name, (r, c) in zip(writes, code.shapes, strict=True)}
-    temporary = [name for name in rows if name not in (*inputs, *results)]
-    slots = {name: i for i, name in enumerate((*inputs, *results, *temporary))}
-    place = max(code.work_size for code, _, _ in steps)
-    places = []
-    for name in temporary:
-        places.append(place)
-        place += rows[name]
+    width, place, places = jit.host().width, max(code.share for code, _, _ in steps), {}
+    for name, n in rows.items():
+        places[name] = place
+        place += n * width
     calls = []
     for code, reads, writes in steps:
         loop = ctypes.cast(code.loaded.run, ctypes.c_void_p).value
         calls += [loop, len(reads), len(writes), code.share]
-        calls += [x for name in (*reads, *writes) for x in (slots[name], rows[name])]
-    slots_at, table_at = place, place + 2 * len(slots)
+        calls += [x for name in (*reads, *writes) for x in (places[name], rows[name])]
     # The work space begins at a cache line.
-    size = 8 * (table_at + _TABLE) + 64
-    counts = [len(inputs) + len(results), len(inputs), size, slots_at, table_at]
-    counts += [len(temporary), len(quaternions), len(steps)]
-    lists = [*inputs.values(), *places, *quaternions, *calls]
+    size = 8 * (place + _TABLE) + 64
+    counts = [len(inputs) + len(results), len(inputs), size, place, len(quaternions), len(steps)]
+    arguments = [x for name, n in (*inputs.items(), *((r, rows[r]) for r in results)) for x in (n, places[name])]
+    turns = [places[next(iter(inputs))] + start * width for start in quaternions]
+    lists = [*arguments, *turns, *calls]
     numbers = np.array([*_process(), *counts, *lists], dtype=np.int64).view(_Numbers)
     numbers.kept = [code for code, _, _ in steps]
     new = ctypes.pythonapi.PyCFunction_NewEx
@@ -175,15 +172,15 @@ def _code() -> str:
         kind = ir.FunctionType(result, [x.type for x in given])
         return b.call(b.inttoptr(address, ir.PointerType(kind)), given)
 
-    inputs, temporary, quaternions = number(_INPUTS), number(_TEMPORARY), number(_QUATERNIONS)
-    sizes = b.at(numbers, _I64(_LISTS), _I64)
-    places = b.at(sizes, inputs, _I64)
-    starts = b.at(places, temporary, _I64)
-    calls = b.at(starts, quaternions, _I64)
+    width = jit.host().width
+    several = _I64(width)
+    lanes = ir.VectorType(_F64, width)
+    entries = b.at(numbers, _I64(_LISTS), _I64)
+    starts = b.at(entries, b.mul(number(_ARGUMENTS), _I64(2)), _I64)
+    calls = b.at(starts, number(_QUATERNIONS), _I64)
+    refused, refused_late = (f.append_basic_block(n) for n in ("refused", "refused_late"))
 
-    refused, kept, refused_late = (f.append_basic_block(n) for n in ("refused", "kept", "refused_late"))
-
-    def require(condition: Any, otherwise: Any) -> None:
+    def require(condition: Any, otherwise: Any = refused_late) -> None:
         yes = f.append_basic_block("yes")
         b.cbranch(condition, yes, otherwise)
         b.position_at_end(yes)
@@ -192,54 +189,55 @@ def _code() -> str:
     block = call(number(_TAKE), _PTR, number(_BYTES))
     require(b.icmp_unsigned("!=", b.ptrtoint(block, _I64), _I64(0)), refused)
     work = b.inttoptr(b.and_(b.add(b.ptrtoint(block, _I64), _I64(63)), _I64(-64)), _PTR)
-    slots, table = (b.at(work, number(place), _I64) for place in (_SLOTS_AT, _TABLE_AT))
+    table = b.at(work, number(_TABLE_AT))
 
-    def fill(slot: Any, address: Any, stride: Any) -> None:
-        b.set(address, slots, b.mul(slot, _I64(2)), _I64)
-        b.set(stride, slots, b.add(b.mul(slot, _I64(2)), _I64(1)), _I64)
+    def described(i: Any) -> tuple[Any, Any, Any]:
+        """Return argument i, its entries, and its place."""
+        size, place = (b.get(entries, b.add(b.mul(i, _I64(2)), _I64(k)), _I64) for k in (0, 1))
+        return b.get(arguments, i, _PTR), size, b.at(work, place)
+
+    def spread(x: Any, place: Any) -> None:
+        one = b.insert_element(ir.Constant(lanes, ir.Undefined), x, _I32(0))
+        zeros = ir.Constant(ir.VectorType(_I32, width), [0] * width)
+        b.store(b.shuffle_vector(one, one, zeros), place, align=8)
 
     def one_input(i: Any) -> None:
-        given, size = b.get(arguments, i, _PTR), b.get(sizes, i, _I64)
+        given, size, place = described(i)
         kind = b.get(given, _I64(_HEAD - 1), _I64)
         with b.if_else(b.icmp_signed("==", size, _I64(-1))) as (is_float, is_array):
             with is_float:
-                require(b.icmp_signed("==", kind, number(_FLOAT)), refused_late)
-                fill(i, b.add(b.ptrtoint(given, _I64), _I64(8 * _HEAD)), _I64(1))
+                require(b.icmp_signed("==", kind, number(_FLOAT)))
+                spread(b.get(given, _I64(_HEAD)), place)
             with is_array:
-                require(b.icmp_signed("==", kind, number(_ARRAY)), refused_late)
-                require(b.icmp_signed("==", b.load(b.at(given, _I64(_RANK)), typ=_I32, align=4), _I32(1)), refused_late)
-                require(b.icmp_signed("==", b.get(b.get(given, _I64(_SHAPE), _PTR), _I64(0), _I64), size), refused_late)
+                require(b.icmp_signed("==", kind, number(_ARRAY)))
+                require(b.icmp_signed("==", b.load(b.at(given, _I64(_RANK)), typ=_I32, align=4), _I32(1)))
+                require(b.icmp_signed("==", b.get(b.get(given, _I64(_SHAPE), _PTR), _I64(0), _I64), size))
                 dtype = b.get(b.get(given, _I64(_DTYPE), _PTR), _I64(_KIND), _I64)
-                require(b.icmp_signed("==", dtype, number(_DOUBLE_KIND)), refused_late)
+                require(b.icmp_signed("==", dtype, number(_DOUBLE_KIND)))
                 address = b.get(given, _I64(_DATA), _I64)
                 stride = b.get(b.get(given, _I64(_STRIDES), _PTR), _I64(0), _I64)
                 whole = b.and_(b.or_(address, stride), _I64(7))
-                require(b.icmp_signed("==", whole, _I64(0)), refused_late)
-                fill(i, address, b.ashr(stride, _I64(3)))
+                require(b.icmp_signed("==", whole, _I64(0)))
+                data, step = b.inttoptr(address, _PTR), b.ashr(stride, _I64(3))
 
-    def one_result(i: Any) -> None:
-        fill(i, b.get(b.get(arguments, i, _PTR), _I64(_DATA), _I64), _I64(1))
+                def one_entry(j: Any) -> None:
+                    spread(b.get(data, b.mul(j, step)), b.at(place, b.mul(j, several)))
 
-    def one_temporary(i: Any) -> None:
-        place = b.at(work, b.get(places, i, _I64))
-        fill(b.add(number(_ARGUMENTS), i), b.ptrtoint(place, _I64), _I64(1))
+                b.count(_I64(0), size, 1, one_entry)
 
     def one_quaternion(i: Any) -> None:
-        q, stride = b.get(slots, _I64(0), _PTR), b.get(slots, _I64(1), _I64)
+        start = b.get(starts, i, _I64)
         error = _F64(-1.0)
         for k in range(4):
-            x = b.get(q, b.mul(b.add(b.get(starts, i, _I64), _I64(k)), stride))
+            x = b.get(work, b.add(start, _I64(k * width)))
             error = b.fadd(error, b.fmul(x, x))
         # Neither holds of NaN.
         low, high = b.fcmp_ordered(">", error, _F64(-NEAR_UNIT)), b.fcmp_ordered("<", error, _F64(NEAR_UNIT))
-        require(b.and_(low, high), refused_late)
+        require(b.and_(low, high))
 
-    b.count(_I64(0), inputs, 1, one_input)
-    b.count(_I64(0), quaternions, 1, one_quaternion)
-    b.count(inputs, number(_ARGUMENTS), 1, one_result)
-    b.count(_I64(0), temporary, 1, one_temporary)
-    for lane in range(jit.host().width):
-        b.set(_F64(0.0), work, _I64(lane))
+    b.count(_I64(0), number(_INPUTS), 1, one_input)
+    b.count(_I64(0), number(_QUATERNIONS), 1, one_quaternion)
+    spread(_F64(0.0), work)
     at = b.room(_PTR, 1)
     b.store(calls, at)
 
@@ -251,22 +249,24 @@ def _code() -> str:
         arrays, many = b.at(entry, _I64(4), _I64), b.add(reads, writes)
 
         def one_array(i: Any) -> None:
-            slot, size = (b.get(arrays, b.add(b.mul(i, _I64(2)), _I64(k)), _I64) for k in (0, 1))
-            address, stride = (b.get(slots, b.add(b.mul(slot, _I64(2)), _I64(k)), _I64) for k in (0, 1))
+            place, rows = (b.get(arrays, b.add(b.mul(i, _I64(2)), _I64(k)), _I64) for k in (0, 1))
             row = b.add(b.mul(i, _I64(4)), _I64(3))
-            for k, x in enumerate((address, size, stride, _I64(0))):
+            for k, x in enumerate((b.ptrtoint(b.at(work, place), _I64), rows, several, _I64(1))):
                 b.set(x, table, b.add(row, _I64(k)), _I64)
 
         b.count(_I64(0), many, 1, one_array)
-        call(loop, ir.VoidType(), table, work, _I64(0), _I64(1))
+        call(loop, ir.VoidType(), table, work, _I64(0), several)
         b.store(b.at(arrays, b.mul(many, _I64(2)), _I64), at)
 
     b.count(_I64(0), number(_CALLS), 1, one_call)
-    # The first lane is the state's own.
-    require(b.fcmp_ordered("==", b.get(work, _I64(0)), _F64(0.0)), refused_late)
-    b.branch(kept)
+    require(b.fcmp_ordered("==", b.get(work, _I64(0)), _F64(0.0)))
 
-    b.position_at_end(kept)
+    def one_result(i: Any) -> None:
+        given, size, place = described(i)
+        data = b.get(given, _I64(_DATA), _PTR)
+        b.count(_I64(0), size, 1, lambda j: b.set(b.get(place, b.mul(j, several)), data, j))
+
+    b.count(number(_INPUTS), number(_ARGUMENTS), 1, one_result)
     call(number(_GIVE), ir.VoidType(), block)
     b.ret(call(number(_BOOL), _PTR, _I64(1)))
     b.position_at_end(refused_late)

@@ -29,11 +29,15 @@ _ONE_PIECE: Final = 20_000
 
 
 class QuantityCall(NamedTuple):
-    """Calls for float64 arrays: `single` of one state fills an array of `shape`, `batch` returns its result or None."""
+    """Calls for float64 arrays: `single` of one state fills an array of `shape`, `batch` returns its result or None.
+
+    `turned` gives the filled array the quantity's shape, which it has already unless entries change places.
+    """
 
     single: Callable[..., bool]
     shape: tuple[int, ...]
     batch: Call
+    turned: Callable[[Array], Array]
 
 
 def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], threads: int | None) -> QuantityCall:
@@ -57,7 +61,11 @@ def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], 
         results, finite = code.call_checked(*given, threads=threads)
         return trim(results[0]) if finite else None
 
-    return QuantityCall(single, trim(np.empty(code.shapes[0])).shape, batch)
+    raw = np.empty(code.shapes[0])
+    shape = trim(raw).shape
+    # More axes than before are a view with the entries in another order.
+    ordered = len(shape) <= raw.ndim
+    return QuantityCall(single, shape if ordered else raw.shape, batch, (lambda x: x) if ordered else trim)
 
 
 def _all_unit(q: Array, starts: tuple[int, ...]) -> bool:

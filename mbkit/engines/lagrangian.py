@@ -39,9 +39,12 @@ def _column(name: str, value: ArrayLike) -> Array:
 # Written out, forward dynamics grows as the cube of a chain's length. Beyond these many multiplications, forming M and
 # solving in LAPACK is faster to make and run.
 _WRITTEN_OUT: Final = {False: 6000, True: 100_000}
-#: Quantities that one compiled function of their name gives, and how its result loses the axes that they do not have.
+#: Three derivatives side by side, which `_TRIM` puts one behind the other.
+_STACKED: Final = "stacked"
+#: What one compiled function gives, and how its result loses the axes that the quantity does not have.
 _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
-    **dict.fromkeys(("mass_matrix", "coriolis_matrix"), lambda x: x),
+    **dict.fromkeys(("mass_matrix", "coriolis_matrix", "pose", "jacobian"), lambda x: x),
+    _STACKED: lambda x: x.reshape(*x.shape[:-1], 3, x.shape[-1] // 3).swapaxes(-2, -3),
     **dict.fromkeys(
         ("coriolis_force", "gravity", "nle", "passive", "inverse_dynamics", "forward_dynamics"), lambda x: x[..., 0]
     ),
@@ -57,9 +60,9 @@ def _quick(checked: _Function) -> _Function:
     name, arguments = checked.__name__, ", ".join([*signature(checked).parameters][1:])
     text = f"""
 def {name}(self, {arguments}):
-    short = self._short.get("{name}")
+    short = self._short.get(("{name}",))
     if short is not None and not self._parametric:
-        single, shape, batch = short
+        single, shape, batch, _ = short
         out = empty(shape)
         if single({arguments}, out) or (out := batch({arguments})) is not None:
             return {"scalar(out)" if name.endswith("energy") else "out"}
@@ -110,7 +113,7 @@ class LagrangianDynamics(Dynamics):
         #: Values of parameters that differ from sample to sample, (N,) each; the others are in the model.
         self._batched: dict[str, Array] = {}
         self._machines: dict[tuple[str, ...], Any] = {}
-        self._short: dict[str, QuantityCall] = {}
+        self._short: dict[tuple[str, ...], QuantityCall] = {}
         self._steps: dict[str, tuple[Method, CompiledStep]] = {}
         self._parametric = bool(model.parameters)
 
@@ -151,7 +154,7 @@ class LagrangianDynamics(Dynamics):
             def derive() -> Any:
                 if make is not None:
                     return make()
-                if name in ("pose", "jacobian", "mass_and_force", "stacked"):
+                if name in ("pose", "jacobian", "mass_and_force", _STACKED):
                     return getattr(self.equations, name)(*extra)
                 return self.equations.function(name)
 
@@ -161,7 +164,8 @@ class LagrangianDynamics(Dynamics):
                 # Loads LLVM, which interpreting never needs.
                 from mbkit.engines.compiled_calls import quantity_call
 
-                self._short[name] = quantity_call(self.model, code, _TRIM[name], self.threads)
+                # Derivatives go by the name of what they are of.
+                self._short[key[key[0] == _STACKED :]] = quantity_call(self.model, code, _TRIM[name], self.threads)
             self._machines[key] = code
         return self._machines[key]
 
@@ -247,12 +251,15 @@ class LagrangianDynamics(Dynamics):
         return super()._states(arguments)
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
-        short = self._short.get(quantity)
+        short = self._short.get((quantity, more[0].name, *more[1:]) if more else (quantity,))
         if short is not None:
             own = (*arguments.values(), *self._trailing(arguments["q"])) if self._parametric else arguments.values()
-            out = np.empty(short.shape)
-            if short.single(*own, out) or (out := short.batch(*own)) is not None:
-                return out
+            one = np.empty(short.shape)
+            if short.single(*own, one):
+                return short.turned(one)
+            many: Array | None = short.batch(*own)
+            if many is not None:
+                return many
         return super()._evaluate(quantity, *more, **arguments)
 
     mass_matrix, coriolis_matrix = _quick(Dynamics.mass_matrix), _quick(Dynamics.coriolis_matrix)
@@ -273,8 +280,7 @@ class LagrangianDynamics(Dynamics):
         return scalar(self._evaluate("energy_rate", q=q, v=v, a=a))
 
     def _stacked(self, name: str, *arguments: Array) -> Array:
-        out = self._machine("stacked", name)(*arguments)[0]
-        return out.reshape(*out.shape[:-1], 3, self.model.nv).swapaxes(-2, -3)
+        return _TRIM[_STACKED](self._machine(_STACKED, name)(*arguments)[0])
 
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
         return self._stacked("inverse_dynamics_derivatives", q, v, a)
