@@ -1,27 +1,32 @@
-"""Memory that models leave behind when they are released, by what was done with them.
+"""Memory that models leave behind when they are released, by stage of a compilation and by use.
 
-Run ``python -m validation.memory`` (25 minutes of processor time; ``--models 200`` for a first look).
+Run ``python -m validation.memory`` (16 minutes of processor time; ``--models 200`` for a first look).
 Each case has a process of its own. It makes one model after another, a double pendulum with other
-numbers each time, uses it and releases it; the resident memory is read every so often. Reported is
-the slope of a straight line through the second half of the readings: caches of bounded size, such
-as heyoka's of 64 MiB, fill in the first half.
+numbers each time, uses it and releases it. Twenty times on the way the resident memory is read, and
+what the C library's allocator has handed out and not got back, which holes in the heap do not hide.
+Reported are the slopes of straight lines through the second half of the readings: caches of bounded
+size, such as heyoka's of 64 MiB, fill in the first half. The stages of a compilation stand alone:
+each case takes one more than that before it, and loading takes one object file again and again.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import gc
 import json
 import multiprocessing
 import os
 import resource
+import tempfile
 import time
 import warnings
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-READINGS = 40
+READINGS = 20
 Q, V = np.array([0.1, 0.2]), np.zeros(2)
 
 
@@ -53,12 +58,63 @@ def run(method, **options):
     return use
 
 
+def graph(model):
+    from mbkit.engines.lagrangian import equations_of
+
+    return equations_of(model).function("forward_dynamics")
+
+
+def llvm_text(model):
+    from mbkit.codegen import jit, program, simd_kernel
+
+    return simd_kernel.vector_code(program.program(graph(model)), jit.host().width)[0]
+
+
+def object_code(*, optimize):
+    def use(model):
+        from mbkit.codegen import jit
+
+        jit.object_code(llvm_text(model), optimize=optimize)
+
+    return use
+
+
+@cache
+def objects():
+    """Return the object files of one kernel and of the loop over a batch."""
+    from mbkit.codegen import jit
+
+    return jit.object_code(llvm_text(fresh(np.random.default_rng(1)))), jit.batch_object()
+
+
+def load(_model):
+    from mbkit.codegen import jit
+
+    jit.load(*objects())
+
+
+def from_disk(_model):
+    """Compile one function at the first call; fetch its machine code from disk and bind it at the others."""
+    import mbkit as mb
+
+    if not os.environ["MBKIT_CACHE_DIR"]:
+        os.environ["MBKIT_CACHE_DIR"] = tempfile.mkdtemp()
+    code = mb.dynamics(fresh(np.random.default_rng(1)), "lagrangian", compile=True).code("gravity")
+    code.bound([Q[None]], [np.empty((1, 2))])[0]()
+
+
 CASES = {
     "model": lambda model: model.digest,
+    "graph": graph,
+    "LLVM text": llvm_text,
+    "object code": object_code(optimize=False),
+    "object code, with LLVM's passes": object_code(optimize=True),
+    "load": load,
+    "from disk": from_disk,
+    "compiled": engine("lagrangian", compile=True),
+    "interpreted": engine("lagrangian", compile=False),
     "pinocchio": engine("pinocchio"),
     "mujoco": engine("mujoco"),
-    "interpreted": engine("lagrangian", compile=False),
-    "compiled": engine("lagrangian", compile=True),
     "rk4": run("rk4", dt=0.01),
     "rk853": run("rk853"),
     "taylor": run("taylor"),
@@ -72,6 +128,24 @@ def resident():
     return pages * resource.getpagesize() / 1000
 
 
+class _Mallinfo(ctypes.Structure):
+    """glibc's ``struct mallinfo2``."""
+
+    _names = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
+    _fields_ = [(name, ctypes.c_size_t) for name in _names]
+
+
+def allocated():
+    """Return the kB that glibc's allocator has handed out and not got back, or None without glibc 2.33."""
+    read = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if read is None:
+        return None
+    read.restype = _Mallinfo
+    gc.collect()
+    now = read()
+    return (now.uordblks + now.hblkhd) / 1000
+
+
 def slope(models, kilobytes):
     """Return kB per model, by least squares over the second half of the readings."""
     half = len(models) // 2
@@ -79,22 +153,25 @@ def slope(models, kilobytes):
 
 
 def measure(name, count):
-    """Use and release `count` models; return the readings and their slope."""
+    """Use and release `count` models; return the readings and their slopes."""
     warnings.simplefilter("ignore")
     rng = np.random.default_rng(0)
-    done, readings = [], []
+    done, readings, live = [], [], []
     start = time.process_time()
     for k in range(1, count + 1):
         CASES[name](fresh(rng))
         if k % max(1, count // READINGS) == 0:
             done.append(k)
+            live.append(allocated())
             readings.append(resident())
     return {
         "case": name,
         "models": count,
         "kB_per_model": slope(done, readings),
+        "allocated_kB_per_model": None if None in live else slope(done, live),
         "first_MB": readings[0] / 1000,
         "last_MB": readings[-1] / 1000,
+        "resident_MB": [round(x / 1000, 2) for x in readings],
         "processor_s": time.process_time() - start,
     }
 
@@ -112,10 +189,10 @@ def main():
     for name in asked.cases:
         with context.Pool(1) as pool:
             row = rows[name] = pool.apply(measure, (name, asked.models))
-        print(f"{name:12} {row['kB_per_model']:8.2f} kB a model  {row['first_MB']:6.0f} to {row['last_MB']:.0f} MB")
+        print(f"{name:32} {row['kB_per_model']:8.2f} kB a model  {row['first_MB']:6.0f} to {row['last_MB']:.0f} MB")
         from validation.stamp import stamp
 
-        whole = {"rows": list(rows.values()), **stamp()}
+        whole = {"rows": [rows[case] for case in CASES if case in rows], **stamp()}
         path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
 
 

@@ -9,7 +9,6 @@ from typing import Any, Final, NamedTuple
 
 import llvmlite
 from llvmlite import binding as llvm
-from llvmlite.binding.newpassmanagers import NewPassManager
 
 from mbkit._fork import fork_safe
 from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, batch_code
@@ -61,21 +60,20 @@ def _target() -> Any:
     return llvm.Target.from_triple(h.triple).create_target_machine(cpu=h.cpu, features=h.features, opt=2, jit=True)
 
 
-def object_code(text: str) -> bytes:
-    """Return the object file of LLVM's textual code."""
+def object_code(text: str, *, optimize: bool = False) -> bytes:
+    """Return the object file of LLVM's textual code.
+
+    `optimize` runs LLVM's passes over the text first, for loops written with llvmlite's builder, compiled once in a
+    process. A kernel gains nothing by them: it is one block whose common expressions CasADi has shared. Its compilation
+    would take a quarter longer, and llvmlite 0.50 never frees a pass manager, nor the callbacks of a pass builder.
+    """
     # LLVM keeps the constants and types of what it compiles as long as the context, of which a global one
     # would grow for ever.
     with COMPILING, llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
         target = _target()
-        builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
-        passes = builder.getModulePassManager()
-        try:
-            passes.run(module, builder)
-        finally:
-            # llvmlite 0.50 frees no pass manager: ObjectRef's empty _dispose hides NewPassManager's.
-            if type(passes)._dispose is llvm.ffi.ObjectRef._dispose:
-                NewPassManager._dispose(passes)
-            passes.close()
+        if optimize:
+            builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=1))
+            builder.getModulePassManager().run(module, builder)
         return bytes(target.emit_object(module))
 
 
@@ -90,7 +88,7 @@ def program_object(program: Program) -> tuple[bytes, int]:
 
 def batch_object() -> bytes:
     """Return the object file of the loop over a batch, which every program shares."""
-    return object_code(batch_code(host().width))
+    return object_code(batch_code(host().width), optimize=True)
 
 
 def load(*objects: bytes) -> Loaded:

@@ -44,12 +44,15 @@ def vector_code(program: Program, width: int) -> tuple[str, int]:
     slots = slots_of(program, pieces)
     for k, piece in enumerate(written):
         piece.write(slots, first=k == 0)
-    functions = [p.function(f"{BODY}_{k}") for k, p in enumerate(written)]
-    functions.append(_zeros(program, width))
-    calls = "\n".join(f"  call void @{BODY}_{k}({_ARGUMENTS.replace('noalias ', '')})" for k in range(len(written)))
-    calls += f"\n  call void @{BODY}_zeros(ptr %out, ptr %os)"
-    whole = f"define void @{BODY}({_ARGUMENTS}) nounwind {{\n{calls}\n  ret void\n}}\n"
-    text = "\n".join([declarations(width), library(width, program), *functions, whole])
+    zeros = _zeros(program, width)
+    if len(written) == 1 and not zeros:
+        functions = [written[0].function(BODY, "")]
+    else:
+        functions = [p.function(f"{BODY}_{k}") for k, p in enumerate(written)]
+        calls = [f"  call void @{BODY}_{k}({_ARGUMENTS.replace('noalias ', '')})" for k in range(len(written))]
+        calls += [f"  call void @{BODY}_zeros(ptr %out, ptr %os)"] if zeros else []
+        functions += [zeros, "\n".join([f"define void @{BODY}({_ARGUMENTS}) nounwind {{", *calls, "  ret void\n}\n"])]
+    text = "\n".join([declarations(width), library(width, program), *functions])
     return text, max(slots.values(), default=0) + 1
 
 
@@ -68,7 +71,7 @@ def pieces_of(program: Program) -> list[list[int]]:
 
 
 def _zeros(program: Program, width: int) -> str:
-    """Return the function that stores zeros: mass matrices of trees are full of them."""
+    """Return the function that stores zeros, if there are any: mass matrices of trees are full of them."""
     t = Text(width, prefix="z")
     tables = []
     for i, out in enumerate(program.outputs):
@@ -88,6 +91,8 @@ def _zeros(program: Program, width: int) -> str:
         t.do(f"store {t.vector} zeroinitializer, ptr {at}, align 8")
         t.lines += [f"  %next{i} = add i64 %k{i}, 1", f"  %more{i} = icmp ult i64 %next{i}, {len(places)}"]
         t.lines += [f"  br i1 %more{i}, label %loop{i}, label %after{i}", f"after{i}:"]
+    if not tables:
+        return ""
     lines = "\n".join([*t.lines, "  ret void"])
     head = f"define internal void @{BODY}_zeros(ptr %out, ptr %os) noinline nounwind {{\n{lines}\n}}\n"
     return "\n".join([*tables, head])
@@ -226,7 +231,12 @@ class Piece:
             return t.put(f"extractvalue {pair} {self._pairs[x]}, {int(o.name == 'cos')}")
         return call(t, o.name, a) if o.name in CALLS else OPERATIONS[o.name](t, *a)
 
-    def function(self, name: str) -> str:
+    def function(self, name: str, linkage: str = "internal") -> str:
         """Return this piece's text."""
+        return self._function(f"{linkage} void @{name}({_ARGUMENTS})")
+
+    def _function(self, head: str) -> str:
+        # Vectors put aside on a stack that is aligned to 16 bytes only would lie across cache lines.
         lines = "\n".join(self._text.lines)
-        return f"define internal void @{name}({_ARGUMENTS}) noinline nounwind {{\n{lines}\n  ret void\n}}\n"
+        attributes = f"noinline nounwind alignstack({8 * self._text.width})"
+        return f"define {head} {attributes} {{\n{lines}\n  ret void\n}}\n"

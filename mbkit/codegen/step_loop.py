@@ -152,10 +152,8 @@ class _Placed(Piece):
         # The error of a step shows numbers that are not finite.
         pass
 
-    def function(self, name: str) -> str:
-        lines = "\n".join(self._text.lines)
-        head = f"define internal void @{name}(ptr noalias %arena, ptr noalias %out) noinline nounwind {{"
-        return f"{head}\n{lines}\n  ret void\n}}\n"
+    def function(self, name: str, linkage: str = "internal") -> str:
+        return self._function(f"{linkage} void @{name}(ptr noalias %arena, ptr noalias %out)")
 
 
 def _round(calls: list[str], outs: dict[str, int], state: tuple[int, int, int]) -> str:
