@@ -26,6 +26,7 @@ from mbkit.codegen import backend, disk_cache, jit, simd_kernel
 from mbkit.codegen.compiled import Call, Compiled, KernelSequence, compiled
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.program import program
+from mbkit.codegen.python_call import python_call
 from tests.random_trees import random_tree, states
 from validation.memory import allocated
 
@@ -258,15 +259,15 @@ def test_machine_code_lives_as_long_as_a_call_of_it(monkeypatch):
     monkeypatch.setenv("MBKIT_CACHE_DIR", "")
     x, out = np.array([[0.3]]), np.empty((40, 1, 1))
     codes = [compiled(("times", str(k)), lambda k=k: times(k)) for k in range(40)]
-    calls = [code.bound([x], [y])[0] for code, y in zip(codes, out, strict=True)]
+    calls = [python_call([(code, ["x"], ["y"])], {"x": 1}, ["y"]) for code in codes]
     sequence = KernelSequence([Call(code, [x], [y]) for code, y in zip(codes, out, strict=True)])
     engines = [weakref.ref(code.loaded._engine) for code in codes]
     del codes
     gc.collect()
     # What is compiled meanwhile would take the place of code that was released.
     built(mixed())
-    for call in calls:
-        call()
+    for call, y in zip(calls, out, strict=True):
+        assert call(x[0], y[0])
     np.testing.assert_allclose(out.ravel(), np.sin(0.3) * (np.arange(40) + 0.5))
     out[:] = np.nan
     sequence.run(0, 40)

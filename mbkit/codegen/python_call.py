@@ -120,7 +120,7 @@ def python_call(
 @cache
 def _definition() -> tuple[_Definition, Any]:
     """Return what Python knows of the function, and its code; both live as long as the process."""
-    loaded = jit.load(shared_object(f"python call {_HEAD}", lambda: jit.object_code(_code())))
+    loaded = jit.load(shared_object(f"python call {_HEAD}", lambda: jit.object_code(_code(), optimize=True)))
     address = ctypes.cast(loaded.run, ctypes.c_void_p).value
     return _Definition(b"evaluate", address, _METH_FASTCALL, None), loaded
 
