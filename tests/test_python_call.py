@@ -80,6 +80,8 @@ class Subclass(np.ndarray):
         A[:-1],
         np.append(A, 0.0),
         A[None],
+        np.tile(A, (N, 1)),
+        np.zeros(N, [("x", "f8"), ("flag", "i4")])["x"],
         np.array(1.0),
         np.empty(0),
         A.astype(np.float32),

@@ -141,6 +141,8 @@ def test_parameters_of_one_state_and_of_each() -> None:
         for i, mass in enumerate(masses.tolist()):
             assert_equal(dyn.at(m=mass).step(q[i], v[i], tau[i], H), [x[i] for x in got])
     assert_equal(each.step(q[0], v[0], tau[0], H), each.step(q[[0] * 4], v[[0] * 4], tau[[0] * 4], H))
+    with pytest.raises(InputError, match="a batch of 3, but the parameters' values are 4"):
+        each.step(q[:3], v[:3], tau[:3], H)
 
 
 def test_one_state_beside_a_batch_is_repeated_and_an_empty_batch_stays_empty() -> None:

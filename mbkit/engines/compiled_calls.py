@@ -6,7 +6,7 @@ not, `Dynamics` repeats it with its checks and messages.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -51,12 +51,7 @@ def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], 
     single = python_call([(code, [*inputs], ["result"])], inputs, ["result"], starts)
 
     def batch(*given: Any) -> Any:
-        # A subclass may be masked, and `is` would refuse the dtype of an array that was unpickled.
-        if not all(type(x) is np.ndarray and x.dtype == _FLOAT for x in given):
-            return None
-        shapes = [x.shape for x in given]
-        n = shapes[0][0] if shapes and shapes[0] else 0
-        if shapes != [(n, size) for size in sizes] or not _all_unit(given[0], starts):
+        if not _is_batch(given, sizes, starts):
             return None
         results, finite = code.call_checked(*given, threads=threads)
         return trim(results[0]) if finite else None
@@ -68,8 +63,16 @@ def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], 
     return QuantityCall(single, shape if ordered else raw.shape, batch, (lambda x: x) if ordered else trim)
 
 
-def _all_unit(q: Array, starts: tuple[int, ...]) -> bool:
-    parts = (q[:, start : start + 4] for start in starts)
+def _is_batch(given: Sequence[Any], sizes: Sequence[int], starts: Sequence[int]) -> bool:
+    """Return whether these are float64 arrays (N, size) with unit quaternions from these places of the first on."""
+    # A subclass may be masked, and `is` would refuse the dtype of an array that was unpickled.
+    if not all(type(x) is np.ndarray and x.dtype == _FLOAT for x in given):
+        return False
+    shapes = [x.shape for x in given]
+    n = shapes[0][0] if shapes and shapes[0] else 0
+    if shapes != [(n, size) for size in sizes]:
+        return False
+    parts = (given[0][:, start : start + 4] for start in starts)
     # A NaN is not below anything.
     return all((np.abs(np.einsum("ni,ni->n", x, x) - 1.0) < NEAR_UNIT).all() for x in parts)
 
@@ -95,7 +98,8 @@ class Plan:
 class CompiledStep:
     """A step from (q, v) to (q, v) by the code of a plan, which carries along the integrators' own velocity.
 
-    `single` takes q, v, tau, dt as a Python float, and the parameters' values if there are some.
+    `single` and `batch` take q, v, tau, dt as a Python float, and the parameters' values if there are some, for one
+    state or many. They return None for arguments that they do not take, and where a number is not finite.
     """
 
     def __init__(self, model: Model, equations: Equations, plan: Plan, code: Callable[[Part], Compiled]) -> None:
@@ -109,7 +113,8 @@ class CompiledStep:
         nq, nv, empty = model.nq, model.nv, np.empty
         inputs = {"q": nq, "v": nv, "tau": nv, "dt": -1, "squares": -1}
         inputs |= {name: x.numel() for name, x in equations.extra_arguments.items()}
-        run = python_call(self._steps, inputs, ["q1", "v1"], [start for start, _ in model.quaternions])
+        self._starts = tuple(start for start, _ in model.quaternions)
+        run = python_call(self._steps, inputs, ["q1", "v1"], self._starts)
 
         def single(q: Any, v: Any, tau: Any, dt: float, *behind: Any) -> Any:
             q1, v1 = empty(nq), empty(nv)
@@ -117,15 +122,25 @@ class CompiledStep:
 
         self.single: Call = single
         self._extra = [*equations.extra_arguments]
+        self._sizes = [nq, nv, nv, *(inputs[name] for name in self._extra)]
 
-    def __call__(
+    def batch(self, q: Any, v: Any, tau: Any, dt: float, *behind: Any, threads: int | None) -> Any:
+        """Return q and v after the step from a batch, or None."""
+        if not _is_batch((q, v, tau, *behind), self._sizes, self._starts):
+            return None
+        q1, v1, finite = self.run(q, v, tau, dt, *behind, threads=threads)
+        return (q1, v1) if finite else None
+
+    def run(
         self, q: Array, v: Array, tau: Array, dt: float, *behind: Array, threads: int | None
-    ) -> tuple[Array, Array]:
-        """Return q and v after the step from one state or a batch, which may not be finite."""
+    ) -> tuple[Array, Array, bool]:
+        """Return q and v after the step from one state or a batch, and whether all numbers on the way are finite."""
         one = (*q.shape[:-1], 1)
         arrays = {"q": q, "v": v, "tau": tau, "dt": np.full(one, dt), "squares": np.zeros(one)}
         arrays |= zip(self._extra, behind, strict=True)
+        finite = True
         for code, reads, writes in self._steps:
-            results = code(*(arrays[name] for name in reads), threads=threads)
+            results, good = code.call_checked(*(arrays[name] for name in reads), threads=threads)
             arrays |= zip(writes, (x[..., 0] for x in results), strict=True)
-        return arrays["q1"], arrays["v1"]
+            finite &= good
+        return arrays["q1"], arrays["v1"], finite

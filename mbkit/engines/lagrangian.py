@@ -339,7 +339,7 @@ class LagrangianDynamics(Dynamics):
         if held is not None and held[0] is METHODS.get(method) and dt > 0:
             behind = self._trailing(q) if self._parametric else ()
             out: tuple[Array, Array] | None = held[1].single(q, v, tau, dt, *behind)
-            if out is not None:
+            if out is not None or (out := held[1].batch(q, v, tau, dt, *behind, threads=self.threads)) is not None:
                 return out
         return super().step(q, v, tau, dt, method)
 
@@ -352,7 +352,7 @@ class LagrangianDynamics(Dynamics):
 
             step = CompiledStep(self.model, self.equations, self.step_plan(method.name), self._part)
             held = self._steps[method.name] = method, step
-        return held[1](q, v, tau, dt, *self._trailing(q), threads=self.threads)
+        return held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)[:2]
 
     def _pose(self, q: Array, frame: Frame) -> Array:
         return self._machine("pose", frame.name)(q)[0]
