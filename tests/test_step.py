@@ -319,7 +319,7 @@ def test_a_state_beyond_all_bounds_is_an_error(compiled: bool, batch: bool) -> N
     dyn = own(unstable(), compiled=compiled)
     q, v, tau = (np.array([1.0, 1.0]), np.zeros(2), np.zeros(2))
     if batch:
-        q = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 1.0]])
+        q, v, tau = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 1.0]]), np.zeros((3, 2)), np.zeros((3, 2))
     where = "in sample 1 after" if batch and compiled else "after dt = 1 s"
 
     def run(q: np.ndarray, v: np.ndarray) -> None:
@@ -330,6 +330,19 @@ def test_a_state_beyond_all_bounds_is_an_error(compiled: bool, batch: bool) -> N
 
     with pytest.raises(NumericalError, match=f"step of unstable by rk4: the state is not finite {where}"):
         run(q, v)
+
+
+@pytest.mark.parametrize("options", [{"compile": True}, {"compile": False}])
+def test_a_stage_beyond_all_bounds_is_an_error(options: dict[str, bool]) -> None:
+    b = mb.ModelBuilder("slide", gravity=(0, 0, 0))
+    b.add_body("block", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0))
+    dyn = mb.dynamics(b.build(point_masses=True), "lagrangian", **options)
+    for shape in ((1,), (3, 1)):
+        state = np.zeros(shape), np.full(shape, 1e307), np.zeros(shape)
+        assert np.isfinite(dyn.step(*state, H)).all()
+        with pytest.raises(NumericalError, match="step of slide by rk4: the state is not finite"):
+            dyn.step(*state, 100.0)
 
 
 def test_an_acceleration_that_is_not_finite_names_the_suspect() -> None:
