@@ -122,17 +122,6 @@ def test_gravity_and_springs_are_the_slope_of_the_potential(tree):
     close(dyn.gravity(q) - dyn.passive(q, 0 * v), slope)
 
 
-def test_the_numerical_solution_for_large_systems_gives_the_same(tree, monkeypatch):
-    _, dyn, (q, v, _, tau) = tree
-    condition = np.linalg.cond(dyn.mass_matrix(q))
-    assert dyn.written_out
-    written = dyn.forward_dynamics_derivatives(q, v, tau)
-    monkeypatch.setitem(vars(dyn), "written_out", False)
-    solved = dyn.forward_dynamics_derivatives(q, v, tau)
-    for x, y in zip(written, solved, strict=True):
-        close(x, y, k=condition)
-
-
 def test_the_tangent_is_that_of_the_models_integrate(tree):
     model, dyn, (q, v, a, _) = tree
     h = 1e-3

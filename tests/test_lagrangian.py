@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import pickle
+
 import casadi as ca
 import numpy as np
 import pytest
 
 import mbkit as mb
 from mbkit.derivation import FUNCTIONS, Equations
-from mbkit.errors import UnknownNameError
+from mbkit.errors import UnknownNameError, UnsupportedError
 from tests.random_trees import off, random_tree, states
 
 SEEDS = range(6)
@@ -88,15 +90,29 @@ def test_forward_dynamics_inverts_inverse_dynamics(tree):
     assert off(back, a) < 1e-14 * np.linalg.cond(dyn.mass_matrix(q)).max()
 
 
-def test_the_written_out_factorization_equals_lapack(tree):
+@pytest.mark.parametrize("elimination", ["links", "mass matrix", "least constraint"])
+def test_every_elimination_equals_lapack(tree, elimination):
     model, dyn, (q, v, _, tau) = tree
     right = tau + dyn.passive(q, v) - dyn.nle(q, v)
     dense = np.linalg.solve(dyn.mass_matrix(q), right[..., None])[..., 0]
-    assert dyn.written_out
-    assert off(dyn.forward_dynamics(q, v, tau), dense) < 1e-14 * np.linalg.cond(dyn.mass_matrix(q)).max()
-    large = mb.dynamics(model, "lagrangian")
-    large.written_out = False
-    assert off(large.forward_dynamics(q, v, tau), dense) < 1e-14 * np.linalg.cond(dyn.mass_matrix(q)).max()
+    one = mb.dynamics(model, "lagrangian", elimination=elimination)
+    assert one.elimination == pickle.loads(pickle.dumps(one)).elimination == elimination
+    assert off(one.forward_dynamics(q, v, tau), dense) < 1e-14 * np.linalg.cond(dyn.mass_matrix(q)).max()
+
+
+def test_other_eliminations_are_refused_by_name():
+    pendulum = mb.catalog.pendulum()
+    with pytest.raises(UnknownNameError, match=r"elimination.*did you mean 'links'"):
+        mb.dynamics(pendulum, "lagrangian", elimination="link")
+    written = mb.lagrangian.from_model(pendulum).dynamics().model
+    with pytest.raises(UnsupportedError, match="written as energies"):
+        mb.dynamics(written, "lagrangian", elimination="links")
+    tilted = mb.ModelBuilder("tilted")
+    a = mb.Parameter("a", 0.01)
+    tilted.add_body("b", mass=1.0, inertia=[[0.1, a, 0], [a, 0.1, 0], [0, 0, 0.1]])
+    tilted.add_joint("j", "revolute", parent="world", child="b", axis=(0, 0, 1))
+    with pytest.raises(UnsupportedError, match="no sum of squares"):
+        mb.dynamics(tilted.build(), "lagrangian", elimination="least constraint")
 
 
 def test_a_scene_pays_for_what_it_has():

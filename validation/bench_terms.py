@@ -181,10 +181,8 @@ def states_of(model, n, seed=0):
 
 
 def operations(model, quantity):
-    """Return what one evaluation computes, counted by kind, or None where it is not written out."""
+    """Return what one evaluation computes, counted by kind."""
     dyn = mb.dynamics(model, "lagrangian")
-    if quantity == "forward_dynamics" and not dyn.written_out:
-        return None
     counted = Counter(o.name for o in program(dyn.function(quantity)).operations)
     return {name: n for name, n in counted.most_common() if name not in ("input", "const")}
 

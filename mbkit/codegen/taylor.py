@@ -134,7 +134,8 @@ class TaylorSystem:
 
     def __init__(self, equations: Equations) -> None:
         heyoka = _heyoka()
-        size = elimination_size(equations.model)
+        # Written out from M, the size is known before the derivation, which would take long.
+        size = 0 if equations.elimination == "links" else elimination_size(equations.model)
         if size <= _MAX_OPERATIONS:
             self.rates = rates(equations)
             graph = program(self.rates)

@@ -14,7 +14,7 @@ constraint (`mbkit.derivation.least_constraint`).
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -22,12 +22,15 @@ import numpy as np
 from mbkit.derivation import kinematics as energies
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
 from mbkit.derivation.kinematics import Kinematics, add, constant_transposed_times
-from mbkit.derivation.least_constraint import LeastConstraint, loses_digits, squares
+from mbkit.derivation.least_constraint import LeastConstraint, squares
 from mbkit.derivation.mass_matrix_solve import elimination_order, solve
 from mbkit.derivation.model_values import Constants, scalar
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 from mbkit.model.joint_types import cross3
+
+Elimination = Literal["links", "mass matrix", "least constraint"]
+ELIMINATIONS: Final[tuple[Elimination, ...]] = get_args(Elimination)
 
 #: Name of each quantity -> the arguments of its function.
 FUNCTIONS: Final = {
@@ -57,6 +60,9 @@ class Equations:
         Whether the model's numbers stand in the expressions as floats, or as symbols that become the last argument,
         ``"constants"``, of every function.
 
+    elimination : {"mass matrix", "least constraint", "links"}
+        What forward dynamics comes from; ``"links"`` is that of `LinkEquations`.
+
     Attributes
     ----------
     q, v, a, tau : casadi.SX
@@ -69,9 +75,11 @@ class Equations:
         What `constants` stands for.
     """
 
-    def __init__(self, model: Model, constants: Constants = "literal") -> None:
+    def __init__(
+        self, model: Model, constants: Constants = "literal", elimination: Elimination = "mass matrix"
+    ) -> None:
         self.model = model
-        self._symbolic = constants == "symbols"
+        self.elimination: Elimination = elimination
         self.kin = Kinematics(model, constants)
         self.parameters = self.kin.values.parameters
         self.constants, self.constant_values = self.kin.values.constants, self.kin.values.constant_values
@@ -188,8 +196,8 @@ class Equations:
 
     @cached_property
     def least_constraint(self) -> LeastConstraint | None:
-        """The orthogonal elimination, for a model that needs it; with symbols, for many digits, none does."""
-        if self._symbolic or not loses_digits(self.model):
+        """The orthogonal elimination, where it is chosen."""
+        if self.elimination != "least constraint":
             return None
         return LeastConstraint(squares(self.kin), self.elimination_order)
 
@@ -242,12 +250,6 @@ class Equations:
         f = self.function(name)
         given = f.sx_in()
         return ca.Function(name, given, [ca.horzcat(*f.call(given))], f.name_in(), [name])
-
-    def mass_and_force(self) -> ca.Function:
-        """Return M and τ_passive - nle together, for a numerical solution."""
-        outs = [ca.densify(self.mass_matrix), ca.densify(self.generalized_force)]
-        given = {"q": self.q, "v": self.v, **self.extra_arguments}
-        return ca.Function("mass_and_force", list(given.values()), outs, list(given), ["M", "f"])
 
     @property
     def extra_arguments(self) -> dict[str, ca.SX]:

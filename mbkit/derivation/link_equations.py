@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.derivation.equations import Equations
+from mbkit.derivation.equations import Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
-from mbkit.derivation.least_constraint import regroups
+from mbkit.derivation.least_constraint import loses_digits, regroups
 from mbkit.derivation.link_mechanics import LinkMechanics
 from mbkit.derivation.links import Links
 from mbkit.derivation.mass_matrix_solve import solve
@@ -26,16 +26,26 @@ from mbkit.model import Model
 _PATIENCE: Final = 2
 
 
-def equations_of(model: Model, constants: Constants = "literal") -> Equations:
+def elimination_of(model: Model) -> Elimination:
+    """Return what a model's forward dynamics comes from, where nobody chooses: the quickest that keeps the digits."""
+    if model.energy_equations is not None:
+        return "mass matrix"
+    return "least constraint" if loses_digits(model) else "links"
+
+
+def equations_of(model: Model, constants: Constants = "literal", elimination: Elimination | None = None) -> Equations:
     """Return a model's equations: from the energies that it was written as, or from its bodies.
 
-    With constants as symbols they are derived from the bodies' energies, with floats from link to link.
+    With constants as symbols, and with the elimination ``"mass matrix"``, all comes from derivatives of the bodies'
+    energies; else from link to link.
     """
     of_energies = model.energy_equations
     if of_energies is not None:
         written: Equations = of_energies(constants)
         return written
-    return LinkEquations(model) if constants == "literal" else Equations(model, constants)
+    if constants == "symbols" or elimination == "mass matrix":
+        return Equations(model, constants)
+    return LinkEquations(model, elimination=elimination or elimination_of(model))
 
 
 class LinkEquations(Equations):

@@ -8,7 +8,7 @@ couplings couple branches; the entries that they fill in are added to the patter
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import casadi as ca
 import numpy as np
@@ -45,6 +45,17 @@ def elimination_size(model: Model) -> int:
             for i in before[k] - {k}:
                 before[i] |= {j for j in before[k] if rank[j] <= rank[i]}
     return sum(len(earlier) ** 2 for earlier in before.values())
+
+
+#: Multiplications of a factorization up to which it is written out as an expression, interpreted and compiled: beyond,
+#: an implicit method's system is formed and solved in LAPACK.
+_WRITTEN_OUT: Final = {False: 6000, True: 100_000}
+
+
+def factors_written_out(model: Model, *, compiled: bool) -> bool:
+    """Return whether a factorization with the pattern of M is worth an expression."""
+    # Under constraints there is no other way.
+    return model.constrained or elimination_size(model) <= _WRITTEN_OUT[compiled]
 
 
 def solve(M: ca.SX, f: ca.SX, order: Sequence[int]) -> ca.SX:

@@ -349,8 +349,8 @@ class Dynamics:
         Notes
         -----
         On the lagrangian engine the step is the same machine code as in `mbkit.simulate`: microseconds for a state, and
-        batches are shared among threads. The first step of a model compiles it. Other engines, ``compile=False`` and
-        models too large to be written out evaluate the forward dynamics stage by stage, by the same formulas.
+        batches are shared among threads. The first step of a model compiles it. Other engines and ``compile=False``
+        evaluate the forward dynamics stage by stage, by the same formulas.
 
         Examples
         --------

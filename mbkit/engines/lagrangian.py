@@ -14,11 +14,10 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, count, finite_array, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
 from mbkit.codegen.interpreter import Machine
-from mbkit.derivation import Equations, equations_of
-from mbkit.derivation.least_constraint import loses_digits
-from mbkit.derivation.mass_matrix_solve import elimination_size
+from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
+from mbkit.derivation.least_constraint import has_squares, regroups
 from mbkit.engines.base import Dynamics, scalar
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Model
 
@@ -36,9 +35,6 @@ def _column(name: str, value: ArrayLike) -> Array:
     return finite_array(f"parameter {name!r}", value, (len(np.asarray(value)),))
 
 
-# Written out, forward dynamics grows as the cube of a chain's length. Beyond these many multiplications, forming M and
-# solving in LAPACK is faster to make and run.
-_WRITTEN_OUT: Final = {False: 6000, True: 100_000}
 #: Three derivatives side by side, which `_TRIM` puts one behind the other.
 _STACKED: Final = "stacked"
 #: What one compiled function gives, and how its result loses the axes that the quantity does not have.
@@ -81,7 +77,7 @@ def _term(name: str) -> Callable[..., Any]:
 
 
 class LagrangianDynamics(Dynamics):
-    """Terms derived from T and V, each at its first use.
+    """Terms derived from kinematics and energies, each at its first use.
 
     Parameters
     ----------
@@ -91,11 +87,23 @@ class LagrangianDynamics(Dynamics):
         for a few evaluations. By default compiled, unless the environment says ``MBKIT_COMPILE=0``.
     threads : int, optional
         Threads that share a large batch; by default as many as the process has cores.
+    elimination : {"links", "mass matrix", "least constraint"}, optional
+        What accelerations come from; by default the first, or the last where the first would lose digits.
 
-    Attributes
-    ----------
-    elimination : {"mass matrix", "least constraint"}
-        What accelerations come from.
+    Notes
+    -----
+    ``"links"`` eliminates one acceleration after the other, link by link, from Gauss's function, and M and inverse
+    dynamics are those of the links too; with the operations of the articulated-body, composite-rigid-body and recursive
+    Newton-Euler algorithms (Featherstone 2008, ch. 5 to 7). ``"mass matrix"`` derives every term from the bodies'
+    energies by Lagrange's equations, and factors M = LᵀDL: an independent route, with two to five times as many
+    operations. ``"least constraint"`` makes the columns of the bodies' velocities orthogonal, and forms no M.
+
+    Elimination loses M_kk/D_k of the digits, D_k being the remainder of a diagonal entry once all beyond joint k gives
+    way. Where that is more than five digits at some pose, as of a light cart below a heavy pole, the default is
+    ``"least constraint"``. It is decided from the description, at the nominal values of parameters when the dynamics
+    were built: `at` changes masses but not the way. The pose is searched within the limits, and may be missed where
+    several coordinates have to be right at once. Systems that were written as energies have the mass matrix only, and
+    so have the methods that solve with it themselves, ``"rodas5"`` and ``"implicit_midpoint"``.
     """
 
     engine = "lagrangian"
@@ -104,8 +112,16 @@ class LagrangianDynamics(Dynamics):
     takes_written = True
     lacks_derivatives = ""
 
-    def __init__(self, model: Model, *, compile: bool | None = None, threads: int | None = None) -> None:  # noqa: A002  # the word that users look for
+    def __init__(
+        self,
+        model: Model,
+        *,
+        compile: bool | None = None,  # noqa: A002  # the word that users look for
+        threads: int | None = None,
+        elimination: Elimination | None = None,
+    ) -> None:
         super().__init__(model)
+        self._chosen = None if elimination is None else _elimination(model, elimination)
         if compile is not None and not isinstance(compile, bool):
             raise InputError(f"compile: expected True, False or None, got {compile!r}")
         self.compile = compile_by_default() if compile is None else compile
@@ -120,28 +136,22 @@ class LagrangianDynamics(Dynamics):
     @cached_property
     def equations(self) -> Equations:
         """The expressions, free to read."""
-        return equations_of(self.model)
+        return equations_of(self.model, elimination=self.elimination)
 
     @cached_property
-    def elimination(self) -> str:
-        """What accelerations come from: ``"mass matrix"``, or ``"least constraint"`` where that would lose digits.
-
-        The sparse LᵀDL of M loses M_kk/D_k of its digits, D_k being the remainder of a diagonal entry once all beyond
-        joint k gives way. Where that is more than six digits at some pose, as of a light cart below a heavy pole, the
-        accelerations, and the products with M⁻¹ in their derivatives, come from Gauss's principle of least constraint,
-        in which no M is formed. It is decided from the description, at the nominal values of parameters when the
-        dynamics were built: `at` changes masses but not the way. Systems that were written as energies, and trees too
-        large to be written out, have the mass matrix only, and so have the methods that solve with it themselves,
-        ``"rodas5"`` and ``"implicit_midpoint"``. The pose is searched within the limits, and may be missed where
-        several coordinates have to be right at once.
-        """
-        return "least constraint" if loses_digits(self.model) else "mass matrix"
+    def elimination(self) -> Elimination:
+        """What accelerations come from."""
+        return self._chosen or elimination_of(self.model)
 
     @cached_property
     def form(self) -> str:
-        """The digest of the derivation: that of the description without its parameters' values, and `elimination`."""
+        """The digest of the derivation: of the description without parameters' values, and of what these decide."""
         digest = self.model.form_digest
-        return f"{digest} by {self.elimination}" if self.model.parameters else digest
+        if self._chosen:
+            digest += f" by {self.elimination}"
+        elif self.model.parameters:
+            digest += f" by {self.elimination}{', regrouped' * regroups(self.model)}"
+        return digest
 
     def code(self, name: str, *extra: str, make: Callable[[], Any] | None = None) -> Any:
         """Return a `Compiled` or `Machine` of a quantity, or of what `make` derives from this model.
@@ -154,7 +164,7 @@ class LagrangianDynamics(Dynamics):
             def derive() -> Any:
                 if make is not None:
                     return make()
-                if name in ("pose", "jacobian", "mass_and_force", _STACKED):
+                if name in ("pose", "jacobian", _STACKED):
                     return getattr(self.equations, name)(*extra)
                 return self.equations.function(name)
 
@@ -237,7 +247,7 @@ class LagrangianDynamics(Dynamics):
         return out
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self.model, self._batched, self.compile, self.threads)
+        return _restore, (self.model, self._batched, self.compile, self.threads, self._chosen)
 
     def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
         n = self.samples
@@ -286,32 +296,21 @@ class LagrangianDynamics(Dynamics):
         return self._stacked("inverse_dynamics_derivatives", q, v, a)
 
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
-        if self.written_out:
-            return self._stacked("forward_dynamics_derivatives", q, v, tau)
-        return super()._forward_dynamics_derivatives(q, v, tau)
-
-    @cached_property
-    def written_out(self) -> bool:
-        """Whether forward dynamics is one expression; else M is formed and solved numerically."""
-        # Under constraints there is no other way.
-        return self.model.constrained or elimination_size(self.model) <= _WRITTEN_OUT[self.compile]
+        return self._stacked("forward_dynamics_derivatives", q, v, tau)
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self.model.constrained:
             self.model.require_independent(q, once=True)
-        if self.written_out:
-            return self._trimmed("forward_dynamics", q, v, tau)
-        M, f = self._machine("mass_and_force")(q, v)
-        return np.asarray(np.linalg.solve(M, f + tau[..., None])[..., 0])
+        return self._trimmed("forward_dynamics", q, v, tau)
 
     # Steps
 
     @property
     def compiles_steps(self) -> bool:
-        """Whether whole steps are machine code: written out, with a compiler, without constraints or a time."""
+        """Whether whole steps are machine code: with a compiler, without constraints or a time."""
         model = self.model
         # A compiled step has one value of each parameter, the time among them, and looks for no constraints behind it.
-        if not model.nv or model.constrained or model.time_parameter or not self.written_out:
+        if not model.nv or model.constrained or model.time_parameter:
             return False
         return not isinstance(self.code("forward_dynamics"), Machine)
 
@@ -372,5 +371,19 @@ def _restore(
     batched: dict[str, Array],
     compile: bool,  # noqa: A002  # as above
     threads: int | None,
+    elimination: Elimination | None,
 ) -> LagrangianDynamics:
-    return LagrangianDynamics(model, compile=compile, threads=threads).at(**batched)
+    return LagrangianDynamics(model, compile=compile, threads=threads, elimination=elimination).at(**batched)
+
+
+def _elimination(model: Model, name: str) -> Elimination:
+    if name not in ELIMINATIONS:
+        raise UnknownNameError("elimination", name, ELIMINATIONS)
+    if name != "mass matrix" and model.energy_equations is not None:
+        raise UnsupportedError(f"{model.name}: written as energies, it has the elimination 'mass matrix', not {name!r}")
+    if name == "least constraint" and not has_squares(model):
+        raise UnsupportedError(
+            f"{model.name}: an inertia is no sum of squares, which elimination 'least constraint' needs; "
+            "give 'links' or 'mass matrix'"
+        )
+    return name

@@ -111,8 +111,7 @@ def simulate(
     the whole step is one function, or, beyond 20,000 operations, parts around the forward dynamics. Chunks of a batch
     are shared among the cores, and no number depends on how. ``"implicit_midpoint"``, and ``"rk853"`` with the choice
     of its steps, are machine code too. The first run of a model compiles its step, which is kept on disk. A callable
-    torque, an engine with ``compile=False``, and models too large to be written out are stepped stage by stage,
-    by the same formulas.
+    torque and an engine with ``compile=False`` are stepped stage by stage, by the same formulas.
 
     Examples
     --------

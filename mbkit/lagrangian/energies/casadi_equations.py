@@ -87,7 +87,7 @@ class EnergyEquations(Equations):
 
     def __init__(self, model: Model, form: EnergyForm, constants: Constants = "literal") -> None:
         values = Values(model, constants)
-        self.model, self.form = model, form
+        self.model, self.form, self.elimination = model, form, "mass matrix"
         self.q, self.v = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
         self.a, self.tau = ca.SX.sym("a", model.nv), ca.SX.sym("tau", model.nv)
         names = {**{p: values.named[p.name] for p in form.parameters}}

@@ -418,20 +418,21 @@ def _report(problem: IntegrationProblem, group: Sequence[TrajectoryRecord], firs
 
 def make_attempts(problem: IntegrationProblem, method: str, space: Space, tolerances: Tolerances) -> StepAttempts:
     """Return the step attempts of ``"rk853"`` or ``"rodas5"``: machine code where there can be some."""
-    dyn = problem.dyn
+    dyn, stiff = problem.dyn, isinstance(method_of(method).formula, RosenbrockTableau)
     # A compiled step has one value of the time, and does not look for constraints.
     plain = not problem.torque.callable and not dyn.model.time_parameter and not dyn.model.constrained
     if dyn.derived and plain and dyn.model.nv:
         # Other engines need no CasADi.
         from mbkit.codegen.backend import has_compiler
+        from mbkit.derivation.mass_matrix_solve import factors_written_out
         from mbkit.engines.lagrangian import LagrangianDynamics
 
-        if isinstance(dyn, LagrangianDynamics) and dyn.compile and dyn.written_out and has_compiler():
+        small = not stiff or factors_written_out(dyn.model, compiled=True)
+        if isinstance(dyn, LagrangianDynamics) and dyn.compile and small and has_compiler():
             # Loads LLVM, which interpreting never needs.
             from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
 
             return CompiledAttempts(problem, space, tolerances, method)
-    stiff = isinstance(method_of(method).formula, RosenbrockTableau)
     return (RosenbrockAttempts if stiff else RungeKuttaAttempts)(problem, space, tolerances)
 
 

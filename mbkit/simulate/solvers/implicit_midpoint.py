@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
+from mbkit.derivation.mass_matrix_solve import factors_written_out
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -87,9 +88,13 @@ def called(
 
 
 def _machine_code(dyn: LagrangianDynamics, midpoint: Midpoint, problem: IntegrationProblem) -> bool:
-    if problem.torque.callable or not dyn.model.nv or not dyn.compile or not dyn.written_out:
+    if problem.torque.callable or not dyn.model.nv or not dyn.compile or not _written_out(dyn):
         return False
     return not any(isinstance(dyn.code(p.name, make=p.make), Machine) for p in (midpoint.newton, midpoint.end))
+
+
+def _written_out(dyn: LagrangianDynamics) -> bool:
+    return factors_written_out(dyn.model, compiled=dyn.compile)
 
 
 def _reason(q: Array, pi: Array) -> str:
@@ -187,7 +192,7 @@ class MidpointStepper(Stepper):
     ) -> tuple[Array, NDArray[np.bool_]]:
         self.iterations += len(q)
         args = (q, pi, w, tau, np.array([[h]]))
-        if self._dyn.written_out:
+        if _written_out(self._dyn):
             w1, miss = called(self._dyn, self._midpoint.newton, members, t, *args)
             return w1, miss[:, 0] == 0
         residual, jacobian = called(self._dyn, self._midpoint.system, members, t, *args)
@@ -221,7 +226,7 @@ def _to_velocities(
         if not len(who):
             continue
         args = who, times[start + at], q[who, at], v[who, at]
-        if dyn.written_out:
+        if _written_out(dyn):
             v[who, at] = called(dyn, midpoint.velocity, *args)[0]
         else:
             M, p = called(dyn, midpoint.velocity_system, *args)
