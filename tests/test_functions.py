@@ -420,6 +420,7 @@ def equations(rates: Callable[[Any, Any], Any], n: int) -> Any:
         extra_arguments={},
         model=double_pendulum(),
         kin=SimpleNamespace(qdot=v),
+        elimination="mass matrix",
         function=lambda _: forward,
     )
 

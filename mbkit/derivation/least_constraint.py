@@ -248,7 +248,7 @@ def regroups(model: Model) -> bool:
 
     Decided at nominal parameters; False where one has no value.
     """
-    if any(x is None for x in model.parameters.values()):
+    if not model.has_bodies or any(x is None for x in model.parameters.values()):
         return False
     if any(joint.type.gimbal is not None for joint in model.joints):
         return False
