@@ -54,12 +54,14 @@ def test_every_term_is_that_of_the_energies(seed):
 
 @pytest.mark.parametrize("name", ["ur5", "panda", "solo12", "iris"])
 def test_robots_are_as_exact_as_before(name):
-    """Against 34 digits; the factors of M lose 40 eps on the Panda."""
+    """Against 34 digits, as rounding of the model's numbers moves the accelerations."""
     model = mb.load(name, floating_base=name == "solo12")
     at, links, oracle = sample(model, 8), LinkEquations(model, elimination="links"), mb.dynamics(model, "oracle")
+    loss = np.sqrt(np.linalg.cond(oracle.mass_matrix(at["q"])).max())
     for term, letters in TERMS.items():
         exact = getattr(oracle, term)(*(at[c] for c in letters))
-        assert off(evaluated(links, term, at).reshape(exact.shape), exact) < 8 * EPS, term
+        bar = 8 * EPS * (loss if term == "forward_dynamics" else 1.0)
+        assert off(evaluated(links, term, at).reshape(exact.shape), exact) < bar, term
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -145,7 +147,7 @@ def test_matter_stays_where_digits_would_go():
     """Behind a light arm a heavy tip's mass in the arm's inertia is a difference of large numbers."""
     model = arm((1, 1, 1e5))
     own = LinkEquations(model, elimination="links")
-    assert not own.links.links[2].inertia.mass == 0.0
+    assert own.links.links[2].inertia.mass != 0.0
     moved = LinkEquations(model, elimination="links")
     moved.links = Links(moved.kin, regroup=True)
     assert 1.2 * error(own, model, "forward_dynamics") < error(moved, model, "forward_dynamics")
