@@ -32,7 +32,7 @@ PARTS = {
     "energy_drift": Part(1, ("energy_drift.json",), "a million steps of a symplectic method"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),
-    "memory": Part(25, ("memory.json",), "memory that released models leave behind"),
+    "memory": Part(14, ("memory.json",), "memory that released models leave behind"),
     "stress": Part(25, ("stress.json",), "what holds to where: stiff and extreme cases"),
     "auto": Part(15, ("auto.json",), "method auto beside the best method of each hard problem"),
     "bench_terms": Part(10, ("terms.json",), "one sample of inverse and forward dynamics"),

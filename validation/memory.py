@@ -1,6 +1,6 @@
 """Memory that models leave behind when they are released, by stage of a compilation and by use.
 
-Run ``python -m validation.memory`` (16 minutes of processor time; ``--models 200`` for a first look).
+Run ``python -m validation.memory`` (14 minutes of processor time; ``--models 200`` for a first look).
 Each case has a process of its own. It makes one model after another, a double pendulum with other
 numbers each time, uses it and releases it. Twenty times on the way the resident memory is read, and
 what the C library's allocator has handed out and not got back, which holes in the heap do not hide.
