@@ -36,6 +36,7 @@ PARTS = {
     "stress": Part(25, ("stress.json",), "what holds to where: stiff and extreme cases"),
     "auto": Part(15, ("auto.json",), "method auto beside the best method of each hard problem"),
     "bench_terms": Part(10, ("terms.json",), "one sample of inverse and forward dynamics"),
+    "operations": Part(20, ("operations.json",), "operations of each form, and the vector units' limit"),
     "bench_single_calls": Part(1, ("single_calls.json",), "a single call, beside the bare call of the engine"),
     "bench_rollouts": Part(5, ("rollouts.json",), "batches of rollouts, beside mujoco.rollout"),
     "bench_trajectory": Part(5, ("trajectory.json",), "one trajectory to an error of 1e-9"),

@@ -43,6 +43,7 @@ from mbkit.codegen.compiled import cores
 from mbkit.codegen.program import program
 from mbkit.engines.mujoco import model as mujoco_model
 from mbkit.engines.pinocchio import model as pinocchio_model
+from mbkit.spatial import conjugate, rotate
 from tests.random_trees import random_tree
 from validation.stamp import stamp
 
@@ -54,6 +55,8 @@ ROBOTS = {
     "ur5": "mb.load('ur5')",
     "panda": "mb.load('panda', mimic='free')",
     "talos_reduced": "mb.load('talos_reduced', mimic='free')",
+    "anymal_b, floating": "mb.load('anymal_b', floating_base=True)",
+    "talos_reduced, floating": "mb.load('talos_reduced', mimic='free', floating_base=True)",
 }
 #: Engines must agree to this before they are timed, relative to the largest entry.
 AGREE = 1e-9
@@ -62,9 +65,9 @@ LOOPED = 4096
 SIZES = (2, 4, 8, 16, 32, 64, 128)
 
 
-def made(name):
+def made(text):
     # The other engines' algorithms know no damping.
-    return eval(ROBOTS[name], {"mb": mb}).without("damping")
+    return eval(text, {"mb": mb}).without("damping")
 
 
 # The calls. Each takes nothing, returns (N, nv) or fills it, and says how many samples it does.
@@ -97,6 +100,23 @@ def pinocchio_calls(model, quantity, states):
         yield f"pinocchio, {run.__name__}, {threads}", (call, lambda call=call: call().T[:, back]), len(q)
 
 
+def in_world(built, q, x, *, back=False):
+    """Return velocities or forces with a free joint's linear part turned into the world's axes, MuJoCo's, or back."""
+    x = x.copy()
+    for iq, iv in built.free:
+        turn = np.roll(q[: len(x), iq + 3 : iq + 7], -1, axis=1)
+        x[:, iv : iv + 3] = rotate(conjugate(turn) if back else turn, x[:, iv : iv + 3])
+    return x
+
+
+def centripetal(built, v):
+    """Return ω × v of free joints: in their own axes the velocity turns with the body."""
+    out = np.zeros_like(v)
+    for _, iv in built.free:
+        out[:, iv : iv + 3] = np.cross(v[:, iv + 3 : iv + 6], v[:, iv : iv + 3])
+    return out
+
+
 def mujoco_calls(model, quantity, states):
     built = mujoco_model.build(model)
     m, back = built.model, np.argsort(built.v_index)
@@ -106,6 +126,14 @@ def mujoco_calls(model, quantity, states):
     few = min(LOOPED, len(q))
     out = np.empty((few, model.nv))
     inverse = quantity == "inverse_dynamics"
+    moved = centripetal(built, v)
+    v, x = in_world(built, q, v), in_world(built, q, x + moved if inverse else x)
+
+    def own(y):
+        """Return what came out in the description's axes and order."""
+        y = in_world(built, q, y, back=True)
+        return (y if inverse else y - moved[: len(y)])[:, back]
+
     evaluate = mujoco.mj_inverse if inverse else mujoco.mj_forward
     given, result = (d.qacc, d.qfrc_inverse) if inverse else (d.qfrc_applied, d.qacc)
 
@@ -116,7 +144,7 @@ def mujoco_calls(model, quantity, states):
             out[k] = result
         return out
 
-    yield f"mujoco, {evaluate.__name__} from Python, 1", (loop, lambda: loop()[:, back]), few
+    yield f"mujoco, {evaluate.__name__} from Python, 1", (loop, lambda: own(loop())), few
     if inverse:
         return
     full = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -134,7 +162,7 @@ def mujoco_calls(model, quantity, states):
 
         def acceleration(step=step):
             step()
-            return (after[:, 0, 1 + m.nq : 1 + m.nq + m.nv] - v)[:, back] / m.opt.timestep
+            return own((after[:, 0, 1 + m.nq : 1 + m.nq + m.nv] - v) / m.opt.timestep)
 
         yield f"mujoco, step by rollout, {threads}", (step, acceleration), len(q)
 
@@ -180,10 +208,9 @@ def states_of(model, n, seed=0):
     return q, v, rng.standard_normal((n, model.nv))
 
 
-def operations(model, quantity):
-    """Return what one evaluation computes, counted by kind."""
-    dyn = mb.dynamics(model, "lagrangian")
-    counted = Counter(o.name for o in program(dyn.function(quantity)).operations)
+def operations(function):
+    """Return what one evaluation computes, counted by kind; a sine is one operation."""
+    counted = Counter(o.name for o in program(function).operations)
     return {name: n for name, n in counted.most_common() if name not in ("input", "const")}
 
 
@@ -219,11 +246,11 @@ def first_result(name, quantity, repetitions):
 def robots(samples, rounds, names):
     out = []
     for name in names:
-        model = made(name)
+        model = made(ROBOTS[name])
         for quantity in QUANTITIES:
             calls, apart = calls_of(model, quantity, states_of(model, samples))
             times = timed(calls, rounds)
-            counted = operations(model, quantity)
+            counted = operations(mb.dynamics(model, "lagrangian").function(quantity))
             row = {"robot": name, "nv": model.nv, "quantity": quantity, "operations": counted}
             row["ns"] = {label: summary(x) | {"difference": apart[label]} for label, x in times.items()}
             theirs = {
@@ -245,50 +272,65 @@ def robots(samples, rounds, names):
 # Growth.
 
 
-def systems(kind, most):
-    for n in SIZES:
-        if n <= most:
-            if kind == "chain":
-                yield n, mb.catalog.chain(n=n)
-            else:
-                yield n, random_tree(n, n, ("revolute", "prismatic"), springs=False, damping=False, armature=False)
+def systems(most):
+    """Yield the kind, the number of joints and the model of chains in a plane and of branched trees in space."""
+    for n in (n for n in SIZES if n <= most):
+        yield "chain", n, mb.catalog.chain(n=n)
+    for n in (n for n in SIZES if n <= most):
+        yield "tree", n, random_tree(n, n, ("revolute", "prismatic"), springs=False, damping=False, armature=False)
 
 
-def growth(samples, rounds, most):
+def growth(samples, rounds, systems):
     """Return ns per sample and seconds to derive and compile, on one thread, against the number of joints."""
     # Nothing may come from the disk.
     os.environ["MBKIT_CACHE_DIR"] = ""
     out = []
-    for kind in ("chain", "tree"):
-        for n, model in systems(kind, most):
-            few = max(64, samples // n)
-            for quantity in QUANTITIES:
-                states = states_of(model, few)
-                # The first call of all pays for a compiler's start, which is not this system's.
-                dyn = mb.dynamics(model, "lagrangian", threads=1)
-                begun = time.perf_counter()
-                getattr(dyn, quantity)(*(x[0] for x in states))
-                seconds = time.perf_counter() - begun
-                _, call, _ = next(pinocchio_calls(model, quantity, states))
-                calls = {
-                    "lagrangian": (lambda dyn=dyn, s=states, quantity=quantity: getattr(dyn, quantity)(*s), few),
-                    "pinocchio": (call[0], few),
-                }
-                times = timed(calls, rounds)
-                counted = operations(model, quantity)
-                row = {"kind": kind, "n": n, "quantity": quantity, "samples": few, "derive_and_compile_s": seconds}
-                row["operations"] = None if counted is None else sum(counted.values())
-                row["ns"] = {name: summary(x) for name, x in times.items()}
-                out.append(row)
-                print(f"{kind} {n} {quantity}: {seconds:.2f} s", row["ns"], file=sys.stderr, flush=True)
+    for kind, n, model in systems:
+        few = max(64, samples // n)
+        for quantity in QUANTITIES:
+            states = states_of(model, few)
+            columns = tuple(np.asfortranarray(x) for x in states)
+            # The first call of all pays for a compiler's start, which is not this system's.
+            dyn = mb.dynamics(model, "lagrangian", threads=1)
+            run = getattr(dyn, quantity)
+            begun = time.perf_counter()
+            run(*(x[0] for x in states))
+            seconds = time.perf_counter() - begun
+            _, call, _ = next(pinocchio_calls(model, quantity, states))
+            calls = {
+                "lagrangian": (lambda run=run, s=states: run(*s), few),
+                "lagrangian, coordinate-major": (lambda run=run, s=columns: run(*s), few),
+                "pinocchio": (call[0], few),
+            }
+            times = timed(calls, rounds)
+            row = {"kind": kind, "n": n, "quantity": quantity, "samples": few, "derive_and_compile_s": seconds}
+            row["operations"] = sum(operations(dyn.function(quantity)).values())
+            row["ns"] = {name: summary(x) for name, x in times.items()}
+            row["times_as_fast_as_pinocchio"] = {
+                name: float(np.median(times["pinocchio"] / x)) for name, x in times.items() if name != "pinocchio"
+            }
+            out.append(row)
+            print(f"{kind} {n} {quantity}: {seconds:.2f} s", row["ns"], file=sys.stderr, flush=True)
     return out
 
 
-def slope(rows, kind, quantity, value):
-    """Return the exponent of growth over the upper half of the sizes."""
-    points = [(r["n"], value(r)) for r in rows if (r["kind"], r["quantity"]) == (kind, quantity) and value(r)]
-    points = points[len(points) // 2 - 1 :] if len(points) > 3 else points
-    return float(np.polyfit(*np.log(np.array(points)).T, 1)[0]) if len(points) > 1 else None
+def exponent(rows, value):
+    """Return the exponent of growth, by least squares over the last three sizes."""
+    points = np.array([(r["n"], value(r)) for r in rows])[-3:]
+    return float(np.polyfit(*np.log(points).T, 1)[0]) if len(points) > 1 else None
+
+
+def exponents(rows):
+    """Return the exponents of each kind of system and quantity."""
+    out = {}
+    for kind, quantity in dict.fromkeys((r["kind"], r["quantity"]) for r in rows):
+        own = [r for r in rows if (r["kind"], r["quantity"]) == (kind, quantity)]
+        out[f"{kind}, {quantity}"] = {
+            "operations": exponent(own, lambda r: r["operations"]),
+            "ns": exponent(own, lambda r: r["ns"]["lagrangian"]["median"]),
+            "derive_and_compile_s": exponent(own, lambda r: r["derive_and_compile_s"]),
+        }
+    return out
 
 
 # What is shown.
@@ -314,7 +356,7 @@ def table(data):
                 for label, x in ns.items()
                 if label.startswith("mujoco") and ("rollout" in label or "inverse" in label)
             )
-            cells = [f"{row['robot']} ({row['nv']})", str(sum(row["operations"].values()) if row["operations"] else "")]
+            cells = [f"{row['robot']} ({row['nv']})", str(sum(row["operations"].values()))]
             cells += [f"{ns['lagrangian, C order, 1']:.3g}", f"{ns['lagrangian, coordinate-major, 1']:.3g}"]
             cells += [f"{ns[f'lagrangian, C order, {threads}']:.3g}"] if threads > 1 else []
             cells += [f"{theirs:.4g}", f"{row['times_as_fast_as_pinocchio']['lagrangian, C order, 1']:.3g}"]
@@ -328,8 +370,8 @@ def main():
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     asked.add_argument("--samples", type=int, default=65_536)
     asked.add_argument("--rounds", type=int, default=15)
-    asked.add_argument("--most", type=int, default=SIZES[-1], help="joints of the longest chain")
-    asked.add_argument("--robots", default=",".join(ROBOTS))
+    asked.add_argument("--most", type=int, default=SIZES[-1], help="joints of the largest chain and tree")
+    asked.add_argument("--robots", nargs="*", default=list(ROBOTS))
     asked.add_argument("--out", type=Path, default=HERE)
     given = asked.parse_args()
     load = os.getloadavg()[0]
@@ -341,18 +383,10 @@ def main():
         "rounds": given.rounds,
         "threads": cores(),
         **stamp(),
-        "robots": robots(given.samples, given.rounds, given.robots.split(",")),
-        "growth": growth(given.samples, given.rounds, given.most),
+        "robots": robots(given.samples, given.rounds, given.robots),
+        "growth": growth(given.samples, given.rounds, systems(given.most)),
     }
-    data["exponents"] = {
-        f"{kind}, {quantity}": {
-            "operations": slope(data["growth"], kind, quantity, lambda r: r["operations"]),
-            "ns": slope(data["growth"], kind, quantity, lambda r: r["ns"]["lagrangian"]["median"]),
-            "derive_and_compile_s": slope(data["growth"], kind, quantity, lambda r: r["derive_and_compile_s"]),
-        }
-        for kind in ("chain", "tree")
-        for quantity in QUANTITIES
-    }
+    data["exponents"] = exponents(data["growth"])
     given.out.mkdir(parents=True, exist_ok=True)
     (given.out / "terms.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     from validation.terms_figure import draw

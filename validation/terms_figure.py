@@ -19,6 +19,8 @@ from mbkit.report.formatting import time_text
 HERE = Path(__file__).parent
 COLOURS = {"pinocchio": "#0072b2", "lagrangian": "#d55e00", "mujoco": "#009e73"}
 ENGINES = {name: COLOURS[name] for name in ("lagrangian", "pinocchio")}
+#: Of growth: each kind of system with its line.
+LINES = {"chain": "o-", "chain in space": "^--", "tree": "s:"}
 TITLES = {"inverse_dynamics": "Inverse dynamics", "forward_dynamics": "Forward dynamics"}
 
 
@@ -65,7 +67,7 @@ def draw_bars(axes, rows, threads):
 
 
 def draw_growth(axes, rows, value, title, unit, colours):
-    for kind, mark in (("chain", "o-"), ("tree", "s:")):
+    for kind, mark in LINES.items():
         for engine, colour in colours.items():
             points = [(r["n"], value(r, engine)) for r in rows if r["kind"] == kind]
             points = [(n, x) for n, x in points if x]
@@ -103,11 +105,15 @@ def drawn(data, tall):
     return fig
 
 
-def draw(data, folder):
-    """Write ``terms.png``, and ``terms.svg`` for the book, to a folder."""
+def style():
     # Text as text, and the same bytes for the same data.
     plt.rcParams.update({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False})
     plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "mbkit"})
+
+
+def draw(data, folder):
+    """Write ``terms.png``, and ``terms.svg`` for the book, to a folder."""
+    style()
     folder.mkdir(parents=True, exist_ok=True)
     drawn(data, tall=False).savefig(folder / "terms.png", dpi=110)
     drawn(data, tall=True).savefig(folder / "terms.svg", transparent=True, metadata={"Date": None})
