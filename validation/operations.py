@@ -1,18 +1,18 @@
 """Scalar operations of each form of the dynamics, and the share of the processor's vector units that they fill.
 
 Run ``python -m validation.operations`` on an otherwise idle machine; it writes ``validation/operations.json`` and
-draws ``validation/figures/operations.svg``. ``--samples 256 --rounds 3 --most 16 --out FOLDER`` is a quick try.
+draws ``validation/figures/operations.svg``. ``--samples 2048 --rounds 3 --most 16 --out FOLDER`` is a quick try.
 
 What is counted
     Operations of one evaluation of inverse dynamics, M and forward dynamics, after repeated ones are merged; a sine is
     one. The forms are those of `FORMS`.
 
 What is measured
-    ns per sample of the compiled kernels on one thread, on coordinate-major arrays that stay in the second cache, with
-    the results' memory given: from the energies, and the form that mbkit chooses. Beside them Pinocchio's RNEA and ABA
-    over the same batch, one thread, and its CRBA in a loop from Python, which pays for the loop. Beside all, the limit
-    of the vector units: independent chains of fused multiply-adds in registers, two operations each. All are timed in
-    turn, round by round; a share or a ratio is the median over the rounds.
+    ns per sample of the compiled kernels on one thread, over a batch of C-ordered arrays that is evaluated again and
+    again without Python in between: from the energies, and the form that mbkit chooses. Beside them Pinocchio's RNEA
+    and ABA over one large batch, one thread, and its CRBA in a loop from Python, which pays for the loop. Beside all,
+    the limit of the vector units: independent chains of fused multiply-adds in registers, two operations each. All are
+    timed in turn, round by round; a share or a ratio is the median over the rounds.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ import pinocchio as pin
 import mbkit as mb
 from mbkit.codegen import jit
 from mbkit.codegen.batch_loop import RUN
+from mbkit.codegen.compiled import Call, KernelSequence
 from mbkit.derivation import FUNCTIONS, Equations, LinkEquations, elimination_of
 from mbkit.derivation.least_constraint import regroups
 from mbkit.derivation.links import Links
@@ -51,8 +52,8 @@ FORMS = {
     "chosen": "what mbkit compiles by default",
 }
 SIZES = (2, 4, 8, 16, 32, 64, 128, 256)
-#: Samples of a batch, and how often a round evaluates it: a millisecond for the smallest kernel.
-BATCH, TIMES = 2048, 32
+#: Samples of a kernel's batch, few enough for the second cache, and of all that a round evaluates.
+BATCH, SAMPLES = 256, 65_536
 #: Chains of multiply-adds: as many as hide their latency, and few enough for the registers.
 CHAINS, TURNS = 12, 100_000
 
@@ -145,26 +146,17 @@ done:
 # Times.
 
 
-def repeated(call, n):
-    """Return the call of a round, and how many samples it does."""
-
-    def calls():
-        for _ in range(TIMES):
-            call()
-
-    return calls, n * TIMES
-
-
 def kernel(model, quantity, states, elimination):
-    """Return the call of a compiled kernel on coordinate-major arrays, and its result's array, (N, entries)."""
+    """Return the call of a compiled kernel, a batch again and again, and its results, (BATCH, entries)."""
     code = mb.dynamics(model, "lagrangian", threads=1, elimination=elimination).code(quantity)
-    inputs = [np.asfortranarray(x) for x in states]
-    out = np.empty((int(np.prod(code.shapes[0])), len(states[0]))).T
-    return lambda: code.run(inputs, [out], 1), out
+    out = np.empty((BATCH, int(np.prod(code.shapes[0]))))
+    times = len(states[0]) // BATCH
+    sequence = KernelSequence([Call(code, [x[:BATCH] for x in states], [out])], times)
+    return lambda: sequence.run(0, times), out
 
 
 def crba(model, q):
-    """Return a loop over `pinocchio.crba` from Python, and the last state's M."""
+    """Return a loop over `pinocchio.crba` from Python, and a function of the last state's M."""
     built = pinocchio_model.build(model)
     data, own, order = built.model.createData(), q[:, built.q_order], np.argsort(built.v_order)
 
@@ -174,28 +166,27 @@ def crba(model, q):
 
     def last():
         upper = np.triu(data.M)
-        return (upper + np.triu(upper, 1).T)[np.ix_(order, order)]
+        return (upper + np.triu(upper, 1).T)[np.ix_(order, order)].ravel()
 
     return loop, last
 
 
 def calls_of(model, quantity, samples):
-    """Return the calls of a quantity by label, after a comparison of their results."""
+    """Return the calls of a quantity by label, after a comparison of one result."""
     states = bench_terms.states_of(model, samples)
     arguments = states[: len(FUNCTIONS[quantity])]
     calls, results = {}, {}
     for label, elimination in (("energies", "mass matrix"), ("chosen", None)):
         call, out = kernel(model, quantity, arguments, elimination)
         call()
-        calls[label], results[label] = repeated(call, samples), out[-1]
+        calls[label], results[label] = (call, samples), out[-1]
     if quantity == "mass_matrix":
-        loop, last = crba(model, states[0])
+        loop, last = crba(model, states[0][:BATCH])
         loop()
-        calls["pinocchio, crba from Python"], results["pinocchio"] = (loop, samples), last().ravel()
+        calls["pinocchio, crba from Python"], results["pinocchio"] = (loop, BATCH), last()
     else:
         label, (call, shown), _ = next(bench_terms.pinocchio_calls(model, quantity, states))
-        results["pinocchio"] = shown()[-1]
-        calls[label.removesuffix(", 1")] = repeated(call, samples)
+        calls[label.removesuffix(", 1")], results["pinocchio"] = (call, samples), shown()[BATCH - 1]
     scale = np.abs(results["chosen"]).max()
     for label, x in results.items():
         if (apart := np.abs(x - results["chosen"]).max() / scale) > bench_terms.AGREE:
@@ -241,7 +232,7 @@ def systems(most):
 
 def main():
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    asked.add_argument("--samples", type=int, default=BATCH)
+    asked.add_argument("--samples", type=int, default=SAMPLES)
     asked.add_argument("--rounds", type=int, default=21)
     asked.add_argument("--most", type=int, default=SIZES[-1], help="joints of the largest chain and tree")
     asked.add_argument("--robots", nargs="*", default=list(ROBOTS), choices=ROBOTS)
@@ -258,7 +249,7 @@ def main():
         **stamp(),
         "forms": FORMS,
         "robots": [robot(name, ROBOTS[name], given.samples, given.rounds, unit) for name in given.robots],
-        "growth": bench_terms.growth(8 * given.samples, given.rounds, systems(given.most)),
+        "growth": bench_terms.growth(given.samples, given.rounds, systems(given.most)),
     }
     data["exponents"] = bench_terms.exponents(data["growth"])
     given.out.mkdir(parents=True, exist_ok=True)

@@ -56,8 +56,8 @@ def times_of(row, quantity):
 
 def drawn(data):
     fig = plt.figure(figsize=(7.2, 9.6))
-    dots = fig.add_gridspec(2, 3, left=0.155, right=0.985, top=0.935, bottom=0.375, hspace=0.3, wspace=0.08)
-    lines = fig.add_gridspec(1, 3, left=0.075, right=0.985, top=0.28, bottom=0.05, wspace=0.36)
+    dots = fig.add_gridspec(2, 3, left=0.195, right=0.985, top=0.935, bottom=0.41, hspace=0.3, wspace=0.08)
+    lines = fig.add_gridspec(1, 3, left=0.075, right=0.985, top=0.27, bottom=0.05, wspace=0.36)
     handles = {}
     for i, (values, unit) in enumerate(((operations_of, "operations"), (times_of, "ns per sample, 1 thread"))):
         for k, (quantity, title) in enumerate(TITLES.items()):
@@ -80,10 +80,8 @@ def drawn(data):
             grown = [r for r in data["growth"] if r["quantity"] == quantity]
             draw_growth(axes, grown, value, title, unit, {quantity.split("_")[0]: colour})
         axes.tick_params(axis="x", labelsize=6)
-        if k:
-            axes.get_legend().remove()
-        else:
-            axes.legend(frameon=False, fontsize=6, handlelength=2.5)
+        axes.get_legend().remove()
+    fig.legend(*axes.get_legend_handles_labels(), ncols=2, frameon=False, loc="center", bbox_to_anchor=(0.53, 0.325))
     return fig
 
 

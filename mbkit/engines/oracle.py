@@ -1,7 +1,7 @@
 """The reference that others are measured by: the own derivation at 113 bits, about 34 digits.
 
-The formulas are the lagrangian engine's, so this measures rounding; that they are right is shown apart, by a
-Newton–Euler recursion in `validation/`, to 30 digits.
+The formulas are derivatives of the energies, those of the lagrangian engine's elimination "mass matrix"; that they are
+right is shown apart, by a Newton–Euler recursion in `validation/`, to 30 digits.
 
 Every number of the description and of the state is the double that it is, exactly. A quaternion stands for its
 rotation: it is divided by its norm, which misses one by about an eps, and an engine that uses it as it is shows that
