@@ -82,13 +82,13 @@ def draw_growth(axes, rows, value, title, unit, colours):
 
 def drawn(data, tall):
     """Return the figure: wide, or as wide as a page of the book."""
-    fig = plt.figure(figsize=(7.2, 15.5) if tall else (12, 11))
+    fig = plt.figure(figsize=(7.2, 21) if tall else (12, 15))
     if tall:
-        upper = fig.add_gridspec(2, 1, left=0.29, right=0.97, top=0.98, bottom=0.4, hspace=0.18)
-        lower = fig.add_gridspec(2, 2, left=0.09, right=0.97, top=0.355, bottom=0.035, hspace=0.32, wspace=0.25)
+        upper = fig.add_gridspec(2, 1, left=0.29, right=0.97, top=0.985, bottom=0.31, hspace=0.12, height_ratios=(5, 7))
+        lower = fig.add_gridspec(2, 2, left=0.09, right=0.97, top=0.275, bottom=0.025, hspace=0.32, wspace=0.25)
     else:
-        upper = fig.add_gridspec(1, 2, left=0.17, right=0.985, top=0.965, bottom=0.42, wspace=0.5)
-        lower = fig.add_gridspec(1, 3, left=0.06, right=0.985, top=0.335, bottom=0.05, wspace=0.28)
+        upper = fig.add_gridspec(1, 2, left=0.17, right=0.985, top=0.97, bottom=0.34, wspace=0.5)
+        lower = fig.add_gridspec(1, 3, left=0.06, right=0.985, top=0.275, bottom=0.04, wspace=0.28)
     for k, quantity in enumerate(TITLES):
         rows = [r for r in data["robots"] if r["quantity"] == quantity]
         draw_bars(fig.add_subplot(upper[k]), rows, data["threads"])
