@@ -1,5 +1,6 @@
 """What a system is: frozen data and its builder. No engine is imported here."""
 
+from mbkit.model.base_parameters import BaseParameters
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.description import Needs
 from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
@@ -9,6 +10,7 @@ from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, Po
 
 __all__ = [
     "KINDS",
+    "BaseParameters",
     "Body",
     "Expression",
     "Frame",

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, generator, real, rows
 from mbkit._escape import html
-from mbkit.errors import UnknownNameError
+from mbkit.errors import UnknownNameError, UnsupportedError
 from mbkit.model import manifold
+from mbkit.model.base_parameters import BaseParameters, base_parameters
 from mbkit.model.description import Description, expect_name
 from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
@@ -131,6 +132,45 @@ class Model(Description):
         q0, q1 = self.check_q(q0, "q0"), self.check_q(q1, "q1")
         batch_of(q0=q0, q1=q1)
         return manifold.difference(self, q0, q1)
+
+    # Inertia
+
+    def base_parameters(self, *, tolerance: float = 1e-7) -> BaseParameters:
+        """Return the smallest set of inertial parameters that decides the motion.
+
+        Each is a combination of the masses, first moments and inertias of bodies, such as ``link3.Ixx - link3.Iyy``.
+        Torques and motion depend on these alone, so no experiment with them can tell more about the bodies
+        (Gautier and Khalil 1990; Khalil and Dombre 2002, Modeling, Identification and Control of Robots, ch. 9.4).
+        Armature, friction, springs and damping are taken as known, and do not count. Limits of joints are ignored.
+
+        Parameters
+        ----------
+        tolerance : float
+            What is smaller than this, relative to the largest, is taken as not there. An axis that a file's rounding
+            tilts against another one by less counts as parallel to it.
+
+        Returns
+        -------
+        BaseParameters
+            With ``values == matrix @ standard``.
+
+        Raises
+        ------
+        UnsupportedError
+            A model written as energies, or one with loops or prescribed motions.
+        InputError
+            A parameter of the model has no value.
+        NumericalError
+            The tolerance falls where there is no clear gap.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> print(mb.catalog.double_pendulum().base_parameters())
+        """
+        if not self.has_bodies:
+            raise UnsupportedError(f"base parameters: {self.name} was written as energies and has no bodies")
+        return base_parameters(self, tolerance)
 
     # Variants
 
