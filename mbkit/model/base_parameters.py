@@ -35,7 +35,7 @@ from mbkit.model.parts import Body, Joint, _Frozen
 from mbkit.spatial import skew
 
 #: The ten standard parameters of a body, in the order of Khalil and Dombre.
-KINDS: Final = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "hx", "hy", "hz", "m")
+_STANDARD: Final = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "hx", "hy", "hz", "m")
 _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 #: Power of a length in the energy of each.
 _POWERS: Final = np.array([0] * 6 + [1] * 3 + [2])
@@ -212,7 +212,7 @@ def base_parameters(model: Description, tolerance: float) -> BaseParameters:
             )
     model.require_values("base parameters")
     bodies = [model.body(joint.child) for joint in model.tree]
-    names = tuple(f"{body.name}.{kind}" for body in bodies for kind in KINDS)
+    names = tuple(f"{body.name}.{kind}" for body in bodies for kind in _STANDARD)
     standard = np.concatenate([np.zeros(0), *map(standard_parameters, bodies)])
     length = _length(model)
     matrix, kept = _regrouped(model, length, tolerance)
@@ -236,15 +236,13 @@ def _regrouped(model: Description, length: float, tolerance: float) -> tuple[Arr
     """
     index = {joint.child: k for k, joint in enumerate(model.tree)}
     left = np.eye(10 * len(index)).reshape(len(index), 10, -1)
-    scale = length**_POWERS
     kept: list[int] = []
     for joint in reversed(model.tree):
         k = index[joint.child]
         points, place = _points_at_rest(joint, length, tolerance)
         pairs = [np.outer(a, b) + np.outer(b, a) for i, a in enumerate(points) for b in points[i:]]
         movable = _parameters(np.array(pairs).reshape(-1, 4, 4))
-        gone, unit = _eliminated(movable / scale)
-        unit = unit * scale / scale[gone, None]
+        gone, unit = _eliminated(movable)
         moved = left[k, gone]
         left[k] -= unit.T @ moved
         kept += [10 * k + i for i in range(10) if i not in gone]
@@ -266,8 +264,8 @@ def _points_at_rest(joint: Joint, length: float, tolerance: float) -> tuple[Arra
         q[:, kind.quaternion + 3] = 1.0
     place = _frame(joint) @ _pose(joint, list(q[:1].T), 1)[0]
     at = list(kind.integrate(q, rng.standard_normal((_POSES, kind.nv))).T)
-    rates = [_rate(joint, at, list(unit), _POSES) for unit in np.eye(kind.nv)]
-    motions = np.concatenate([np.zeros((1, 4)), *(rate.reshape(-1, 4) for rate in rates)])
+    units = np.diag([length if k in kind.lengths else 1.0 for k in range(kind.nv)])
+    motions = np.concatenate([np.zeros((1, 4)), *(_rate(joint, at, list(v), _POSES).reshape(-1, 4) for v in units)])
     motions[:, 3] /= length
     _, sizes, axes = np.linalg.svd(motions)
     moving = int(np.sum(sizes > tolerance * sizes[0]))
@@ -283,13 +281,12 @@ def _reduced(
     rates = np.ones(model.nv)
     for joint in model.independent_joints:
         rates[[model.layout.v[joint.name].start + k for k in joint.type.lengths]] = length
-    q = manifold.integrate(
-        model, np.tile(manifold.neutral(model), (size, 1)), rates * rng.uniform(-np.pi, np.pi, (size, model.nv))
-    )
+    moves = rates * rng.uniform(-np.pi, np.pi, (size, model.nv))
+    q = manifold.integrate(model, np.tile(manifold.neutral(model), (size, 1)), moves)
+    v = rates * rng.standard_normal((size, model.nv))
+    # Gravity of one length a second squared makes V as large as T.
     weight = float(np.linalg.norm(model.gravity)) / length or 1.0
-    kinetic, potential = energy_regressor(
-        model, q, rates * rng.standard_normal((size, model.nv)), model.gravity / weight
-    )
+    kinetic, potential = energy_regressor(model, q, v, model.gravity / weight)
     Y = np.concatenate([kinetic, potential - potential.mean(axis=0)])[:, kept] / np.sqrt(size)
     scale = (length ** np.tile(_POWERS, len(model.tree)))[kept]
     columns = np.linalg.norm(Y / scale, axis=0)
@@ -324,7 +321,7 @@ def _eliminated(null: Array) -> tuple[list[int], Array]:
         across = left[:, k] / sizes[k]
         left = left - np.outer(across, across @ left)
     gone.sort()
-    return gone, np.linalg.solve(null[:, gone], null)
+    return gone, np.asarray(np.linalg.solve(null[:, gone], null), dtype=np.float64)
 
 
 # Poses and velocities as 4 x 4 matrices.
@@ -332,7 +329,7 @@ def _eliminated(null: Array) -> tuple[list[int], Array]:
 
 def _parameters(J: Array) -> Array:
     """Return the ten parameters, (..., 10), of pseudo-inertias."""
-    return np.einsum("kij,...ij->...k", _F, J)
+    return np.asarray(np.einsum("kij,...ij->...k", _F, J))
 
 
 def _frame(joint: Joint) -> Array:
