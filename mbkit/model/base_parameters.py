@@ -39,8 +39,8 @@ _STANDARD: Final = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "hx", "hy", "hz", 
 _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 #: Power of a length in the energy of each.
 _POWERS: Final = np.array([0] * 6 + [1] * 3 + [2])
-#: Rounding of a coefficient.
-_ROUNDING: Final = 1e-12
+#: Rounding of a coefficient, and of right angles in a file: π is often written with eleven digits.
+_ROUNDING: Final = 1e-10
 #: How much smaller than the least kept singular value the largest dropped one has to be.
 _GAP: Final = 100.0
 #: A column whose independent part is this part of the largest one may be eliminated.
@@ -124,7 +124,7 @@ class BaseParameters(_Frozen):
 
     @property
     def text(self) -> str:
-        """One line for each base parameter: its value and what it is."""
+        """One line for each base parameter, with its value and its combination."""
         lines = [self._title]
         lines += [f"{x:12.6g}  {sum_}" for x, sum_ in zip(self.values, self.combinations, strict=True)]
         return terminal("\n".join(lines))

@@ -167,6 +167,13 @@ class Model(Description):
         --------
         >>> import mbkit as mb
         >>> print(mb.catalog.double_pendulum().base_parameters())
+        double_pendulum: 6 base parameters of 20 standard ones
+                   2  rod1.Iyy + rod2.m
+                   0  rod1.hx
+                  -2  rod1.hz - rod2.m
+                   1  rod2.Iyy
+                   0  rod2.hx
+                  -1  rod2.hz
         """
         if not self.has_bodies:
             raise UnsupportedError(f"base parameters: {self.name} was written as energies and has no bodies")
