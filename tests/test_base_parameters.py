@@ -111,14 +111,14 @@ def test_the_form_of_the_result(seed):
 
 
 def chain(axes: str, *, gravity: tuple[float, float, float] = (0, 0, -9.81), seed: int = 0) -> Model:
-    """Return a serial robot of turns R, slides P and screws h along random axes; r turns about the z axis before."""
+    """Return a serial robot of turns R, slides P and screws h along random axes; r and p along z before."""
     rng = np.random.default_rng(seed)
     b = mb.ModelBuilder(axes, gravity=gravity)
     for k, letter in enumerate(axes):
         b.add_body(f"b{k}", mass=1.0 + k, com=rng.standard_normal(3), inertia=(2.0, 3.0, 4.0))
-        own = {} if letter == "r" else {"rotation": rotation(rng)}
+        own = {} if letter in "rp" else {"rotation": rotation(rng)}
         own |= {"pitch": 0.3} if letter == "h" else {}
-        kind = {"R": "revolute", "r": "revolute", "P": "prismatic", "h": "helical"}[letter]
+        kind = {"R": "revolute", "r": "revolute", "P": "prismatic", "p": "prismatic", "h": "helical"}[letter]
         place = rng.standard_normal(3) if k else np.zeros(3)
         b.add_joint(
             f"j{k}", kind, parent=f"b{k - 1}" if k else "world", child=f"b{k}", axis=(0, 0, 1), translation=place, **own
@@ -142,6 +142,8 @@ def test_slides_have_four_behind_two_turns_and_less_before():
     assert chain("rRPRRR").base_parameters().count == 7 * 5 + 4 - 6
     # Behind one turn the first moment along its axis is not seen; before any turn nothing but the mass is.
     assert chain("RPR").base_parameters().count == 3 + 3 + 7
+    # Of a slide along that axis the first moment is the parent's.
+    assert chain("RpR").base_parameters().count == 3 + 1 + 7
     assert chain("P").base_parameters().names == ("b0.m",)
     assert chain("PP").base_parameters().count == 2
     assert chain("PR").base_parameters().count == 1 + 3
@@ -505,6 +507,6 @@ def test_models_of_another_form_are_refused():
 
 
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, 1.0, np.nan, "small"])
-def test_tolerances_that_are_none(tolerance):
+def test_tolerances_out_of_range(tolerance):
     with pytest.raises(InputError, match="tolerance"):
         mb.catalog.pendulum().base_parameters(tolerance=tolerance)

@@ -292,7 +292,7 @@ def _reduced(
     columns = np.linalg.norm(Y / scale, axis=0)
     # A column of nothing but rounding stays as small as it is.
     scale = scale * np.where(columns > tolerance, columns, 1.0)
-    _, sizes, axes = np.linalg.svd(Y / scale, full_matrices=False)
+    _, sizes, axes = np.linalg.svd(np.linalg.qr(Y / scale, mode="r"))
     count = int(np.sum(sizes > tolerance * sizes[0]))
     if 0 < count < len(sizes) and sizes[count] * _GAP > sizes[count - 1]:
         raise NumericalError(
