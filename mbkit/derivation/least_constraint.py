@@ -214,8 +214,6 @@ def _subtract(x: dict[int, Any], factor: Any, y: dict[int, Any]) -> None:
 
 #: Largest M_kk/D_k of an elimination, some 5 of 16 digits.
 _MAX_RATIO: Final = 1e5
-#: Largest M_kk/D_k where matter is moved between links, which loses up to twice as many eps.
-_MAX_REGROUPED: Final = 1e4
 #: Largest count of multiplications of the sparse LᵀDL, some n³/3 for a chain: the orthogonal elimination takes several
 #: times as many, which doubles forward dynamics of 16 links.
 _MAX_SIZE: Final = 2000
@@ -242,22 +240,6 @@ def loses_digits(model: Model) -> bool:
     return cancellation(model, enough=_MAX_RATIO) > _MAX_RATIO
 
 
-@lru_cache(maxsize=64)
-def regroups(model: Model) -> bool:
-    """Return whether matter that no motion tells apart can be moved to parents without a loss of digits.
-
-    Decided at nominal parameters; False where one has no value.
-    """
-    if not model.has_bodies or any(x is None for x in model.parameters.values()):
-        return False
-    if any(joint.type.gimbal is not None for joint in model.joints):
-        return False
-    rng = np.random.default_rng(0)
-    with np.errstate(all="ignore"):
-        poses = np.concatenate([model.random_state(rng, _STATES)[0], _right_angles(model, rng)])
-        return bool(model.nv and _bound(model, poses) <= _MAX_REGROUPED)
-
-
 def cancellation(model: Model, enough: float = np.inf) -> float:
     """Return about the largest M_kk/D_k of any pose, or an upper bound if that is below 1e5.
 
@@ -267,7 +249,7 @@ def cancellation(model: Model, enough: float = np.inf) -> float:
     if any(joint.type.gimbal is not None for joint in model.joints):
         return np.inf
     rng = np.random.default_rng(0)
-    poses = np.concatenate([model.random_state(rng, _STATES)[0], _right_angles(model, rng)])
+    poses = hard_poses(model, rng)
     with np.errstate(all="ignore"):
         bound = _bound(model, poses)
         if bound <= _MAX_RATIO:
@@ -288,6 +270,11 @@ def cancellation(model: Model, enough: float = np.inf) -> float:
                 worst, q = float(ratios.max()), poses[np.argmax(ratios)]
             reach *= _SHRINK
     return worst
+
+
+def hard_poses(model: Model, rng: np.random.Generator) -> Array:
+    """Return random poses, and as many with right angles, where the axes of machines align."""
+    return np.concatenate([model.random_state(rng, _STATES)[0], _right_angles(model, rng)])
 
 
 def _right_angles(model: Model, rng: np.random.Generator) -> Array:

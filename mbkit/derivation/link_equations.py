@@ -7,15 +7,17 @@ principle (`mbkit.derivation.link_mechanics`), M and forward dynamics from Gauss
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, Final
 
 import casadi as ca
+import numpy as np
 
+from mbkit.derivation.composite_bodies import mass_matrix
 from mbkit.derivation.equations import Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
-from mbkit.derivation.least_constraint import loses_digits, regroups
+from mbkit.derivation.least_constraint import hard_poses, has_squares, loses_digits
 from mbkit.derivation.link_mechanics import LinkMechanics
 from mbkit.derivation.links import Links
 from mbkit.derivation.mass_matrix_solve import solve
@@ -24,6 +26,12 @@ from mbkit.model import Model
 
 #: Carrying the velocities of so many more links is tried in vain before the search for the fewest operations ends.
 _PATIENCE: Final = 2
+#: Poses at the ends of limits.
+_CORNERS: Final = 8
+#: Velocities and forces at each pose.
+_STATES: Final = 3
+#: Distance in eps from which a short form has lost digits: rounding of the forms themselves makes up to 1.3.
+_MAX_ERROR: Final = 1.4
 
 
 def elimination_of(model: Model) -> Elimination:
@@ -52,14 +60,14 @@ class LinkEquations(Equations):
     """The equations of motion of a model with bodies, its numbers as floats; parameters may be symbols."""
 
     @cached_property
-    def links(self) -> Links:
-        """The tree in axes of its own."""
-        return Links(self.kin, regroup=regroups(self.model))
+    def mechanics(self) -> LinkMechanics:
+        """Motions and forces of the links, in the frames with the fewest operations."""
+        return LinkMechanics(Links(self.kin))
 
     @cached_property
-    def mechanics(self) -> LinkMechanics:
-        """Motions and forces of the links."""
-        return LinkMechanics(self.links)
+    def plain(self) -> LinkMechanics:
+        """The same in the description's own frames, with its constants to the last digit."""
+        return LinkMechanics(Links(self.kin, short=False))
 
     def _column(self, entries: list[Any]) -> Any:
         return ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in entries))
@@ -67,48 +75,58 @@ class LinkEquations(Equations):
     @cached_property
     def gravity(self) -> Any:
         """Forces that hold the system against gravity."""
-        return self._column(LinkMechanics(self.links, moving=False).forces())
+        return self._forces(lambda mechanics: LinkMechanics(mechanics.tree, moving=False).forces())
 
     @cached_property
     def coriolis_force(self) -> Any:
         """C(q, v) v."""
-        return self._column(LinkMechanics(self.links, falling=False).forces())
+        return self._forces(lambda mechanics: LinkMechanics(mechanics.tree, falling=False).forces())
 
     @cached_property
     def nle(self) -> Any:
         """C v + g."""
-        return self._column(self.mechanics.forces())
+        return self._forces(lambda mechanics: mechanics.forces())
 
     @cached_property
     def inverse_dynamics(self) -> Any:
         """M a + C v + g - τ_passive."""
-        return self._column(self.mechanics.forces(self._scalars(self.a))) - self.passive
+        return self._forces(lambda mechanics: mechanics.forces(self._scalars(self.a))) - self.passive
+
+    def _forces(self, of: Callable[[LinkMechanics], list[Any]]) -> Any:
+        """Return forces in the frames with the fewer operations."""
+        return min((self._column(of(mechanics)) for mechanics in (self.plain, self.mechanics)), key=ca.n_nodes)
 
     @cached_property
     def mass_matrix(self) -> Any:
-        """M, by composite bodies: what Gauss's function leaves where no velocity is eliminated."""
-        n = self.model.nv
-        M: Any = ca.SX(n, n)
-        for (i, j), x in GaussElimination(self.mechanics, range(n)).rest.items():
-            M[i, j] = M[j, i] = x
-        return ca.sparsify(M)
+        """M, by composite bodies.
+
+        From the energies where matter depends on parameters, which may be zero, and where an inertia is no sum of
+        squares: then the composite bodies' terms are none either, and cancel.
+        """
+        composite = self.plain.tree.literal and has_squares(self.model)
+        return mass_matrix(self.plain) if composite else super().mass_matrix
 
     @cached_property
     def forward_dynamics(self) -> Any:
-        """M⁻¹ (τ + τ_passive - C v - g), in the form with the fewest operations.
+        """M⁻¹ (τ + τ_passive - C v - g), in the form with the fewest operations that keeps the digits.
 
         All accelerations are eliminated link by link, or those next to the root are carried and come from the factors
-        of a small matrix.
+        of a small matrix. Short frames and moved matter are taken where they agree with the description's own frames at
+        hard poses.
         """
         if self.least_constraint is not None:
             return self.least_constraint.accelerations(self.tau + self.passive)
-        best = self._reduced(())
-        if not regroups(self.model):
-            # A matrix of what is left would lose digits too.
-            return best
+        exact = self._reduced(self.plain, ())
+        for form in (self._shortest(), self._reduced(self.mechanics, ())):
+            if ca.n_nodes(form) < ca.n_nodes(exact) and self._error(form, exact) < _MAX_ERROR:
+                return form
+        return exact
+
+    def _shortest(self) -> Any:
+        best = self._reduced(self.mechanics, ())
         worse, least = 0, ca.n_nodes(best)
         for carried in self._carried():
-            other = self._reduced(carried)
+            other = self._reduced(self.mechanics, carried)
             size = ca.n_nodes(other)
             worse = 0 if size < least else worse + 1
             if not worse:
@@ -117,9 +135,46 @@ class LinkEquations(Equations):
                 break
         return best
 
+    def _error(self, form: Any, exact: Any) -> float:
+        """Return how far two forms of the accelerations are apart at hard poses, in eps.
+
+        Accelerations are √M_jj a_j, beside those of the forces that act; their gap counts per cond(M), and so does the
+        force that it amounts to. Infinite where M is singular, and of a model with parameters, whose values may change.
+        """
+        model = self.model
+        if model.parameters:
+            return np.inf
+        rng = np.random.default_rng(0)
+        corners = rng.random((_CORNERS, model.nq)) < 0.5
+        q = np.concatenate([[model.neutral()], hard_poses(model, rng), model.neutral() * np.ones((_CORNERS, 1))])
+        limits = np.where(corners, model.lower, model.upper)
+        q[-_CORNERS:] = np.where(np.isfinite(limits), limits, q[-_CORNERS:])
+        given = [self.q, self.v, self.tau]
+        forms = ca.Function("forms", given, [ca.densify(x) for x in (form, exact, self.nle, self.passive)])
+        mass_matrix = ca.Function("M", [self.q], [ca.densify(self.mass_matrix)])
+        worst = 0.0
+        with np.errstate(all="ignore"):
+            for pose in q:
+                M = np.array(mass_matrix(pose))
+                root = np.sqrt(np.diag(M))
+                scaled = M / np.outer(root, root)
+                if not np.isfinite(scaled).all():
+                    return np.inf
+                condition, norm = np.linalg.cond(scaled), np.linalg.norm(scaled, 2)
+                for v, tau in rng.standard_normal((_STATES, 2, model.nv)):
+                    one, two, nle, passive = (np.array(x)[:, 0] for x in forms(pose, v, tau))
+                    acting = (np.abs(tau) + np.abs(nle) + np.abs(passive)) / root
+                    size = max(np.linalg.norm(root * two), np.linalg.norm(acting))
+                    gap = root * (one - two)
+                    error = max(np.linalg.norm(gap) / condition, np.linalg.norm(scaled @ gap) / norm) / size
+                    if not np.isfinite(error):
+                        return np.inf
+                    worst = max(worst, float(error))
+        return worst / float(np.finfo(float).eps)
+
     def _carried(self) -> Iterator[tuple[int, ...]]:
         """Yield the velocities of the links next to the root, deeper and deeper."""
-        links = self.links.links
+        links = self.mechanics.links
         depths: list[int] = []
         for link in links:
             depths.append(depths[link.parent] + 1 if link.parent >= 0 else 1)
@@ -128,9 +183,9 @@ class LinkEquations(Equations):
         for depth in range(1, max(depths, default=0) + 1):
             yield tuple(k for k in self.elimination_order if least[k] <= depth)
 
-    def _reduced(self, carried: tuple[int, ...]) -> Any:
+    def _reduced(self, mechanics: LinkMechanics, carried: tuple[int, ...]) -> Any:
         """Return the accelerations, those in `carried` from the factors of a matrix that is left."""
-        elimination = GaussElimination(self.mechanics, carried)
+        elimination = GaussElimination(mechanics, carried)
         force, unfold = elimination.accelerations(self._scalars(self.tau + self.passive))
         place = {k: i for i, k in enumerate(carried)}
         M: Any = ca.SX(len(carried), len(carried))

@@ -80,7 +80,7 @@ class LinkMechanics:
     """
 
     def __init__(self, links: Links, *, moving: bool = True, falling: bool = True) -> None:
-        self.links, self.kin = links.links, links.kin
+        self.tree, self.links, self.kin = links, links.links, links.kin
         g = links.kin.values.gravity if falling else [0.0] * 3
         self.ground = [*(negative(x) for x in g), 0.0, 0.0, 0.0]
         self.motions: list[Motion] = []

@@ -130,6 +130,8 @@ class Link:
         Armature of each velocity, as the velocity that it follows feels it.
     inertia : Inertia
         The matter that is left to the link, about its origin.
+    exact : Inertia
+        The same in 120 bits, without expressions.
     motion : SingleMotion or None
         The motion along z, None for a joint that stays whole.
     """
@@ -145,6 +147,7 @@ class Link:
     drift: Vector = field(default_factory=lambda: [0.0] * 6)
     rotors: list[Any] = field(default_factory=list)
     inertia: Inertia = field(default_factory=Inertia)
+    exact: Inertia = field(default_factory=Inertia)
     motion: SingleMotion | None = None
 
     @property
@@ -159,29 +162,34 @@ class Links:
     Parameters
     ----------
     kin : Kinematics
-    regroup : bool
-        Whether matter is moved towards the root.
+    short : bool
+        Whether frames lie along common normals and matter is moved towards the root, for the fewest operations. If not,
+        links have the description's own constants, exactly: no digit of them is rounded again.
 
     Attributes
     ----------
     links : list of Link
     """
 
-    def __init__(self, kin: Kinematics, *, regroup: bool = True) -> None:
-        self.kin = kin
+    def __init__(self, kin: Kinematics, *, short: bool = True) -> None:
+        self.kin, self._short = kin, short
         #: Of each link, what its frame is moved by: a turn about z and a slide along it.
         self._turns: dict[int, Any] = {}
         self._slides: dict[int, Any] = {}
         self._place_links()
-        self._choose_frames()
-        self._place_links()
+        if short:
+            self._choose_frames()
+            self._place_links()
         self._literal = [Inertia() for _ in self.links]
         self._symbolic: list[Inertia | None] = [None for _ in self.links]
         for body in kin.model.bodies:
             self._hold(body.name)
-        if regroup:
+        if short:
             self._regroup()
+        #: Whether all matter is in numbers.
+        self.literal = not any(self._symbolic)
         for link, literal, symbolic in zip(self.links, self._literal, self._symbolic, strict=True):
+            link.exact = literal
             link.inertia = literal.rounded if symbolic is None else literal.rounded + symbolic
 
     def _place_links(self) -> None:
@@ -247,20 +255,20 @@ class Links:
         number = _exact if _literal(*(x for row in R for x in row), *p, *values.translation) else _rounded
         own: Rotation = [Matrix([[number(x) for x in row] for row in R])]
         p_J = add([number(x) for x in p], to_parent(own, [number(x) for x in values.translation]))
-        R_J = _product(R, _orthonormal(values.rotation))
+        R_J = _product(R, _orthonormal(values.rotation) if self._short else values.rotation)
         motions = joint.type.motions(values)
-        if motions is None or not all(_literal(*motion.axis) for motion in motions):
+        if motions is None or not all(self._opens(motion) for motion in motions):
             return self._carry_whole(joint, parent, R_J, p_J)
         q, v = kin.coordinates(joint), kin.velocities(joint)
         first = self._velocities(joint)
         ratio = values.ratio if joint.mimic else 1.0
         for k, motion in enumerate(motions):
-            fixed, aligned = _aligned(R_J, motion.axis)
+            fixed, aligned = _aligned(R_J, motion.axis) if self._short else _permuted(R_J, motion.axis)
             index = len(self.links)
             slide = self._slides.get(index, 0)
             if slide:
                 p_J = [_exact(x) + row[2] * slide for x, row in zip(p_J, fixed, strict=True)]
-            link = Link(joint, parent, _factors(fixed), [_rounded(x) for x in p_J], motion=motion)
+            link = Link(joint, parent, _factors(fixed, self._short), [_rounded(x) for x in p_J], motion=motion)
             angle = q[k]
             if index in self._turns:
                 c, s = _MP.cos(self._turns[index]), _MP.sin(self._turns[index])
@@ -277,6 +285,12 @@ class Links:
             parent, R_J, p_J = index, _transposed(aligned), [0.0, 0.0, -slide if slide else 0.0]
         return parent, R_J, p_J
 
+    def _opens(self, motion: SingleMotion) -> bool:
+        """Return whether a motion becomes a link along z; the description's own frames have axes of x, y and z only."""
+        if not _literal(*motion.axis):
+            return False
+        return self._short or sorted(abs(float(x)) for x in motion.axis) == [0.0, 0.0, 1.0]
+
     def _velocities(self, joint: Joint) -> int:
         return int(self.kin.model.layout.v[joint.mimic.joint if joint.mimic else joint.name].start)
 
@@ -285,7 +299,7 @@ class Links:
         kin, values = self.kin, self.kin.values.joints[joint.name]
         q, v = kin.coordinates(joint), kin.velocities(joint)
         R, p = joint.type.placement(kin.formulas, values, q)
-        link = Link(joint, parent, _factors(R_J), [_rounded(x) for x in p_J])
+        link = Link(joint, parent, _factors(R_J, self._short), [_rounded(x) for x in p_J])
         link.turn, link.slide = [Matrix([[_number(x) for x in row] for row in R])], [_number(x) for x in p]
         first, ratio = self._velocities(joint), values.ratio if joint.mimic else 1.0
         for k in range(joint.type.nv):
@@ -389,14 +403,10 @@ def _aligned(R_J: Rows, axis: Any) -> tuple[Rows, Rows]:
     and one about the x axis after it.
     """
     z = _unit([_exact(x) for x in axis])
-    for A in _PERMUTATIONS:
-        if all(row[2] == x for row, x in zip(A, z, strict=True)):
-            fixed = _product(R_J, A)
-            if not _literal(*(x for row in fixed for x in row)):
-                return fixed, [[_exact(x) for x in row] for row in A]
-            fixed = [[_snapped(x) for x in row] for row in fixed]
-            if _is_permutation(fixed):
-                return fixed, [[_exact(x) for x in row] for row in A]
+    if sorted(abs(x) for x in z) == [0, 0, 1]:
+        fixed, A = _permuted(R_J, axis)
+        if not _literal(*(x for row in fixed for x in row)) or _is_permutation(fixed):
+            return fixed, A
     if not _literal(*(x for row in R_J for x in row)):
         return _product(R_J, (A := _frame(z))), A
     up = [dot3(row, z) for row in R_J]
@@ -407,6 +417,18 @@ def _aligned(R_J: Rows, axis: Any) -> tuple[Rows, Rows]:
         up = [_MP.mpf(0), _MP.mpf(0), _MP.mpf(1 if up[2] > 0 else -1)]
     fixed = [[_snapped(c) for c in row] for row in _transposed([x, cross3(up, x), up])]
     return fixed, _product(_transposed(R_J), fixed)
+
+
+def _permuted(R_J: Rows, axis: Any) -> tuple[Rows, Rows]:
+    """Return R_J A and A, a permutation of axes whose third column is the axis; R_J A is one too, if possible."""
+    fitting = [A for A in _PERMUTATIONS if all(row[2] == x for row, x in zip(A, axis, strict=True))]
+    for A in fitting:
+        fixed = _product(R_J, A)
+        if _literal(*(x for row in fixed for x in row)):
+            fixed = [[_snapped(x) for x in row] for row in fixed]
+            if _is_permutation(fixed):
+                break
+    return fixed, [[_exact(x) for x in row] for row in A]
 
 
 def _unit(x: Vector) -> Vector:
@@ -448,7 +470,7 @@ def _is_permutation(R: Rows) -> bool:
     return all(x in (0, 1, -1) for row in R for x in row)
 
 
-def _factors(R: Rows) -> list[Factor]:
+def _factors(R: Rows, short: bool) -> list[Factor]:
     """Return a rotation as factors, numbers rounded."""
     if not _literal(*(x for row in R for x in row)):
         return [Matrix([[_rounded(x) for x in row] for row in R])]
@@ -456,7 +478,7 @@ def _factors(R: Rows) -> list[Factor]:
         places = [next(j for j in range(3) if row[j]) for row in R]
         signs = [float(row[j]) for row, j in zip(R, places, strict=True)]
         return [] if R == _IDENTITY else [Permutation(places, signs)]
-    if R[2][0] == 0:
+    if short and R[2][0] == 0:
         turns = PlaneRotation(2, float(R[0][0]), float(R[1][0])), PlaneRotation(0, float(R[2][2]), float(R[2][1]))
         return [turn for turn in turns if turn.s != 0.0 or turn.c != 1.0]
     return [Matrix([[float(x) for x in row] for row in R])]

@@ -170,6 +170,15 @@ def congruence(R: Rotation, A: Vector) -> Vector:
     return A
 
 
+def exact_congruence(R: Rotation, A: Vector) -> Vector:
+    """Return R A Rᵀ of a symmetric matrix, row by row: small entries of a matrix with large ones keep their digits."""
+    for factor in reversed(R):
+        columns = [factor.apply([A[SYMMETRIC[i][j]] for i in range(3)]) for j in range(3)]
+        rows = [factor.apply([columns[j][i] for j in range(3)]) for i in range(3)]
+        A = [rows[i][j] for i in range(3) for j in range(i, 3)]
+    return A
+
+
 def two_sided(R: Rotation, H: Rows) -> Rows:
     """Return R H Rᵀ of any matrix."""
     for factor in reversed(R):

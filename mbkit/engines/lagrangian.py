@@ -15,7 +15,7 @@ from mbkit._check import Array, count, finite_array, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
-from mbkit.derivation.least_constraint import has_squares, regroups
+from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import Dynamics, scalar
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
@@ -147,11 +147,8 @@ class LagrangianDynamics(Dynamics):
     def form(self) -> str:
         """The digest of the derivation: of the description without parameters' values, and of what these decide."""
         digest = self.model.form_digest
-        if self._chosen:
-            digest += f" by {self.elimination}"
-        elif self.model.parameters:
-            digest += f" by {self.elimination}{', regrouped' * regroups(self.model)}"
-        return digest
+        chosen = self._chosen or self.model.parameters
+        return f"{digest} by {self.elimination}" if chosen else digest
 
     def code(self, name: str, *extra: str, make: Callable[[], Any] | None = None) -> Any:
         """Return a `Compiled` or `Machine` of a quantity, or of what `make` derives from this model.
