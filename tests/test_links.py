@@ -146,7 +146,7 @@ def test_heavy_and_light_links_cost_no_more_digits_than_the_factors_of_M(masses)
 
 @pytest.mark.parametrize("name", ["anymal-kinova", "kinova"])
 def test_short_forms_are_left_where_digits_would_go(name):
-    """Axes that are nearly parallel: moments about distant origins cancel, and constants that are rounded again show."""
+    """Near parallel axes moments about distant origins cancel, and constants that are rounded again show."""
     model = mb.load(name)
     eq = LinkEquations(model, elimination="links")
     exact = eq._reduced(eq.plain, ())
