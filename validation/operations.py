@@ -32,8 +32,8 @@ from mbkit.codegen import jit
 from mbkit.codegen.batch_loop import RUN
 from mbkit.codegen.compiled import Call, KernelSequence
 from mbkit.derivation import FUNCTIONS, Equations, LinkEquations, elimination_of
-from mbkit.derivation.least_constraint import regroups
-from mbkit.derivation.links import Links
+from mbkit.derivation.gauss_elimination import GaussElimination
+from mbkit.derivation.model_values import scalar
 from mbkit.engines.pinocchio import model as pinocchio_model
 from tests.random_trees import random_tree
 from validation import bench_terms
@@ -46,8 +46,8 @@ ROBOTS = {name: make for name, make in bench_terms.ROBOTS.items() if name != "do
 #: Name -> where the numbers come from.
 FORMS = {
     "energies": "derivatives of T and V; forward dynamics by LᵀDL of M",
-    "links": "link by link, each link's matter where the description has it; all accelerations eliminated",
-    "regrouped": "the same, with matter that no motion tells apart moved towards the root",
+    "links": "link by link, in the description's own frames and constants; all accelerations eliminated",
+    "regrouped": "the same, in frames along common normals, with matter that no motion tells apart moved to parents",
     "M and factors": "regrouped; no acceleration eliminated: M by composite bodies, and its LᵀDL",
     "chosen": "what mbkit compiles by default",
 }
@@ -62,17 +62,23 @@ def expressions(model):
     """Yield (quantity, form, equations, expression)."""
     energies = Equations(model)
     chosen = LinkEquations(model, elimination=elimination_of(model))
-    links, regrouped = (LinkEquations(model, elimination="links") for _ in range(2))
-    for equations, moved in ((links, False), (regrouped, True)):
-        equations.links = Links(equations.kin, regroup=moved)
+    links = LinkEquations(model, elimination="links")
+    frames = {"links": links.plain, "regrouped": links.mechanics}
     for quantity in ("inverse_dynamics", "mass_matrix"):
-        for form, equations in (("energies", energies), ("links", links), ("regrouped", regrouped), ("chosen", chosen)):
+        for form, equations in (("energies", energies), ("chosen", chosen)):
             yield quantity, form, equations, getattr(equations, quantity)
+    a = [scalar(links.a[i]) for i in range(model.nv)]
+    for form, mechanics in frames.items():
+        yield "inverse_dynamics", form, links, ca.vertcat(*(ca.SX(x) for x in mechanics.forces(a))) - links.passive
+        M = ca.SX(model.nv, model.nv)
+        for (i, j), x in GaussElimination(mechanics, range(model.nv)).rest.items():
+            M[i, j] = M[j, i] = x
+        yield "mass_matrix", form, links, M
     quantity = "forward_dynamics"
     yield quantity, "energies", energies, energies.forward_dynamics
-    yield quantity, "links", links, links._reduced(())
-    yield quantity, "regrouped", regrouped, regrouped._reduced(())
-    yield quantity, "M and factors", regrouped, regrouped._reduced(regrouped.elimination_order)
+    for form, mechanics in frames.items():
+        yield quantity, form, links, links._reduced(mechanics, ())
+    yield quantity, "M and factors", links, links._reduced(links.mechanics, links.elimination_order)
     yield quantity, "chosen", chosen, chosen.forward_dynamics
 
 
@@ -82,7 +88,13 @@ def carried(model):
     if equations.elimination != "links":
         return None
     size = ca.n_nodes(equations.forward_dynamics)
-    return next(len(c) for c in ((), *equations._carried()) if ca.n_nodes(equations._reduced(c)) == size)
+    forms = {c: ca.n_nodes(equations._reduced(equations.mechanics, c)) for c in ((), *equations._carried())}
+    return next((len(c) for c, n in forms.items() if n == size), None)
+
+
+def short(model):
+    """Return whether the chosen forward dynamics is in short frames, with matter moved."""
+    return carried(model) is not None
 
 
 def counted(model):
@@ -196,7 +208,7 @@ def calls_of(model, quantity, samples):
 
 def robot(name, make, samples, rounds, unit):
     model = bench_terms.made(make)
-    row = {"robot": name, "nv": model.nv, "regrouped": regroups(model), "carried": carried(model), "quantities": {}}
+    row = {"robot": name, "nv": model.nv, "regrouped": short(model), "carried": carried(model), "quantities": {}}
     for quantity, forms in counted(model).items():
         calls = calls_of(model, quantity, samples)
         times = bench_terms.timed(calls | {"limit": unit}, rounds)
