@@ -13,7 +13,7 @@ import mbkit as mb
 from validation.__main__ import PARTS
 
 TOP = Path(__file__).parent.parent
-PAGES = sorted((TOP / "notebooks" / "numbers").glob("*.md"))
+PAGES = sorted((TOP / "notebooks").glob("*/*.md"))
 
 
 def read(name: str) -> str:
