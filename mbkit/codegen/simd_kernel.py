@@ -26,7 +26,7 @@ BODY: Final = "mbkit_body"
 #: LLVM's time to compile one block grows faster than its length, most of all with
 #: what it stores. A program heavier than _WHOLE is compiled in pieces of _PIECE.
 _WHOLE: Final = 20000
-_PIECE: Final = 3000
+_PIECE: Final = 1000
 _STORE: Final = 4  # weight of a store, in operations
 _ARGUMENTS: Final = "ptr noalias %in, ptr noalias %is, ptr noalias %out, ptr noalias %os, ptr noalias %work"
 #: Operations that can be finite where an argument is not: 1/inf, exp(-inf), atan(inf), NaN to the power of 0.

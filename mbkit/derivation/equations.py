@@ -164,13 +164,18 @@ class Equations:
         return ca.jacobian(self.momentum, self.v)
 
     @cached_property
+    def _coriolis_by_v(self) -> Any:
+        """∂(C v)/∂v."""
+        return ca.jacobian(self.coriolis_force, self.v)
+
+    @cached_property
     def coriolis_matrix(self) -> Any:
         """Christoffel's C = ½ ∂(C v)/∂v + ½ M A(v).
 
         A holds the quasi-velocities' structure, -Aᵀ p = hamel(v, p): [[ω̂, v̂], [0, ω̂]] for a free joint and ω̂ for a
         ball joint, zero where v = q̇. A(v) v = 0 leaves C v as it is, and the second term makes Ṁ - 2C skew.
         """
-        half = 0.5 * ca.jacobian(self.coriolis_force, self.v)
+        half = 0.5 * self._coriolis_by_v
         if not self.model.quaternions:
             return half
         A: Any = ca.SX(self.model.nv, self.model.nv)

@@ -338,3 +338,47 @@ class GaussElimination:
             return [done[k] for k in range(self._kin.model.nv)]
 
         return rest, unfold
+
+    def inverse_factors(self) -> tuple[list[Any], dict[tuple[int, int], Any]]:
+        """Return D⁻¹ and L⁻¹ of M = LᵀDL, with no velocity carried.
+
+        L⁻¹_jk is v̇_j where v̇_k is one, what is eliminated before k gives way, and all else stands still.
+        """
+        inverse: list[Any] = [0.0] * self._kin.model.nv
+        factors: dict[tuple[int, int], Any] = {}
+        places = [(-1, self._top.first)]
+        places += [(i, pivots) for i, level in enumerate(self._levels) for pivots in (level.then, level.first)]
+        for index, pivots in places:
+            for pivot in pivots:
+                k = pivot.velocity
+                inverse[k] = pivot.inverse
+                factors |= {(j, k): x for j, x in self._released(k, index).items() if not is_zero(x)}
+        return inverse, factors
+
+    def _released(self, k: int, start: int) -> dict[int, Any]:
+        """Return the accelerations below link `start`, where v̇_k is eliminated, as v̇_k is one and forces are zero."""
+        done: dict[int, Any] = {}
+
+        def resolve(pivots: list[Pivot], A: Vector) -> None:
+            for pivot in reversed(pivots):
+                if pivot.velocity == k:
+                    done[k] = 1.0
+                elif done:
+                    known = sum((x * done.get(i, 0.0) for i, x in pivot.others.items()), 0.0) + dot6(pivot.row, A)
+                    done[pivot.velocity] = negative(known * pivot.inverse)
+
+        still = [0.0] * 6
+        A: dict[int, Vector] = {}
+        if start < 0:
+            A[-1] = still
+            resolve(self._top.first, still)
+        for index, (link, level) in enumerate(zip(self.links, self._levels, strict=True)):
+            if index != start and link.parent not in A:
+                continue
+            x = self.mechanics.carried(index, A.get(link.parent, still), drifts=False)
+            resolve(level.then, x)
+            for i, column in link.columns:
+                x = add(x, [c * done.get(i, 0.0) for c in column])
+            resolve(level.first, x)
+            A[index] = x
+        return done

@@ -18,9 +18,10 @@ from mbkit.derivation.composite_bodies import mass_matrix
 from mbkit.derivation.equations import Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
 from mbkit.derivation.least_constraint import hard_poses, has_squares, loses_digits
+from mbkit.derivation.link_derivatives import Entries, LinkDerivatives, has_constant_columns
 from mbkit.derivation.link_mechanics import LinkMechanics
 from mbkit.derivation.links import Links
-from mbkit.derivation.mass_matrix_solve import solve
+from mbkit.derivation.mass_matrix_solve import implicit, solve
 from mbkit.derivation.model_values import Constants, scalar
 from mbkit.model import Model
 
@@ -194,6 +195,56 @@ class LinkEquations(Equations):
         order = [place[k] for k in self.elimination_order if k in place]
         y = solve(ca.sparsify(M), self._column([force[k] for k in carried]), order)
         return self._column(unfold({k: scalar(y[i]) for k, i in place.items()}))
+
+    @cached_property
+    def _derivatives(self) -> LinkDerivatives | None:
+        """Derivatives from link to link; None where a joint's columns move in its link."""
+        return LinkDerivatives(self.mechanics) if has_constant_columns(self.mechanics.tree) else None
+
+    @cached_property
+    def _coriolis_by_v(self) -> Any:
+        return super()._coriolis_by_v if self._derivatives is None else self._matrix(self._derivatives.by_v)
+
+    @cached_property
+    def inverse_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
+        """∂ID/∂q, ∂ID/∂v and ∂ID/∂a = M, from link to link."""
+        if self._derivatives is None:
+            return super().inverse_dynamics_derivatives
+        return *self._derivatives_at(self._derivatives, self.a), self.mass_matrix
+
+    @cached_property
+    def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
+        """∂FD/∂q, ∂FD/∂v and ∂FD/∂τ = M⁻¹, from those of inverse dynamics at a = FD."""
+        if self._derivatives is None:
+            return super().forward_dynamics_derivatives
+        if self.least_constraint is not None:
+            by_q, by_v = self._derivatives_at(self._derivatives, self.forward_dynamics)
+            by_q, by_v, by_tau = (self.over_mass(x) for x in (-by_q, -by_v, ca.SX.eye(self.model.nv)))
+        else:
+            elimination = GaussElimination(self._sound)
+            _, unfold = elimination.accelerations(self._scalars(self.tau + self.passive))
+            by_q, by_v = self._derivatives_at(self._derivatives, self._column(unfold({})))
+            inverse, factors = elimination.inverse_factors()
+            by_q, by_v, by_tau = implicit(self._column(inverse), self._matrix(factors), by_q, by_v)
+        return by_q, by_v, by_tau
+
+    @cached_property
+    def _sound(self) -> LinkMechanics:
+        """The frames with the fewest operations in which all accelerations can be eliminated without a loss of digits."""
+        exact, form = (self._reduced(mechanics, ()) for mechanics in (self.plain, self.mechanics))
+        shorter = ca.n_nodes(form) < ca.n_nodes(exact)
+        return self.mechanics if shorter and self._error(form, exact) < _MAX_ERROR else self.plain
+
+    def _derivatives_at(self, own: LinkDerivatives, a: Any) -> tuple[Any, Any]:
+        """Return ∂ID/∂q and ∂ID/∂v at these accelerations."""
+        tangent = ca.jacobian(self.kin.qdot, self.v)
+        by_q = self._matrix(own.by_q(self._scalars(a))) - ca.mtimes(ca.jacobian(self.passive, self.q), tangent)
+        return by_q, self._matrix(own.by_v) - ca.jacobian(self.passive, self.v)
+
+    def _matrix(self, entries: Entries) -> Any:
+        n = self.model.nv
+        rows, columns = ([key[i] for key in entries] for i in (0, 1))
+        return ca.SX.triplet(rows, columns, self._column(list(entries.values())), n, n)
 
     @staticmethod
     def _scalars(x: Any) -> list[Any]:

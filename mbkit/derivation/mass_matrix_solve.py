@@ -122,3 +122,16 @@ class Factors(Elimination):
                 for j, entry in row.items():
                     if rank[j] <= rank[i]:
                         rows[i][j] = rows[i].get(j, 0.0) - factor * entry
+
+
+def implicit(inverse: ca.SX, L: ca.SX, *by: ca.SX) -> tuple[ca.SX, ...]:
+    """Return -M⁻¹ of each sparse matrix, (n, k), and M⁻¹ = L D⁻¹ Lᵀ, of D⁻¹ as a column and a sparse L.
+
+    These are the derivatives of the x that solves f(x, y) = τ, with ∂f/∂x = M. A column of one branch takes products in
+    another branch only with the velocities that both hang on.
+    """
+    weighted, lowered = (ca.mtimes(ca.diag(x), L.T) for x in (inverse, -inverse))
+    # The upper half would be computed in another order, and not be the same.
+    whole = ca.mtimes(L, weighted)
+    whole = ca.tril(whole) + ca.tril(whole, False).T
+    return *(ca.mtimes(L, ca.mtimes(lowered, x)) for x in by), whole

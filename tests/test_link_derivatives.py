@@ -1,0 +1,259 @@
+"""Derivatives from link to link: those of the energies by CasADi, on every joint type, in a count of operations."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.codegen.program import program
+from mbkit.derivation import equations_of
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.gauss_elimination import GaussElimination
+from mbkit.derivation.link_derivatives import has_constant_columns
+from mbkit.derivation.link_equations import LinkEquations
+from mbkit.derivation.mass_matrix_solve import Factors, implicit
+from tests.joint_of_ones_own import OWN
+from tests.random_trees import ALL, off, random_tree, rotation, states
+
+EPS = np.finfo(float).eps
+#: Roundings of a matrix of derivatives, on a scale of the whole matrix: two ways of computing it.
+K = 100
+DERIVATIVES = {"inverse_dynamics_derivatives": "a", "forward_dynamics_derivatives": "tau"}
+
+
+def own_types(*kinds: str) -> mb.Model:
+    """Return a chain with joint types of one's own between hinges on skew axes."""
+    rng = np.random.default_rng(4)
+    b = mb.ModelBuilder("own types", gravity=(1.0, 2.0, -9.0))
+    for i, kind in enumerate(("revolute", *kinds, "revolute")):
+        inertia = np.diag([0.2, 0.3, 0.4])
+        b.add_body(f"b{i}", mass=1.0 + i, com=rng.standard_normal(3), inertia=inertia)
+        place = {"rotation": rotation(rng), "translation": rng.standard_normal(3)}
+        parent = f"b{i - 1}" if i else "world"
+        axis = {} if kind == "ball" else {"axis": rng.standard_normal(3)}
+        b.add_joint(f"j{i}", kind, parent=parent, child=f"b{i}", damping=0.3, **place, **axis)
+    return b.build()
+
+
+def coupled_branches() -> mb.Model:
+    """Return two fingers on a floating palm, with a rotor, spring and damper that couple them, and a mimic joint."""
+    b = mb.ModelBuilder("fingers", gravity=(0.0, 1.0, -9.0))
+    b.add_body("palm", mass=1.0, com=(0.1, 0.0, 0.2), inertia=(0.1, 0.2, 0.25))
+    b.add_joint("base", "free", parent="world", child="palm")
+    for side in (-1.0, 1.0):
+        parent = "palm"
+        for k in range(3):
+            name = f"{'left' if side < 0 else 'right'}{k}"
+            b.add_body(name, mass=0.3, com=(0.1, 0.05 * side, 0.02), inertia=(0.01, 0.02, 0.015))
+            mimic = {"mimic": ("j_left1", 0.7, 0.1)} if name == "right2" else {}
+            place = {"translation": (0.2, side * 0.1 * (k == 0), 0.03)}
+            b.add_joint(f"j_{name}", "revolute", parent=parent, child=name, axis=(0.1 * k, side, 0.2), **place, **mimic)
+            parent = name
+    factors = {"j_left0": 1.0, "j_right1": -2.0, "j_right2": 0.5}
+    b.add_coupling("tendon", factors, stiffness=3.0, rest_length=0.2, damping=0.4, armature=0.6)
+    return b.build()
+
+
+def parametric() -> mb.Model:
+    """Return a hinge, a helical joint that follows it and a ball, with parameters in every place that takes them."""
+    m, x = mb.Parameter("m", 1.3), mb.Parameter("x", 0.4)
+    b = mb.ModelBuilder("parametric", gravity=(0.0, mb.Parameter("g", -9.0), 1.0))
+    b.add_body("a", mass=m, com=(x, 0.1, 0.2), inertia=(0.2, 0.3, 0.4))
+    b.add_body("b", mass=2.0, com=(0.3, x, 0.1), inertia=(0.2, 0.3, 0.4))
+    b.add_body("c", mass=1.0, com=(0.3, 0.1, 0.1), inertia=(0.2, x, 0.4))
+    b.add_joint("first", "revolute", parent="world", child="a", axis=(0, 0, 1), armature=m, damping=x)
+    follows = {"pitch": 0.3, "mimic": ("first", x, 0.2)}
+    b.add_joint("second", "helical", parent="a", child="b", axis=(0.0, 0.6, 0.8), translation=(x, 0.2, 0.0), **follows)
+    b.add_joint("third", "ball", parent="b", child="c", translation=(0.1, x, 0.2))
+    return b.build()
+
+
+MODELS = {
+    **{f"all types {s}": random_tree(s, 12) for s in (20, 21)},
+    **{f"a branch of all types {s}": random_tree(s, 10, nearest=1) for s in (22, 23)},
+    **{f"mimic joints {s}": random_tree(s, 12, mimic=True, nearest=2) for s in (24, 25)},
+    "free and ball joints below others": random_tree(26, 6, ("free", "ball", "helical", "prismatic"), nearest=1),
+    "slides": random_tree(27, 8, ("prismatic", "helical", "planar"), nearest=2),
+    "many roots": random_tree(28, 6, ("revolute", "ball"), nearest=6),
+    "coupled branches": coupled_branches(),
+    "own constant columns": own_types("cylindrical", "ball"),
+    "own moving columns": own_types("sliding_ball", "cylindrical"),
+    "parameters": parametric(),
+}
+#: Where a joint's columns move in its link: CasADi differentiates the forces.
+MOVING = ("own moving columns",)
+
+
+@pytest.fixture(params=list(MODELS))
+def case(request):
+    return request.param, MODELS[request.param]
+
+
+def values(equations: Equations, name: str, *arguments: np.ndarray) -> list[np.ndarray]:
+    parameters = list(equations.model.parameters.values())
+    return [np.array(x) for x in equations.function(name).call([*arguments, *([parameters] if parameters else [])])]
+
+
+def test_they_are_those_of_the_energies(case):
+    _, model = case
+    links, energies = LinkEquations(model, elimination="links"), Equations(model)
+    for q, v, a, tau in zip(*states(model, 3), strict=True):
+        for name, third in (("inverse_dynamics_derivatives", a), ("forward_dynamics_derivatives", tau)):
+            M = values(energies, "mass_matrix", q)[0]
+            k = K * (1.0 if name.startswith("inverse") else np.linalg.cond(M))
+            for x, y in zip(values(links, name, q, v, third), values(energies, name, q, v, third), strict=True):
+                assert np.linalg.norm(x - y) <= k * EPS * np.linalg.norm(y)
+        C, other = (values(equations, "coriolis_matrix", q, v)[0] for equations in (links, energies))
+        assert np.linalg.norm(C - other) <= K * EPS * np.linalg.norm(other)
+
+
+def test_casadi_differentiates_where_columns_move(case):
+    name, model = case
+    assert has_constant_columns(LinkEquations(model).links) == (name not in MOVING)
+    assert {"cylindrical", "sliding_ball"} == set(OWN)
+
+
+@pytest.mark.parametrize("elimination", ["links", "least constraint"])
+def test_both_eliminations_solve_for_them(elimination):
+    model = random_tree(30, 7, ALL[:4], nearest=2)
+    q, v, _, tau = (x[0] for x in states(model, 1))
+    oracle = mb.dynamics(model, "oracle").forward_dynamics_derivatives(q, v, tau)
+    own = values(LinkEquations(model, elimination=elimination), "forward_dynamics_derivatives", q, v, tau)
+    condition = np.linalg.cond(mb.dynamics(model, "oracle").mass_matrix(q))
+    for x, y in zip(own, oracle, strict=True):
+        assert off(x, y) < condition * EPS
+
+
+def test_the_inverse_of_the_mass_matrix_is_exactly_symmetric():
+    model = MODELS["coupled branches"]
+    q, v, _, tau = (x[0] for x in states(model, 1))
+    inverse = values(equations_of(model), "forward_dynamics_derivatives", q, v, tau)[2]
+    assert np.array_equal(inverse, inverse.T)
+
+
+def test_a_uniform_motion_changes_nothing_that_hangs_below():
+    """Galileo: to the last digit, since no velocity of an origin enters."""
+    model = random_tree(31, 8, ("revolute", "prismatic", "ball"), nearest=2, springs=False, damping=False)
+    floating = mb.ModelBuilder("ship", gravity=model.gravity)
+    floating.add_body("hull", mass=3.0, com=(0.1, 0.2, 0.3), inertia=(1.0, 1.1, 1.2))
+    floating.add_joint("sea", "free", parent="world", child="hull")
+    for body in model.bodies:
+        floating.add_body(body.name, mass=body.mass, com=body.com, inertia=body.inertia)
+    for j in model.joints:
+        axis = {"axis": j.axes[0]} if len(j.axes) else {}
+        parent = "hull" if j.parent == "world" else j.parent
+        place = {"rotation": j.rotation, "translation": j.translation}
+        floating.add_joint(j.name, j.kind, parent=parent, child=j.child, **place, **axis)
+    ship = floating.build()
+    equations = LinkEquations(ship)
+    q, v, a, _ = (x[0] for x in states(ship, 1))
+    part = ship.layout.v["sea"]
+    # It does not turn, whose product with the velocity would be a force.
+    v[part] = 0.0
+    slow = values(equations, "inverse_dynamics_derivatives", q, v, a)
+    v[part][:3] = 1e9
+    fast = values(equations, "inverse_dynamics_derivatives", q, v, a)
+    below = np.setdiff1d(np.arange(ship.nv), np.arange(part.start, part.stop))
+    for x, y in zip(fast, slow, strict=True):
+        assert np.abs(y[np.ix_(below, below)]).max() > 0.1
+        assert np.array_equal(x[np.ix_(below, below)], y[np.ix_(below, below)])
+
+
+def operations(equations: Equations, results: tuple[ca.SX, ...]) -> int:
+    given = [equations.q, equations.v, equations.a, equations.tau]
+    return program(ca.Function("f", given, [ca.densify(x) for x in results])).arithmetic
+
+
+@pytest.mark.parametrize("kinds", [("revolute",), ALL], ids=["hinges", "all types"])
+def test_they_take_fewer_operations_than_the_forces_differentiated(kinds):
+    model = random_tree(32, 12, kinds, nearest=2, springs=False, damping=False)
+    own, other = LinkEquations(model), LinkEquations(model)
+    by_casadi = Equations.inverse_dynamics_derivatives.func(other)
+    assert operations(own, own.inverse_dynamics_derivatives) < 0.6 * operations(other, by_casadi)
+
+
+def test_their_number_grows_with_the_pairs_of_joints_on_a_branch():
+    counts = []
+    for n in (6, 12, 24):
+        model = random_tree(33, n, ("revolute",), nearest=1, springs=False, damping=False)
+        equations = LinkEquations(model)
+        counts.append(operations(equations, equations.inverse_dynamics_derivatives))
+    # A chain's pairs; of a star each joint takes as many.
+    assert counts[2] - counts[1] < 4 * (counts[1] - counts[0])
+    star = mb.ModelBuilder("star", gravity=(1.0, 2.0, 3.0))
+    for i in range(16):
+        star.add_body(f"b{i}", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))
+        star.add_joint(f"j{i}", "revolute", parent="world", child=f"b{i}", axis=(0, 1, 0))
+    equations = LinkEquations(star.build())
+    assert operations(equations, equations.inverse_dynamics_derivatives) < 16 * 40
+
+
+def hands() -> mb.Model:
+    """Return two hands of six links on one wrist."""
+    b = mb.ModelBuilder("hands", gravity=(1.0, 2.0, 3.0))
+    b.add_body("wrist", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))
+    b.add_joint("w", "revolute", parent="world", child="wrist", axis=(0, 0, 1))
+    for hand in range(2):
+        parent = "wrist"
+        for k in range(6):
+            name = f"h{hand}_{k}"
+            b.add_body(name, mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))
+            axis = np.eye(3)[k % 3]
+            b.add_joint(f"j_{name}", "revolute", parent=parent, child=name, axis=axis, translation=(0.1, 0.3, 0.2))
+            parent = name
+    return b.build()
+
+
+def test_branches_share_only_what_they_hang_on():
+    """M⁻¹ of many columns takes fewer operations than a substitution through each hand for the other."""
+    equations = LinkEquations(hands())
+    n = equations.model.nv
+    by_q, by_v, M = equations.inverse_dynamics_derivatives
+    inverse, entries = GaussElimination(equations.mechanics).inverse_factors()
+    # Rows 1 to 6 are one hand, 7 to 12 the other.
+    assert not any(1 <= min(key) <= 6 < max(key) for key in entries)
+    rows, columns = zip(*entries, strict=True)
+    L = ca.SX.triplet(rows, columns, ca.vertcat(*entries.values()), n, n)
+    D = ca.vertcat(*inverse)
+    factors = Factors(M, equations.elimination_order)
+    known = [ca.vertcat(*(x for row in factors.factors for x in row.values())), ca.vertcat(*factors.inverse)]
+    right = ca.horzcat(-by_q, -by_v, ca.SX.eye(n))
+    substituted = [M, by_q, by_v, *known, factors.solve(right)]
+    by_substitution = operations(equations, substituted) - operations(equations, substituted[:-1])
+    products = operations(equations, (by_q, by_v, L, D, *implicit(D, L, by_q, by_v)))
+    assert products - operations(equations, (by_q, by_v, L, D)) < 0.75 * by_substitution
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in MOVING])
+def test_the_links_give_inverse_factors_of_the_mass_matrix(name):
+    equations = LinkEquations(MODELS[name], elimination="links")
+    n = equations.model.nv
+    inverse, entries = GaussElimination(equations.mechanics).inverse_factors()
+    q = states(equations.model, 1)[0][0]
+    results = [ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in part)) for part in (inverse, entries.values())]
+    f = ca.Function("f", [equations.q, equations.parameters], [*results, ca.densify(equations.mass_matrix)])
+    inverse, values_, M = (np.array(x) for x in f(q, list(equations.model.parameters.values())))
+    L = np.zeros((n, n))
+    L[tuple(zip(*entries, strict=True))] = values_.ravel()
+    assert np.array_equal(L.diagonal(), np.ones(n))
+    assert off(L @ (inverse * L.T) @ M, np.eye(n)) < 10 * np.linalg.cond(M) * EPS
+
+
+@pytest.mark.parametrize("seed", [1, 4, 10])
+def test_they_have_the_digits_of_the_accelerations(seed):
+    """Factors of a formed mass matrix would lose up to a hundred times as many."""
+    model = random_tree(seed, 12, nearest=2, mimic=True, springs=False, damping=False)
+    q, v, _, tau = states(model, 12)
+    oracle, links = mb.dynamics(model, "oracle"), LinkEquations(model, elimination="links")
+    names = ("forward_dynamics", "forward_dynamics_derivatives")
+    accelerations, derivatives = (links.function(name).map(len(q)) for name in names)
+    exact = oracle.forward_dynamics(q, v, tau), oracle.forward_dynamics_derivatives(q, v, tau).tau
+    own = np.array(accelerations(q.T, v.T, tau.T)).T, np.array(derivatives(q.T, v.T, tau.T)[2])
+    inverses = own[1].reshape(model.nv, len(q), model.nv).swapaxes(0, 1)
+    errors = [
+        (off(x, y), off(M.ravel(), N.ravel())) for x, y, M, N in zip(own[0], exact[0], inverses, exact[1], strict=True)
+    ]
+    worst = np.max(errors, axis=0)
+    assert worst[1] < 3 * worst[0]
