@@ -230,7 +230,7 @@ class LinkEquations(Equations):
 
     @cached_property
     def _sound(self) -> LinkMechanics:
-        """The frames with the fewest operations in which all accelerations can be eliminated without a loss of digits."""
+        """The short frames if an elimination of all accelerations keeps its digits there, else the plain ones."""
         exact, form = (self._reduced(mechanics, ()) for mechanics in (self.plain, self.mechanics))
         shorter = ca.n_nodes(form) < ca.n_nodes(exact)
         return self.mechanics if shorter and self._error(form, exact) < _MAX_ERROR else self.plain
