@@ -245,3 +245,17 @@ def test_the_single_motions_of_a_joint_make_its_placement(name):
     expected = kind.placement(np, joint, q.tolist())
     np.testing.assert_allclose(R, np.array(expected[0], dtype=float), atol=1e-14)
     np.testing.assert_allclose(p, np.array(expected[1], dtype=float), atol=1e-14)
+
+
+def test_constants_of_a_long_chain_keep_their_digits():
+    """Rounding of a rotation would double from link to link."""
+    eq = LinkEquations(random_tree(0, 100, ("revolute",), nearest=1, armature=False), elimination="links")
+    short, plain = (ca.vertcat(*m.forces(eq._scalars(eq.a))) for m in (eq.mechanics, eq.plain))
+    assert eq._force_error(short, plain) < 100
+
+
+def test_forces_come_from_the_plain_frames_where_short_ones_lose_digits():
+    eq = LinkEquations(mb.load("hextilt"), elimination="links")
+    assert eq.sound is eq.plain
+    eq = LinkEquations(mb.load("panda"), elimination="links")
+    assert eq.sound is eq.mechanics

@@ -255,7 +255,7 @@ class Links:
         number = _exact if _literal(*(x for row in R for x in row), *p, *values.translation) else _rounded
         own: Rotation = [Matrix([[number(x) for x in row] for row in R])]
         p_J = add([number(x) for x in p], to_parent(own, [number(x) for x in values.translation]))
-        R_J = _product(R, _orthonormal(values.rotation) if self._short else values.rotation)
+        R_J = _product(R, values.rotation)
         motions = joint.type.motions(values)
         if motions is None or not all(self._opens(motion) for motion in motions):
             return self._carry_whole(joint, parent, R_J, p_J)
@@ -263,6 +263,7 @@ class Links:
         first = self._velocities(joint)
         ratio = values.ratio if joint.mimic else 1.0
         for k, motion in enumerate(motions):
+            R_J = _orthonormal(R_J) if self._short else R_J
             fixed, aligned = _aligned(R_J, motion.axis) if self._short else _permuted(R_J, motion.axis)
             index = len(self.links)
             slide = self._slides.get(index, 0)
@@ -437,14 +438,15 @@ def _unit(x: Vector) -> Vector:
 
 
 def _orthonormal(R: Rows) -> Rows:
-    """Return a rotation of doubles, orthonormal to 30 digits: its defects would double from link to link."""
+    """Return a rotation, orthonormal to all bits from 16 digits: its defects would double from link to link."""
     if not _literal(*(x for row in R for x in row)) or _is_permutation(R):
         return R
     A = [[_exact(x) for x in row] for row in R]
-    # A step of Newton's iteration for the polar factor.
-    square = _product(_transposed(A), A)
-    cube = _product(A, square)
-    return [[1.5 * a - 0.5 * b for a, b in zip(*rows, strict=True)] for rows in zip(A, cube, strict=True)]
+    # Two steps of Newton's iteration for the polar factor.
+    for _ in range(2):
+        cube = _product(A, _product(_transposed(A), A))
+        A = [[1.5 * a - 0.5 * b for a, b in zip(*rows, strict=True)] for rows in zip(A, cube, strict=True)]
+    return A
 
 
 def _frame(z: Vector) -> Rows:
