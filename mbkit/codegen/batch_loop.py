@@ -25,9 +25,6 @@ RUN: Final = "mbkit_run"
 #: Inputs, and outputs, of one function at most.
 MOST_ARRAYS: Final = 16
 
-#: Vectors ahead of the one at work whose memory is asked for.
-_AHEAD: Final = 4
-
 _I64: Final = ir.IntType(64)
 _DOUBLE: Final = ir.DoubleType()
 _POINTER: Final = ir.PointerType()
@@ -209,15 +206,6 @@ def batch_code(width: int) -> str:
         b.branch(done)
         b.position_at_end(done)
 
-    def fetch(array: Any, across: Any, inward: bool) -> Any:
-        """Ask for what the vectors after this one read and write: processors do not foresee so many streams."""
-
-        def one(j: Any) -> None:
-            ahead = b.at(array, b.add(b.mul(j, across), _I64(_AHEAD * width)))
-            b.call(prefetch, [ahead, *(ir.Constant(ir.IntType(32), x) for x in (int(not inward), 3, 1))])
-
-        return one
-
     def prepare(inward: bool, offset: Any, s: Any, full: Any, left: Any) -> Any:
         def one(i: Any) -> None:
             array, rows, across, along, direct = described(b.add(i, offset), s, full)
@@ -225,7 +213,6 @@ def batch_code(width: int) -> str:
             tile = b.at(work, place)
             with b.if_else(direct) as (here, there):
                 with here:
-                    b.count(_I64(0), rows, 1, fetch(array, across, inward))
                     b.set(array, held["p", inward], i, _POINTER)
                     b.set(across, held["s", inward], i, _I64)
                 with there:
@@ -246,9 +233,6 @@ def batch_code(width: int) -> str:
 
         return one
 
-    prefetch = ir.Function(
-        module, ir.FunctionType(ir.VoidType(), [_POINTER, *[ir.IntType(32)] * 3]), "llvm.prefetch.p0"
-    )
     body = ir.Function(module, ir.FunctionType(ir.VoidType(), [_POINTER] * 5), BODY)
 
     def vector(s: Any) -> None:
