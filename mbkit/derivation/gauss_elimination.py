@@ -24,7 +24,7 @@ all gives M and the forces of v̇ = 0, by composite bodies.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -60,6 +60,20 @@ class Pivot:
     others: dict[int, Any]
     #: The direction in which A drops out, so that the joint's force alone passes.
     free: int | None
+    #: Of the others, the directions of those whose columns are unit vectors, and whose Y_ki are entries of U.
+    units: dict[int, int]
+
+    def acceleration(self, force: Any, A: Vector, done: Mapping[int, Any]) -> Any:
+        """Return v̇_k from f_k - r_k, A without the link's own velocities, and the other accelerations."""
+        moved = list(A)
+        for i, place in self.units.items():
+            moved[place] = moved[place] + done[i]
+        along = [x for n, x in enumerate(zip(self.row, moved, strict=True)) if n != self.free]
+        known = sum((x * a for x, a in along if not is_zero(x)), 0.0)
+        known = known + sum((x * done[i] for i, x in self.others.items() if i not in self.units), 0.0)
+        out = difference(force, known) * self.inverse
+        # In that direction U is the pivot.
+        return out if self.free is None else out - A[self.free]
 
 
 @dataclass
@@ -128,8 +142,12 @@ class GaussFunction:
         """Return Y_ik."""
         return self.Y.get((i, k) if i <= k else (k, i), 0.0)
 
-    def eliminate(self, k: int, free: int | None) -> Pivot:
-        """Minimize over y_k; `free` is the direction in which A then drops out, if there is one."""
+    def eliminate(self, k: int, free: int | None, units: Mapping[int, int]) -> Pivot:
+        """Minimize over y_k; `free` is the direction in which A then drops out, if there is one.
+
+        `units` are the directions of velocities whose columns are unit vectors: K and Y of these are entries of J, and
+        their products are written alike, so that they are computed once.
+        """
         self.soften()
         row, diagonal = self.K.pop(k), self.coupling(k, k)
         others = {i: self.coupling(i, k) for i in self.K}
@@ -140,11 +158,14 @@ class GaussFunction:
             for j in range(i, 6):
                 self._lower(i, j, None if free in (i, j) else ratio[i] * row[j])
         for i, y in others.items():
-            self.K[i] = [0.0 if n == free else difference(x, ratio[n] * y) for n, x in enumerate(self.K[i])]
+            share, place = y * inverse, units.get(i, 5)
+            products = [ratio[n] * y if n <= place else share * row[n] for n in range(6)]
+            self.K[i] = [0.0 if n == free else difference(x, products[n]) for n, x in enumerate(self.K[i])]
             for j, z in others.items():
                 if i <= j:
-                    self.raise_coupling(i, j, negative(y * z * inverse))
-        return Pivot(k, inverse, row, ratio, others, free)
+                    self.Y[i, j] = difference(self.Y.get((i, j), 0.0), share * z)
+        units = {i: place for i, place in units.items() if i in others}
+        return Pivot(k, inverse, row, ratio, others, free, units)
 
     def _lower(self, i: int, j: int, x: Any) -> None:
         """Subtract from J_ij; None makes it zero."""
@@ -259,15 +280,19 @@ class GaussElimination:
                         if i <= j:
                             function.raise_coupling(i, j, armature * a * b)
         ready = [k for k in function.K if function.uses[k] == self._uses[k] and k not in self._carried]
-        return [function.eliminate(k, self._free(k, link)) for k in reversed(ready)]
+        own = () if link is None else ((k, _unit(column)) for k, column in link.columns if self._uses[k] == 1)
+        units = {k: place for k, place in own if place is not None}
+        return [
+            function.eliminate(k, self._free(k, link), units if self._uses[k] == 1 else {}) for k in reversed(ready)
+        ]
 
     def _free(self, k: int, link: Link | None) -> int | None:
         """Return the direction of a velocity that nothing else couples, along which A drops out."""
         if link is None or self._uses[k] > 1:
             return None
         for (index, column), rotor in zip(link.columns, link.rotors, strict=True):
-            if index == k and is_zero(rotor) and [x for x in column if not is_zero(x)] == [1.0]:
-                return column.index(1.0)
+            if index == k and is_zero(rotor):
+                return _unit(column)
         return None
 
     def accelerations(self, f: Sequence[Any], *, drifts: bool = True) -> tuple[dict[int, Any], Unfold]:
@@ -290,7 +315,10 @@ class GaussElimination:
                 if pivot.free is not None:
                     p[pivot.free] = f[k]
                 for i, y in pivot.others.items():
-                    r[i] = r.get(i, 0.0) + y * (force * pivot.inverse)
+                    # Along a unit column r is an entry of p.
+                    unit = pivot.units.get(i)
+                    share = y * (force * pivot.inverse) if unit is None else pivot.ratio[unit] * force
+                    r[i] = r.get(i, 0.0) + share
             return p
 
         def moved(p: Vector, r: dict[int, Any], images: tuple[Vector, dict[int, Any]]) -> Vector:
@@ -320,9 +348,7 @@ class GaussElimination:
 
             def resolve(pivots: list[Pivot], A: Vector) -> None:
                 for pivot in reversed(pivots):
-                    k = pivot.velocity
-                    known = sum((x * done[i] for i, x in pivot.others.items()), 0.0) + dot6(pivot.row, A)
-                    done[k] = difference(forces[k], known) * pivot.inverse
+                    done[pivot.velocity] = pivot.acceleration(forces[pivot.velocity], A, done)
 
             world = self.mechanics.ground if drifts else [0.0] * 6
             resolve(self._top.first, world)
@@ -382,3 +408,8 @@ class GaussElimination:
             resolve(level.first, x)
             A[index] = x
         return done
+
+
+def _unit(column: Vector) -> int | None:
+    """Return the direction of a column that is a unit vector."""
+    return column.index(1.0) if [x for x in column if not is_zero(x)] == [1.0] else None

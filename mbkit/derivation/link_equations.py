@@ -132,10 +132,10 @@ class LinkEquations(Equations):
 
     def _shortest(self) -> Any:
         best = self._reduced(self.mechanics, ())
-        worse, least = 0, ca.n_nodes(best)
+        worse, least = 0, _size(best)
         for carried in self._carried():
             other = self._reduced(self.mechanics, carried)
-            size = ca.n_nodes(other)
+            size = _size(other)
             worse = 0 if size < least else worse + 1
             if not worse:
                 best, least = other, size
@@ -274,3 +274,8 @@ class LinkEquations(Equations):
     @staticmethod
     def _scalars(x: Any) -> list[Any]:
         return [scalar(x[i]) for i in range(x.shape[0])]
+
+
+def _size(x: Any) -> int:
+    """Return how many operations an expression has, repeated ones once."""
+    return int(ca.n_nodes(ca.cse(x)))
