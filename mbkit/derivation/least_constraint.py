@@ -325,6 +325,11 @@ def _ratios(model: Model, q: Array) -> Array:
     return np.asarray(np.nan_to_num(1 / left, nan=np.inf, posinf=np.inf).max(axis=1))
 
 
+def mass_matrices(model: Model, q: Array) -> Array:
+    """Return M at poses (N, nq) from the bodies' Jacobians, (N, nv, nv)."""
+    return np.asarray(sum(B.transpose(0, 2, 1) @ B for B in _rows(model, q).values()))
+
+
 def _pivots(B: Array) -> Array:
     """Return D of BᵀB = LᵀDL, from the last to the first."""
     missing = max(0, B.shape[2] - B.shape[1])

@@ -18,7 +18,7 @@ from mbkit._check import Array
 from mbkit.derivation.composite_bodies import mass_matrix
 from mbkit.derivation.equations import Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
-from mbkit.derivation.least_constraint import hard_poses, has_squares, loses_digits
+from mbkit.derivation.least_constraint import hard_poses, has_squares, loses_digits, mass_matrices
 from mbkit.derivation.link_derivatives import Entries, LinkDerivatives, has_constant_columns
 from mbkit.derivation.link_mechanics import LinkMechanics
 from mbkit.derivation.links import Links
@@ -154,11 +154,10 @@ class LinkEquations(Equations):
             return np.inf
         given = [self.q, self.v, self.tau]
         forms = ca.Function("forms", given, [ca.densify(x) for x in (form, exact, self.nle, self.passive)])
-        mass_matrix = ca.Function("M", [self.q], [ca.densify(self.mass_matrix)])
         worst = 0.0
         with np.errstate(all="ignore"):
-            for pose in self._poses(rng):
-                M = np.array(mass_matrix(pose))
+            poses = self._poses(rng)
+            for pose, M in zip(poses, mass_matrices(model, poses), strict=True):
                 root = np.sqrt(np.diag(M))
                 scaled = M / np.outer(root, root)
                 if not np.isfinite(scaled).all():
