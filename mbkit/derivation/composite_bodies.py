@@ -108,11 +108,9 @@ def mass_matrix(mechanics: LinkMechanics) -> Any:
             for k, b in row.items():
                 if i <= k:
                     add_entry(i, k, armature * a * b)
-    M: Any = ca.SX(n, n)
-    for (i, k), x in entries.items():
-        if not is_zero(x):
-            M[i, k] = M[k, i] = x
-    return M
+    full = {place: x for (i, k), x in entries.items() if not is_zero(x) for place in ((i, k), (k, i))}
+    rows, columns = ([place[i] for place in full] for i in (0, 1))
+    return ca.SX.triplet(rows, columns, ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in full.values())), n, n)
 
 
 def _carried(link: Link, wrench: Vector) -> Vector:
